@@ -7,7 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.simulation import film_clip
 from torchvision_dddas.tuning import Plan, Step, descend, judge, prepare
 

@@ -13,8 +13,8 @@ from torchvision_dddas.evaluation.datasets import motchallenge
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.truth import Truth
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import find
 from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.io.images import ImageSource, read_image

@@ -29,7 +29,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.motion import MotionFamily

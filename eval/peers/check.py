@@ -20,7 +20,7 @@ import numpy as np
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import truth as true_boxes
-from torchvision_dddas.evaluation.studies.results import Found, round_as_written
+from torchvision_dddas.evaluation.studies.records import Found, round_as_written
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.summary import measures
 

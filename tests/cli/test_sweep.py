@@ -1,7 +1,6 @@
 """`dddas sweep` on small clips: what it writes, that it repeats, what becomes of clips held out and of bad input."""
 
 import json
-from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -64,19 +63,11 @@ def test_clips_held_out_have_no_say_and_are_told_apart(swept) -> None:
     assert "Held out (held)" in swept[1]
 
 
-def test_how_far_the_next_points_are_is_told_meanwhile(capsys, monkeypatch) -> None:
-    sweep = import_module("torchvision_dddas.cli.sweep")
-    monkeypatch.setattr(sweep, "EVERY_S", 0.0)
-    sweep._progress(False)(3, 24)
-    sweep._progress(True)(4, 24)
-    assert capsys.readouterr().err == "3 of 24 clips of the next points\n"
-
-
 def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(study, swept, monkeypatch) -> None:
     def none(*_, **__):
         raise AssertionError("something was computed again")
 
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.workers.do_job", none)
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", none)
     out = study.parent / "again"
     assert asked(study, *GRID, "--holdout", "h*", "--out", str(out), "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):

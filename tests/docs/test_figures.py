@@ -119,8 +119,8 @@ def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
 
     from torchvision_dddas.cli import app
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies.goals import parse_goal
-    from torchvision_dddas.evaluation.studies.search_space import parse_grid
+    from torchvision_dddas.evaluation.studies.summary import parse_goal
+    from torchvision_dddas.evaluation.studies.sweep import parse_grid
     from torchvision_dddas.simulation import load_scenario as load_scenario
 
     program, name, *words = command.split()

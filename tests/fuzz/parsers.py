@@ -24,7 +24,7 @@ from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import clip, truth
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.geo.site import looks_swapped
 from torchvision_dddas.geometry import poses_at
 from torchvision_dddas.io.camera_files import (

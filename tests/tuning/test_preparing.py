@@ -6,7 +6,7 @@ import pytest
 
 from tests.evaluation.studies.world import filmed, followed, study
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.tuning.family import FAMILIES, load_family, prepare
 
 

@@ -8,9 +8,8 @@ import pytest
 from tests.evaluation.studies.world import filmed, study
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.evaluation.studies.goals import goal_value, parse_goal
-from torchvision_dddas.evaluation.studies.runner import run_study
-from torchvision_dddas.evaluation.studies.spec import read_spec
+from torchvision_dddas.evaluation.studies.runner import read_spec, run_study
+from torchvision_dddas.evaluation.studies.summary import goal_value, parse_goal
 from torchvision_dddas.tuning import verdict as judging
 from torchvision_dddas.tuning.verdict import Verdict, judge
 

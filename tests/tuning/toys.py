@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.tuning.family import Example, Family
 
 

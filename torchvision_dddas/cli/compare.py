@@ -7,11 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.options import report_errors
-from torchvision_dddas.cli.study import MOST_CLIPS, format_figure, open_console
+from torchvision_dddas.cli.evaluate import MOST_CLIPS, format_figure
+from torchvision_dddas.cli.options import print_lines, report_errors
+from torchvision_dddas.cli.progress import open_console
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+MEANING = (
+    "better, worse: beyond noise, p below 0.05 after Holm's correction. On these clips: by blocks of their frames; "
+    "their number is too small, or they are too unlike, to say so of others. Too little to tell: so few frames or "
+    "clips could not show any change."
+)
 
 
 @report_errors
@@ -26,9 +33,8 @@ def compare(
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.evaluation.report.comparison import comparison_report
-    from torchvision_dddas.evaluation.studies.comparison import compare_studies
-    from torchvision_dddas.evaluation.studies.storage import read_scores
+    from torchvision_dddas.evaluation.studies.cache import read_scores
+    from torchvision_dddas.evaluation.studies.comparison import compare_studies, comparison_report
     from torchvision_dddas.io.atomic_files import refuse_folder, save_file
     from torchvision_dddas.io.output.run_record import finite
 
@@ -38,41 +44,32 @@ def compare(
         save_file(out, comparison_report(finite(found)).encode())
     if as_json:
         typer.echo(json.dumps(finite(found), indent=2))
-    else:
-        _show(found, str(first), str(second))
-
-
-def _show(found: Mapping[str, Any], first: str, second: str) -> None:
-    """Print a table of each task, the clips that changed, and the notes."""
+        return
+    print_lines([f"A: {first}", f"B: {second}"])
     console = open_console()
-    console.print(f"A: {first}\nB: {second}", markup=False, highlight=False)
-    for task, mine in found["tasks"].items():
-        names = [(group, name) for group in mine["pooled"] for name in mine["pooled"][group]]
-        rows = [(f"{group} {name}", mine["pooled"][group][name]) for group, name in names]
-        count = len(mine["same"]) + len(mine["clips"])
-        console.print(_table(f"{task}, {count} clip{'s' * (count != 1)} together", rows))
+    for task, changes in found["tasks"].items():
+        pooled = [(f"{group} {name}", entry) for group, name, entry in _rows(changes["pooled"])]
+        count = len(changes["clips"]) + len(changes["same"])
+        console.print(_table(f"{task}, {count} clip{'s' * (count != 1)} together", pooled))
         clips = [
             (f"{clip}: {group} {name}", entry)
-            for clip, groups in mine["clips"].items()
-            for group, by_name in groups.items()
-            for name, entry in by_name.items()
+            for clip, groups in changes["clips"].items()
+            for group, name, entry in _rows(groups)
             if entry["change"]
         ]
-        clips.sort(key=lambda row: _p(row[1]))
+        clips.sort(key=lambda row: row[1]["over_frames"]["p_holm"] if row[1]["over_frames"] else 2.0)
         if clips:
             console.print(_table(f"{task}, single clips", clips[:MOST_CLIPS]))
         if len(clips) > MOST_CLIPS:
-            console.print(f"{len(clips) - MOST_CLIPS} more rows: --json", highlight=False)
-        if mine["same"]:
-            console.print(f"the same in both to the last digit: {', '.join(mine['same'])}", markup=False)
-    console.print(
-        "better, worse: beyond noise, p below 0.05 after Holm's correction. On these clips: by blocks of their frames; "
-        "their number is too small, or they are too unlike, to say so of others. Too little to tell: so few frames or "
-        "clips could not show any change.",
-        highlight=False,
-    )
-    for note in found["notes"]:
-        console.print(f"note: {note}", markup=False, highlight=False)
+            typer.echo(f"{len(clips) - MOST_CLIPS} more rows: --json")
+        if changes["same"]:
+            typer.echo(f"the same in both to the last digit: {', '.join(changes['same'])}")
+    console.print(MEANING, highlight=False)
+    print_lines([f"note: {note}" for note in found["notes"]])
+
+
+def _rows(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, Mapping[str, Any]]]:
+    return [(group, name, entry) for group, by_name in groups.items() for name, entry in by_name.items()]
 
 
 def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
@@ -85,7 +82,7 @@ def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("says")
     for name, entry in rows:
-        ways = [entry.get(way) or {} for way in (("over_clips", "over_frames") if pooled else ("over_frames",))]
+        ways = [entry[way] or {} for way in (("over_clips", "over_frames") if pooled else ("over_frames",))]
         span = next((way["interval"] for way in ways if way.get("interval")), None)
         table.add_row(
             name,
@@ -97,8 +94,3 @@ def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
             entry["says"],
         )
     return table
-
-
-def _p(entry: Mapping[str, Any]) -> float:
-    way = entry.get("over_frames")
-    return float(way["p_holm"]) if way else 2.0

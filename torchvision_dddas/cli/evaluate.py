@@ -1,9 +1,12 @@
 """`dddas evaluate`: results against the truth, of files or of the whole study that `--dataset` names."""
 
 import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -18,11 +21,19 @@ from torchvision_dddas.cli.options import (
     StudyBackend,
     check_interval,
     check_jobs,
+    print_lines,
     report_errors,
     split_patterns,
 )
-from torchvision_dddas.cli.study import change_spec, open_console, print_measures, print_study, show_progress
+from torchvision_dddas.cli.progress import open_console, show_progress
 from torchvision_dddas.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from torchvision_dddas.evaluation.studies.records import Results, Spec
+
+MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
 
 
 class Ignored(StrEnum):
@@ -98,10 +109,9 @@ def evaluate(
             show(report)
             typer.echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
-    from torchvision_dddas.evaluation.studies.output import write_study
-    from torchvision_dddas.evaluation.studies.runner import cache_folder
-    from torchvision_dddas.evaluation.studies.storage import Cache
-    from torchvision_dddas.evaluation.studies.workers import Workers
+    from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
+    from torchvision_dddas.evaluation.studies.jobs import Workers
+    from torchvision_dddas.evaluation.studies.runner import write_study
 
     _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
     check_jobs(jobs, scheduler)
@@ -111,12 +121,12 @@ def evaluate(
     with Workers(jobs, scheduler) as workers, show_progress(quiet) as (begin, advance):
         results, measures = write_study(folder, spec, base, workers, cache, used, advance, begin)
     if not quiet:
-        print_study(results, measures, folder)
+        _show_study(results, measures, folder)
     if prune_cache is not None:
         place = cache or cache_folder()
         count, size = Cache(place).prune(prune_cache)
-        if not quiet:
-            typer.echo(f"{place}: {count} results unused for {prune_cache:g} days were removed, {size / 1e6:.1f} MB")
+        text = f"{place}: {count} results unused for {prune_cache:g} days were removed, {size / 1e6:.1f} MB"
+        print_lines([text], quiet)
     if all(case.cause for case in results.cases):
         case = results.cases[0]
         raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")
@@ -127,6 +137,17 @@ def _refuse(options: dict[str, object], why: str) -> None:
     for option, given in options.items():
         if given is not None:
             raise InputError(f"{option} {why}")
+
+
+def change_spec(
+    file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
+) -> "Spec":
+    """Read a study's file and change it by what the command line says. Raises InputError for bad input."""
+    from torchvision_dddas.evaluation.studies.runner import read_spec
+
+    spec = read_spec(file)
+    spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
+    return replace(spec, backend=backend or spec.backend, interval=spec.interval if interval is None else interval)
 
 
 def score(
@@ -147,9 +168,79 @@ def score(
     return report
 
 
-def show(report: dict[str, Any]) -> None:
-    """Print a table for each group of measures, and the notes."""
+def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None) -> None:
+    """Print a table for each group of measures: "clips" by name, "pooled" (with "intervals" in a study) and "mean".
+
+    prefix: of titles. most: clips in a table, the worst of them if there are more. Without it, the notes follow.
+    """
+    from torchvision_dddas.evaluation.metrics.registry import GROUPS
+
     console = open_console()
-    print_measures(console, report)
-    for note in report["notes"]:
-        console.print(f"note: {note}", markup=False, highlight=False)
+    for group in GROUPS:
+        if clips := {name: clip for name, clip in measures["clips"].items() if group in clip}:
+            console.print(_table(group, clips, measures, prefix, most or len(clips)))
+    print_lines([f"note: {note}" for note in measures["notes"]], quiet=most is not None)
+
+
+def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -> None:
+    """Print the main measures of each task, what was left out, and where the rest is."""
+    from torchvision_dddas.evaluation.studies.runner import FILES
+
+    for task, found in measures["tasks"].items():
+        show(found, f"{task}: ", MOST_CLIPS)
+    lines = [f"left out: {line}" for line in results.left_out]
+    notes = results.facts["notes"]
+    lines += [f"note: {line}" for line in notes[:MOST_NOTES]]
+    if len(notes) > MOST_NOTES:
+        lines.append(f"note: {len(notes) - MOST_NOTES} more in run.json")
+    kept = sum(1 for case in results.cases if not case.cause)
+    lines.append(f"{kept} of {len(results.cases)} cases scored, {results.facts['computed']} stages computed")
+    print_lines([*lines, f"{folder}: {', '.join(name for name in FILES if (folder / name).is_file())}"])
+
+
+def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], prefix: str, most: int) -> "Table":
+    from rich.markup import escape
+    from rich.table import Table
+
+    from torchvision_dddas.evaluation.metrics.registry import GROUPS, describe, is_lower_better
+
+    columns, title = GROUPS[group].columns, GROUPS[group].title
+
+    def rank(name: str) -> float:  # lowest for the worst clip
+        value = clips[name][group][columns[0]]
+        if value is None or math.isnan(value):
+            return math.inf
+        return -value if is_lower_better(columns[0]) else value
+
+    shown = list(clips) if len(clips) <= most else sorted(clips, key=rank)[:most]
+    more = f"; the {most} worst of {len(clips)} clips" if len(clips) > most else ""
+    table = Table(title=f"{prefix}{title[0].upper()}{title[1:]}{more}")
+    table.add_column("clip", no_wrap=True)
+    for heading in ("frames", *(describe(column).short or describe(column).title for column in columns)):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name in shown:
+        cells = (format_figure(clips[name][group][c]) for c in columns)
+        table.add_row(escape(str(InputError(name))), str(clips[name]["frames"]), *cells)
+    if len(clips) > 1:
+        pooled, mean = measures["pooled"], measures["mean"].get(group, {})
+        table.add_section()
+        table.add_row("pooled", "", *(format_figure(pooled.get(group, {}).get(c)) for c in columns))
+        if "intervals" in pooled:
+            intervals = pooled["intervals"].get(group, {})
+            table.add_row("95 % interval", "", *(_format_interval(intervals.get(c)) for c in columns))
+        table.add_row("mean", "", *(format_figure(mean.get(c)) for c in columns))
+    return table
+
+
+def format_figure(value: float | int | None, sign: str = "") -> str:
+    """A measure or a count for a table."""
+    if type(value) is int:
+        return f"{value:{sign}d}"
+    return "–" if value is None or math.isnan(value) else f"{value:{sign}.3f}"
+
+
+def _format_interval(interval: Sequence[float] | None) -> str:
+    if interval is None:
+        return "–"
+    low, high = interval
+    return f"{low:.2f} to {high:.2f}" if abs(high) < 100 else f"{low:.0f} to {high:.0f}"

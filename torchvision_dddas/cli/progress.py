@@ -9,8 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from torchvision_dddas.evaluation.studies.jobs import Event
+    from torchvision_dddas.evaluation.studies.runner import Plan
     from torchvision_dddas.io.output import RunRecord, RunRecorder
     from torchvision_dddas.types import Source
+
+    Hooks = tuple[Callable[[Plan], None], Callable[[Event], None]]
 
 EVERY_S = 5.0
 
@@ -23,11 +30,113 @@ def progress(name: str, count: int | None, quiet: bool) -> Iterator[Callable[[],
     """
     if quiet:
         yield lambda: None
-    elif sys.stderr.isatty():
-        with _bar(name, count) as tick:
+        return
+    start = printed = time.monotonic()
+    done = 0
+
+    def speed() -> tuple[float, str]:
+        rate_hz = done / max(time.monotonic() - start, 1e-3)
+        return rate_hz, f"{rate_hz:.1f} frames/s" if rate_hz >= 0.2 else f"{1 / rate_hz:.0f} s per frame"
+
+    if sys.stderr.isatty():
+        with _bar("{task.fields[speed]}", "TimeRemainingColumn") as bar:
+            task = bar.add_task(name, total=count, speed="")
+
+            def tick() -> None:
+                nonlocal done
+                done += 1
+                bar.update(task, advance=1, speed=speed()[1])
+
             yield tick
     else:
-        yield _lines(name, count)
+
+        def tick() -> None:
+            nonlocal done, printed
+            done += 1
+            if time.monotonic() - printed >= EVERY_S:
+                printed = time.monotonic()
+                rate_hz, text = speed()
+                total = "" if count is None else f" of {count}"
+                left = "" if count is None else f", {max(count - done, 0) / rate_hz:.0f} s left"
+                print_now(f"{name}: {done}{total} frames, {text}{left}")
+
+        yield tick
+
+
+@contextmanager
+def show_progress(quiet: bool) -> "Iterator[Hooks]":
+    """How far a study is: a bar on a terminal, elsewhere a line for each clip and every few seconds.
+
+    Yields functions to call with the plan of the study, and with each of its events.
+    """
+    total = done = frames = 0
+    start = printed = time.monotonic()
+
+    def say(text: str) -> None:
+        nonlocal printed
+        printed = time.monotonic()
+        print_now(text)
+
+    def begin(plan: "Plan") -> None:
+        nonlocal total
+        total = len(plan.jobs)
+        say(f"{total} clip{'s' * (total != 1)}, {plan.frames} frames to process over all tasks")
+
+    def advance(event: "Event") -> None:
+        nonlocal done, frames
+        frames += event.frames
+        if event.note:
+            say(event.note)
+        if event.done is not None:
+            done += 1
+            words = ((d.task, " left out" if d.cause else "" if d.computed else " kept") for d in event.done)
+            say(f"{done} of {total}: {event.job.clip.name} ({', '.join(map(''.join, words))})")
+        elif time.monotonic() - printed >= EVERY_S:
+            say(f"{done} of {total} clips, {frames} frames, {frames / (time.monotonic() - start):.1f} frames/s")
+
+    if quiet:
+        yield lambda plan: None, lambda event: None
+    elif sys.stderr.isatty():
+        with _bar("clips, {task.fields[frames]} frames", "TimeElapsedColumn") as bar:
+            task = bar.add_task("study", total=None, frames=0)
+
+            def update(event: "Event") -> None:
+                nonlocal frames
+                frames += event.frames
+                bar.update(task, advance=event.done is not None, frames=frames, description=event.job.clip.name)
+                if event.note:
+                    bar.console.print(event.note, markup=False, highlight=False, soft_wrap=True)
+
+            yield lambda plan: bar.update(task, total=len(plan.jobs)), update
+    else:
+        yield begin, advance
+
+
+def _bar(text: str, clock: str) -> "Progress":
+    """A bar with a text and a clock, the name of one of rich's columns, behind it."""
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TextColumn(text),
+        getattr(progress, clock)(),
+    )
+    return progress.Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+def print_now(line: str) -> None:
+    """Print a line on stderr at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def open_console() -> "Console":
+    """Standard output; 120 columns wide if it is no terminal."""
+    from rich.console import Console
+
+    return Console() if sys.stdout.isatty() else Console(width=120)
 
 
 def record_results(
@@ -81,49 +190,3 @@ def closing_lines(first: str | Sequence[str], record: "RunRecord", folder: Path,
             f"{count} problem{'s' * (count != 1)} while reading, the first: {record.problems[0]} (all in run.json)"
         )
     return [*lines, *(f"note: {note}" for note in record.notes), f"{folder}: {', '.join(files)}"]
-
-
-@contextmanager
-def _bar(name: str, count: int | None) -> Iterator[Callable[[], None]]:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task, start, done = bar.add_task(escape(name), total=count, speed=""), time.monotonic(), 0
-
-        def tick() -> None:
-            nonlocal done
-            done += 1
-            bar.update(task, advance=1, speed=_format_speed(done / max(time.monotonic() - start, 1e-3)))
-
-        yield tick
-
-
-def _lines(name: str, count: int | None) -> Callable[[], None]:
-    start = printed = time.monotonic()
-    done = 0
-
-    def tick() -> None:
-        nonlocal printed, done
-        done += 1
-        now = time.monotonic()
-        if now - printed >= EVERY_S:
-            printed = now
-            rate = done / (now - start)
-            total = "" if count is None else f" of {count}"
-            left = "" if count is None else f", {max(count - done, 0) / rate:.0f} s left"
-            print(f"{name}: {done}{total} frames, {_format_speed(rate)}{left}", file=sys.stderr, flush=True)
-
-    return tick
-
-
-def _format_speed(rate_hz: float) -> str:
-    return f"{rate_hz:.1f} frames/s" if rate_hz >= 0.2 else f"{1 / rate_hz:.0f} s per frame"

@@ -1,8 +1,6 @@
 """`dddas sweep`: a study with many values of parameters, and which of them measure best."""
 
-import sys
 import time
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchvision_dddas.cli.evaluate import change_spec
 from torchvision_dddas.cli.options import (
     CacheFolder,
     Clips,
@@ -20,11 +19,11 @@ from torchvision_dddas.cli.options import (
     Scheduler,
     StudyBackend,
     check_jobs,
+    print_lines,
     report_errors,
     split_patterns,
 )
-from torchvision_dddas.cli.progress import EVERY_S
-from torchvision_dddas.cli.study import change_spec, open_console
+from torchvision_dddas.cli.progress import EVERY_S, open_console, print_now
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
@@ -79,48 +78,45 @@ def sweep(
     Results are kept as those of dddas evaluate --dataset: a repeated sweep continues where it stopped.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies import search_space
-    from torchvision_dddas.evaluation.studies.goals import parse_goal
-    from torchvision_dddas.evaluation.studies.sweep import (
-        StudyMeasure,
-        SweepRecord,
-        best,
-        check_optuna,
-        format_value,
-        search_grid,
-        search_ranges,
-        split_clips,
-    )
-    from torchvision_dddas.evaluation.studies.workers import Workers
+    from torchvision_dddas.evaluation.studies import sweep as sweeps
+    from torchvision_dddas.evaluation.studies.jobs import Workers
+    from torchvision_dddas.evaluation.studies.summary import parse_goal
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
     goal, spec = parse_goal(measure, by), change_spec(dataset, config, set_ or [], backend and backend.value)
     spec = replace(spec, tasks=(goal.task,))
     settings = load_config(spec.config, spec.overrides)
-    points = search_space.parse_grid(grid or [], settings)
-    ranges = search_space.parse_ranges(range_ or [], settings)
-    count = optuna or search_space.count_points(points)
+    points, ranges = sweeps.parse_grid(grid or [], settings), sweeps.parse_ranges(range_ or [], settings)
+    count = optuna or sweeps.count_points(points)
     if optuna is not None:
-        check_optuna()
-    tuned, held = split_clips(
-        spec, dataset.parent, split_patterns(clips, "--clips"), split_patterns(holdout, "--holdout")
-    )
-    asked_for: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
-    record = SweepRecord(out, settings, goal, asked_for, tuned, held)
+        sweeps.check_optuna()
+    used, left = split_patterns(clips, "--clips"), split_patterns(holdout, "--holdout")
+    tuned, held = sweeps.split_clips(spec, dataset.parent, used, left)
+    search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
+    record = sweeps.SweepRecord(out, settings, goal, search, tuned, held)
+    printed = time.monotonic()
+
+    def on_progress(done: int, total: int) -> None:
+        nonlocal printed
+        if not quiet and time.monotonic() - printed >= EVERY_S:
+            printed = time.monotonic()
+            print_now(f"{done} of {total} clips of the next points")
+
     with Workers(jobs, scheduler) as workers:
-        study = StudyMeasure(spec, dataset.parent, goal, workers, cache, _progress(quiet))
+        study = sweeps.StudyMeasure(spec, dataset.parent, goal, workers, cache, on_progress)
         on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
         if optuna is None:
-            trials = search_grid(points, settings, on_tuned, prepare)
+            trials = sweeps.search_grid(points, settings, on_tuned, prepare)
         else:
-            trials = search_ranges(ranges, settings, on_tuned, optuna, seed, goal.minimize)
+            trials = sweeps.search_ranges(ranges, settings, on_tuned, optuna, seed, goal.minimize)
         for trial in trials:
             record.add(trial)
             if not quiet:
-                point, value = _format_point(trial.parameters), trial.cause or format_value(trial.value)
-                print(f"{trial.number} of {count}: {point}: {value}", file=sys.stderr, flush=True)
-        if (found := best(record.trials, goal.minimize)) is None:
+                point = ", ".join(f"{name}={_format(value)}" for name, value in trial.parameters.items())
+                text = trial.cause or sweeps.format_value(trial.value)
+                print_now(f"{trial.number} of {count}: {point or 'unchanged'}: {text}")
+        if (found := sweeps.best(record.trials, goal.minimize)) is None:
             raise InputError(f"no setting has a {goal.name}: {record.trials[0].cause}")
         on_held = None
         if held:
@@ -129,19 +125,6 @@ def sweep(
     record.finish(found, on_held)
     if not quiet:
         _show(record)
-
-
-def _progress(quiet: bool) -> Callable[[int, int], None]:
-    """Print every few seconds, on stderr, how many clips of the next points are done."""
-    printed = time.monotonic()
-
-    def advance(done: int, of: int) -> None:
-        nonlocal printed
-        if not quiet and time.monotonic() - printed >= EVERY_S:
-            printed = time.monotonic()
-            print(f"{done} of {of} clips of the next points", file=sys.stderr, flush=True)
-
-    return advance
 
 
 def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] | None) -> None:
@@ -159,40 +142,33 @@ def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] 
         raise InputError(f"--optuna must be 1 to {MOST_PROPOSED} points, got {optuna}")
 
 
-def _show(swept: "SweepRecord") -> None:
+def _show(record: "SweepRecord") -> None:
     """Print the best trials, the measures on held-out clips, and where the rest is."""
     from rich.table import Table
 
     from torchvision_dddas.evaluation.studies.sweep import format_value, ranked
 
-    console = open_console()
-    parameters = list(dict.fromkeys(parameter for trial in swept.trials for parameter in trial.parameters))
-    table = Table(title=f"{swept.heading}, {'least' if swept.goal.minimize else 'most'} first")
-    for column in ("trial", *parameters, swept.goal.measure):
+    minimize = record.goal.minimize
+    parameters = list(dict.fromkeys(parameter for trial in record.trials for parameter in trial.parameters))
+    table = Table(title=f"{record.heading}, {'least' if minimize else 'most'} first")
+    for column in ("trial", *parameters, record.goal.measure):
         table.add_column(column, justify="left" if column in parameters else "right")
-    ordered = ranked(swept.trials, swept.goal.minimize)
+    ordered = ranked(record.trials, minimize)
     shown = ordered[:MOST_SHOWN]
-    if swept.trials[0] not in shown:
-        shown.append(swept.trials[0])
+    if record.trials[0] not in shown:
+        shown.append(record.trials[0])
     for trial in shown:
-        cells = [_value(trial.parameters[k]) if k in trial.parameters else "unchanged" for k in parameters]
+        cells = [_format(trial.parameters[name]) if name in trial.parameters else "unchanged" for name in parameters]
         table.add_row(str(trial.number), *cells, format_value(trial.value))
-    console.print(table)
+    open_console().print(table)
+    lines = [f"trial {trial.number} has no value: {trial.cause}" for trial in ordered if trial.cause]
     if len(ordered) > len(shown):
-        console.print(f"{len(ordered) - len(shown)} more in {swept.folder / 'sweep.json'}", highlight=False)
-    for trial in ordered:
-        if trial.cause:
-            console.print(f"trial {trial.number} has no value: {trial.cause}", markup=False, highlight=False)
-    if swept.on_held is not None:
-        before, after = (format_value(value) for value, _ in swept.on_held)
-        names = ", ".join(swept.held)
-        console.print(f"Held out ({names}): {after} with the best, {before} before.", markup=False, highlight=False)
-    typer.echo(f"{swept.folder}: sweep.json, best.toml (for --config)")
+        lines.insert(0, f"{len(ordered) - len(shown)} more in {record.folder / 'sweep.json'}")
+    if record.on_held is not None:
+        before, after = (format_value(value) for value, _ in record.on_held)
+        lines.append(f"Held out ({', '.join(record.held)}): {after} with the best, {before} before.")
+    print_lines([*lines, f"{record.folder}: sweep.json, best.toml (for --config)"])
 
 
-def _format_point(parameters: Mapping[str, object]) -> str:
-    return ", ".join(f"{name}={_value(value)}" for name, value in parameters.items()) or "unchanged"
-
-
-def _value(value: object) -> str:
+def _format(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(list(value) if isinstance(value, tuple) else value)

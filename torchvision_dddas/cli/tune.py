@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchvision_dddas.cli.evaluate import change_spec
 from torchvision_dddas.cli.options import (
     CacheFolder,
     Clips,
@@ -22,8 +23,7 @@ from torchvision_dddas.cli.options import (
     report_errors,
     split_patterns,
 )
-from torchvision_dddas.cli.progress import EVERY_S, progress
-from torchvision_dddas.cli.study import change_spec, open_console, show_progress
+from torchvision_dddas.cli.progress import EVERY_S, open_console, progress, show_progress
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from torch import Tensor
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.goals import Goal, check_possible, parse_goal
+from torchvision_dddas.evaluation.studies.records import Spec, Task
 from torchvision_dddas.evaluation.studies.runner import plan_study
-from torchvision_dddas.evaluation.studies.spec import Spec, Task
+from torchvision_dddas.evaluation.studies.summary import Goal, check_possible, parse_goal
 from torchvision_dddas.evaluation.studies.sweep import split_clips
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, expand_names
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.tuning.aerial_examples import aerial_examples
 from torchvision_dddas.tuning.aerial_location import AerialExample, aerial_losses, default_values, fit_ground
 from torchvision_dddas.tuning.family import Family

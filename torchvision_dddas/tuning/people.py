@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.boxes import SAME, areas, iou, judged
 from torchvision_dddas.evaluation.metrics.matching import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional.soft import step
 from torchvision_dddas.people import pyramid

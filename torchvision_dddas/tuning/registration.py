@@ -23,7 +23,7 @@ from torchvision_dddas.detection import (
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional import affine, homography
 from torchvision_dddas.functional.consensus import Fit, fit_to_inliers, inlier_weights, transfer_error

@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.evaluation.metrics.registry import describe, title_of_group
-from torchvision_dddas.evaluation.report.comparison import MEANING, comparison_section
+from torchvision_dddas.evaluation.studies.comparison import MEANING, comparison_section
 from torchvision_dddas.io.report import (
     Axis,
     Cell,

@@ -14,8 +14,7 @@ from torch import Tensor
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.results import Found
-from torchvision_dddas.evaluation.studies.spec import Task
+from torchvision_dddas.evaluation.studies.records import Found, Task
 from torchvision_dddas.evaluation.studies.stages import find, upstream_task
 from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.tuning.parameters import TUNABLE, value_of

@@ -13,7 +13,7 @@ import torch
 
 from torchvision_dddas.config import all_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.spec import Spec
+from torchvision_dddas.evaluation.studies.records import Spec
 from torchvision_dddas.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.io.atomic_files import cannot_write, save_file
 from torchvision_dddas.io.output.run_record import finite, versions

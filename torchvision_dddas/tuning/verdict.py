@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.evaluation.studies.comparison import LEVEL, compare_studies
-from torchvision_dddas.evaluation.studies.goals import Goal, goal_value
-from torchvision_dddas.evaluation.studies.jobs import Event
-from torchvision_dddas.evaluation.studies.results import Case, ScoredCase, ScoredStudy
+from torchvision_dddas.evaluation.studies.jobs import Event, Workers
+from torchvision_dddas.evaluation.studies.records import Case, ScoredCase, ScoredStudy, Spec
 from torchvision_dddas.evaluation.studies.runner import Plan, run_study
-from torchvision_dddas.evaluation.studies.spec import Spec
+from torchvision_dddas.evaluation.studies.summary import Goal, goal_value
 from torchvision_dddas.evaluation.studies.sweep import format_value, toml_value
-from torchvision_dddas.evaluation.studies.workers import Workers
 
 BEFORE, AFTER = "before", "after"
 

@@ -8,9 +8,8 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
-from torchvision_dddas.evaluation.studies.results import Case, Found, Results, Scored
+from torchvision_dddas.evaluation.studies.records import Case, Found, Results, Scored, Spec, Task
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Spec, Task
 
 SIZE = (160, 120)
 FRAMES = 6

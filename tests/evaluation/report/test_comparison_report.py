@@ -4,7 +4,7 @@ import pytest
 
 from tests.browser import evaluate, needs_browser
 from tests.pages import Page
-from torchvision_dddas.evaluation.report.comparison import comparison_report
+from torchvision_dddas.evaluation.studies.comparison import comparison_report
 
 
 def entry(first, second, says, interval=None, p=0.01):

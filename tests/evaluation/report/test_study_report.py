@@ -222,7 +222,7 @@ def test_a_video_gives_the_frames_that_were_asked_for(tmp_path):
 
 def test_matched_boxes_are_those_that_are_counted():
     overlap = np.array([[0.9, 0.6], [0.8, 0.0]])
-    assert matched(np.zeros((2, 4)), np.zeros((2, 4)), overlap).tolist() == [0, -1]
+    assert matched(overlap).tolist() == [0, -1]
 
 
 def test_curves_of_many_clips_are_bounded_and_say_so(tmp_path):

@@ -9,8 +9,7 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.studies.results import Case, Found, Results, Scored
-from torchvision_dddas.evaluation.studies.spec import Spec, Task
+from torchvision_dddas.evaluation.studies.records import Case, Found, Results, Scored, Spec, Task
 
 SIZE = (60, 80)
 

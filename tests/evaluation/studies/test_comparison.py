@@ -9,10 +9,10 @@ from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.studies import comparison
+from torchvision_dddas.evaluation.studies.cache import SCORES, read_scores, write_scores
 from torchvision_dddas.evaluation.studies.comparison import compare_studies
-from torchvision_dddas.evaluation.studies.results import ScoredCase, ScoredStudy
+from torchvision_dddas.evaluation.studies.records import ScoredCase, ScoredStudy
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.storage import SCORES, read_scores, write_scores
 
 
 @pytest.fixture(autouse=True)
@@ -104,8 +104,8 @@ def test_another_truth_or_other_frames_are_not_compared(tmp_path):
 
 def test_less_is_better_where_it_is(tmp_path):
     entry = {"change": -0.1, "over_frames": {"p_holm": 0.01, "enough": True}}
-    assert comparison._verdict(entry, "log_average_miss_rate") == "better"
-    assert comparison._verdict(entry, "f") == "worse"
+    assert comparison.verdict(entry, "log_average_miss_rate") == "better"
+    assert comparison.verdict(entry, "f") == "worse"
 
 
 def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):

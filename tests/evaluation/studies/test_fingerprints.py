@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies import fingerprints
-from torchvision_dddas.evaluation.studies.fingerprints import PACKAGE, FileDigests, code_digest
+from torchvision_dddas.evaluation.studies import cache
+from torchvision_dddas.evaluation.studies.cache import PACKAGE, code_digest, files_digest
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.stages import STAGES
 
@@ -21,42 +21,42 @@ def old(path, text: str):
 
 def test_files_count_by_their_content_and_order_not_by_name_or_time(tmp_path) -> None:
     one, same, other = (old(tmp_path / name, text) for name, text in (("a", "one"), ("b", "one"), ("c", "two")))
-    files = FileDigests()
-    assert files.digest([one]) == files.digest([same]) != files.digest([other])
-    assert files.digest([one, other]) != files.digest([other, one])
+    files = files_digest
+    assert files([one]) == files([same]) != files([other])
+    assert files([one, other]) != files([other, one])
 
 
 def test_a_file_is_read_again_only_once_it_was_touched(tmp_path, monkeypatch) -> None:
     path, memory = old(tmp_path / "a", "one"), tmp_path / "memory"
-    first = FileDigests(memory).digest([path])
+    first = files_digest([path], memory)
     with monkeypatch.context() as blind:
-        blind.setattr(fingerprints, "_file_digest", lambda path: pytest.fail("it was read again"))
-        assert FileDigests(memory).digest([path]) == first
+        blind.setattr(cache, "_file_digest", lambda path: pytest.fail("it was read again"))
+        assert files_digest([path], memory) == first
     time.sleep(0.05)
     old(path, "two")  # of the same size and with its old time
-    assert FileDigests(memory).digest([path]) != first
+    assert files_digest([path], memory) != first
 
 
 def test_a_file_written_just_now_is_not_remembered(tmp_path) -> None:
     """It may be written again within one tick of its time stamp."""
     (tmp_path / "a").write_text("one")
-    FileDigests(tmp_path / "memory").digest([tmp_path / "a"])
+    files_digest([tmp_path / "a"], tmp_path / "memory")
     assert not (tmp_path / "memory").exists()
 
 
 def test_a_file_that_is_gone_is_named(tmp_path) -> None:
     with pytest.raises(InputError, match=r"gone\.png cannot be read"):
-        FileDigests().digest([tmp_path / "gone.png"])
+        files_digest([tmp_path / "gone.png"])
 
 
 def changed_by(monkeypatch, *paths: str) -> dict[str, bool]:
     """Whose digest of code another content of some files changes."""
     functions: dict[str, Any] = dict[str, Any](STAGES.items()) | {"score": score}
     before = {name: code_digest.__wrapped__(function) for name, function in functions.items()}
-    real = fingerprints._file_digest
+    real = cache._file_digest
     other = {PACKAGE / path for path in paths}
     assert all(path.is_file() for path in other)
-    monkeypatch.setattr(fingerprints, "_file_digest", lambda path: "other" if path in other else real(path))
+    monkeypatch.setattr(cache, "_file_digest", lambda path: "other" if path in other else real(path))
     return {name: code_digest.__wrapped__(function) != before[name] for name, function in functions.items()}
 
 

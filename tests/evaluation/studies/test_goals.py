@@ -7,9 +7,8 @@ import pytest
 from tests.evaluation.studies.scored_clips import masked, targeted, tracked
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.registry import HEADLINES, groups_of_task, is_lower_better, measure_names
-from torchvision_dddas.evaluation.studies.goals import check_possible, parse_goal, possible_groups
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import measures
+from torchvision_dddas.evaluation.studies.summary import check_possible, measures, parse_goal, possible_groups
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,9 @@ from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
-from torchvision_dddas.evaluation.studies.fingerprints import FileDigests
+from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.evaluation.studies.jobs import Job, do_job, find_cached, make_keys
-from torchvision_dddas.evaluation.studies.spec import Task
-from torchvision_dddas.evaluation.studies.storage import Cache
+from torchvision_dddas.evaluation.studies.records import Task
 
 TASKS: tuple[Task, ...] = ("motion", "tracking", "association")
 ALL = ["motion", "motion: score", "tracking", "tracking: score", "association", "association: score"]
@@ -34,7 +33,7 @@ def job_of(place, *overrides, interval=1):
 
 
 def do(place, job, cache=None):
-    return do_job(job, make_keys(job, FileDigests()), cache or Cache(place / "cache"))
+    return do_job(job, make_keys(job, None), cache or Cache(place / "cache"))
 
 
 def computed(place, job):
@@ -82,7 +81,7 @@ def test_a_changed_truth_scores_again_and_finds_again_only_what_was_made_of_it(f
 
 
 def test_other_code_is_another_key(folder, monkeypatch) -> None:
-    job, files = job_of(folder), FileDigests()
+    job, files = job_of(folder), None
     before = make_keys(job, files)
     monkeypatch.setattr(jobs, "code_digest", lambda function, engine="": "another")
     after = make_keys(job, files)
@@ -92,7 +91,7 @@ def test_other_code_is_another_key(folder, monkeypatch) -> None:
 
 def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
     cache, job = Cache(folder / "cache"), job_of(folder)
-    keys = make_keys(job, FileDigests())
+    keys = make_keys(job, None)
     assert find_cached(job, keys, cache) == do(folder, job)
     cache.path(keys.found["tracking"]).write_bytes(b"damaged")
     assert find_cached(job, keys, cache) is None

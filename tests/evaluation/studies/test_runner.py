@@ -7,19 +7,18 @@ import pytest
 
 from tests.evaluation.studies import world
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies import workers
-from torchvision_dddas.evaluation.studies.runner import cache_folder, plan_study, run_jobs, run_study
-from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.evaluation.studies.storage import Cache
+from torchvision_dddas.evaluation.studies import jobs
+from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
+from torchvision_dddas.evaluation.studies.jobs import Workers
+from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
 from torchvision_dddas.evaluation.studies.summary import summarize
-from torchvision_dddas.evaluation.studies.workers import Workers
 
 
 def test_no_worker_is_started_if_all_is_kept(tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
     spec = read_spec(world.three(tmp_path / "clips"))
     first = run_study(spec, tmp_path, cache=tmp_path / "cache")
-    monkeypatch.setattr(workers, "_start_local", lambda *given: pytest.fail("a worker was started"))
+    monkeypatch.setattr(jobs, "_start_local", lambda *given: pytest.fail("a worker was started"))
     with Workers(2) as two:
         again = run_study(spec, tmp_path, two, cache=tmp_path / "cache")
     assert again.facts["computed"] == 0 < first.facts["computed"]
@@ -52,8 +51,10 @@ def test_clips_are_picked_by_patterns_and_done_the_longest_first(tmp_path) -> No
     with pytest.raises(InputError, match="by study: nobody fits none; there are masks, table, tracks"):
         plan_study(spec, tmp_path, ["nobody"])
     ended: list[str] = []
-    jobs = plan_study(spec, tmp_path, ["ta*", "masks"]).jobs
-    run_jobs(jobs, Workers(1), Cache(tmp_path / "cache"), lambda e: ended.append(e.job.clip.name) if e.done else None)
+    planned = plan_study(spec, tmp_path, ["ta*", "masks"]).jobs
+    run_jobs(
+        planned, Workers(1), Cache(tmp_path / "cache"), lambda e: ended.append(e.job.clip.name) if e.done else None
+    )
     assert ended == ["table", "masks"]
 
 

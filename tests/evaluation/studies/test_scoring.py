@@ -15,11 +15,10 @@ from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.registry import figures
 from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, TrackTable, Truth
-from torchvision_dddas.evaluation.studies.results import round_as_written
+from torchvision_dddas.evaluation.studies.cache import pack, unpack
+from torchvision_dddas.evaluation.studies.records import Task, round_as_written
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import find
-from torchvision_dddas.evaluation.studies.storage import pack, unpack
 from torchvision_dddas.geometry import lonlat
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Source
-from torchvision_dddas.evaluation.studies.spec import Spec, read_spec
+from torchvision_dddas.evaluation.studies.records import Spec
+from torchvision_dddas.evaluation.studies.runner import read_spec
 
 SET = '[[dataset]]\nkind = "bms"\nfolder = "data"\n'
 

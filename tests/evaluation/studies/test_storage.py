@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.results import Found
-from torchvision_dddas.evaluation.studies.storage import Cache, CarriedRecords, DamagedError, digest, pack, unpack
+from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, DamagedError, digest, pack, unpack
+from torchvision_dddas.evaluation.studies.records import Found
 
 KEY = "ab" + "0" * 62
 RNG = np.random.default_rng(0)

@@ -9,10 +9,9 @@ import pytest
 from tests.evaluation.studies.scored_clips import as_files, found_of, masked, study_of, tracked
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.evaluation.studies import estimates
-from torchvision_dddas.evaluation.studies.output import frame_rows, metric_rows, write_csv, write_parquet
+from torchvision_dddas.evaluation.studies.runner import frame_rows, metric_rows, write_csv, write_parquet
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import measures, summarize, summarize_costs
+from torchvision_dddas.evaluation.studies.summary import measures, over_clips, over_frames, summarize, summarize_costs
 from torchvision_dddas.io.output.run_record import finite
 
 
@@ -99,7 +98,7 @@ def test_weights_of_one_give_the_figures_themselves(tmp_path):
     for make, task in ((masked, "motion"), (tracked, "tracking"), (tracked, "people")):
         scored = [case[3] for case in several(tmp_path / task, make, task, 3)]
         whole = measures(scored)
-        for estimate in (estimates.over_clips(scored), estimates.over_frames(scored)):
+        for estimate in (over_clips(scored), over_frames(scored)):
             for group, one in estimate.items():
                 found = one.statistic(np.ones(sum(stratum.units for stratum in one.strata)))
                 assert found == pytest.approx({name: whole[group][name] for name in found}, nan_ok=True)
@@ -107,7 +106,7 @@ def test_weights_of_one_give_the_figures_themselves(tmp_path):
 
 def test_a_clip_that_counts_twice_is_the_clip_twice(tmp_path):
     scored = [case[3] for case in several(tmp_path, tracked, "tracking", 3)]
-    estimate = estimates.over_clips(scored)["tracks"]
+    estimate = over_clips(scored)["tracks"]
     twice = measures([scored[0], scored[0], scored[2]])["tracks"]
     found = estimate.statistic(np.array([2.0, 0.0, 1.0]))
     assert found == pytest.approx({name: twice[name] for name in found})
@@ -155,10 +154,10 @@ def test_tables_have_every_figure_to_the_last_digit(tmp_path):
 def test_parquet_says_the_same(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     results, metrics = study(tmp_path)
-    assert write_parquet(tmp_path, metrics, results) == ("metrics.parquet", "frames.parquet")
+    write_parquet(tmp_path, metrics, results)
     table = parquet.read_table(tmp_path / "metrics.parquet").to_pylist()
-    assert [row["measure"] for row in table] == [row.measure for row in metric_rows(metrics)]
-    np.testing.assert_array_equal([row["value"] for row in table], [row.value for row in metric_rows(metrics)])
+    assert [row["measure"] for row in table] == [row[5] for row in metric_rows(metrics)]
+    np.testing.assert_array_equal([row["value"] for row in table], [row[6] for row in metric_rows(metrics)])
     frames = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert [tuple(row.values()) for row in frames] == list(frame_rows(results))
     assert sorted(p.name for p in tmp_path.iterdir() if p.suffix) == ["frames.parquet", "metrics.parquet"]

@@ -7,11 +7,15 @@ import pytest
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies import sweep
-from torchvision_dddas.evaluation.studies.search_space import Choice, Range, count_points, parse_grid, parse_ranges
 from torchvision_dddas.evaluation.studies.sweep import (
     AHEAD,
+    Choice,
+    Range,
     Trial,
     best,
+    count_points,
+    parse_grid,
+    parse_ranges,
     ranked,
     search_grid,
     search_ranges,

@@ -16,12 +16,11 @@ import pytest
 
 from tests.evaluation.studies import world
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies import workers
-from torchvision_dddas.evaluation.studies.runner import plan_study, run_jobs, run_study
-from torchvision_dddas.evaluation.studies.spec import read_spec
-from torchvision_dddas.evaluation.studies.storage import Cache
+from torchvision_dddas.evaluation.studies import jobs as studies_jobs
+from torchvision_dddas.evaluation.studies.cache import Cache
+from torchvision_dddas.evaluation.studies.jobs import CONNECT_S, MAX_DEATHS, Workers
+from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
 from torchvision_dddas.evaluation.studies.summary import summarize
-from torchvision_dddas.evaluation.studies.workers import CONNECT_S, MAX_DEATHS, Workers
 
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds workers by /proc")
 
@@ -46,7 +45,7 @@ WORKER = """
     asyncio.run(main())
 """
 
-OTHER_CODE = "from torchvision_dddas.evaluation.studies import workers; workers.code_identity = lambda backend: 'other'"
+OTHER_CODE = "import torchvision_dddas.evaluation.studies.jobs as jobs; jobs.code_identity = lambda backend: 'other'"
 
 
 @contextmanager
@@ -93,19 +92,19 @@ def children(parent: int) -> list[int]:
 
 
 def die_over_tracks(job, keys, store, code):
-    """In place of `workers._remote`: the worker is killed, so often as a file says."""
+    """In place of `studies_jobs._do_remotely`: the worker is killed, so often as a file says."""
     left = store.folder / "deaths"
     if job.clip.name == "tracks" and (deaths := int(left.read_text())):
         left.write_text(str(deaths - 1))
         os.kill(os.getpid(), signal.SIGKILL)
-    return workers._remote(job, keys, store, code)
+    return studies_jobs._do_remotely(job, keys, store, code)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("deaths", [1, MAX_DEATHS])
 def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(jobs, tmp_path, monkeypatch, deaths) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr(workers, "_remote", die_over_tracks)
+    monkeypatch.setattr(studies_jobs, "_do_remotely", die_over_tracks)
     cache = Cache(tmp_path / "cache")
     (cache.folder / "deaths").write_text(str(deaths))
     with Workers(2) as team:
@@ -183,7 +182,7 @@ def test_a_worker_with_another_version_of_the_package_is_one_line(scheduler, job
 
 
 def test_a_scheduler_without_workers_is_one_line(scheduler, jobs, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "NO_WORKER_S", 0.0)
+    monkeypatch.setattr(studies_jobs, "NO_WORKER_S", 0.0)
     with Workers(scheduler=scheduler) as cluster, pytest.raises(InputError, match="has had no worker"):
         run_jobs([jobs["table"]], cluster, Cache(tmp_path / "cache"))
 
@@ -208,13 +207,13 @@ def test_an_address_that_is_none_is_one_line(address) -> None:
 
 @pytest.mark.parametrize("asked", [{"jobs": 2}, {"scheduler": "tcp://127.0.0.1:1"}])
 def test_without_dask_the_line_says_what_to_install(monkeypatch, asked) -> None:
-    monkeypatch.setattr(workers, "find_spec", lambda name: None)
+    monkeypatch.setattr(studies_jobs, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'torchvision-dddas\[distributed\]'"):
         Workers(**asked)
 
 
 def test_one_process_does_jobs_without_dask(jobs, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(workers, "find_spec", lambda name: None)
+    monkeypatch.setattr(studies_jobs, "find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, "distributed", None)
     frames = []
     done = run_jobs([jobs["table"]], Workers(), Cache(tmp_path), lambda event: frames.append(event.frames))

@@ -4,37 +4,30 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.registry import HEADLINES, describe, title_of_group
-from torchvision_dddas.evaluation.report.measures import (
-    TITLES,
-    TaskFigures,
-    groups_of,
-    measure_plot,
-    measure_table,
-    read_figures,
-    shown,
-)
+from torchvision_dddas.evaluation.metrics.registry import GROUPS, HEADLINES, describe, title_of_group
 from torchvision_dddas.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
-from torchvision_dddas.evaluation.report.worst_frames import Worst, draw_pictures, find_worst_frames
-from torchvision_dddas.evaluation.studies.results import Case, Results
-from torchvision_dddas.evaluation.studies.spec import TASKS, Task
+from torchvision_dddas.evaluation.report.worst_frames import draw_pictures, find_worst_frames
+from torchvision_dddas.evaluation.studies.records import TASKS, Case, Results, Task
 from torchvision_dddas.evaluation.studies.summary import sum_costs
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.io.report import (
+    MOST_ROWS,
     Axis,
     Cell,
     Column,
     Dots,
+    Interval,
     chart,
     format_count,
     format_number,
+    interval_chart,
     number_cell,
     render_page,
     table,
@@ -45,11 +38,14 @@ from torchvision_dddas.io.sources import open_source
 MAX_STAGES = 8
 """Columns of the table of costs."""
 
+Groups = Mapping[str, Any]
+"""Measures by group, and beside them their "intervals", as metrics.json has them of a clip, pooled and in the mean."""
+
 
 def study_report(metrics: Mapping[str, Any], results: Results) -> str:
     """The HTML. metrics: as `summarize` returns them, NaN as None; pictures are read from the clips' files."""
     by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
-    tasks = [_task(task, read_figures(metrics, task), cases) for task, cases in by_task.items() if cases]
+    tasks = [_task(task, metrics["tasks"].get(task, {}), cases) for task, cases in by_task.items() if cases]
     n_clips = len({str(case.clip.place) + case.clip.name for case in results.cases if case.scored is not None})
     state = f"{format_count(n_clips, 'clip')}, {format_count(len(tasks), 'task')}; "
     left_out = list(results.left_out)
@@ -72,91 +68,128 @@ def study_report(metrics: Mapping[str, Any], results: Results) -> str:
     )
 
 
-def _task(task: Task, figures: TaskFigures, cases: Sequence[Case]) -> dict[str, Any]:
+def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict[str, Any]:
     """What the page shows of a task: its card and its section."""
-    frames = {case.clip.name: len(case.scored.frames) for case in cases if case.scored is not None}
-    groups = groups_of(figures)
-    plots: list[Any] = []
-    for group in groups:
-        plot, more = measure_plot(figures, group)
-        note = f"the worst {len(figures.clips) - more}; {more} better ones are in the table" if more else ""
-        plots += [(plot, note)] if plot else []
+    clips: Mapping[str, Groups] = metrics.get("clips", {})
+    groups = [group for group in GROUPS if any(group in clip for clip in clips.values())]
     worst, n_other_faults = find_worst_frames(cases)
-    courses = course_charts(sorted(cases, key=lambda case: _rank(case, worst)))
+    rank = {id(one.case): k for k, one in reversed(list(enumerate(worst)))}
+    courses = course_charts(sorted(cases, key=lambda case: rank.get(id(case), len(worst))))
+    titles = {group: title_of_group(group) for group in groups}
     return {
         "id": task,
-        "title": TITLES[task],
+        "title": task.capitalize(),
         "meaning": TASKS[task],
-        "headline": _headline(task, figures),
+        "headline": _headline(task, metrics, groups) if groups else None,
         "cost": _format_cost(cases),
         "n_left_out": sum(case.cause != "" for case in cases),
-        "plots": [*plots, *ranked_charts(cases)],
-        "tables": [(_capital(title_of_group(group)), measure_table(figures, group, frames)) for group in groups],
+        "plots": [*(plot for group in groups for plot in _measure_plot(metrics, group)), *ranked_charts(cases)],
+        "tables": [(title[:1].upper() + title[1:], _measure_table(metrics, group)) for group, title in titles.items()],
         "worst": draw_pictures(worst),
         "n_other_faults": n_other_faults,
         "courses": courses,
-        "n_courses_left_out": len(frames) - len(courses),
+        "n_courses_left_out": len(clips) - len(courses),
         "maps": [*maps(cases), *error_clouds(cases)],
         "notes": _unique(f"{case.clip.name}: {note}" for case in cases if case.scored for note in case.scored.notes),
     }
 
 
-def _headline(task: Task, figures: TaskFigures) -> dict[str, str] | None:
-    """The measure that a task is judged by, as its card shows it; None if the task has none."""
-    chosen = _headline_measure(task, figures)
-    if chosen is None:
-        return None
-    group, name = chosen
-    known, pooled = describe(name), figures.pooled.get(group, {}).get(name)
-    found = {"value": "", "clips": _clips_in_words(figures, group, name), "meaning": known.meaning}
-    if pooled is not None:
+def _figure(groups: Groups, group: str, measure: str, name: str = "") -> Interval:
+    """A measure with its interval, NaN where unknown. name: what it is of."""
+    low, high = groups.get("intervals", {}).get(group, {}).get(measure) or (None, None)
+    value, low, high = (
+        math.nan if number is None else float(number) for number in (groups.get(group, {}).get(measure), low, high)
+    )
+    return Interval(name, value, low, high)
+
+
+def _known_figures(metrics: Mapping[str, Any], group: str, measure: str) -> list[Interval]:
+    """The figures of all clips that have the measure."""
+    figures = [_figure(clip, group, measure, name) for name, clip in metrics["clips"].items()]
+    return [figure for figure in figures if math.isfinite(figure.value)]
+
+
+def _shown(metrics: Mapping[str, Any], group: str) -> list[str]:
+    """The measures of a group's table that any clip has a value of."""
+    return [name for name in GROUPS[group].shown if _known_figures(metrics, group, name)]
+
+
+def _measure_table(metrics: Mapping[str, Any], group: str) -> Markup:
+    """A row a clip, and below them what belongs to all; each figure with its interval."""
+    names = _shown(metrics, group)
+    known = [describe(name) for name in names]
+    columns = [Column("clip", text=True), Column("frames", "frames scored")]
+    columns += [Column(metric.title, metric.meaning) for metric in known]
+
+    def cells(groups: Groups) -> list[Cell]:
+        figures = [_figure(groups, group, name) for name in names]
+        return [number_cell(f.value, m.digits, (f.low, f.high)) for f, m in zip(figures, known, strict=True)]
+
+    clips = {name: groups for name, groups in metrics["clips"].items() if group in groups}
+    rows = [[text_cell(name), number_cell(groups["frames"]), *cells(groups)] for name, groups in clips.items()]
+    whole = {"pooled": metrics["pooled"], "mean over clips": metrics["mean"]} if len(rows) > 1 else {}
+    foot = [[text_cell(title), Cell(""), *cells(groups)] for title, groups in whole.items() if group in groups]
+    return table(f"{title_of_group(group)}, clip by clip", columns, rows, foot)
+
+
+def _measure_plot(metrics: Mapping[str, Any], group: str) -> list[tuple[Markup, str]]:
+    """The group's first measure clip by clip, the worst first, and a note; none where no clip has it."""
+    names = _shown(metrics, group)
+    if not names or group == "location":  # its plot would say no more than its table
+        return []
+    known, rows = describe(names[0]), _known_figures(metrics, group, names[0])
+    rows.sort(key=lambda row: -row.value if known.better < 0 else row.value)
+    whole = _figure(metrics["pooled"], group, names[0], "pooled") if len(rows) > 1 else None
+    title, span = f"{known.title}, {title_of_group(group)}", (0.0, 1.0 if known.is_share else 0.0)
+    more = max(len(rows) - MOST_ROWS, 0)
+    note = f"the worst {len(metrics['clips']) - more}; {more} better ones are in the table" if more else ""
+    return [(interval_chart(title, rows, whole, span), note)]
+
+
+def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> dict[str, str] | None:
+    """The measure that a task is judged by, as its card shows it: that of HEADLINES that most clips have.
+
+    Where none has any, the first that any clip has; None without one.
+    """
+    count = {
+        pair: sum(pair[1] in clip.get(pair[0], {}) for clip in metrics["clips"].values()) for pair in HEADLINES[task]
+    }
+    group, name = max(count, key=lambda pair: count[pair])
+    if not any(count.values()):
+        chosen = next(((group, names[0]) for group in groups if (names := _shown(metrics, group))), None)
+        if chosen is None:
+            return None
+        group, name = chosen
+    known, figures = describe(name), _known_figures(metrics, group, name)
+    clips = f"one clip: {figures[0].name if figures else 'none'}"
+    if len(figures) > 1:
+        worst = (max if known.better < 0 else min)(figures, key=lambda figure: figure.value)
+        value = format_number(worst.value, known.digits)
+        clips = f"pooled over {len(figures)} clips; worst: {worst.name}, {value}"
+    found = {"value": "", "clips": clips, "meaning": known.meaning}
+    if name in metrics["pooled"].get(group, {}):
+        pooled = _figure(metrics["pooled"], group, name)
         found["value"] = format_number(pooled.value, known.digits)
         found["metric"] = f"{known.title}, {title_of_group(group)}"
         if known.unit == "m":
             found["metric"] = f"m, {known.meaning.removesuffix(', metres')}"
         found["interval"] = "no interval: too few clips or frames"
         if math.isfinite(pooled.low) and math.isfinite(pooled.high):
-            over = "clips" if figures.over.get(group) == "clips" else "blocks of frames"
+            over = "clips" if metrics["pooled"]["over"].get(group) == "clips" else "blocks of frames"
             ends = (format_number(end, known.digits) for end in (pooled.low, pooled.high))
             found["interval"] = f"95 % interval over {over}: {' to '.join(ends)}"
     return found
 
 
-def _headline_measure(task: Task, figures: TaskFigures) -> tuple[str, str] | None:
-    """The group and name of that of HEADLINES that most clips have, else of the first measure that any has."""
-    count = {
-        (group, name): sum(name in clip.get(group, {}) for clip in figures.clips.values())
-        for group, name in HEADLINES[task]
-    }
-    if any(count.values()):
-        return max(count, key=lambda pair: count[pair])
-    for group in groups_of(figures):
-        if names := shown(figures, group):
-            return group, names[0]
-    return None
+class _Cost(NamedTuple):
+    """A case that has times, its cost, and the megapixels of its pictures (NaN: unknown)."""
+
+    case: Case
+    cost: dict[str, Any]
+    megapixels: float
 
 
-def _clips_in_words(figures: TaskFigures, group: str, name: str) -> str:
-    """How many clips have a measure, and which is the worst."""
-    values: Mapping[str, float] = {
-        clip: groups[group][name].value
-        for clip, groups in figures.clips.items()
-        if name in groups.get(group, {}) and math.isfinite(groups[group][name].value)
-    }
-    if len(values) < 2:
-        return f"one clip: {next(iter(values), 'none')}"
-    known = describe(name)
-    worst = (max if known.better < 0 else min)(values, key=lambda clip: values[clip])
-    return f"pooled over {len(values)} clips; worst: {worst}, {format_number(values[worst], known.digits)}"
-
-
-def _rank(case: Case, worst: Sequence[Worst]) -> int:
-    """Clips with a worst frame first, in the order of these."""
-    return next((k for k, one in enumerate(worst) if one.case is case), len(worst))
-
-
-def _costs(cases: Sequence[Case]) -> list[tuple[Case, dict[str, Any], float]]:
-    """Each case that has times, its cost, and the megapixels of its pictures (NaN: unknown)."""
+def _costs(cases: Sequence[Case]) -> list[_Cost]:
     sizes: dict[str, float] = {}
     costs = []
     for case in cases:
@@ -164,8 +197,22 @@ def _costs(cases: Sequence[Case]) -> list[tuple[Case, dict[str, Any], float]]:
             name = str(case.clip.place) + case.clip.name
             if name not in sizes:
                 sizes[name] = _megapixels(case)
-            costs.append((case, sum_costs([case]), sizes[name]))
+            costs.append(_Cost(case, sum_costs([case]), sizes[name]))
     return costs
+
+
+def _megapixels(case: Case) -> float:
+    """The size of a clip's first picture; NaN if it cannot be read."""
+    files = case.clip.pictures
+    try:
+        if not files:
+            return math.nan
+        if files[0].suffix.lower() in IMAGE_SUFFIXES:
+            picture = read_image(files[0])
+            return math.nan if picture is None else picture.shape[0] * picture.shape[1] / 1e6
+        return math.prod(open_source(files[0]).size) / 1e6
+    except InputError:
+        return math.nan
 
 
 def _format_cost(cases: Sequence[Case]) -> str:
@@ -177,7 +224,7 @@ def _format_cost(cases: Sequence[Case]) -> str:
     return f"{_format_rate(cost['frames_per_s'])} frames/s ({format_number(cost['seconds'], 1)} s){memory}"
 
 
-def _cost_table(costs: Sequence[tuple[Case, dict[str, Any], float]]) -> Markup:
+def _cost_table(costs: Sequence[_Cost]) -> Markup:
     """A row a case: time, rate, memory, and the time a frame of the longest stages."""
     total: Counter[str] = Counter()
     for _, cost, _ in costs:
@@ -196,7 +243,7 @@ def _cost_table(costs: Sequence[tuple[Case, dict[str, Any], float]]) -> Markup:
     rows = [
         [
             text_cell(case.clip.name),
-            text_cell(TITLES[case.task]),
+            text_cell(case.task.capitalize()),
             number_cell(cost["frames"]),
             number_cell(megapixels, 2),
             number_cell(cost["seconds"], 2),
@@ -209,35 +256,21 @@ def _cost_table(costs: Sequence[tuple[Case, dict[str, Any], float]]) -> Markup:
     return table("what each clip cost", columns, rows)
 
 
-def _cost_plots(costs: Sequence[tuple[Case, dict[str, Any], float]]) -> list[Markup]:
+def _cost_plots(costs: Sequence[_Cost]) -> list[Markup]:
     """Milliseconds a frame against the size of the pictures, of each task that reads pictures."""
     dots = []
-    for k, task in enumerate(TITLES):
-        mine = [
-            (case.clip.name, megapixels, 1000 * cost["seconds"] / cost["frames"])
-            for case, cost, megapixels in costs
-            if case.task == task and math.isfinite(megapixels) and cost["frames"]
-        ]
-        if mine:
-            hints = [f"{clip}: {format_number(mpx, 2)} Mpx, {format_number(ms, 1)} ms" for clip, mpx, ms in mine]
-            sizes, times = (np.array(values) for values in list(zip(*mine, strict=True))[1:])
-            dots.append(Dots(TITLES[task], sizes, times, k % 6 + 1, hints))
+    for k, task in enumerate(TASKS):
+        drawn = [one for one in costs if one.case.task == task and math.isfinite(one.megapixels) and one.cost["frames"]]
+        if drawn:
+            sizes = np.array([one.megapixels for one in drawn])
+            times = np.array([1000 * one.cost["seconds"] / one.cost["frames"] for one in drawn])
+            hints = [
+                f"{one.case.clip.name}: {format_number(size, 2)} Mpx, {format_number(ms, 1)} ms"
+                for one, size, ms in zip(drawn, sizes.tolist(), times.tolist(), strict=True)
+            ]
+            dots.append(Dots(task.capitalize(), sizes, times, k % 6 + 1, hints))
     axes = Axis("megapixels of a picture", 0), Axis("ms a frame", log=True)
     return [chart("Time and resolution", *axes, dots=dots)] if dots else []
-
-
-def _megapixels(case: Case) -> float:
-    """The size of a clip's first picture; NaN if it cannot be read."""
-    files = case.clip.pictures
-    try:
-        if not files:
-            return math.nan
-        if files[0].suffix.lower() in IMAGE_SUFFIXES:
-            picture = read_image(files[0])
-            return math.nan if picture is None else picture.shape[0] * picture.shape[1] / 1e6
-        return math.prod(open_source(files[0]).size) / 1e6
-    except InputError:
-        return math.nan
 
 
 def _format_rate(per_s: float) -> str:
@@ -254,13 +287,15 @@ def _fact_table(results: Results) -> Markup:
         "set": spec.overrides or "nothing",
         "interval": f"{spec.interval} frames, of tracking and association",
     }
-    facts |= {
-        name.replace("backend", "back end"): fact
-        for name, fact in results.facts.items()
-        if name not in ("faults", "notes")
-    }
+    for name, fact in results.facts.items():
+        if name not in ("faults", "notes"):
+            facts[name.replace("backend", "back end")] = fact
     if sets := results.facts.get("datasets"):
-        facts["datasets"] = [_format_dataset(one) for one in sets]
+        facts["datasets"] = [
+            f"{one['kind']} in {one['folder']}, {format_count(int(one['clips']), 'clip')}"
+            + (f" ({one['terms']})" if one["terms"] else "")
+            for one in sets
+        ]
     facts["versions"] = versions()
     rows = [
         [text_cell(name.replace("_", " ")), text_cell(_in_words(value))]
@@ -270,22 +305,12 @@ def _fact_table(results: Results) -> Markup:
     return table("what was run", [Column("what", text=True), Column("value", text=True)], rows, sorts=False)
 
 
-def _format_dataset(source: Mapping[str, Any]) -> str:
-    """A data set in words: kind, folder, clips, terms of use."""
-    where = f"{source.get('kind')} in {source.get('folder')}, {format_count(int(source.get('clips', 0)), 'clip')}"
-    return where + (f" ({source['terms']})" if source.get("terms") else "")
-
-
 def _in_words(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_in_words(v)}" for name, v in value.items())
     if isinstance(value, (list, tuple)):
         return "; ".join(_in_words(v) for v in value)
     return "unknown" if value is None else str(value)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _unique(lines: Iterable[str]) -> list[str]:

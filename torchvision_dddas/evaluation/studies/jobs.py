@@ -1,19 +1,30 @@
-"""One clip from its files to its measures: each stage is taken from the cache, or computed and kept."""
+"""Jobs: one clip from its files to its measures, each stage from the cache or computed; shared among processes by Dask.
 
+One job at a time needs no Dask. Workers of a cluster read the clips' files where this machine has them, so that folders
+must be shared. Their results come back, and this machine keeps them.
+"""
+
+import logging
+import os
+import queue
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
+
+import cv2
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.fingerprints import FileDigests, code_digest
-from torchvision_dddas.evaluation.studies.results import Found
+from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, code_digest, digest, files_digest
+from torchvision_dddas.evaluation.studies.records import Found, Task
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.spec import Task
 from torchvision_dddas.evaluation.studies.stages import (
     PARAMETER_GROUPS,
     STAGES,
@@ -24,9 +35,24 @@ from torchvision_dddas.evaluation.studies.stages import (
     labelled_frames,
     upstream_task,
 )
-from torchvision_dddas.evaluation.studies.storage import Cache, Store, digest
+from torchvision_dddas.runtime import VERSION
 
-_REPORT_S = 0.25
+MAX_DEATHS = 3
+"""If so many workers die over a job, its clip is left out."""
+
+CONNECT_S = 5.0
+"""How long a scheduler may take to answer."""
+
+NO_WORKER_S = 30.0
+"""How long a scheduler may be without any worker."""
+
+_POLL_S = _REPORT_S = 0.25
+_TOPIC = "dddas-frames"
+_ONE_THREAD = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
+    "OMP_WAIT_POLICY": "PASSIVE",
+}
+_INSTALL = "dask and distributed; pip install 'torchvision-dddas[distributed]'"
 
 
 @dataclass(frozen=True)
@@ -78,37 +104,48 @@ class Event:
 OnEvent = Callable[[Event], object]
 
 
-class FrameCounter:
-    """Called once per frame; reports the number of new frames a few times a second, and the rest by `flush`."""
+def make_keys(job: Job, memory: Path | None = None) -> Keys:
+    """The keys of a job's tasks and of the tasks they build upon: all that a result depends on, and nothing else.
 
-    def __init__(self, report: Callable[[int], object]) -> None:
-        self._report, self._count, self._reported_s = report, 0, time.monotonic()
-
-    def __call__(self) -> None:
-        """Count another frame."""
-        self._count += 1
-        if time.monotonic() - self._reported_s >= _REPORT_S:
-            self.flush()
-
-    def flush(self) -> None:
-        """Report the rest."""
-        if self._count:
-            self._report(self._count)
-        self._count, self._reported_s = 0, time.monotonic()
-
-
-def make_keys(job: Job, files: FileDigests) -> Keys:
-    """The keys of a job's tasks and of the tasks they build upon: all that a result depends on, and nothing else."""
+    memory: as in `files_digest`.
+    """
     keys, clip = Keys(), job.clip
     needed = [need for task in job.tasks if (need := upstream_task(clip, task)) is not None]
     for task in dict.fromkeys([*needed, *job.tasks]):
         try:
-            keys.found[task] = _found_key(job, task, keys, files)
-            known = (clip.still, clip.shows, _truth_content(clip, files))
+            keys.found[task] = _found_key(job, task, keys, memory)
+            truth: Any = None  # its content, without where it is written
+            if clip.truth is not None:
+                numbers = sorted(clip.truth.masks)
+                rest = {name: value for name, value in vars(clip.truth).items() if name not in ("masks", "place")}
+                truth = (numbers, files_digest([clip.truth.masks[number] for number in numbers], memory), rest)
+            known = (clip.still, clip.shows, truth)
             keys.scored[task] = digest("scored", task, code_digest(score), keys.found[task], job.interval, known)
         except InputError as error:
             keys.causes[task] = str(error)
     return keys
+
+
+def _found_key(job: Job, task: Task, keys: Keys, memory: Path | None) -> str:
+    clip, before = job.clip, upstream_task(job.clip, task)
+    if before in keys.causes:
+        raise InputError(keys.causes[before])
+    truth: Any = sorted(labelled_frames(clip)) if task == "motion" else None
+    if task == "association" and clip.truth is not None:
+        truth = clip.truth.tracks
+    files = files_of(clip, task)
+    if "people" in PARAMETER_GROUPS[task]:
+        for path in (Path(job.settings.people.classifier), Path(job.settings.people.graphs)):
+            files += sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
+    return digest(
+        ("found", task, code_digest(STAGES[task], job.backend), job.backend),
+        {group: getattr(job.settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
+        files_digest(files, memory),
+        clip.rate_hz,
+        truth,
+        None if task in ("motion", "people") else job.interval,
+        "" if before is None else keys.found[before],
+    )
 
 
 def code_identity(backend: str) -> str:
@@ -124,77 +161,241 @@ def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
     return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
-def do_job(job: Job, keys: Keys, store: Store, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
+def do_job(job: Job, keys: Keys, store: Cache | CarriedRecords, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
     """Do all tasks of a job. Bad input of one does not stop the others. on_frame: called once per frame."""
-    return tuple(_do_task(job, task, keys, store, on_frame) for task in job.tasks)
+
+    def find_or_get(task: Task, on_frame: OnFrame, computed: list[str]) -> Found:
+        found: Found | None = store.get(keys.found[task])
+        if found is None:
+            need = upstream_task(job.clip, task)
+            before = None if need is None else find_or_get(need, lambda: None, computed)
+            found = find(job.clip, task, job.settings, job.backend, job.interval, before, on_frame)
+            store.put(keys.found[task], found)
+            computed.append(task)
+        return found
+
+    def do_task(task: Task) -> Done:
+        computed: list[str] = []
+        try:
+            if task not in allowed_tasks(job.clip):
+                raise InputError(f"its pictures and truth do not allow {task}")
+            if task in keys.causes:
+                raise InputError(keys.causes[task])
+            found = find_or_get(task, on_frame, computed)
+            if store.get(keys.scored[task]) is None:
+                store.put(keys.scored[task], score(job.clip, task, found, job.interval))
+                computed.append(f"{task}: score")
+        except InputError as error:
+            return Done(task, cause=str(error), computed=tuple(computed))
+        except Exception as error:
+            cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
+            return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
+        return Done(task, keys.found[task], keys.scored[task], computed=tuple(computed))
+
+    return tuple(map(do_task, job.tasks))
 
 
-def _do_task(job: Job, task: Task, keys: Keys, store: Store, on_frame: OnFrame) -> Done:
-    computed: list[str] = []
-    try:
-        if task not in allowed_tasks(job.clip):
-            raise InputError(f"its pictures and truth do not allow {task}")
-        if task in keys.causes:
-            raise InputError(keys.causes[task])
-        found = _find(job, task, keys, store, on_frame, computed)
-        if store.get(keys.scored[task]) is None:
-            store.put(keys.scored[task], score(job.clip, task, found, job.interval))
-            computed.append(f"{task}: score")
-    except InputError as error:
-        return Done(task, cause=str(error), computed=tuple(computed))
-    except Exception as error:
-        cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
-        return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
-    return Done(task, keys.found[task], keys.scored[task], computed=tuple(computed))
+def _do_on_one_thread(
+    job: Job, keys: Keys, store: Cache | CarriedRecords, report: OnEvent
+) -> tuple[tuple[Done, ...], str]:
+    """Do a job and report the number of new frames a few times a second; its outcome, and the store's notes."""
+    frames, reported_s = 0, time.monotonic()
+
+    def count_frame() -> None:
+        nonlocal frames, reported_s
+        frames += 1
+        if time.monotonic() - reported_s >= _REPORT_S:
+            report(Event(job, frames=frames))
+            frames, reported_s = 0, time.monotonic()
+
+    with _one_thread(job.backend):
+        done = do_job(job, keys, store, count_frame)
+    if frames:
+        report(Event(job, frames=frames))
+    notes = "; ".join(store.notes)
+    store.notes.clear()
+    return done, notes
 
 
-def _find(job: Job, task: Task, keys: Keys, store: Store, on_frame: OnFrame, computed: list[str]) -> Found:
-    known: Found | None = store.get(keys.found[task])
-    if known is not None:
-        return known
-    need = upstream_task(job.clip, task)
-    before = None if need is None else _find(job, need, keys, store, lambda: None, computed)
-    found = find(job.clip, task, job.settings, job.backend, job.interval, before, on_frame)
-    store.put(keys.found[task], found)
-    computed.append(task)
-    return found
+class Workers:
+    """The processes that do jobs, each on one thread. A context manager: they end with the block.
+
+    jobs: how many; 1 is this process itself; None is one per core, or 1 without Dask. scheduler: the address of a Dask
+    scheduler, whose workers are taken instead. Local workers start when they are first needed. Raises InputError if
+    Dask is needed and not installed, or the scheduler does not answer.
+    """
+
+    def __init__(self, jobs: int | None = None, scheduler: str | None = None) -> None:
+        has_dask = find_spec("distributed") is not None
+        if scheduler is not None and not has_dask:
+            raise InputError(f"--scheduler needs {_INSTALL}")
+        if jobs is None:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            jobs = cores if has_dask else 1
+        if jobs < 1:
+            raise InputError(f"--jobs must be 1 or more, got {jobs}")
+        if jobs > 1 and not has_dask:
+            raise InputError(f"--jobs {jobs} needs {_INSTALL}, or take --jobs 1")
+        self._jobs, self._scheduler, self._stack = jobs, scheduler, ExitStack()
+        self._client: Any = None
+
+    def __enter__(self) -> "Workers":
+        if self._scheduler is not None:
+            self._client = self._stack.enter_context(_connect(self._scheduler))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
+        """Do jobs in the order given; report each one's progress and outcome. Results are in the cache afterwards.
+
+        Results do not depend on the number of workers, but for the last digits where BLAS runs on several threads in
+        this process. Raises InputError if no worker can do them.
+        """
+        iterator = iter(jobs)
+        if self._scheduler is None and self._jobs == 1:
+            for job, keys in iterator:
+                done, note = _do_on_one_thread(job, keys, cache, on_event)
+                on_event(Event(job, done, note=note))
+        elif (first := next(iterator, None)) is not None:  # otherwise no worker has to start
+            self._share(chain([first], iterator), cache, on_event)
+
+    def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
+        if self._client is None:
+            self._client = _start_local(self._jobs, self._stack)
+        client, running, news = self._client, dict[Any, Job](), queue.SimpleQueue[Any]()
+        client.subscribe_topic(_TOPIC, lambda event: news.put(event[1]))
+        alone_since = time.monotonic()
+        try:
+            while True:
+                # No more jobs than threads: Dask blames a worker's death on the jobs that wait there, too.
+                threads = sum(client.nthreads().values())
+                for job, keys in islice(jobs, max(threads - len(running), 0)):
+                    store: Cache | CarriedRecords = cache
+                    if self._scheduler is not None:
+                        wanted = {key: cache.read(key) for key in (*keys.found.values(), *keys.scored.values())}
+                        store = CarriedRecords({key: known for key, known in wanted.items() if known is not None})
+                    code = "" if self._scheduler is None else code_identity(job.backend)
+                    future = client.submit(_do_remotely, job, keys, store, code, pure=False)
+                    running[future] = job
+                    future.add_done_callback(news.put)
+                if threads and not running:
+                    return
+                if threads:
+                    alone_since = time.monotonic()
+                elif time.monotonic() - alone_since > NO_WORKER_S:
+                    raise InputError(
+                        f"the scheduler {self._scheduler} has had no worker for {NO_WORKER_S:g} s; {self._advice()}"
+                    )
+                with suppress(queue.Empty):
+                    new = news.get(timeout=_POLL_S)
+                    if new in running:
+                        on_event(self._outcome(running.pop(new), new, cache))
+                    elif isinstance(new, tuple):
+                        for job in running.values():
+                            if job.number == new[0]:
+                                on_event(Event(job, frames=new[1]))
+        except OSError as error:
+            raise InputError(f"the Dask scheduler is gone ({error})") from None
+        finally:
+            client.unsubscribe_topic(_TOPIC)
+            client.cancel(list(running), force=True)
+
+    def _outcome(self, job: Job, future: Any, cache: Cache) -> Event:
+        from distributed import KilledWorker
+
+        try:
+            done, notes, made = future.result()
+        except KilledWorker as error:
+            deaths = error.allowed_failures + 1
+            cause = f"its worker died {deaths} times; is there memory enough for {job.clip.name} and {job.backend}?"
+            return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
+        except InputError:
+            raise
+        except Exception as error:  # `do_job` raises none: the worker cannot even start it
+            raise InputError(f"a worker cannot do jobs ({type(error).__name__}: {error}); {self._advice()}") from None
+        for key, content in made.items():
+            cache.write(key, content)
+        return Event(job, done, note=notes)
+
+    def _advice(self) -> str:
+        return (
+            f"start `dask worker {self._scheduler} --nthreads 1` in this environment, with version {VERSION} of "
+            "torchvision-dddas"
+        )
 
 
-def _found_key(job: Job, task: Task, keys: Keys, files: FileDigests) -> str:
-    clip, before = job.clip, upstream_task(job.clip, task)
-    if before in keys.causes:
-        raise InputError(keys.causes[before])
-    truth: Any = sorted(labelled_frames(clip)) if task == "motion" else None
-    if task == "association" and clip.truth is not None:
-        truth = clip.truth.tracks
-    return digest(
-        ("found", task, code_digest(STAGES[task], job.backend), job.backend),
-        {group: getattr(job.settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
-        files.digest([*files_of(clip, task), *_files_in_settings(job.settings, task)]),
-        clip.rate_hz,
-        truth,
-        None if task in ("motion", "people") else job.interval,
-        "" if before is None else keys.found[before],
+def _do_remotely(
+    job: Job, keys: Keys, store: Cache | CarriedRecords, code: str
+) -> tuple[tuple[Done, ...], str, dict[str, bytes]]:
+    """A job on a worker: its outcome, notes, and records that have to travel back. code: what its package must be."""
+    from distributed import get_worker
+
+    if code and code_identity(job.backend) != code:
+        raise InputError(f"a worker has another version of the package, its libraries or code; wanted {VERSION}")
+    worker = get_worker()
+    done, notes = _do_on_one_thread(
+        job, keys, store, lambda event: worker.log_event(_TOPIC, (job.number, event.frames))
     )
+    return done, notes, store.made if isinstance(store, CarriedRecords) else {}
 
 
-def _files_in_settings(settings: Settings, task: Task) -> list[Path]:
-    """Files that parameters name."""
-    if "people" not in PARAMETER_GROUPS[task]:
-        return []
-    places = [Path(settings.people.classifier), Path(settings.people.graphs)]
-    return [
-        file
-        for path in places
-        for file in (sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else [])
-    ]
+@contextmanager
+def _one_thread(backend: str) -> Iterator[None]:
+    """Hold OpenCV, and torch if it is the engine, to one thread: sums on several differ in their last digits."""
+    libraries: list[tuple[Callable[[int], object], int]] = [(cv2.setNumThreads, cv2.getNumThreads())]
+    if backend == "torch":
+        import torch
+
+        libraries.append((torch.set_num_threads, torch.get_num_threads()))
+    for set_threads, _ in libraries:
+        set_threads(1)
+    try:
+        yield
+    finally:
+        for set_threads, before in libraries:
+            set_threads(before)
 
 
-def _truth_content(clip: Clip, files: FileDigests) -> Any:
-    """The truth of a clip, without where it is written."""
-    truth = clip.truth
-    if truth is None:
-        return None
-    masks = files.digest([truth.masks[frame] for frame in sorted(truth.masks)])
-    rest: Mapping[str, Any] = {name: value for name, value in vars(truth).items() if name not in ("masks", "place")}
-    return (sorted(truth.masks), masks, rest)
+def _start_local(jobs: int, stack: ExitStack) -> Any:
+    """A client of new processes on this machine, which end with the stack."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with dask.config.set({"distributed.scheduler.allowed-failures": MAX_DEATHS - 1}):
+        cluster = LocalCluster(
+            n_workers=jobs,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=None,
+            silence_logs=logging.CRITICAL,
+            env=_ONE_THREAD,
+        )
+    stack.enter_context(cluster)
+    return stack.enter_context(Client(cluster, set_as_default=False))
+
+
+def _connect(scheduler: str) -> Any:
+    """A client of a scheduler. Raises InputError if it cannot be reached."""
+    from distributed import Client
+    from distributed.comm.addressing import parse_address, parse_host_port
+    from distributed.comm.registry import get_backend
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # lost workers are reported here anyway
+    try:
+        # Checked before there is a client, which would complain about a bad address again as it ends.
+        scheme, host = parse_address(scheduler)
+        get_backend(scheme)
+        if scheme in ("tcp", "tls"):
+            parse_host_port(host)
+        return Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError, ImportError) as error:
+        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(
+            f"no Dask scheduler answers at {scheduler} ({first}); wanted an address as tcp://host:8786, where "
+            "`dask scheduler` runs"
+        ) from None

@@ -8,26 +8,28 @@ import glob
 import itertools
 import json
 import math
+import re
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torchvision_dddas.config import Settings, changes, format_toml, with_parameters
+from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, nearest, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.goals import Goal, goal_value
-from torchvision_dddas.evaluation.studies.jobs import Event
-from torchvision_dddas.evaluation.studies.runner import cache_folder, plan_study, run_jobs, run_study
-from torchvision_dddas.evaluation.studies.search_space import Axis, Choice, why_impossible
-from torchvision_dddas.evaluation.studies.spec import Spec
-from torchvision_dddas.evaluation.studies.storage import Cache
-from torchvision_dddas.evaluation.studies.workers import Workers
-from torchvision_dddas.io.atomic_files import cannot_write, write_whole
+from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
+from torchvision_dddas.evaluation.studies.jobs import Event, Workers
+from torchvision_dddas.evaluation.studies.records import Spec
+from torchvision_dddas.evaluation.studies.runner import plan_study, run_jobs, run_study
+from torchvision_dddas.evaluation.studies.summary import Goal, goal_value
+from torchvision_dddas.io.atomic_files import save_file
 
-if TYPE_CHECKING:
-    from optuna.trial import Trial as Proposal
+MAX_POINTS = 10_000
+AHEAD = 12  # points of a grid whose clips the workers share
+
+_RANGE = re.compile(r"\s*([^\s:,\[\]]+)\s*:\s*([^\s:,\[\]]+)\s*(?::\s*(\w+)\s*)?")
 
 Measured = tuple[float, str]
 """The measure, NaN if there is none, and then why."""
@@ -35,7 +37,140 @@ Measured = tuple[float, str]
 Measure = Callable[[Mapping[str, object]], Measured]
 """What a study measures with some parameters changed."""
 
-AHEAD = 12  # points of a grid whose clips the workers share
+
+@dataclass(frozen=True)
+class Choice:
+    """Some values of a parameter."""
+
+    parameter: str
+    values: tuple[object, ...]
+
+
+@dataclass(frozen=True)
+class Range:
+    """Values of a parameter from low to high, both included. step: 0 for real numbers. log: even in the logarithm."""
+
+    parameter: str
+    low: float
+    high: float
+    step: int = 0
+    log: bool = False
+
+
+Axis = Choice | Range
+
+
+def parse_grid(texts: Sequence[str], settings: Settings) -> list[Choice]:
+    """Axes from texts such as `difference.threshold=10,20,30`.
+
+    Raises InputError for an unknown parameter, one that is named twice, no values, a bad value, or too many points.
+    """
+    axes: list[Choice] = []
+    for text in texts:
+        parameter, values = _split(text, "group.parameter=value,value", axes)
+        axes.append(_choice(parameter, values, text, settings))
+    if (count := count_points(axes)) > MAX_POINTS:
+        raise InputError(f"the grid may have {MAX_POINTS} points, got {count}; give fewer values, or take --optuna")
+    return axes
+
+
+def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
+    """Axes from texts such as `difference.threshold=8:30`, `small.gap_frames=2:20:log`, `difference.kind=a,b`.
+
+    Raises InputError as `parse_grid`, and for bad ends of a range.
+    """
+    axes: list[Axis] = []
+    for text in texts:
+        parameter, values = _split(text, "group.parameter=low:high", axes)
+        found = _RANGE.fullmatch(values)
+        axes.append(_range(parameter, found, text, settings) if found else _choice(parameter, values, text, settings))
+    return axes
+
+
+def count_points(axes: Sequence[Choice]) -> int:
+    """The number of points of a grid."""
+    return math.prod(len(axis.values) for axis in axes)
+
+
+def _split(text: str, wanted: str, axes: Sequence[Axis]) -> tuple[str, str]:
+    parameter, equals, values = (part.strip() for part in text.partition("="))
+    if not equals or not parameter or not values:
+        raise InputError(f"'{text}' is no axis of a sweep; wanted {wanted}, such as difference.threshold=10,20")
+    names = [known.name for known in all_parameters()]
+    if parameter not in names:
+        raise InputError(f"unknown parameter '{parameter}'; {nearest(parameter, names)}")
+    if any(axis.parameter == parameter for axis in axes):
+        raise InputError(f"{parameter} is given twice; give all its values in one place")
+    return parameter, values
+
+
+def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Choice:
+    """Values between commas, as TOML has them; words need no quotes."""
+    try:
+        values = list(tomllib.loads(f"values = [{listed}]")["values"])
+    except (ValueError, RecursionError):
+        values = []
+        for word in filter(None, (part.strip() for part in listed.split(","))):
+            try:
+                values.append(tomllib.loads(f"value = {word}")["value"])
+            except (ValueError, RecursionError):
+                values.append(word)
+    if not values:
+        raise InputError(f"'{text}' has no values; wanted some, such as difference.threshold=10,20")
+    values = [tuple(value) if isinstance(value, list) else value for value in values]
+    for value in values:
+        _check(parameter, value, settings)
+    if isinstance(_current(settings, parameter), float):
+        values = [float(value) if isinstance(value, int) else value for value in values]
+    return Choice(parameter, tuple(dict.fromkeys(values)))
+
+
+def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Range:
+    current = _current(settings, parameter)
+    if isinstance(current, bool) or not isinstance(current, int | float):
+        raise InputError(f"{parameter} is no number and has no range; give its values, as {parameter}=first,second")
+    try:
+        low, high = float(found[1]), float(found[2])
+    except ValueError:
+        raise InputError(f"'{text}': the ends of a range must be numbers, low:high") from None
+    if not low < high:
+        raise InputError(f"'{text}': the lower end must come first, got {low:g}:{high:g}")
+    log = found[3] is not None
+    if log and found[3] != "log":
+        raise InputError(f"'{text}' ends in '{found[3]}'; wanted low:high, or low:high:log")
+    if log and low <= 0:
+        raise InputError(f"'{text}': the lower end of a logarithmic range must be above 0, got {low:g}")
+    odd = next(known.range for known in all_parameters() if known.name == parameter).endswith(", odd")
+    if isinstance(current, int):
+        if fractions := [end for end in (low, high) if end != int(end)]:
+            raise InputError(f"{parameter} takes whole numbers, got {fractions[0]:g}")
+        low, high = int(low), int(high)
+    for end in (low, high):
+        _check(parameter, end, settings)
+    if log and odd:
+        raise InputError(f"{parameter} takes odd numbers, which have no logarithmic range; leave out :log")
+    return Range(parameter, low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
+
+
+def _check(parameter: str, value: object, settings: Settings) -> None:
+    """Raises InputError for a bad value. Rules over several parameters are checked at each point."""
+    cause = _why_impossible(settings, {parameter: value})
+    if cause.startswith((f"{parameter} = ", f"{parameter} must ")):
+        raise InputError(cause)
+
+
+def _why_impossible(settings: Settings, parameters: Mapping[str, object]) -> str:
+    """Why parameters cannot have these values together; empty if they can."""
+    try:
+        with_parameters(settings, parameters)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _current(settings: Settings, parameter: str) -> object:
+    group, name = parameter.split(".")
+    return getattr(getattr(settings, group), name)
 
 
 @dataclass(frozen=True)
@@ -62,7 +197,7 @@ def search_grid(
     points: list[tuple[dict[str, object], str]] = [({}, "")]
     for values in itertools.product(*(axis.values for axis in axes)):
         parameters = {axis.parameter: value for axis, value in zip(axes, values, strict=True)}
-        points.append((parameters, why_impossible(settings, parameters)))
+        points.append((parameters, _why_impossible(settings, parameters)))
     if all(cause for _, cause in points[1:]):
         raise InputError(f"no point of the grid is possible; the first: {points[1][1]}")
     for first in range(0, len(points), AHEAD):
@@ -88,14 +223,21 @@ def search_ranges(
     check_optuna()
     import optuna
 
+    def suggest(axis: Axis) -> object:
+        if isinstance(axis, Choice):  # by their places, as Optuna takes no lists as values
+            return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
+        if axis.step:
+            return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
+        return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
+
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampler = optuna.samplers.TPESampler(seed=seed)
     study = optuna.create_study(direction="minimize" if minimize else "maximize", sampler=sampler)
     yield Trial(0, {}, *measure({}))
     for number in range(1, count + 1):
         proposal = study.ask()
-        parameters = {axis.parameter: _suggest(proposal, axis) for axis in axes}
-        cause = why_impossible(settings, parameters)
+        parameters = {axis.parameter: suggest(axis) for axis in axes}
+        cause = _why_impossible(settings, parameters)
         trial = Trial(number, parameters, *((math.nan, cause) if cause else measure(parameters)))
         if math.isnan(trial.value):
             study.tell(proposal, state=optuna.trial.TrialState.FAIL)
@@ -104,24 +246,15 @@ def search_ranges(
         yield trial
 
 
-def _suggest(proposal: "Proposal", axis: Axis) -> object:
-    if isinstance(axis, Choice):
-        # By their places: Optuna takes no lists as values.
-        return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
-    if axis.step:
-        return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
-    return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
+def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
+    """The best first, equal ones in their order, those without a value last."""
+    sign = 1 if minimize else -1
+    return sorted(trials, key=lambda t: (math.isnan(t.value), 0 if math.isnan(t.value) else sign * t.value, t.number))
 
 
 def best(trials: Sequence[Trial], minimize: bool) -> Trial | None:
     """The trial with the best value, of equal ones the first; None if none has a value."""
     return next((trial for trial in ranked(trials, minimize) if not math.isnan(trial.value)), None)
-
-
-def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
-    """The best first, equal ones in their order, those without a value last."""
-    sign = 1 if minimize else -1
-    return sorted(trials, key=lambda t: (math.isnan(t.value), 0 if math.isnan(t.value) else sign * t.value, t.number))
 
 
 @dataclass
@@ -146,12 +279,8 @@ class StudyMeasure:
     def prepare(self, points: Sequence[Mapping[str, object]], clips: Sequence[str]) -> None:
         """Compute what the studies of several points need, so that no worker has to wait between them."""
         planned = plan_study(self.spec, self.base, [glob.escape(name) for name in clips])
-        each = [
-            replace(job, settings=with_parameters(job.settings, parameters))
-            for parameters in points
-            for job in planned.jobs
-        ]
-        jobs = [replace(job, number=number) for number, job in enumerate(each)]
+        pairs = enumerate(itertools.product(points, planned.jobs))
+        jobs = [replace(j, number=k, settings=with_parameters(j.settings, point)) for k, (point, j) in pairs]
         run_jobs(jobs, self.workers, Cache(self.cache or cache_folder()), self._counter(len(jobs)))
 
     def _counter(self, total: int) -> Callable[[Event], None]:
@@ -210,7 +339,8 @@ class SweepRecord:
         if on_held is not None:
             about.append(f"On the clips held out: {format_value(on_held[1][0])}, before {format_value(on_held[0][0])}.")
         self._write_json()
-        self._write("best.toml", settings_toml(with_parameters(self.settings, best.parameters), about))
+        text = settings_toml(with_parameters(self.settings, best.parameters), about)
+        save_file(self.folder / "best.toml", text.encode())
 
     @property
     def heading(self) -> str:
@@ -218,13 +348,10 @@ class SweepRecord:
         return f"{self.goal.name}, {self.goal.by} over {len(self.tuned)} clip{'s' * (len(self.tuned) != 1)}"
 
     def _write_json(self) -> None:
-        trials = [
-            {"number": t.number, "knobs": dict(t.parameters), "value": _null_if_nan(t.value), "cause": t.cause}
-            for t in self.trials
-        ]
-        held = None
-        if self.on_held is not None:
-            held = {"before": _null_if_nan(self.on_held[0][0]), "best": _null_if_nan(self.on_held[1][0])}
+        def null_if_nan(value: float) -> float | None:
+            return None if math.isnan(value) else value
+
+        held = self.on_held and {"before": null_if_nan(self.on_held[0][0]), "best": null_if_nan(self.on_held[1][0])}
         content = {
             "format": 1,
             "measure": self.goal.name,
@@ -234,18 +361,14 @@ class SweepRecord:
             "settings": changes(self.settings),
             "clips": self.tuned,
             "held_out": self.held,
-            "trials": trials,
+            "trials": [
+                {"number": t.number, "knobs": dict(t.parameters), "value": null_if_nan(t.value), "cause": t.cause}
+                for t in self.trials
+            ],
             "best": None if self.best is None else self.best.number,
             "on_held_out": held,
         }
-        self._write("sweep.json", json.dumps(content, indent=2) + "\n")
-
-    def _write(self, name: str, text: str) -> None:
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_whole(self.folder / name, text.encode())
-        except OSError as error:
-            raise cannot_write(self.folder / name, error) from error
+        save_file(self.folder / "sweep.json", (json.dumps(content, indent=2) + "\n").encode())
 
 
 def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
@@ -265,7 +388,3 @@ def toml_value(value: object) -> str:
 def format_value(value: float) -> str:
     """A measure to four digits; a dash if there is none."""
     return "–" if math.isnan(value) else f"{value:.4f}"
-
-
-def _null_if_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value

@@ -1,15 +1,24 @@
-"""Results on disk: records as npz with JSON inside, a cache of them by key, and the scores.bin of a study."""
+"""Results on disk: records as npz with JSON inside, in a cache by key, and the scores.bin of a study.
 
+A key is the digest of the settings, the content of the files, and the source code and libraries that compute a result.
+"""
+
+import ast
 import dataclasses
 import hashlib
 import io
 import json
+import os
+import platform
 import time
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from types import CodeType, FunctionType, ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +28,9 @@ from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import Clear, Hota, Identity, TargetTrack, TrackCounts
-from torchvision_dddas.evaluation.studies.results import Found, Scored, ScoredCase, ScoredStudy
+from torchvision_dddas.evaluation.studies.records import Found, Scored, ScoredCase, ScoredStudy
 from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
+from torchvision_dddas.runtime import VERSION
 
 SCORES = "scores.bin"
 """The file of a study's folder that holds its counts, frame by frame."""
@@ -46,25 +56,24 @@ def pack(record: Any) -> bytes:
     return hashlib.sha256(body).digest() + body
 
 
-def digest(*values: Any) -> str:
-    """The SHA-256 of values that `pack` takes. Values that differ in content, type or order have different digests."""
-    return pack(values)[:32].hex()
-
-
-def is_whole(content: bytes) -> bool:
-    """Whether bytes are as `pack` made them."""
-    return hashlib.sha256(memoryview(content)[32:]).digest() == content[:32]
-
-
 def unpack(content: bytes) -> Any:
     """The record of such bytes. Raises DamagedError if they are damaged, or hold no known record."""
-    if not is_whole(content):
+    if not _is_whole(content):
         raise DamagedError("its digest is another")
     try:
         with np.load(io.BytesIO(content[32:]), allow_pickle=False) as arrays:
             return _decode(json.loads(arrays["content"].tobytes()), arrays)
     except (ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise DamagedError(f"{type(error).__name__}: {error}") from error
+
+
+def digest(*values: Any) -> str:
+    """The SHA-256 of values that `pack` takes. Values that differ in content, type or order have different digests."""
+    return pack(values)[:32].hex()
+
+
+def _is_whole(content: bytes) -> bool:
+    return hashlib.sha256(memoryview(content)[32:]).digest() == content[:32]
 
 
 def _encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -100,19 +109,10 @@ def _decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     return {"tuple": tuple, "list": list}[kind](_decode(v, arrays) for v in inner)
 
 
-class Store(Protocol):
-    """Where results are kept. notes: lines for the user. made: new records that have to travel to another cache."""
-
-    notes: list[str]
-    made: dict[str, bytes]
-
-    def get(self, key: str) -> Any | None:
-        """The record of a key; None if there is none."""
-        ...
-
-    def put(self, key: str, record: Any) -> None:
-        """Keep a record."""
-        ...
+def cache_folder() -> Path:
+    """The default folder of cached results."""
+    home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(home) / "torchvision_dddas" / "studies"
 
 
 class Cache:
@@ -124,7 +124,6 @@ class Cache:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.notes: list[str] = []
-        self.made: dict[str, bytes] = {}  # records that have to travel: none
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -137,7 +136,7 @@ class Cache:
     def has(self, key: str) -> bool:
         """Whether there is a whole entry. A damaged one is noted and removed."""
         content = self.read(key)
-        return content is not None and (is_whole(content) or self._drop(key))
+        return content is not None and (_is_whole(content) or self._drop(key))
 
     def get(self, key: str) -> Any | None:
         """The record of a key; None if there is none. A damaged one is noted and removed."""
@@ -190,7 +189,7 @@ class Cache:
 
 
 class CarriedRecords:
-    """Records that travel with a job to another machine: known ones there, new ones back."""
+    """Records that travel with a job to another machine: known ones there; new ones, in `made`, back."""
 
     def __init__(self, known: dict[str, bytes]) -> None:
         self._known = known
@@ -232,3 +231,110 @@ def read_scores(folder: Path) -> ScoredStudy:
     if not isinstance(study, ScoredStudy):
         raise InputError(f"{path} holds no scores of a study; run the study again")
     return study
+
+
+PACKAGE = Path(__file__).resolve().parents[2]
+
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "pymap3d", "av")
+_ENGINE_LIBRARIES = {"torch": ("torch", "kornia")}
+_SETTLED_S = 2.0  # a file that was written a moment ago may be written again within one tick of its time stamp
+
+
+@cache
+def code_digest(function: Callable[..., Any], engine: str = "") -> str:
+    """The digest of the code that a function can run: its own module, and all that it imports from this package.
+
+    The import graph is read from the sources. Data files of the package, versions of libraries (those of an engine
+    too) and the processor's architecture count as well.
+    """
+    files = {PACKAGE.parent / Path(*function.__module__.split(".")).with_suffix(".py")}
+    waiting = set(_modules_used(function, set()))
+    while waiting:
+        module = PACKAGE.parent / Path(*waiting.pop().split("."))
+        for path in (module.with_suffix(".py"), module / "__init__.py"):
+            if path not in files and path.is_file():
+                files.add(path)
+                waiting |= set(_imports(path))
+    files |= {path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    content = {path.relative_to(PACKAGE).as_posix(): _file_digest(path) for path in sorted(files)}
+    libraries = {}
+    for name in (*_LIBRARIES, *_ENGINE_LIBRARIES.get(engine, ())):
+        try:
+            libraries[name] = version(name)
+        except PackageNotFoundError:
+            libraries[name] = ""
+    return digest(VERSION, content, libraries, platform.machine())
+
+
+def _modules_used(function: Callable[..., Any], seen: set[Any]) -> Iterator[str]:
+    """Names of the modules whose functions, classes or constants a function uses, directly or in its own module."""
+    if not isinstance(function, FunctionType) or function in seen:
+        return
+    seen.add(function)
+    for name in _names(function.__code__):
+        used = function.__globals__.get(name, name)
+        module = used.__name__ if isinstance(used, ModuleType) else getattr(used, "__module__", used)
+        if module != function.__module__:
+            if isinstance(module, str) and module.startswith(PACKAGE.name):
+                yield module
+        else:
+            for part in vars(used).values() if isinstance(used, type) else (used,):
+                yield from _modules_used(part, seen)
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+@cache
+def _imports(path: Path) -> tuple[str, ...]:
+    """Names that may be modules of this package, which a file imports anywhere but for types alone."""
+    found: list[str] = []
+    waiting: list[Any] = ast.parse(path.read_bytes()).body
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        elif isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            waiting += node.orelse
+        else:  # statements alone, for no expression imports
+            for name in ("body", "orelse", "finalbody", "handlers", "cases"):
+                part = getattr(node, name, ())
+                waiting += part if isinstance(part, list) else ()
+    return tuple(name for name in found if name.split(".")[0] == PACKAGE.name)
+
+
+def _file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def files_digest(paths: Sequence[Path], memory: Path | None = None) -> str:
+    """The digest of the content of files, in order. Raises InputError if one cannot be read.
+
+    memory: the folder that remembers digests: a list whose sizes and times are unchanged is not read again.
+    """
+    if not paths:
+        return ""
+    try:
+        stats = [(path, path.stat()) for path in paths]
+        marks = [(str(path.absolute()), s.st_size, s.st_mtime_ns, s.st_ctime_ns) for path, s in stats]
+        place = None if memory is None else memory / f"{digest(marks)}.txt"
+        if place is not None:
+            with suppress(OSError):
+                known = place.read_text(encoding="ascii", errors="replace").strip()
+                if len(known) == 64:
+                    return known
+        found = digest([_file_digest(path) for path in paths])
+    except OSError as error:
+        raise InputError(f"{error.filename} cannot be read: {error.strerror}") from None
+    if place is not None and all(time.time() - stat.st_mtime > _SETTLED_S for _, stat in stats):
+        with suppress(OSError):  # only time is lost
+            place.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(place, found.encode())
+    return found

@@ -1,16 +1,38 @@
-"""What a study finds in its clips, and how right it is."""
+"""The records of a study: what it asks for, what it finds in its clips, and how right that is."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-if TYPE_CHECKING:  # else what finds would seem to depend on what scores; see fingerprints.py
+if TYPE_CHECKING:  # otherwise code that finds would seem to depend on code that scores; see cache.code_digest
     from torchvision_dddas.config import Settings
-    from torchvision_dddas.evaluation.datasets.record import Clip
+    from torchvision_dddas.evaluation.datasets.record import Clip, Source
     from torchvision_dddas.evaluation.metrics.registry import Counts
-    from torchvision_dddas.evaluation.studies.spec import Spec, Task
+
+Task = Literal["motion", "tracking", "association", "people", "location"]
+
+TASKS: Mapping[Task, str] = {
+    "motion": "what moves in the clip's pictures, against masks, boxes or one target; in a still clip all is false",
+    "tracking": "identities of what was found, or of the data set's own detections, against true tracks",
+    "association": "identities of the true boxes, at each interval-th frame, against the true identities",
+    "people": "persons in each picture, against true boxes",
+    "location": "places on the ground, in metres, against the true ones",
+}
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A study. tasks: empty for all that each clip allows. config, overrides: as --config and --set."""
+
+    name: str
+    sources: "tuple[Source, ...]"
+    tasks: tuple[Task, ...] = ()
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    backend: str = "auto"
+    interval: int = 1
 
 
 @dataclass(frozen=True)
@@ -26,7 +48,7 @@ class Found:
     masks: PNG bytes by frame, where the truth is a mask; nonzero is foreground.
     steps: by frame, the (3, 3) homography from the previous frame that was read; reliable ones only.
     more: further columns (N, ...) that a later stage needs, by name. The location task has lonlat_deg (N, 2) and
-        relative_m2 (N, 2, 2), the covariance relative to the team, where they are known.
+        relative_m2 (N, 2, 2), the covariance relative to the team, NaN where unknown.
     seconds: time by stage, over the clip. peak_mb: the most memory that the process held.
     """
 
@@ -70,7 +92,7 @@ class Case:
     """A task on a clip, and its result. cause: one line on why there is no result, else empty."""
 
     clip: "Clip"
-    task: "Task"
+    task: Task
     found: Found | None = None
     scored: Scored | None = None
     cause: str = ""
@@ -80,7 +102,7 @@ class Case:
 class Results:
     """A study that was run. left_out: clips and tasks without a case. facts: versions, engine, terms of use."""
 
-    spec: "Spec"
+    spec: Spec
     settings: "Settings"
     cases: tuple[Case, ...]
     left_out: tuple[str, ...] = ()
@@ -108,7 +130,7 @@ def round_as_written(box_px: np.ndarray) -> np.ndarray:
     """Round (N, 4) boxes to a hundredth of a pixel, as tables have them: scores must be those of the files."""
     hundredths = box_px * 100
     written = np.round(hundredths) / 100
-    # Half a hundredth goes where the decimal text of the number goes, which is not always where the product goes.
+    # Half a hundredth is rounded as the decimal text of the number is, which may differ from the product's rounding.
     for i, j in np.argwhere(np.abs(np.abs(hundredths - np.floor(hundredths)) - 0.5) < 1e-6):
         written[i, j] = float(f"{box_px[i, j]:.2f}")
     return written
