@@ -4,17 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.colours import (
     ColourFinder,
     ColourSample,
     build_ranges,
-    find_samples,
+    calibrate_colours,
     hue_difference,
     load_colours,
+    mask_colours,
     mask_range,
-    name_hues,
-    pool_samples,
-    sample_box,
     to_hsv,
 )
 
@@ -46,16 +45,34 @@ def inside(mask, box):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_plates_are_found_and_each_range_marks_its_own_and_no_other(seed):
     image, boxes = painted(PLATES, seed)
-    hsv = to_hsv(image)
-    groups = pool_samples([find_samples(hsv, LEAST)], None)
-    names = name_hues([group[0].hue for group in groups])
-    assert sorted(names) == sorted(PLATES)
-    low, high, others = build_ranges(groups, [hsv], LEAST)
-    assert others.tolist() == [0, 0, 0, 0]
-    for k, name in enumerate(names):
-        mask = mask_range(hsv, low[k], high[k])
+    found = calibrate_colours([image], LEAST)
+    assert sorted(found.ranges.names) == sorted(PLATES)
+    assert found.others == (0, 0, 0, 0)
+    for name, low, high in zip(found.ranges.names, found.ranges.low, found.ranges.high, strict=True):
+        mask = mask_range(to_hsv(image), low, high)
         assert {other for other, box in boxes.items() if inside(mask, box) > 0.02} == {name}
         assert inside(mask, boxes[name]) > 0.95
+
+
+def test_names_go_to_the_nearest_hues_or_in_their_order():
+    image, _ = painted(PLATES)
+    wanted = ["yellow", "blue", "magenta", "red"]
+    assert list(calibrate_colours([image], LEAST, names=sorted(PLATES)).ranges.names) == wanted
+    assert calibrate_colours([image], LEAST, names="abcd").ranges.names == tuple("abcd")
+    two = calibrate_colours([painted({"blue": (108, 200, 190), "deep": (121, 200, 190)})[0]], LEAST)
+    assert two.ranges.names == ("blue-1", "blue-2")
+
+
+def test_too_few_and_too_similar_colours_and_boxes_without_one_are_refused():
+    image, boxes = painted(PLATES)
+    with pytest.raises(InputError, match="of 20 colours stand out in the picture"):
+        calibrate_colours([image], LEAST, 20)
+    with pytest.raises(InputError, match="the hues of a and b are too similar"):
+        calibrate_colours([image], LEAST, boxes=[("a", boxes["blue"]), ("b", boxes["blue"])])
+    with pytest.raises(InputError, match="is not inside the picture, 640 x 480 px"):
+        calibrate_colours([image], LEAST, boxes=[("a", (630, 0, 20, 20))])
+    with pytest.raises(InputError, match="has a strong colour"):
+        calibrate_colours([np.full((20, 20, 3), 128, np.uint8)], LEAST, boxes=[("a", (0, 0, 20, 20))])
 
 
 def test_neighbouring_hues_share_the_gap_between_them():
@@ -68,12 +85,11 @@ def test_neighbouring_hues_share_the_gap_between_them():
     assert (low[2, 0], high[2, 0]) == (167, 3)
 
 
-def test_a_box_on_grey_has_no_colour_and_one_half_on_the_plate_has_the_plates():
+def test_a_box_half_on_the_plate_has_the_plates_colour():
     image, boxes = painted({"blue": PLATES["blue"]})
     x, y, _, _ = boxes["blue"]
-    half = sample_box(to_hsv(image), (x - 8, y - 4, 24, 16))
-    assert half is not None and abs(hue_difference(half.hue, 112)) <= 4
-    assert sample_box(np.full((20, 20, 3), (90, 10, 200), np.uint8), (0, 0, 20, 20)) is None
+    ((half,),) = calibrate_colours([image], LEAST, boxes=[("blue", (x - 8, y - 4, 24, 16))]).groups
+    assert abs(hue_difference(half.hue, 112)) <= 4
 
 
 LOW = np.array([[170, 80, 60], [10, 80, 60], [55, 40, 40], [0, 0, 0]], float)
@@ -102,25 +118,24 @@ def by_in_range(image: np.ndarray) -> np.ndarray:
 
 def test_masks_are_those_of_opencv_also_for_a_hue_that_goes_over_zero(finder):
     image = picture()
-    found, wanted = finder.masks(image, LOW, HIGH), by_in_range(image)
+    found, wanted = finder(image, LOW, HIGH), by_in_range(image)
     assert found.dtype == np.uint8 and found.shape == (4, 120, 160) and set(np.unique(found)) == {0, 255}
     assert ((wanted > 0).mean((1, 2)) > 0.002).all()
-    assert (found != wanted).mean() <= (0 if finder.name == "onboard" else 0.002)
+    assert (found != wanted).mean() <= (0 if finder is mask_colours else 0.002)
 
 
 def test_large_pictures_are_looked_at_in_parts_that_leave_no_trace():
     image = picture(700, 900)
-    np.testing.assert_array_equal(load_colours("onboard").masks(image, LOW, HIGH), by_in_range(image))
+    np.testing.assert_array_equal(mask_colours(image, LOW, HIGH), by_in_range(image))
     wide = picture(20, 140_000 // 10 * 10)
-    np.testing.assert_array_equal(load_colours("onboard").masks(wide, LOW, HIGH), by_in_range(wide))
+    np.testing.assert_array_equal(mask_colours(wide, LOW, HIGH), by_in_range(wide))
 
 
 def test_no_ranges_and_no_pixels_give_empty_masks(finder):
-    assert finder.masks(picture(), LOW[:0], HIGH[:0]).shape == (0, 120, 160)
-    assert finder.masks(np.zeros((0, 5, 3), np.uint8), LOW, HIGH).shape == (4, 0, 5)
+    assert finder(picture(), LOW[:0], HIGH[:0]).shape == (0, 120, 160)
+    assert finder(np.zeros((0, 5, 3), np.uint8), LOW, HIGH).shape == (4, 0, 5)
 
 
 def test_pictures_of_one_team_are_taken_together():
-    pictures = [to_hsv(painted(PLATES, seed)[0]) for seed in (0, 1)]
-    groups = pool_samples([find_samples(hsv, LEAST, n) for n, hsv in enumerate(pictures)], 4)
-    assert sorted(tuple(sorted(one.picture for one in group)) for group in groups) == [(0, 1)] * 4
+    groups = calibrate_colours([painted(PLATES, seed)[0] for seed in (0, 1)], LEAST, 4).groups
+    assert [{one.picture for one in group} for group in groups] == [{0, 1}] * 4

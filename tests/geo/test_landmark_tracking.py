@@ -59,7 +59,7 @@ def blobs(*boxes):
 
 
 def follower(names="a", **parameters):
-    return LandmarkTracker(tuple(names), LandmarkParameters(reach_px=30.0, **parameters))
+    return LandmarkTracker(len(names), LandmarkParameters(reach_px=30.0, **parameters))
 
 
 def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.colours import OpenCVColourFinder
+from torchvision_dddas.geo.colours import mask_colours
 from torchvision_dddas.tuning.colours import fit_colours
 
 NAMES = ("red", "green")
@@ -33,7 +33,7 @@ def f(colours, seeds) -> float:
         hit = told = true = 0
         for seed in seeds:
             picture, labels = scene(seed)
-            mask = OpenCVColourFinder().masks(picture, colours.low, colours.high)[k] > 0
+            mask = mask_colours(picture, colours.low, colours.high)[k] > 0
             hit, told, true = hit + (mask & (labels == k + 1)).sum(), told + mask.sum(), true + (labels == k + 1).sum()
         found.append(2 * hit / (told + true))
     return float(np.mean(found))

@@ -1,32 +1,34 @@
-"""How high a camera stands and where it looks, from upright people all over its picture.
+"""Calibration of a camera on the ground by people: its height and pitch, and its focal length.
 
 With the camera h above the ground, the slope of the ray to a head is 1 - H / h of that to the feet (see `ranging`). So
 each body's feet and the camera's pitch say where its head is to be, and the pitch and height that fit all heads are
 the camera's. People of different heights average out; the scale is that of the typical person, H.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import level
-from torchvision_dddas.types import Bool, Camera, Float
+from torchvision_dddas.types import Camera, Float
 
 # Fewest boxes for a calibration.
 FEWEST = 20
 # The rows of the feet, without a tenth on either side, must span this many body heights at least.
-NARROW = 0.3
+_NARROW = 0.3
 # Jackknife: this many stretches of time are left out in turn, for the standard deviations.
-BLOCKS = 10
-# Starts of the search: pitches, each with all heights.
-PITCHES = np.radians([0.0, 5.0, 15.0, 30.0, 50.0])
-# In heights of the typical person.
-HEIGHTS = (0.5, 1.2, 2.5, 8.0)
-# A fit whose median residual exceeds this many body heights is refused.
-POOR = 0.5
-# A fit whose height has a larger relative standard deviation is refused.
-UNSURE = 0.2
+_BLOCKS = 10
+# Starts of the search: pitches, each with all heights, in heights of the typical person.
+_PITCHES, _HEIGHTS = np.radians([0.0, 5.0, 15.0, 30.0, 50.0]), (0.5, 1.2, 2.5, 8.0)
+# A fit is refused whose median residual exceeds this many body heights, or whose height has a larger relative
+# standard deviation.
+_POOR, _UNSURE = 0.5, 0.2
+# A measurement is an outlier so many robust standard deviations from the median, or _SURE of it where that is more.
+_OUTLIER = 3.5
+# Shares of the focal length. A box is never read more surely than _SURE; no calibration of people is finer than
+# _FINEST, for all their boxes may be too tall or too low together.
+_SURE, _FINEST = 0.03, 0.01
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,19 @@ class MountedPose:
     height_sigma_m: float
     pitch_sigma_rad: float
     miss: float
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """focal_px: the focal length. sigma_px: its standard deviation. outlier: (N,) the measurements that were not used.
+
+    spread_px: standard deviation of one measurement; NaN where there is but one.
+    """
+
+    focal_px: float
+    sigma_px: float
+    spread_px: float
+    outlier: np.ndarray
 
 
 def calibrate_pose(
@@ -61,7 +76,7 @@ def calibrate_pose(
             f"{len(box)} whole boxes of people{lost}; wanted {FEWEST} at least to tell how the camera stands"
         )
     low, high = np.percentile(box[:, 1] + box[:, 3], [10, 90])
-    if high - low < NARROW * np.median(box[:, 3]):
+    if high - low < _NARROW * np.median(box[:, 3]):
         raise InputError(
             f"most feet lie within {high - low:.0f} rows of the picture, which does not tell how the camera stands; "
             "give people near and far"
@@ -69,73 +84,34 @@ def calibrate_pose(
 
     from scipy.optimize import least_squares  # here, as it takes half a second and 45 MB
 
-    def residual(guess: np.ndarray, here: np.ndarray) -> np.ndarray:
+    def residual(guess: np.ndarray, rows: np.ndarray) -> np.ndarray:
         pitch, height = guess[0], np.exp(guess[1])
-        slope = np.tan(pitch + np.arctan(feet[here])) * (1 - 1 / height)
-        return (head[here] - np.tan(np.arctan(slope) - pitch)) / (feet[here] - head[here])
+        slope = np.tan(pitch + np.arctan(feet[rows])) * (1 - 1 / height)
+        return (head[rows] - np.tan(np.arctan(slope) - pitch)) / (feet[rows] - head[rows])
 
-    def fit(here: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
-        # Beyond the horizon the tangent turns round; the bounds keep feet of most people below it.
-        found = least_squares(
-            residual,
-            start,
-            args=(here,),
-            loss="soft_l1",
-            f_scale=max(height_sigma, 1e-3),
-            bounds=([-0.3, np.log(0.05)], [1.5, np.log(1000)]),
-        )
-        return found.x, float(found.cost)
-
+    # Beyond the horizon the tangent turns round; the bounds keep feet of most people below it.
+    robust = {"loss": "soft_l1", "f_scale": max(height_sigma, 1e-3)}
+    bounds = [-0.3, np.log(0.05)], [1.5, np.log(1000)]
     everyone = np.ones(len(box), bool)
-    starts = [np.array([pitch, np.log(height)]) for pitch in PITCHES for height in HEIGHTS]
-    best = min((fit(everyone, start) for start in starts), key=lambda found: found[1])[0]
-    block = np.arange(len(box)) * BLOCKS // len(box)
-    without = np.array([fit(block != n, best)[0] for n in range(BLOCKS)])
-    sigma = np.sqrt((BLOCKS - 1) * without.var(axis=0))
+    starts = [np.array([pitch, np.log(height)]) for pitch in _PITCHES for height in _HEIGHTS]
+    fits = (least_squares(residual, start, args=(everyone,), bounds=bounds, **robust) for start in starts)
+    best = min(fits, key=lambda fit: fit.cost).x
+    block = np.arange(len(box)) * _BLOCKS // len(box)
+    without = [least_squares(residual, best, args=(block != n,), bounds=bounds, **robust).x for n in range(_BLOCKS)]
+    sigma = np.sqrt((_BLOCKS - 1) * np.array(without).var(axis=0))
     height = float(np.exp(best[1])) * body_height_m
-    if not sigma[1] < UNSURE:
+    if not sigma[1] < _UNSURE:
         raise InputError(
             f"these people do not tell how the camera stands: its height would be {height:.2f} m, unsure by "
             f"{min(sigma[1], 99):.0%}. Give more of them, near and far"
         )
     miss = float(np.median(np.abs(residual(best, everyone))))
-    if not miss < POOR:
+    if not miss < _POOR:
         raise InputError(
             f"no height and pitch fit these boxes: half of them miss by more than {min(miss, 99):.0%} of their height; "
             "check that they are upright people, and the camera's focal length and size"
         )
     return MountedPose(height, float(best[0]), float(sigma[1]) * height, float(sigma[0]), miss)
-
-
-def with_pose(camera: Camera, found: MountedPose) -> Camera:
-    """The camera with the calibrated height and pitch."""
-    return replace(
-        camera,
-        height_m=found.height_m,
-        pitch_rad=found.pitch_rad,
-        height_sigma_m=found.height_sigma_m,
-        pitch_sigma_rad=found.pitch_sigma_rad,
-    )
-
-
-# A measurement is an outlier so many robust standard deviations from the median, or SURE of it where that is more.
-OUTLIER = 3.5
-# Shares of the focal length. A box is never read more surely than SURE; no calibration of people is finer than
-# FINEST, for all their boxes may be too tall or too low together.
-SURE, FINEST = 0.03, 0.01
-
-
-@dataclass(frozen=True)
-class FocalLength:
-    """focal_px: the focal length. sigma_px: its standard deviation. outlier: (N,) the measurements that were not used.
-
-    spread_px: standard deviation of one measurement; NaN where there is but one.
-    """
-
-    focal_px: float
-    sigma_px: float
-    spread_px: float
-    outlier: np.ndarray
 
 
 def calibrate_focal_length(
@@ -150,18 +126,18 @@ def calibrate_focal_length(
     if len(height) == 0:
         raise InputError("no measurement to calibrate by; wanted one or more heights in pixels, each with its distance")
     for name, values in (("distance", distance), ("height in pixels", height), ("body height", [body_height_m])):
-        if not all(np.isfinite(v) and v > 0 for v in values):
-            wrong = next(v for v in values if not (np.isfinite(v) and v > 0))
-            raise InputError(f"a {name} of {wrong:g} will not do to calibrate by; wanted a number above 0")
+        for value in values:
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"a {name} of {value:g} will not do to calibrate by; wanted a number above 0")
     with np.errstate(over="ignore"):
         each = distance * height / body_height_m
     if not np.isfinite(each).all():
         raise InputError("a distance times a height in pixels is beyond all numbers; wanted metres and pixels")
     middle = float(np.median(each))
     spread = 1.4826 * float(np.median(np.abs(each - middle)))
-    outlier: Bool[np.ndarray, N] = np.abs(each - middle) > OUTLIER * max(spread, SURE * middle)
+    outlier = np.abs(each - middle) > _OUTLIER * max(spread, _SURE * middle)
     used = each[~outlier]
     focal = float(used.mean())
     deviation = float(used.std(ddof=1)) if len(used) > 1 else np.nan
-    single = np.fmax(deviation, SURE * focal)
-    return FocalLength(focal, float(max(single / np.sqrt(len(used)), FINEST * focal)), deviation, outlier)
+    single = np.fmax(deviation, _SURE * focal)
+    return FocalLength(focal, float(max(single / np.sqrt(len(used)), _FINEST * focal)), deviation, outlier)

@@ -1,15 +1,14 @@
-"""Colours in pictures."""
+"""Colours in pictures: masks of ranges of hue, saturation and value, their patches, and ranges found by search."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Protocol
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import occupied
+from torchvision_dddas.geometry import cheapest, occupied, shared_px
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Colours, Table
 
@@ -20,81 +19,91 @@ _CLOSE_KERNEL = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSE_PX, _CLOSE_
 # cv2.inRange takes on the whole picture, for eight colours at 1080p.
 _PIXELS = 1 << 17
 
+# Names of hues, in OpenCV's units.
+HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
+# Windows of hue in which patches are searched: half width and step; lowest saturations and value.
+_HALF, _STEP = 7, 4
+_SATURATIONS, _VALUE = (80, 120, 160), 50
+# Least fill of a patch's box; its greatest length over width; its greatest share of the picture.
+_FILL, _LONG, _MOST = 0.4, 3.0, 0.02
+# A hue that covers a larger share of the picture belongs to the ground.
+_GROUND = 0.05
+# Least difference in hue between colours.
+_APART = 10
+# Area from which size no longer raises the score, and the score of a clear colour.
+_AREA_PX, _CLEAR = 150.0, 0.24
+# Margins of ranges in hue, saturation and value that are tried: the widest that marks least else is taken.
+_MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
+_LOWEST = (40, 30)
+_ENDS = (2, 98)
 
-class ColourFinder(Protocol):
-    """Finds colours in pictures."""
-
-    name: str
-
-    def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """(K, H, W) uint8, 255 where the BGR image lies within a range of hue, saturation and value, else 0.
-
-        low, high: (K, 3) in OpenCV's units (hue 0 to 180). A range whose lowest hue is above its highest goes over 0.
-        A grey picture has no colours.
-        """
-        ...
+ColourFinder = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""(K, H, W) uint8 masks, as `mask_colours` gives them."""
 
 
 def load_colours(backend: str) -> ColourFinder:
-    """The colour finder of a back end: auto, onboard or torch. Raises InputError for another name."""
-    return TorchColourFinder() if wants_torch(backend) else OpenCVColourFinder()
+    """The colour finder of a back end: auto, onboard or torch. Raises InputError for another name.
 
-
-class OpenCVColourFinder:
-    """ColourFinder with the values of cv2.inRange and one conversion for all colours."""
-
-    name = "onboard"
-
-    def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """See ColourFinder."""
-        if image.ndim == 2 or not len(low) or not image.size:
-            return np.zeros((len(low), *image.shape[:2]), np.uint8)
-        found = np.empty((len(low), *image.shape[:2]), np.uint8)
-        rows = max(1, _PIXELS // image.shape[1])
-        other = np.empty((rows, image.shape[1]), np.uint8)
-        for top in range(0, len(image), rows):
-            hue, *rest = cv2.split(cv2.cvtColor(image[top : top + rows], cv2.COLOR_BGR2HSV))
-            spare = other[: len(hue)]
-            for mask, lowest, highest in zip(found[:, top : top + rows], low, high, strict=True):
-                if lowest[0] <= highest[0]:
-                    cv2.inRange(hue, float(lowest[0]), float(highest[0]), dst=mask)
-                else:
-                    cv2.inRange(hue, float(lowest[0]), 255.0, dst=mask)
-                    cv2.bitwise_or(mask, cv2.inRange(hue, 0.0, float(highest[0]), dst=spare), dst=mask)
-                for plane, least, most in zip(rest, lowest[1:], highest[1:], strict=True):
-                    cv2.bitwise_and(mask, cv2.inRange(plane, float(least), float(most), dst=spare), dst=mask)
-        return found
-
-
-class TorchColourFinder:
-    """ColourFinder by `functional.color`, on a CPU or GPU.
-
-    Hue and saturation are compared unrounded. OpenCV's 8-bit conversion is up to 0.64 of a level off, so a pixel next
-    to a bound may be classified differently.
+    torch compares hue and saturation unrounded, on a CPU or GPU. OpenCV's 8-bit conversion is up to 0.64 of a level
+    off, so a pixel next to a bound may be classified differently.
     """
+    if not wants_torch(backend):
+        return mask_colours
+    import torch
 
-    name = "torch"
+    from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
 
-    def __init__(self, device: Any = None) -> None:
-        """device: by default the GPU where there is one."""
-        import torch
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
-        from torchvision_dddas.functional import color
-
-        self._torch, self._color = torch, color
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-
-    def masks(self, image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """See ColourFinder."""
+    def by_torch(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         if image.ndim == 2 or not len(low) or not image.size:
             return np.zeros((len(low), *image.shape[:2]), np.uint8)
-        torch = self._torch
         with torch.inference_mode():
-            pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device).permute(2, 0, 1)[None]
-            lowest, highest = (torch.from_numpy(np.array(bound, np.float32)).to(self.device) for bound in (low, high))
-            found = self._color.within_ranges(self._color.bgr_to_hsv(pixels.float() / 255), lowest, highest)[0]
+            pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None]
+            lowest, highest = (torch.from_numpy(np.array(bound, np.float32)).to(device) for bound in (low, high))
+            found = within_ranges(bgr_to_hsv(pixels.float() / 255), lowest, highest)[0]
             masks: np.ndarray = (found * 255).byte().cpu().numpy()
         return masks
+
+    return by_torch
+
+
+def mask_colours(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(K, H, W) uint8, 255 where the BGR image lies within a range of hue, saturation and value, else 0.
+
+    low, high: (K, 3) in OpenCV's units (hue 0 to 180). A range whose lowest hue is above its highest goes over 0. A
+    grey picture has no colours. The values are those of cv2.inRange.
+    """
+    masks = np.zeros((len(low), *image.shape[:2]), np.uint8)
+    if image.ndim == 2 or not len(low) or not image.size:
+        return masks
+    rows = max(1, _PIXELS // image.shape[1])
+    spare = np.empty((rows, image.shape[1]), np.uint8)
+    for top in range(0, len(image), rows):
+        hue, *rest = cv2.split(cv2.cvtColor(image[top : top + rows], cv2.COLOR_BGR2HSV))
+        other = spare[: len(hue)]
+        for mask, lowest, highest in zip(masks[:, top : top + rows], low, high, strict=True):
+            if lowest[0] <= highest[0]:
+                cv2.inRange(hue, float(lowest[0]), float(highest[0]), dst=mask)
+            else:
+                cv2.inRange(hue, float(lowest[0]), 255.0, dst=mask)
+                cv2.bitwise_or(mask, cv2.inRange(hue, 0.0, float(highest[0]), dst=other), dst=mask)
+            for plane, least, most in zip(rest, lowest[1:], highest[1:], strict=True):
+                cv2.bitwise_and(mask, cv2.inRange(plane, float(least), float(most), dst=other), dst=mask)
+    return masks
+
+
+def to_hsv(image: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
+    return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+
+
+def mask_range(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
+    if low[0] <= high[0]:
+        return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
+    below = cv2.inRange(hsv, np.asarray(low, float), np.array([180.0, *high[1:]]))
+    return cv2.bitwise_or(below, cv2.inRange(hsv, np.array([0.0, *low[1:]]), np.asarray(high, float)))
 
 
 @dataclass(frozen=True)
@@ -114,37 +123,14 @@ class Patches(Table):
 
 def find_patches(mask: np.ndarray, least_area_px: int) -> Patches:
     """The patches (8-connected) of a (H, W) uint8 mask with at least an area, after small gaps were closed."""
-    centres: list[np.ndarray] = [np.zeros((0, 2))]
-    areas: list[np.ndarray] = [np.zeros(0)]
-    boxes: list[np.ndarray] = [np.zeros((0, 4))]
+    parts = [Patches(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)))]
     for left, top, wide, high in occupied(mask, 2 * _CLOSE_PX):
         part = cv2.morphologyEx(mask[top : top + high, left : left + wide], cv2.MORPH_CLOSE, _CLOSE_KERNEL)
         count, _, stats, middles = cv2.connectedComponentsWithStats(part, ltype=cv2.CV_32S)
         large = 1 + np.flatnonzero(stats[1:count, cv2.CC_STAT_AREA] >= least_area_px)
-        centres.append(middles[large] + (left, top))
-        areas.append(stats[large, cv2.CC_STAT_AREA].astype(float))
-        boxes.append((stats[large, :4] + (left, top, 0, 0)).astype(float))
-    return Patches(np.concatenate(centres), np.concatenate(areas), np.concatenate(boxes))
-
-
-# Names of hues, in OpenCV's units.
-HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
-
-# Windows of hue in which patches are searched: half width and step; lowest saturations and value.
-_HALF, _STEP = 7, 4
-_SATURATIONS, _VALUE = (80, 120, 160), 50
-# Least fill of a patch's box; its greatest length over width; its greatest share of the picture.
-_FILL, _LONG, _MOST = 0.4, 3.0, 0.02
-# A hue that covers a larger share of the picture belongs to the ground.
-_GROUND = 0.05
-# Least difference in hue between colours.
-_APART = 10
-# Area from which size no longer raises the score, and the score of a clear colour.
-_AREA_PX, _CLEAR = 150.0, 0.24
-# Margins of ranges in hue, saturation and value that are tried: the widest that marks least else is taken.
-_MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
-_LOWEST = (40, 30)
-_ENDS = (2, 98)
+        area = stats[large, cv2.CC_STAT_AREA].astype(float)
+        parts.append(Patches(middles[large] + (left, top), area, stats[large, :4] + (left, top, 0.0, 0.0)))
+    return Patches.concat(parts)
 
 
 @dataclass(frozen=True)
@@ -185,7 +171,7 @@ def calibrate_colours(
     """
     hsv = [to_hsv(image) for image in images]
     if boxes:
-        groups, names = [[_named_sample(hsv[0], name, box)] for name, box in boxes], [name for name, _ in boxes]
+        groups, names = [[_sample_box(hsv[0], name, box)] for name, box in boxes], [name for name, _ in boxes]
     else:
         groups = _search(hsv, least_area_px, count or len(names) or None)
         names = _match_names(names, [group[0].hue for group in groups])
@@ -195,73 +181,63 @@ def calibrate_colours(
             f"the hues of {names[a]} and {names[b]} are too similar (about {low[a, 0]} and {low[b, 0]}); "
             "give the landmarks colours that differ more"
         )
-    return CalibratedColours(Colours(tuple(names), low, high), tuple(map(tuple, groups)), tuple(others.tolist()))
-
-
-def _named_sample(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -> ColourSample:
-    (x, y, wide, high), (height, width) = box_px, hsv.shape[:2]
-    if wide < 1 or high < 1 or x + wide > width or y + high > height:
-        raise InputError(f"the box {x},{y},{wide},{high} of {name} is not inside the picture, {width} x {height} px")
-    sample = sample_box(hsv, box_px)
-    if sample is None:
-        raise InputError(f"nothing in the box {x},{y},{wide},{high} of {name} has a strong colour")
-    return sample
-
-
-def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
-    groups = pool_samples([find_samples(one, least_area_px, number) for number, one in enumerate(hsv)], count)
-    if not groups or (count is not None and len(groups) < count):
-        has = f"{len(groups)} of {count} colours stand" if groups else "no colour stands"
-        where = "the picture" if len(hsv) == 1 else f"the {len(hsv)} pictures"
-        raise InputError(f"{has} out in {where}; give a box of each landmark with --at NAME=X,Y,W,H")
-    return sorted(groups, key=lambda group: group[0].hue)
-
-
-def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
-    """A name for each hue: the colour names that fit best, or the given names in the order of hues."""
-    from scipy.optimize import linear_sum_assignment  # heavy, and used by nothing else that runs onboard
-
-    if not names:
-        return name_hues(hues)
-    if not set(names) <= HUES.keys():
-        return list(names)
-    apart = [[float(abs(hue_difference(HUES[name], hue))) for name in names] for hue in hues]
-    return [names[place] for place in linear_sum_assignment(apart)[1].tolist()]
+    return CalibratedColours(Colours(tuple(names), low, high), tuple(map(tuple, groups)), tuple(others))
 
 
 def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
     """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
+    hues = [
+        {hue % 180 for hue in range(first, last + 1 if first <= last else last + 181)}
+        for first, last in zip(low[:, 0], high[:, 0], strict=True)
+    ]
     return [
         (a, b)
         for a, b in combinations(range(len(low)), 2)
-        if _hues(low[a, 0], high[a, 0]) & _hues(low[b, 0], high[b, 0])
-        and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
+        if hues[a] & hues[b] and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
     ]
 
 
-def _hues(low: int, high: int) -> set[int]:
-    """The hues from 0 to 179 in a range."""
-    return {hue % 180 for hue in range(low, high + 1 if low <= high else high + 181)}
+def _sample_box(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -> ColourSample:
+    """The saturated colour that most of a box is of."""
+    (x, y, wide, high), (height, width) = box_px, hsv.shape[:2]
+    if wide < 1 or high < 1 or x + wide > width or y + high > height:
+        raise InputError(f"the box {x},{y},{wide},{high} of {name} is not inside the picture, {width} x {height} px")
+    part = hsv[y : y + high, x : x + wide].reshape(-1, 3)
+    vivid = part[(part[:, 1] >= _SATURATIONS[0]) & (part[:, 2] >= _VALUE)]
+    if len(vivid) < max(4, len(part) // 10):
+        raise InputError(f"nothing in the box {x},{y},{wide},{high} of {name} has a strong colour")
+    count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
+    around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], np.ones(2 * _HALF + 1), "valid")
+    most = vivid[np.abs(hue_difference(vivid[:, 0], float(around.argmax()))) <= _HALF]
+    return ColourSample(_mean_hue(most[:, 0]), most, 1.0, 0, box_px)
 
 
-def to_hsv(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
-    return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
+    """The colours of all pictures, those of one hue together, best first: `count` of them, or those that are clear."""
+    samples = [sample for number, one in enumerate(hsv) for sample in _find_samples(one, least_area_px, number)]
+    groups: list[list[ColourSample]] = []
+    for sample in sorted(samples, key=lambda one: -one.score):
+        near = [group for group in groups if abs(hue_difference(group[0].hue, sample.hue)) < _APART]
+        if not near:
+            groups.append([sample])
+        elif all(one.picture != sample.picture for one in near[0]):
+            near[0].append(sample)
+    scores = [sum(one.score for one in group) for group in groups]
+    best = sorted(range(len(groups)), key=lambda k: -scores[k])
+    if count is None:
+        best = [k for k in best if scores[k] >= _CLEAR * len(hsv)]
+    if not best or (count is not None and len(best) < count):
+        has = f"{len(best)} of {count} colours stand" if best else "no colour stands"
+        where = "the picture" if len(hsv) == 1 else f"the {len(hsv)} pictures"
+        raise InputError(f"{has} out in {where}; give a box of each landmark with --at NAME=X,Y,W,H")
+    return sorted((groups[k] for k in best[:count]), key=lambda group: group[0].hue)
 
 
-def mask_range(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
-    if low[0] <= high[0]:
-        return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
-    below = cv2.inRange(hsv, np.asarray(low, float), np.array([180.0, *high[1:]]))
-    return cv2.bitwise_or(below, cv2.inRange(hsv, np.array([0.0, *low[1:]]), np.asarray(high, float)))
-
-
-def find_samples(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[ColourSample]:
+def _find_samples(hsv: np.ndarray, least_area_px: int, picture: int) -> list[ColourSample]:
     """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
 
-    hsv: (H, W, 3) uint8. A patch's score is its share of all pixels of its hue and saturation in the picture and around
-    it: ground and plants, of whatever hue, are in many places.
+    A patch's score is its share of all pixels of its hue and saturation in the picture and around it: ground and
+    plants, of whatever hue, are in many places.
     """
     found: list[ColourSample] = []
     counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
@@ -273,82 +249,28 @@ def find_samples(hsv: np.ndarray, least_area_px: int, picture: int = 0) -> list[
             low = np.array([(hue - _HALF) % 180, saturation, _VALUE])
             mask = mask_range(hsv, low, np.array([(hue + _HALF) % 180, 255, 255]))
             total = int(np.count_nonzero(mask))
-            if total >= least_area_px:
-                patches = find_patches(mask, least_area_px)
-                found += [_sample(hsv, mask, patches, k, total, picture) for k in _compact(patches, mask.size)]
-    return _distinct(sorted(found, key=lambda sample: -sample.score))
-
-
-def sample_box(hsv: np.ndarray, box_px: tuple[int, int, int, int], picture: int = 0) -> ColourSample | None:
-    """The saturated colour that most of a box x, y, width, height is of; None where nothing in it is saturated."""
-    x, y, width, height = box_px
-    part = hsv[y : y + height, x : x + width].reshape(-1, 3)
-    vivid = part[(part[:, 1] >= _SATURATIONS[0]) & (part[:, 2] >= _VALUE)]
-    if len(vivid) < max(4, len(part) // 10):
-        return None
-    count = np.bincount(vivid[:, 0] % 180, minlength=180).astype(float)
-    window = np.ones(2 * _HALF + 1)
-    around = np.convolve(np.r_[count[-_HALF:], count, count[:_HALF]], window, "valid")
-    most = vivid[np.abs(hue_difference(vivid[:, 0], float(around.argmax()))) <= _HALF]
-    return ColourSample(_mean_hue(most[:, 0]), most, 1.0, picture, box_px)
-
-
-def pool_samples(samples: Sequence[Sequence[ColourSample]], count: int | None) -> list[list[ColourSample]]:
-    """The colours of several pictures, those of one hue together, best first: `count` of them, or those that are clear.
-
-    samples: of each picture.
-    """
-    groups: list[list[ColourSample]] = []
-    for sample in sorted((one for of in samples for one in of), key=lambda one: -one.score):
-        near = [group for group in groups if abs(hue_difference(group[0].hue, sample.hue)) < _APART]
-        if not near:
-            groups.append([sample])
-        elif all(one.picture != sample.picture for one in near[0]):
-            near[0].append(sample)
-    groups.sort(key=lambda group: -sum(one.score for one in group))
-    if count is not None:
-        return groups[:count]
-    return [group for group in groups if sum(one.score for one in group) >= _CLEAR * len(samples)]
-
-
-def build_ranges(
-    groups: Sequence[Sequence[ColourSample]], pictures: Sequence[np.ndarray], least_area_px: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
-
-    pictures: (H, W, 3) uint8 in hue, saturation, value. Hues are widened, up to half the gap to the next colour's, as
-    far as the range marks no more patches beside its own; saturations and values likewise.
-    """
-    middle = np.array([group[0].hue for group in groups])
-    ends = []
-    for group, hue in zip(groups, middle, strict=True):
-        pixels = np.concatenate([one.pixels for one in group]).astype(float)
-        away = np.percentile(hue_difference(pixels[:, 0], hue), _ENDS)
-        ends.append((away[0], away[1], *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
-    low, high, others = (np.zeros((len(groups), n), np.int64) for n in (3, 3, 1))
-    for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
-        down, up = _rooms(k, middle, ends)
-        best: int | None = None
-        for hue_margin, saturation_margin, value_margin in _MARGINS:
-            first = int(np.ceil(middle[k] + below - min(hue_margin, down)))
-            last = int(np.floor(middle[k] + above + min(hue_margin, up)))
-            least = (max(saturation - saturation_margin, _LOWEST[0]), max(value - value_margin, _LOWEST[1]))
-            lowest, highest = np.array([first % 180, *map(int, least)]), np.array([max(last, first) % 180, 255, 255])
-            count = sum(_others(hsv, lowest, highest, group, n, least_area_px) for n, hsv in enumerate(pictures))
-            if best is None or count < best:
-                best, low[k], high[k], others[k] = count, lowest, highest, count
-            if count == 0:
-                break
-    return low, high, others[:, 0]
-
-
-def name_hues(hues: Sequence[float]) -> list[str]:
-    """A name for each hue; those of one name are numbered."""
-    words = [min(HUES, key=lambda word: abs(hue_difference(HUES[word], hue))) for hue in hues]
-    return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
+            if total < least_area_px:
+                continue
+            patches = find_patches(mask, least_area_px)
+            # Compact like a vehicle's plate.
+            sides = patches.box_px[:, 2:]
+            fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
+            long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
+            compact = (fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * mask.size)
+            found += [_sample(hsv, mask, patches, k, total, picture) for k in np.flatnonzero(compact)]
+    kept: list[ColourSample] = []
+    for sample in sorted(found, key=lambda sample: -sample.score):
+        if all(
+            abs(hue_difference(sample.hue, one.hue)) >= _APART
+            and not shared_px(np.array(sample.box_px), np.array(one.box_px))
+            for one in kept
+        ):
+            kept.append(sample)
+    return kept
 
 
 def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> ColourSample:
+    """The k-th patch of a mask that has so many pixels in all."""
     x, y, width, height = (int(v) for v in patches.box_px[k])
     seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
     hue = _mean_hue(seen[:, 0])
@@ -358,55 +280,66 @@ def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: 
     # The middle of the box is all of it, also what the window of hue and saturation left out.
     inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
     alike = inner[(np.abs(hue_difference(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
-    pixels = np.concatenate([seen, alike])
-    return ColourSample(hue, pixels, float(share * seen[:, 1].mean() / 255), picture, (x, y, width, height))
+    score = float(share * seen[:, 1].mean() / 255)
+    return ColourSample(hue, np.concatenate([seen, alike]), score, picture, (x, y, width, height))
+
+
+def build_ranges(
+    groups: Sequence[Sequence[ColourSample]], pictures: Sequence[np.ndarray], least_area_px: int
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
+
+    pictures: (H, W, 3) uint8 in hue, saturation, value. Hues are widened, up to half the gap to the next colour's, as
+    far as the range marks no more patches beside its own; saturations and values likewise.
+    """
+    middle = [group[0].hue for group in groups]
+    ends = []
+    for group, hue in zip(groups, middle, strict=True):
+        pixels = np.concatenate([one.pixels for one in group]).astype(float)
+        away = np.percentile(hue_difference(pixels[:, 0], hue), _ENDS)
+        ends.append((*away, *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
+    chosen = []
+    for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
+        # A range of hues may be widened to just under half the gap to the next colour's.
+        down, up = 90.0, 90.0
+        for j in set(range(len(middle))) - {k}:
+            gap = (middle[j] - middle[k]) % 180
+            up = min(up, (gap + ends[j][0] - above - 1) / 2)
+            down = min(down, (180 - gap - ends[j][1] + below - 1) / 2)
+        tried = []
+        for hue_margin, saturation_margin, value_margin in _MARGINS:
+            first = int(np.ceil(middle[k] + below - min(hue_margin, down)))
+            last = int(np.floor(middle[k] + above + min(hue_margin, up)))
+            least = (max(saturation - saturation_margin, _LOWEST[0]), max(value - value_margin, _LOWEST[1]))
+            low, high = [first % 180, *map(int, least)], [max(last, first) % 180, 255, 255]
+            others = 0
+            for number, hsv in enumerate(pictures):
+                patches = find_patches(mask_range(hsv, np.array(low), np.array(high)), least_area_px)
+                own = np.array([one.box_px for one in group if one.picture == number], float).reshape(-1, 4)
+                others += int((shared_px(patches.box_px[:, None], own) == 0).all(axis=1).sum())
+            tried.append((others, low, high))
+            if others == 0:
+                break
+        chosen.append(min(tried, key=lambda one: one[0]))
+    low, high = (np.array([one[side] for one in chosen], np.int64) for side in (1, 2))
+    return low, high, [one[0] for one in chosen]
+
+
+def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
+    """A name for each hue: the colour names that fit best, or the given names in the order of hues."""
+    if names and not set(names) <= HUES.keys():
+        return list(names)
+    known = names or list(HUES)
+    apart = np.array([[float(abs(hue_difference(HUES[name], hue))) for name in known] for hue in hues])
+    if names:
+        return [names[place] for place in cheapest(apart)[1].tolist()]
+    words = [known[place] for place in apart.argmin(axis=1).tolist()]
+    # Those of one name are numbered.
+    return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
 
 
 def _mean_hue(hues: np.ndarray) -> float:
     return float(np.angle(np.exp(1j * np.pi * hues.astype(float) / 90).mean()) * 90 / np.pi % 180)
-
-
-def _compact(patches: Patches, picture_px: int) -> np.ndarray:
-    """The rows of patches that are compact like a vehicle's plate."""
-    sides = patches.box_px[:, 2:]
-    fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
-    long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
-    return np.flatnonzero((fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * picture_px))
-
-
-def _distinct(samples: list[ColourSample]) -> list[ColourSample]:
-    kept: list[ColourSample] = []
-    for sample in samples:
-        if all(
-            abs(hue_difference(sample.hue, one.hue)) >= _APART and not _meet(sample.box_px, one.box_px) for one in kept
-        ):
-            kept.append(sample)
-    return kept
-
-
-def _meet(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
-    return all(a[i] < b[i] + b[i + 2] and b[i] < a[i] + a[i + 2] for i in (0, 1))
-
-
-def _rooms(k: int, middle: np.ndarray, ends: Sequence[tuple[float, ...]]) -> tuple[float, float]:
-    """How far a range of hues may be widened down and up: just under half the gap to the next colour's."""
-    down, up = 90.0, 90.0
-    for j in range(len(middle)):
-        if j != k:
-            ahead = (middle[j] - middle[k]) % 180
-            up = min(up, (ahead + ends[j][0] - ends[k][1] - 1) / 2)
-            down = min(down, (180 - ahead - ends[j][1] + ends[k][0] - 1) / 2)
-    return down, up
-
-
-def _others(
-    hsv: np.ndarray, low: np.ndarray, high: np.ndarray, group: Sequence[ColourSample], picture: int, least_area_px: int
-) -> int:
-    """Number of patches that a range marks in a picture beside the colour's own."""
-    patches = find_patches(mask_range(hsv, low, high), least_area_px)
-    own = [one.box_px for one in group if one.picture == picture]
-    boxes = [(int(x), int(y), int(w), int(h)) for x, y, w, h in patches.box_px]
-    return sum(not any(_meet(box, mine) for mine in own) for box in boxes)
 
 
 def hue_difference(hue: np.ndarray | float, other: float) -> np.ndarray:

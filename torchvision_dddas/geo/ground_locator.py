@@ -1,6 +1,14 @@
-"""People seen by cameras on the ground to places."""
+"""People seen by cameras on the ground to places, frame by frame; several cameras are fused.
+
+What is common to sightings is estimated with the places, not counted anew with each: a vehicle's position, heading,
+pitch, camera height and focal length are common to all that it sees, a person's height to all that see the person. So
+two people seen by the same two vehicles tell how far the vehicles' GPS disagree, and each gains by the other. All is
+linear about the single sightings. Assumed independent: what is new in each sighting, and the vehicles from one another;
+a GPS error common to the whole team is in no covariance here and no fusion takes it away.
+"""
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -10,7 +18,6 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import range_people, touches_border
-from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import (
     Camera,
     DetectionTable,
@@ -25,167 +32,11 @@ from torchvision_dddas.types import (
 )
 
 # Rounds in which each vehicle's sightings are matched anew to the others'.
-ROUNDS = 3
+_ROUNDS = 3
 # Most pairs that are tried as hypotheses of a vehicle's common error.
-BELIEFS = 60
+_BELIEFS = 60
 # Hypotheses times pairs that are computed at once: a few megabytes.
-MATRICES = 20_000
-
-
-@dataclass(frozen=True)
-class Fused:
-    """People seen by a team at one time, one row a person.
-
-    east_north_m: (P, 2). covariance_m2: (P, 2, 2). members: (P, V) the row of each vehicle's sighting, -1 for none.
-    """
-
-    east_north_m: np.ndarray
-    covariance_m2: np.ndarray
-    members: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.members)
-
-
-def fuse(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Fused:
-    """Fuse what several vehicles see at one time, the sightings of each vehicle in one item; all must be located.
-
-    gate_sigmas: sightings are of one person if their distance, by its covariance, is as likely as this many sigmas.
-    """
-    members = associate(team, gate_sigmas)
-    where, joint, _ = estimate_places(team, members)
-    own = joint[np.arange(len(members)), :, np.arange(len(members))]
-    return Fused(where, own, members)
-
-
-def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.ndarray, "P V"]:
-    """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
-
-    The vehicle that sees most begins; each other's are matched to what is known by then. Then each vehicle in turn is
-    matched anew to the others, whose disagreement is known better by then, until nothing changes.
-    """
-    order = sorted(range(len(team)), key=lambda v: -len(team[v]))
-    members = np.zeros((0, len(team)), np.int64)
-    for vehicle in order:
-        members = _matched(team, members, vehicle, gate_sigmas)
-    for _ in range(ROUNDS if len(team) > 2 else 0):
-        before = {tuple(row) for row in members.tolist()}
-        for vehicle in order:
-            others = members.copy()
-            others[:, vehicle] = -1
-            members = _matched(team, others[(others >= 0).any(axis=1)], vehicle, gate_sigmas)
-        if {tuple(row) for row in members.tolist()} == before:
-            break
-    return members[np.lexsort(np.where(members < 0, np.iinfo(np.int64).max, members).T[::-1])]
-
-
-def gate_distance(sigmas: float) -> float:
-    """Squared Mahalanobis distance in the plane with the tail probability of this many sigmas on a line."""
-    return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
-
-
-def estimate_places(
-    team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
-) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 P 2"], Float[np.ndarray, "V 6"]]:
-    """Places of people, their joint covariance, and each vehicle's errors in sigmas: least squares over all sightings.
-
-    Unknown are each person's place and height, and each vehicle's six errors; what is known of the heights and errors
-    beforehand is that their sigma is 1.
-    """
-    people, vehicles = members.shape
-    size = 3 * people + 6 * vehicles
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    normal[2 * people :, 2 * people :] = np.eye(size - 2 * people)
-    for vehicle, seen in enumerate(team):
-        who = np.flatnonzero(members[:, vehicle] >= 0)
-        row, n = members[who, vehicle], len(who)
-        place = np.broadcast_to(np.eye(2), (n, 2, 2))
-        design = np.concatenate([place, seen.body_m[row][:, :, None], seen.camera_m[row]], axis=2)
-        errors = np.broadcast_to(3 * people + 6 * vehicle + np.arange(6), (n, 6))
-        at = np.concatenate([np.stack([2 * who, 2 * who + 1, 2 * people + who], axis=1), errors], axis=1)
-        weighed = design.swapaxes(1, 2) @ np.linalg.inv(seen.own_m2[row])
-        np.add.at(normal, (at[:, :, None], at[:, None, :]), weighed @ design)
-        np.add.at(right, at, np.einsum("nij,nj->ni", weighed, seen.east_north_m[row]))
-    # Scaled to ones on the diagonal: metres and sigmas differ by orders of magnitude.
-    scale = 1 / np.sqrt(np.diag(normal))
-    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
-    found = covariance @ right
-    joint = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
-    return found[: 2 * people].reshape(-1, 2), joint, found[3 * people :].reshape(-1, 6)
-
-
-def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_sigmas: float) -> np.ndarray:
-    """The people known by other vehicles, with this vehicle's sightings among them; unmatched ones are new people."""
-    seen = team[vehicle]
-    members = known.copy()
-    left = np.ones(len(seen), bool)
-    if len(known) and len(seen):
-        where, joint, _ = estimate_places(team, known)
-        for person, row in _pairs(where, joint, seen, gate_distance(gate_sigmas)):
-            members[person, vehicle], left[row] = row, False
-    new = np.full((left.sum(), len(team)), -1, np.int64)
-    new[:, vehicle] = np.flatnonzero(left)
-    return np.concatenate([members, new])
-
-
-def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) -> np.ndarray:
-    """(K, 2) the people and the sightings that are the same, one to one.
-
-    The sightings may all be off together, by more than people stand apart. So each likely pair in turn is believed, and
-    what it says of the errors in common is taken from the rest before these are matched (Hungarian). The belief under
-    which most agrees holds.
-    """
-    apart = seen.east_north_m - where[:, None]
-    spread = joint[np.arange(len(where)), :, np.arange(len(where))][:, None] + seen.covariance_m2
-    distance = _squared(apart, spread)
-    common = np.einsum("nik,mjk->nimj", seen.camera_m, seen.camera_m)
-    best, most = np.zeros((0, 2), np.int64), 0.0
-    likely = np.argsort(distance, axis=None)[:BELIEFS]
-    likely = likely[distance.ravel()[likely] < limit]
-    persons, rows = np.unravel_index(likely, distance.shape)
-    at_once = max(1, MATRICES // max(distance.size, 1))
-    for begin in range(0, len(likely), at_once):
-        person, row = persons[begin : begin + at_once], rows[begin : begin + at_once]
-        # Covariance of what any other pair is apart with what this one is in its own sigmas: (beliefs, P, N, 2, 2).
-        whiten = np.linalg.inv(np.linalg.cholesky(spread[person, row])).swapaxes(1, 2)
-        of_person, of_row = (
-            held.transpose(2, 0, 1, 3) @ whiten[:, None] for held in (joint[:, :, person], common[:, :, row])
-        )
-        cross = of_person[:, :, None] + of_row[:, None]
-        told = np.einsum("kij,ki->jk", whiten, apart[person, row])[:, :, None, None]
-        # By components: NumPy is slow with many small matrices.
-        (ee, en), (ne, nn) = np.moveaxis(cross, (-2, -1), (0, 1))
-        rest = _by_covariance(
-            apart[..., 0] - ee * told[0] - en * told[1],
-            apart[..., 1] - ne * told[0] - nn * told[1],
-            spread[..., 0, 0] - ee**2 - en**2,
-            spread[..., 0, 1] - ee * ne - en * nn,
-            spread[..., 1, 1] - ne**2 - nn**2,
-        )
-        belief = np.arange(len(person))
-        rest[belief, person, :] = rest[belief, :, row] = np.inf
-        rest[belief, person, row] = distance[person, row]
-        score = np.where(rest < limit, limit - rest, 0.0)
-        reach = np.minimum(score.max(axis=2).sum(axis=1), score.max(axis=1).sum(axis=1))
-        for k in np.flatnonzero(reach > most).tolist():
-            if reach[k] > most:  # which may have grown
-                found = best_pairs(score[k])
-                agreed = score[k][found[:, 0], found[:, 1]].sum()
-                if agreed > most:
-                    best, most = found, agreed
-    return best
-
-
-def _squared(apart: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared distances by their covariances; (..., 2) and (..., 2, 2)."""
-    return _by_covariance(
-        apart[..., 0], apart[..., 1], covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    )
-
-
-def _by_covariance(east: np.ndarray, north: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The same, with the variance a of east, the covariance b, and the variance c of north."""
-    return (c * east**2 - 2 * b * east * north + a * north**2) / (a * c - b**2)
+_MATRICES = 20_000
 
 
 @dataclass(frozen=True)
@@ -238,7 +89,9 @@ class GroundLocator:
                 "use default"
             )
         self.origin_deg: tuple[float, float] | None = None
-        self._names = _PersonNumbers()
+        # Numbers of people seen by several vehicles: by (vehicle, target), and the last one given.
+        self._number: dict[tuple[int, int], int] = {}
+        self._last_number = 0
 
     def locate(self, people: People | Sequence[People], frame: int = 1) -> GroundLocations:
         """Where the people of one frame stand. people: of the one camera, or of each in their order."""
@@ -250,11 +103,13 @@ class GroundLocator:
             for one in seen
         ]
         views = self.place_tables(tables)
-        return self._frame(frame, views, [np.arange(len(view.table)) for view in views])
+        return self._locate(frame, views, [np.arange(len(view.table)) for view in views])
 
     def locate_tables(self, tables: Sequence[DetectionTable]) -> Iterator[GroundLocations]:
         """Where people stand, frame by frame. Raises InputError as `place_tables`, at once."""
-        return self._frames(self.place_tables(tables))
+        views = self.place_tables(tables)
+        frames = _simultaneous_rows(views, self.settings.ground.within_frames)
+        return (self._locate(frame, views, rows) for frame, rows in frames)
 
     def place_tables(self, tables: Sequence[DetectionTable]) -> list[CameraView]:
         """Where each camera alone puts the people of its table.
@@ -295,94 +150,208 @@ class GroundLocator:
         score = table.score if table.probable else np.ones(len(table))
         return CameraView(table, seen, table.targets, cut, score, degrees)
 
-    def _frames(self, views: list[CameraView]) -> Iterator[GroundLocations]:
-        for frame, rows in simultaneous_rows(views, self.settings.ground.within_frames):
-            yield self._frame(frame, views, rows)
-
-    def _frame(self, frame: int, views: list[CameraView], here: list[np.ndarray]) -> GroundLocations:
-        located = [rows[view.sightings.by[rows] != "bearing"] for view, rows in zip(views, here, strict=True)]
+    def _locate(self, frame: int, views: list[CameraView], rows: list[np.ndarray]) -> GroundLocations:
+        pairs = list(zip(views, rows, strict=True))
+        sightings = [view.sightings[own] for view, own in pairs]
+        located = [own[seen.by != "bearing"] for own, seen in zip(rows, sightings, strict=True)]
+        team = [view.sightings[own] for view, own in zip(views, located, strict=True)]
         if len(views) == 1:
-            view, rows = views[0], located[0]
-            seen = view.sightings[rows]
-            degrees = None if view.lonlat_deg is None else view.lonlat_deg[rows]
-            target, place, covariance, score = (
-                view.target[rows],
-                seen.east_north_m,
-                seen.covariance_m2,
-                view.score[rows],
-            )
-            members = np.arange(len(rows))[:, None]
+            (view,), (own,), (seen,) = views, located, team
+            target, place, covariance, score = view.target[own], seen.east_north_m, seen.covariance_m2, view.score[own]
+            degrees = None if view.lonlat_deg is None else view.lonlat_deg[own]
+            members = np.arange(len(own))[:, None]
         else:
-            fused = fuse(
-                [view.sightings[rows] for view, rows in zip(views, located, strict=True)],
-                self.settings.ground.gate_sigmas,
-            )
-            people = [[(v, located[v][r]) for v, r in enumerate(row) if r >= 0] for row in fused.members.tolist()]
-            numbers = self._names.assign([[(v, int(views[v].target[r])) for v, r in person] for person in people])
-            target, place, covariance = np.array(numbers, np.int64), fused.east_north_m, fused.covariance_m2
+            members, place, covariance = fuse(team, self.settings.ground.gate_sigmas)
+            people = [[(v, located[v][r]) for v, r in enumerate(row) if r >= 0] for row in members.tolist()]
+            target = self._numbers([[(v, int(views[v].target[r])) for v, r in person] for person in people])
             score = np.array([max(views[v].score[r] for v, r in person) for person in people], float)
             degrees = None if self.origin_deg is None else geometry.lonlat(place, self.origin_deg)
-            members = fused.members
-        positions = Positions(np.full(len(place), frame), target, place, covariance, score, self.origin_deg, degrees)
-        pairs = list(zip(views, here, strict=True))
         return GroundLocations(
             frame,
-            positions,
+            Positions(np.full(len(place), frame), target, place, covariance, score, self.origin_deg, degrees),
             members,
-            Sightings.concat([view.sightings[rows] for view, rows in pairs]),
-            np.repeat(np.arange(len(here)), [len(rows) for rows in here]),
-            np.concatenate([view.target[rows] for view, rows in pairs]),
-            np.concatenate([view.cut[rows] for view, rows in pairs]),
-            np.concatenate([view.table.score[rows] for view, rows in pairs]),
-            np.concatenate([view.table.box_px[rows] for view, rows in pairs]),
+            Sightings.concat(sightings),
+            np.repeat(np.arange(len(rows)), [len(own) for own in rows]),
+            np.concatenate([view.target[own] for view, own in pairs]),
+            np.concatenate([view.cut[own] for view, own in pairs]),
+            np.concatenate([view.table.score[own] for view, own in pairs]),
+            np.concatenate([view.table.box_px[own] for view, own in pairs]),
         )
 
+    def _numbers(self, people: list[list[tuple[int, int]]]) -> np.ndarray:
+        """A number for each person, given as (vehicle, target) of its sightings; each number is given once.
 
-def simultaneous_rows(views: Sequence[CameraView], within_frames: int = 0) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """The first frame of each group of simultaneous frames, and each view's rows in it.
-
-    A group holds at most one frame of each camera, none later than within_frames after the first: cameras need not take
-    their pictures together.
-    """
-    frames = [np.unique(view.table.frame).tolist() for view in views]
-    place = [0] * len(views)
-    while any(k < len(own) for k, own in zip(place, frames, strict=True)):
-        first = min(own[k] for k, own in zip(place, frames, strict=True) if k < len(own))
-        rows = []
-        for n, (view, own) in enumerate(zip(views, frames, strict=True)):
-            here = slice(0, 0)
-            if place[n] < len(own) and own[place[n]] <= first + within_frames:
-                here = view.table.rows(own[place[n]])
-                place[n] += 1
-            rows.append(np.arange(here.start, here.stop))
-        yield first, rows
-
-
-class _PersonNumbers:
-    """Numbers of people seen by several vehicles, kept as long as the vehicles' own identities are.
-
-    A person takes the number that most of the vehicles' targets had when they were seen last.
-    """
-
-    def __init__(self) -> None:
-        self._number: dict[tuple[int, int], int] = {}
-        self._last = 0
-
-    def assign(self, people: Sequence[Sequence[tuple[int, int]]]) -> list[int]:
-        """A number for each person, given as (vehicle, target) of its sightings; each number is given once."""
+        A person takes the number that most of the vehicles' targets had when they were seen last.
+        """
         wish = []
         for person, seen in enumerate(people):
             before = [self._number[one] for one in seen if one in self._number]
             wish += [(-before.count(number), number, person) for number in set(before)]
         given: dict[int, int] = {}
-        taken: set[int] = set()
         for _, number, person in sorted(wish):
-            if person not in given and number not in taken:
+            if person not in given and number not in given.values():
                 given[person] = number
-                taken.add(number)
         for person, seen in enumerate(people):
             if person not in given:
-                self._last += 1
-                given[person] = self._last
+                self._last_number += 1
+                given[person] = self._last_number
             self._number.update(dict.fromkeys(seen, given[person]))
-        return [given[person] for person in range(len(people))]
+        return np.array([given[person] for person in range(len(people))], np.int64)
+
+
+def _simultaneous_rows(views: Sequence[CameraView], within_frames: int) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """The first frame of each group of simultaneous frames, and each view's rows in it.
+
+    A group holds at most one frame of each camera, none later than within_frames after the first: cameras need not take
+    their pictures together.
+    """
+    queues = [deque(np.unique(view.table.frame).tolist()) for view in views]
+    while any(queues):
+        first = min(queue[0] for queue in queues if queue)
+        rows = []
+        for view, queue in zip(views, queues, strict=True):
+            taken = queue and queue[0] <= first + within_frames
+            span = view.table.rows(queue.popleft()) if taken else slice(0, 0)
+            rows.append(np.arange(span.start, span.stop))
+        yield first, rows
+
+
+# Fusion: which sightings are of the same person, and where that person stands.
+
+
+def fuse(
+    team: Sequence[Sightings], gate_sigmas: float = 3.0
+) -> tuple[Int[np.ndarray, "P V"], Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 2"]]:
+    """Fuse what the vehicles of a team see at one time: `associate`, and the people's places with their covariances.
+
+    team: the sightings of each vehicle, all located. gate_sigmas: sightings are of one person if their distance, by its
+    covariance, is as likely as this many sigmas.
+    """
+    members = associate(team, gate_sigmas)
+    place, joint = estimate_places(team, members)
+    own = np.arange(len(members))
+    return members, place, joint[own, :, own]
+
+
+def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.ndarray, "P V"]:
+    """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
+
+    The vehicle that sees most begins; each other's are matched to what is known by then. Then each vehicle in turn is
+    matched anew to the others, whose disagreement is known better by then, until nothing changes.
+    """
+    order = sorted(range(len(team)), key=lambda v: -len(team[v]))
+    members = np.zeros((0, len(team)), np.int64)
+    for vehicle in order:
+        members = _matched(team, members, vehicle, gate_sigmas)
+    for _ in range(_ROUNDS if len(team) > 2 else 0):
+        before = {tuple(row) for row in members.tolist()}
+        for vehicle in order:
+            others = members.copy()
+            others[:, vehicle] = -1
+            members = _matched(team, others[(others >= 0).any(axis=1)], vehicle, gate_sigmas)
+        if {tuple(row) for row in members.tolist()} == before:
+            break
+    return members[np.lexsort(np.where(members < 0, np.iinfo(np.int64).max, members).T[::-1])]
+
+
+def gate_distance(sigmas: float) -> float:
+    """Squared Mahalanobis distance in the plane with the tail probability of this many sigmas on a line."""
+    return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
+
+
+def estimate_places(
+    team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
+) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 P 2"]]:
+    """Places of people and their joint covariance: least squares over all sightings.
+
+    Unknown are each person's place and height, and each vehicle's six errors; what is known of the heights and errors
+    beforehand is that their sigma is 1.
+    """
+    people, vehicles = members.shape
+    size = 3 * people + 6 * vehicles
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    normal[2 * people :, 2 * people :] = np.eye(size - 2 * people)
+    for vehicle, seen in enumerate(team):
+        who = np.flatnonzero(members[:, vehicle] >= 0)
+        row, n = members[who, vehicle], len(who)
+        place = np.broadcast_to(np.eye(2), (n, 2, 2))
+        design = np.concatenate([place, seen.body_m[row][:, :, None], seen.camera_m[row]], axis=2)
+        errors = np.broadcast_to(3 * people + 6 * vehicle + np.arange(6), (n, 6))
+        at = np.concatenate([np.stack([2 * who, 2 * who + 1, 2 * people + who], axis=1), errors], axis=1)
+        weighted = design.swapaxes(1, 2) @ np.linalg.inv(seen.own_m2[row])
+        np.add.at(normal, (at[:, :, None], at[:, None, :]), weighted @ design)
+        np.add.at(right, at, np.einsum("nij,nj->ni", weighted, seen.east_north_m[row]))
+    # Scaled to ones on the diagonal: metres and sigmas differ by orders of magnitude.
+    scale = 1 / np.sqrt(np.diag(normal))
+    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    joint = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
+    return (covariance @ right)[: 2 * people].reshape(-1, 2), joint
+
+
+def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_sigmas: float) -> np.ndarray:
+    """The people known by other vehicles, with this vehicle's sightings among them; unmatched ones are new people."""
+    seen = team[vehicle]
+    members = known.copy()
+    left = np.ones(len(seen), bool)
+    if len(known) and len(seen):
+        for person, row in _pairs(*estimate_places(team, known), seen, gate_distance(gate_sigmas)):
+            members[person, vehicle], left[row] = row, False
+    new = np.full((left.sum(), len(team)), -1, np.int64)
+    new[:, vehicle] = np.flatnonzero(left)
+    return np.concatenate([members, new])
+
+
+def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) -> np.ndarray:
+    """(K, 2) the people and the sightings that are the same, one to one.
+
+    The sightings may all be off together, by more than people stand apart. So each likely pair in turn is believed, and
+    what it says of the errors in common is taken from the rest before these are matched (Hungarian). The belief under
+    which most agrees holds.
+    """
+    apart = seen.east_north_m - where[:, None]
+    spread = joint[np.arange(len(where)), :, np.arange(len(where))][:, None] + seen.covariance_m2
+    east, north = apart[..., 0], apart[..., 1]
+    var_east, covar, var_north = spread[..., 0, 0], spread[..., 0, 1], spread[..., 1, 1]
+    distance = _squared_distance(east, north, var_east, covar, var_north)
+    common = np.einsum("nik,mjk->nimj", seen.camera_m, seen.camera_m)
+    best, most = np.zeros((0, 2), np.int64), 0.0
+    likely = np.argsort(distance, axis=None)[:_BELIEFS]
+    persons, rows = np.unravel_index(likely[distance.ravel()[likely] < limit], distance.shape)
+    at_once = max(1, _MATRICES // max(distance.size, 1))
+    for begin in range(0, len(persons), at_once):
+        person, row = persons[begin : begin + at_once], rows[begin : begin + at_once]
+        # Covariance of what any other pair is apart with what this one is in its own sigmas: (beliefs, P, N, 2, 2).
+        whiten = np.linalg.inv(np.linalg.cholesky(spread[person, row])).swapaxes(1, 2)
+        of_person, of_row = (
+            held.transpose(2, 0, 1, 3) @ whiten[:, None] for held in (joint[:, :, person], common[:, :, row])
+        )
+        cross = of_person[:, :, None] + of_row[:, None]
+        believed = np.einsum("kij,ki->jk", whiten, apart[person, row])[:, :, None, None]
+        # By components: NumPy is slow with many small matrices.
+        (ee, en), (ne, nn) = np.moveaxis(cross, (-2, -1), (0, 1))
+        rest = _squared_distance(
+            east - ee * believed[0] - en * believed[1],
+            north - ne * believed[0] - nn * believed[1],
+            var_east - ee**2 - en**2,
+            covar - ee * ne - en * nn,
+            var_north - ne**2 - nn**2,
+        )
+        belief = np.arange(len(person))
+        rest[belief, person, :] = rest[belief, :, row] = np.inf
+        rest[belief, person, row] = distance[person, row]
+        score = np.where(rest < limit, limit - rest, 0.0)
+        reach = np.minimum(score.max(axis=2).sum(axis=1), score.max(axis=1).sum(axis=1))
+        for k in np.flatnonzero(reach > most).tolist():
+            if reach[k] > most:  # which may have grown
+                found = geometry.best_pairs(score[k])
+                agreed = score[k][found[:, 0], found[:, 1]].sum()
+                if agreed > most:
+                    best, most = found, agreed
+    return best
+
+
+def _squared_distance(
+    east: np.ndarray, north: np.ndarray, var_east: np.ndarray, covar: np.ndarray, var_north: np.ndarray
+) -> np.ndarray:
+    """Squared distances by their covariances."""
+    return (var_north * east**2 - 2 * covar * east * north + var_east * north**2) / (var_east * var_north - covar**2)

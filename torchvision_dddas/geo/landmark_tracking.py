@@ -5,6 +5,7 @@ and a person, and landmarks that the picture's border cuts.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,23 +22,35 @@ _SHARED = 1.8
 _LONGER, _WITHIN = 1.25, 0.6
 # Frames whose blobs define the usual size, and the fewest that do.
 _MEMORY, _ENOUGH = 25, 3
+# Score of a patch, in logarithms of its area: for motion at it; for its travel over the ground; for being the
+# landmark already. Greatest penalty for its distance from the expected place.
+_BLOB, _TRAVEL, _LOCK, _FAR = 2.0, 3.0, 1.0, 4.0
+# A patch of this many times the usual area is no better than one of half as many, and one that fills its box by less
+# than this is a shadow or a roof's edge rather than a vehicle's plate.
+_LARGE, _FILL = 2.0, 0.5
+# Gain of a new frame in velocity, area and share of frames with motion.
+_GAIN = 0.3
+# Most patches of a colour that are tracked.
+_MOST = 16
+# Margin by which the best patch must beat the next one to be taken for the landmark.
+_MARGIN = 1.0
+# Patches smaller than the best by more than this logarithm are no rivals.
+_ALIKE = 2.0
 
 
 def separate(
-    colour_px: np.ndarray, blob_px: np.ndarray, parameters: LandmarkParameters, allowed: np.ndarray | None = None
+    colour_px: np.ndarray, blob_px: np.ndarray, parameters: LandmarkParameters, allowed: np.ndarray | bool = True
 ) -> np.ndarray:
     """(n,) int64, which of the m blobs is each landmark's, -1 for none; no blob is of two.
 
     colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of what moves. allowed: (n, m) bool,
-    pairs that may be; None: all.
+    pairs that may be.
     exact: as many matches as there can be within reach_px, then the least distance in all. The source asks for one blob
     for each landmark, which is infeasible where one has none in reach; its text says "if any". greedy: its heuristic,
     row by row, each landmark the nearest blob that is left.
     """
     distance = np.linalg.norm(colour_px[:, None] - blob_px[None], axis=2)
-    within = distance <= parameters.reach_px  # False for NaN
-    if allowed is not None:
-        within &= allowed
+    within = (distance <= parameters.reach_px) & allowed  # False for NaN
     match = np.full(len(colour_px), -1, np.int64)
     if not within.any():
         return match
@@ -58,7 +71,7 @@ def separate(
 
 @dataclass(frozen=True)
 class TrackedLandmarks:
-    """The landmarks in one frame's picture, one row a landmark of the names given.
+    """The landmarks in one frame's picture, one row a landmark.
 
     image_px: (K, 2) where each is, NaN where it was not found or the border cuts it. by: (K,) motion, colour, or "".
     colour_px: (K, 2) centres of their colours. blob: (K,) int64, which detection is its own, -1 for none.
@@ -74,20 +87,124 @@ class TrackedLandmarks:
     shared: np.ndarray
 
 
-def _of_vehicles(at_px: np.ndarray, length_px: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(N,) bool, the blobs that lie where a vehicle is, at (K, 2) and so long (K,), and are no longer than it."""
-    middle, longest = boxes[:, :2] + (boxes[:, 2:] - 1) / 2, boxes[:, 2:].max(axis=1, initial=0)
-    away = np.linalg.norm(at_px[:, None] - middle, axis=2)  # NaN where unknown: of no vehicle
-    return ((away <= _WITHIN * length_px[:, None]) & (longest <= _LONGER * length_px[:, None])).any(axis=0)
-
-
 @dataclass
-class _Coupling:
-    """State of a landmark's blob; blob_px: in the last frame, NaN if there was none."""
+class _Patch:
+    """A patch over time. Places are in the picture of the present frame; where it was not seen, as predicted.
 
-    blob_px: np.ndarray = field(default_factory=lambda: np.full(2, np.nan))
-    coupled: bool = False
-    ratios: deque[float] = field(default_factory=lambda: deque(maxlen=_MEMORY))
+    origin_px: where the ground lies now on which it was seen first. moving: share of the late frames in which
+    something moved at it. seen, missed: frames in which it was, and since.
+    """
+
+    centre_px: np.ndarray
+    box_px: np.ndarray
+    area_px: float
+    origin_px: np.ndarray
+    moving: float
+    velocity_px: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    seen: int = 1
+    missed: int = 0
+
+
+class _ColourTracker:
+    """The patches of one colour, which of them is the landmark, and its blob.
+
+    sure: clearly more speaks for the lock than for the next best. blob_px: where the landmark's blob was in the last
+    frame, NaN without one. ratios: its blob's area over its colour's in late frames.
+    """
+
+    def __init__(self, parameters: LandmarkParameters) -> None:
+        self._parameters = parameters
+        self._patches: list[_Patch] = []
+        self.lock: _Patch | None = None
+        self.sure = False
+        self.coupled = False
+        self.blob_px = np.full(2, np.nan)
+        self.ratios: deque[float] = deque(maxlen=_MEMORY)
+
+    @property
+    def shown(self) -> _Patch | None:
+        """The landmark's patch where this frame shows it for sure."""
+        return self.lock if self.lock is not None and self.sure and not self.lock.missed else None
+
+    def update(self, found: Patches, moving: np.ndarray, now_from_before: np.ndarray | None) -> None:
+        """Go on to the next picture and its patches; moving: (P,) bool, whether something moves at each."""
+        if now_from_before is not None and self._patches:
+            places = np.array([(one.centre_px, one.origin_px) for one in self._patches])
+            places = transfer(now_from_before, places.reshape(-1, 2)).reshape(places.shape)
+            for one, (centre, origin) in zip(self._patches, places, strict=True):
+                one.centre_px, one.origin_px = centre, origin
+        for one in self._patches:
+            one.centre_px = one.centre_px + one.velocity_px
+        # The most likely patches: those near the landmark first.
+        area, near = found.area_px, np.zeros(len(found), bool)
+        if self.lock is not None:
+            area = np.minimum(area, _LARGE * self.lock.area_px)
+            near = np.linalg.norm(found.centre_px - self.lock.centre_px, axis=1) <= self._parameters.reach_px
+        fill = found.area_px / found.box_px[:, 2:].prod(axis=1)
+        foremost = np.lexsort((-area * np.minimum(fill / _FILL, 1.0) ** 4, ~near))[:_MOST]
+        taken = self._continue(found, foremost, blind=now_from_before is None)
+        for k, one in enumerate(self._patches):
+            if k not in taken:
+                one.missed += 1
+                continue
+            row = taken[k]
+            centre = found.centre_px[row]
+            one.velocity_px = one.velocity_px + _GAIN * (centre - one.centre_px)
+            one.centre_px, one.box_px, one.seen, one.missed = centre, found.box_px[row], one.seen + 1, 0
+            one.area_px += _GAIN * (found.area_px[row] - one.area_px)
+            one.moving += _GAIN * (moving[row] - one.moving)
+        longest = self._parameters.interval_frames
+        self._patches = [one for one in self._patches if one.missed <= min(longest, one.seen)]
+        for row in foremost.tolist():
+            if row not in taken.values():
+                centre, area_px = found.centre_px[row], float(found.area_px[row])
+                self._patches.append(_Patch(centre, found.box_px[row], area_px, centre, float(moving[row])))
+        if not any(one is self.lock for one in self._patches):
+            self.lock, self.sure = None, False
+
+    def _continue(self, found: Patches, rows: np.ndarray, blind: bool) -> dict[int, int]:
+        """The row of the patch that continues each tracked one; blind: the background's motion is not known."""
+        if not self._patches or not len(rows):
+            return {}
+        before = np.array([one.centre_px for one in self._patches])
+        areas = np.array([one.area_px for one in self._patches])
+        reach = max(self._parameters.reach_px, 4.0)
+        gate = np.sqrt(areas) * (1 + 0.2 * np.array([one.missed for one in self._patches])) + 4
+        gate = np.full(len(gate), reach) if blind else np.minimum(gate, reach)
+        apart = np.linalg.norm(before[:, None] - found.centre_px[rows][None], axis=2) / gate[:, None]
+        change = np.log(found.area_px[rows][None] / areas[:, None])
+        cost = np.where(apart <= 1, apart + 0.3 * np.abs(change), 100.0)
+        return {int(i): int(rows[j]) for i, j in zip(*cheapest(cost), strict=True) if cost[i, j] < 100}
+
+    def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:
+        """Which patch is the landmark: as before, unless it is lost or in doubt, or the question is put anew.
+
+        expected_px: (2,) where it should be, NaN for unknown. usual_px: area of the landmarks' patches, inf: unknown.
+        """
+        if not self._patches or not (anew or self.lock is None or not self.sure):
+            return
+        sizes = np.array([np.log(min(one.area_px, _LARGE * usual_px)) for one in self._patches])
+        signs = np.array([self._score(one, expected_px, usual_px) for one in self._patches])
+        held = np.array([_LOCK * (one is self.lock) for one in self._patches])
+        best = int((sizes + signs + held).argmax())
+        same, self.lock = self._patches[best] is self.lock, self._patches[best]
+        # Size alone does not tell a vehicle from a roof.
+        rivals = sizes > sizes[best] - _ALIKE
+        rivals[best] = False
+        clear = not rivals.any() or signs[best] - signs[rivals].max() >= _MARGIN
+        self.sure = bool(clear or (same and self.sure))
+
+    def _score(self, one: _Patch, expected_px: np.ndarray, usual_px: float) -> float:
+        """Score of a patch without its size."""
+        fill = float(one.area_px / one.box_px[2:].prod())  # half for a square on its corner
+        travelled = min(np.linalg.norm(one.centre_px - one.origin_px) / np.sqrt(one.area_px), 1.0)
+        score = 4 * np.log(min(fill / _FILL, 1.0)) + _BLOB * one.moving + _TRAVEL * travelled
+        if np.isfinite(usual_px):
+            score -= max(np.log(one.area_px / (_LARGE * usual_px)), 0.0)
+        if np.isfinite(expected_px).all():
+            away = np.linalg.norm(one.centre_px - expected_px) / (2 * max(self._parameters.reach_px, 1.0))
+            score -= min(away**2 / 2, _FAR)
+        return float(score)
 
 
 class LandmarkTracker:
@@ -97,10 +214,9 @@ class LandmarkTracker:
     interval_frames landmarks are told from targets anew; between, a landmark's blob is the one where it is predicted.
     """
 
-    def __init__(self, names: tuple[str, ...], parameters: LandmarkParameters) -> None:
-        self.names, self._parameters = names, parameters
-        self._colours = [ColourTracker(parameters) for _ in names]
-        self._blobs = [_Coupling() for _ in names]
+    def __init__(self, count: int, parameters: LandmarkParameters) -> None:
+        self._parameters = parameters
+        self._colours = [_ColourTracker(parameters) for _ in range(count)]
         self._next = 0
 
     def update(
@@ -121,67 +237,67 @@ class LandmarkTracker:
         expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN or
         None: unknown.
         """
-        size = masks.shape[2], masks.shape[1]
+        size, shape = (masks.shape[2], masks.shape[1]), (len(masks), len(detections))
         anew = frame >= self._next
         if anew:
             self._next = frame + self._parameters.interval_frames
+        expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
         boxes = detections.box_px
         blobs = centres_of(boxes, foreground)
         blob_area = detections.area_px if len(detections.area_px) else boxes[:, 2:].prod(axis=1)
-        chosen, colour, area = self._find(masks, boxes, now_from_before, expected_px, anew)
-        shape = len(masks), len(boxes)
+        self._find(masks, boxes, now_from_before, expected, anew)
+        shown = [colour.shown for colour in self._colours]
+        chosen = [None if one is None else one.box_px for one in shown]
+        centre = np.array([(np.nan, np.nan) if one is None else one.centre_px for one in shown]).reshape(-1, 2)
+        area = np.array([np.nan if one is None else one.area_px for one in shown])
         near = np.array([beside(box, boxes) for box in chosen], bool).reshape(shape)
-        match = self._couple(colour, blobs, near, now_from_before, anew)
+        match = self._couple(centre, blobs, near, now_from_before, anew)
+        has = match >= 0
         touching = np.array([covering(box, boxes, blob_area, foreground) for box in chosen], bool).reshape(shape)
         # A blob that is not at the colour is a part of the vehicle; its centre is not the vehicle's.
         whole = touching.sum(axis=0) == 1
-        touching[match >= 0, match[match >= 0]] = True
+        touching[has, match[has]] = True
         shared = self._shared(match, touching, area, blob_area)
         clean = whole & ~shared & (touching.sum(axis=0) == 1) & ~touches_border(boxes, size)
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
-        for k, (coupling, box) in enumerate(zip(self._blobs, chosen, strict=True)):
-            blob = blobs[match[k]] if match[k] >= 0 and clean[match[k]] else None
-            if blob is not None and self._parameters.centre == "motion":
-                image[k], by[k] = blob, "motion"
+        for k, (colour, box) in enumerate(zip(self._colours, chosen, strict=True)):
+            is_clean = bool(has[k] and clean[match[k]])
+            if is_clean:
+                colour.blob_px = blobs[match[k]]
+            if is_clean and self._parameters.centre == "motion":
+                image[k], by[k] = blobs[match[k]], "motion"
             elif box is not None and not touches_border(box[None], size)[0]:
-                image[k], by[k] = colour[k], "colour"
-            if blob is not None:
-                coupling.blob_px = blob
+                image[k], by[k] = centre[k], "colour"
         # Too large for its colour need not be too large for a vehicle: of most, a part alone is seen to move at first.
         own = np.zeros(len(boxes), bool)
         if length_px is not None:
-            at = colour if expected_px is None else np.where(np.isnan(colour), expected_px, colour)
-            own = _of_vehicles(at, length_px, boxes)
-        return TrackedLandmarks(image, tuple(by), colour, match, touching.any(axis=0) & ~shared | own, shared & ~own)
+            at, long = np.where(np.isnan(centre), expected, centre), length_px[:, None]
+            away = np.linalg.norm(at[:, None] - (boxes[:, :2] + (boxes[:, 2:] - 1) / 2), axis=2)  # NaN where unknown
+            own = ((away <= _WITHIN * long) & (boxes[:, 2:].max(axis=1, initial=0) <= _LONGER * long)).any(axis=0)
+        return TrackedLandmarks(image, tuple(by), centre, match, touching.any(axis=0) & ~shared | own, shared & ~own)
 
     def _find(
         self,
         masks: np.ndarray,
         boxes: np.ndarray,
         now_from_before: np.ndarray | None,
-        expected_px: np.ndarray | None,
+        expected_px: np.ndarray,
         anew: bool,
-    ) -> tuple[list[np.ndarray | None], np.ndarray, np.ndarray]:
-        """Boxes, centres (K, 2) and areas (K,) of the landmarks' colours; None and NaN where not seen."""
-        expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
+    ) -> None:
+        """Choose the patches of this frame that are the landmarks."""
         for mask, colour in zip(masks, self._colours, strict=True):
             found = find_patches(mask, self._parameters.least_area_px)
-            colour.advance(now_from_before)
-            colour.see(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)))
+            colour.update(found, inside(found.centre_px, boxes).any(axis=1), now_from_before)
         # Plates of one team are alike in size: those of others tell the usual size.
         usual = np.inf
         for _ in range(2):
-            for colour, where in zip(self._colours, expected, strict=True):
+            for colour, where in zip(self._colours, expected_px, strict=True):
                 colour.decide(where, usual, anew)
             areas = [colour.lock.area_px for colour in self._colours if colour.lock is not None]
-            usual = float(np.median(areas)) if len(areas) >= _ENOUGH else np.inf
-        locks = [c.lock if c.lock is not None and c.sure and c.lock.row >= 0 else None for c in self._colours]
-        centre = np.array([(np.nan, np.nan) if one is None else one.centre_px for one in locks]).reshape(-1, 2)
-        area = np.array([np.nan if one is None else one.area_px for one in locks])
-        return [None if one is None else one.box_px for one in locks], centre, area
+            usual = _median_of(areas, np.inf)
 
     def _couple(
-        self, colour: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
+        self, centre: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
     ) -> np.ndarray:
         """Which blob is each landmark's: matched anew, or the one at its prediction.
 
@@ -189,23 +305,21 @@ class LandmarkTracker:
         seen to move. Where the colour is hidden any will do.
         """
         if anew:
-            match = separate(colour, blobs, self._parameters, near)
-            for coupling, blob in zip(self._blobs, match, strict=True):
-                coupling.coupled = bool(blob >= 0)
+            match = separate(centre, blobs, self._parameters, near)
+            for colour, blob in zip(self._colours, match, strict=True):
+                colour.coupled = bool(blob >= 0)
             return match
-        predicted = np.full((len(colour), 2), np.nan)
-        for k, (coupling, candidates) in enumerate(zip(self._blobs, self._colours, strict=True)):
-            if not coupling.coupled:
+        predicted = np.full((len(centre), 2), np.nan)
+        for k, colour in enumerate(self._colours):
+            if not colour.coupled:
                 continue
             # A lost blob, as of a vehicle that stood still, returns at the colour.
-            predicted[k] = colour[k]
-            if np.isfinite(coupling.blob_px).all():
-                moved = coupling.blob_px
-                if now_from_before is not None:
-                    moved = transfer(now_from_before, moved)[0]
-                velocity = 0.0 if candidates.lock is None else candidates.lock.velocity_px
-                predicted[k] = coupling.blob_px = moved + velocity
-        return separate(predicted, blobs, self._parameters, near | np.isnan(colour[:, :1]))
+            predicted[k] = centre[k]
+            if np.isfinite(colour.blob_px).all():
+                moved = colour.blob_px if now_from_before is None else transfer(now_from_before, colour.blob_px)[0]
+                velocity = 0.0 if colour.lock is None else colour.lock.velocity_px
+                predicted[k] = colour.blob_px = moved + velocity
+        return separate(predicted, blobs, self._parameters, near | np.isnan(centre[:, :1]))
 
     def _shared(self, match: np.ndarray, touching: np.ndarray, area: np.ndarray, blob_area: np.ndarray) -> np.ndarray:
         """(N,) bool: the blobs that are much larger than the landmarks at them explain; takes note of what is usual.
@@ -214,167 +328,18 @@ class LandmarkTracker:
         """
         ratio = np.full(len(match), np.nan)
         ratio[match >= 0] = blob_area[match[match >= 0]] / area[match >= 0]
-        alone = touching.sum(axis=1) == 1
-        peers = ratio[np.isfinite(ratio) & alone]
-        others = float(np.median(peers)) if len(peers) >= _ENOUGH else np.inf
-        explained = np.zeros(len(match))
-        for k, (coupling, candidates) in enumerate(zip(self._blobs, self._colours, strict=True)):
-            usual = float(np.median(coupling.ratios)) if len(coupling.ratios) >= _ENOUGH else others
-            # Where the colour is hidden, the area that it had stands for it.
-            explained[k] = usual * (candidates.lock.area_px if candidates.lock is not None else np.inf)
-        limit = np.where(touching, explained[:, None], 0).sum(axis=0)
+        others = _median_of(ratio[np.isfinite(ratio) & (touching.sum(axis=1) == 1)], np.inf)
+        # Where the colour is hidden, the area that it had stands for it.
+        areas = [np.inf if colour.lock is None else colour.lock.area_px for colour in self._colours]
+        explained = np.array([_median_of(c.ratios, others) * own for c, own in zip(self._colours, areas, strict=True)])
+        limit = np.where(touching, explained.reshape(-1, 1), 0).sum(axis=0)
         shared = touching.any(axis=0) & (blob_area > _SHARED * limit)
-        for k, coupling in enumerate(self._blobs):
+        for k, colour in enumerate(self._colours):
             if match[k] >= 0 and not shared[match[k]] and touching[:, match[k]].sum() == 1 and np.isfinite(ratio[k]):
-                coupling.ratios.append(float(ratio[k]))
+                colour.ratios.append(float(ratio[k]))
         return shared
 
 
-# Score of a patch, in logarithms of its area: for motion at it; for its travel over the ground; for being the
-# landmark already. Greatest penalty for its distance from the expected place.
-_BLOB, _TRAVEL, _LOCK, _FAR = 2.0, 3.0, 1.0, 4.0
-# A patch of this many times the usual area is no better than one of half as many, and one that fills its box by less
-# than this is a shadow or a roof's edge rather than a vehicle's plate.
-_LARGE, _FILL = 2.0, 0.5
-# Gain of a new frame in velocity, area and share of frames with motion.
-_GAIN = 0.3
-# Most patches of a colour that are tracked.
-_MOST = 16
-# Margin by which the best patch must beat the next one to be taken for the landmark.
-_MARGIN = 1.0
-# Patches smaller than the best by more than this logarithm are no rivals.
-_ALIKE = 2.0
-
-
-@dataclass
-class TrackedPatch:
-    """A patch over time. Places are in the picture of the frame at hand; where it was not seen, as predicted.
-
-    origin_px: where the ground lies now on which it was seen first. moving: share of the late frames in which
-    something moved at it. seen, missed: frames in which it was, and since. row: among the frame's patches; -1: missed.
-    """
-
-    centre_px: np.ndarray
-    box_px: np.ndarray
-    area_px: float
-    origin_px: np.ndarray
-    velocity_px: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    moving: float = 0.0
-    seen: int = 1
-    missed: int = 0
-    row: int = -1
-
-    @property
-    def fill(self) -> float:
-        """Share of its box that it fills; half for a square on its corner."""
-        return float(self.area_px / self.box_px[2:].prod())
-
-    @property
-    def travelled(self) -> float:
-        """Distance that it went over the ground, in its own sizes, up to 1."""
-        return float(min(np.linalg.norm(self.centre_px - self.origin_px) / np.sqrt(self.area_px), 1.0))
-
-
-class ColourTracker:
-    """The patches of one colour, and which of them is the landmark."""
-
-    def __init__(self, parameters: LandmarkParameters) -> None:
-        self._parameters = parameters
-        self._all: list[TrackedPatch] = []
-        self.lock: TrackedPatch | None = None
-        self.sure = False
-        self._blind = False
-
-    def advance(self, now_from_before: np.ndarray | None) -> None:
-        """Go on to the next picture. Without the background's motion, patches are searched further around."""
-        self._blind = now_from_before is None
-        if now_from_before is not None and self._all:
-            places = np.array([(one.centre_px, one.origin_px) for one in self._all])
-            places = transfer(now_from_before, places.reshape(-1, 2)).reshape(places.shape)
-            for one, (centre, origin) in zip(self._all, places, strict=True):
-                one.centre_px, one.origin_px = centre, origin
-        for one in self._all:
-            one.centre_px = one.centre_px + one.velocity_px
-
-    def see(self, found: Patches, moving: np.ndarray) -> None:
-        """Take in the patches of a frame; moving: (P,) bool, whether something moves at each."""
-        largest = self._foremost(found)
-        taken = self._continue(found, largest)
-        for one in self._all:
-            one.row = taken.get(id(one), -1)
-            if one.row < 0:
-                one.missed += 1
-                continue
-            centre = found.centre_px[one.row]
-            one.velocity_px = one.velocity_px + _GAIN * (centre - one.centre_px)
-            one.centre_px, one.box_px, one.seen, one.missed = centre, found.box_px[one.row], one.seen + 1, 0
-            one.area_px += _GAIN * (found.area_px[one.row] - one.area_px)
-            one.moving += _GAIN * (moving[one.row] - one.moving)
-        new = [
-            TrackedPatch(
-                *(found.centre_px[row], found.box_px[row], float(found.area_px[row]), found.centre_px[row]),
-                moving=float(moving[row]),
-                row=int(row),
-            )
-            for row in largest
-            if row not in taken.values()
-        ]
-        self._all = [one for one in self._all if one.missed <= min(self._parameters.interval_frames, one.seen)] + new
-        if self.lock is not None and not any(one is self.lock for one in self._all):
-            self.lock, self.sure = None, False
-
-    def _foremost(self, found: Patches) -> np.ndarray:
-        """The rows of the most likely patches."""
-        area, near = found.area_px, np.zeros(len(found), bool)
-        if self.lock is not None:
-            area = np.minimum(area, _LARGE * self.lock.area_px)
-            near = np.linalg.norm(found.centre_px - self.lock.centre_px, axis=1) <= self._parameters.reach_px
-        fill = found.area_px / found.box_px[:, 2:].prod(axis=1)
-        return np.lexsort((-area * np.minimum(fill / _FILL, 1.0) ** 4, ~near))[:_MOST]
-
-    def _continue(self, found: Patches, rows: np.ndarray) -> dict[int, int]:
-        """The patch that continues each candidate, by the candidate's id."""
-        if not self._all or not len(rows):
-            return {}
-        before = np.array([one.centre_px for one in self._all])
-        gate = np.array([np.sqrt(one.area_px) * (1 + 0.2 * one.missed) + 4 for one in self._all])
-        reach = max(self._parameters.reach_px, 4.0)
-        gate = np.full(len(gate), reach) if self._blind else np.minimum(gate, reach)
-        apart = np.linalg.norm(before[:, None] - found.centre_px[rows][None], axis=2) / gate[:, None]
-        change = np.log(found.area_px[rows][None] / np.array([one.area_px for one in self._all])[:, None])
-        cost = np.where(apart <= 1, apart + 0.3 * np.abs(change), 100.0)
-        pairs = zip(*cheapest(cost), strict=True)
-        return {id(self._all[i]): int(rows[j]) for i, j in pairs if cost[i, j] < 100}
-
-    def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:
-        """Which patch is the landmark: as before, unless it is lost or in doubt, or the question is put anew.
-
-        `sure` tells whether clearly more speaks for it than for the next best.
-        expected_px: (2,) where it should be, NaN for unknown. usual_px: area of the landmarks' patches, inf: unknown.
-        """
-        if not self._all or not (anew or self.lock is None or not self.sure):
-            return
-        sizes = np.array([self._size(one, usual_px) for one in self._all])
-        signs = np.array([self._signs(one, expected_px, usual_px) for one in self._all])
-        held = np.array([_LOCK * (one is self.lock) for one in self._all])
-        best = int((sizes + signs + held).argmax())
-        same, self.lock = self._all[best] is self.lock, self._all[best]
-        # Size alone does not tell a vehicle from a roof.
-        rivals = sizes > sizes[best] - _ALIKE
-        rivals[best] = False
-        clear = not rivals.any() or signs[best] - signs[rivals].max() >= _MARGIN
-        self.sure = bool(clear or (same and self.sure))
-
-    @staticmethod
-    def _size(one: TrackedPatch, usual_px: float) -> float:
-        return float(np.log(min(one.area_px, _LARGE * usual_px)))
-
-    def _signs(self, one: TrackedPatch, expected_px: np.ndarray, usual_px: float) -> float:
-        """Score of a candidate without its size."""
-        score = 4 * np.log(min(one.fill / _FILL, 1.0)) + _BLOB * one.moving + _TRAVEL * one.travelled
-        if np.isfinite(usual_px):
-            score -= max(np.log(one.area_px / (_LARGE * usual_px)), 0.0)
-        if np.isfinite(expected_px).all():
-            away = np.linalg.norm(one.centre_px - expected_px) / (2 * max(self._parameters.reach_px, 1.0))
-            score -= min(away**2 / 2, _FAR)
-        return float(score)
+def _median_of(values: Sequence[float] | np.ndarray, otherwise: float) -> float:
+    """The median of values; `otherwise` where they are too few to say what is usual."""
+    return float(np.median(values)) if len(values) >= _ENOUGH else otherwise

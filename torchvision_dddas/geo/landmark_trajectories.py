@@ -15,34 +15,38 @@ from torchvision_dddas.types import Adjustment, LandmarkObservations, Landmarks
 _SLACK = 1.5
 # A landmark's velocity is fitted to the reports of this time.
 _PACE_S = 5.0
+# Hysteresis: landmarks count as well detected again below this share of poor_speed_m_s.
+_CALM = 0.8
+# Other landmarks replace those in use once they are spread better by this factor.
+_BETTER = 1.25
+# Of more landmarks than this, only this many that lie far apart are tried.
+_TRIED = 12
+
+_Place = tuple[np.ndarray, float]
+"""East and north (2,), and its standard deviation in metres."""
 
 
 @dataclass(frozen=True)
 class _Track:
-    """Places over time, sorted: frame (R,), place (R, 2) local metres, sigma_m (R,)."""
+    """Places over time, sorted by frame (R,). values: (3, R) east, north and sigma in metres."""
 
     frame: np.ndarray
-    place: np.ndarray
-    sigma_m: np.ndarray
+    values: np.ndarray
 
-    def at(self, frame: float) -> tuple[np.ndarray, float] | None:
-        """Place and sigma, linear between; None before the first and after the last."""
+    def at(self, frame: float) -> _Place | None:
+        """Linear between reports; None before the first and after the last."""
         if not len(self.frame) or not self.frame[0] <= frame <= self.frame[-1]:
             return None
-        after = min(int(np.searchsorted(self.frame, frame, side="right")), len(self.frame) - 1)
-        before = max(after - 1, 0)
-        span = self.frame[after] - self.frame[before]
-        share = (frame - self.frame[before]) / span if span > 0 else 1.0
-        place = (1 - share) * self.place[before] + share * self.place[after]
-        # Not less between two reports than at them: a receiver's error lasts for longer than that.
-        return place, float((1 - share) * self.sigma_m[before] + share * self.sigma_m[after])
+        # The sigma is not less between two reports than at them: a receiver's error lasts for longer than that.
+        east, north, sigma_m = (np.interp(frame, self.frame, row) for row in self.values)
+        return np.array([east, north]), float(sigma_m)
 
 
 class LandmarkTrajectories:
     """The places of landmarks over a clip; `at` gives those of one frame.
 
     Between reports a landmark goes straight on. A gap between them that is unusually long is a dropout: there it
-    follows its planned waypoints, shifted by how far its reports lay from them; without a plan it goes straight from
+    takes its planned waypoints, shifted by how far its reports lay from them; without a plan it goes straight from
     report to report in a gap of up to gap_s, or on as it went for gap_s, its sigma growing by drift_m_s. After that it
     is absent. A landmark's plan alone, without reports, will do.
     """
@@ -51,42 +55,37 @@ class LandmarkTrajectories:
         """landmarks: their places in local metres. Raises ValueError for degrees."""
         if landmarks.geographic:
             raise ValueError("these landmarks are in degrees; wanted local metres")
-        self.names = landmarks.names
-        self._parameters, self._rate_hz = parameters, rate_hz
+        self._count, self._parameters, self._rate_hz = len(landmarks.names), parameters, rate_hz
+        self._longest = parameters.gap_s * rate_hz
         known = np.isfinite(landmarks.place).all(axis=1)
         sigma = np.where(np.isfinite(landmarks.sigma_m), landmarks.sigma_m, parameters.sigma_m)
-        reports: list[_Track] = []
-        plans: list[_Track] = []
-        for k in range(len(landmarks.names)):
-            for tracks, planned in ((reports, False), (plans, True)):
-                rows = known & (landmarks.landmark == k) & (landmarks.planned == planned)
-                tracks.append(_Track(landmarks.frame[rows], landmarks.place[rows], sigma[rows]))
-        self._reports, self._plans = reports, plans
-        self._usual = [self._usual_gap(track.frame) for track in reports]
-        seen = np.isfinite(landmarks.image_px).all(axis=1)
-        self._seen_frame = landmarks.frame[seen]
-        self._seen_landmark = landmarks.landmark[seen]
-        self._seen_px = landmarks.image_px[seen]
 
-    @property
-    def pictured(self) -> bool:
-        """Whether the table itself says where pictures show landmarks."""
-        return len(self._seen_frame) > 0
+        def track(landmark: int, planned: bool) -> _Track:
+            rows = known & (landmarks.landmark == landmark) & (landmarks.planned == planned)
+            return _Track(landmarks.frame[rows], np.stack([*landmarks.place[rows].T, sigma[rows]]))
+
+        self._reports = [track(k, False) for k in range(self._count)]
+        self._plans = [track(k, True) for k in range(self._count)]
+        # Longest usual gap; with two reports alone nothing is usual, and no gap up to gap_s is long.
+        frames = [reports.frame for reports in self._reports]
+        self._near = [_SLACK * float(np.median(np.diff(f))) if len(f) > 2 else self._longest for f in frames]
+        seen = np.isfinite(landmarks.image_px).all(axis=1)
+        self._seen_frame, self._seen_landmark = landmarks.frame[seen], landmarks.landmark[seen]
+        self._seen_px = landmarks.image_px[seen]
 
     def at(self, frame: int) -> LandmarkObservations:
         """The landmarks of a frame whose places are known.
 
         Where the table says places in pictures, those that it has for this frame; else all, with image_px NaN.
         """
-        if self.pictured:
-            first, last = np.searchsorted(self._seen_frame, [frame - 0.5, frame + 0.5])
-            landmark, image = self._seen_landmark[first:last], self._seen_px[first:last]
+        if len(self._seen_frame):
+            rows = slice(*np.searchsorted(self._seen_frame, [frame - 0.5, frame + 0.5]))
+            landmark, image = self._seen_landmark[rows], self._seen_px[rows]
         else:
-            landmark = np.arange(len(self.names))
-            image = np.full((len(landmark), 2), np.nan)
-        found = [self._place(int(k), float(frame)) for k in landmark]
-        kept = np.array([place is not None for place in found], bool)
-        known = [place for place in found if place is not None]
+            landmark, image = np.arange(self._count), np.full((self._count, 2), np.nan)
+        places = [self._place(k, float(frame)) for k in landmark.tolist()]
+        kept = np.array([place is not None for place in places], bool)
+        known = [place for place in places if place is not None]
         return LandmarkObservations(
             landmark[kept].astype(np.int64),
             image[kept],
@@ -99,23 +98,16 @@ class LandmarkTrajectories:
     def speed_m_s(self, frame: int) -> np.ndarray:
         """(K,) how fast each landmark goes over the ground, over the second around a frame; NaN where unknown."""
         half = self._rate_hz / 2
-        speeds = np.full(len(self.names), np.nan)
-        for k in range(len(self.names)):
-            ends = [(at, place) for at in (frame - half, frame, frame + half) if (place := self._place(k, at))]
+        speeds = np.full(self._count, np.nan)
+        for k in range(self._count):
+            ends = [(at, place[0]) for at in (frame - half, frame, frame + half) if (place := self._place(k, at))]
             if len(ends) > 1:
-                (before, (a, _)), (after, (b, _)) = ends[0], ends[-1]
+                (before, a), (after, b) = ends[0], ends[-1]
                 speeds[k] = np.linalg.norm(b - a) / (after - before) * self._rate_hz
         return speeds
 
-    def _usual_gap(self, frame: np.ndarray) -> float:
-        """Frames between two reports; with two reports alone nothing is usual, and no gap up to gap_s is long."""
-        longest = self._parameters.gap_s * self._rate_hz / _SLACK
-        if len(frame) < 3:
-            return longest
-        return float(np.median(np.diff(frame)))
-
-    def _place(self, k: int, frame: float) -> tuple[np.ndarray, float] | None:
-        reports, near = self._reports[k], _SLACK * self._usual[k]
+    def _place(self, k: int, frame: float) -> _Place | None:
+        reports, near, longest = self._reports[k], self._near[k], self._longest
         after = int(np.searchsorted(reports.frame, frame))
         past = frame - reports.frame[after - 1] if after > 0 else np.inf
         ahead = reports.frame[after] - frame if after < len(reports.frame) else np.inf
@@ -123,7 +115,6 @@ class LandmarkTrajectories:
             return reports.at(frame)
         if planned := self._planned(k, frame, past, ahead):
             return planned
-        longest = self._parameters.gap_s * self._rate_hz
         if past + ahead <= longest and (chord := reports.at(frame)):
             return chord[0], self._grown(chord[1], min(past, ahead))
         if past <= longest:
@@ -133,20 +124,16 @@ class LandmarkTrajectories:
             return self._straight_on(reports, 0, frame)
         return None
 
-    def _planned(self, k: int, frame: float, past: float, ahead: float) -> tuple[np.ndarray, float] | None:
+    def _planned(self, k: int, frame: float, past: float, ahead: float) -> _Place | None:
         """Along the plan, shifted by how far the reports before and after lay from it."""
         plan, reports = self._plans[k], self._reports[k]
-        there = plan.at(frame)
-        if there is None:
+        if (there := plan.at(frame)) is None:
             return None
         place, loose = there
         offsets, weights, sigmas = [], [], []
         # The nearer report counts for more, so that nothing jumps where a dropout ends.
         for distance, weight, at in ((past, ahead, frame - past), (ahead, past, frame + ahead)):
-            if not np.isfinite(distance) or (meant := plan.at(at)) is None:
-                continue
-            report = reports.at(at)
-            if report is not None:
+            if np.isfinite(distance) and (meant := plan.at(at)) and (report := reports.at(at)):
                 offsets.append(report[0] - meant[0])
                 weights.append(weight if np.isfinite(weight) else 1.0)
                 sigmas.append(report[1])
@@ -157,29 +144,20 @@ class LandmarkTrajectories:
         strayed = min(self._parameters.drift_m_s * min(past, ahead) / self._rate_hz, loose)
         return place, float(np.hypot(np.average(sigmas, weights=weights), strayed))
 
-    def _straight_on(self, reports: _Track, last: int, frame: float) -> tuple[np.ndarray, float]:
+    def _straight_on(self, reports: _Track, last: int, frame: float) -> _Place:
         """From a report on with the velocity of those around it, before it or after the first."""
-        reach = max(
-            _PACE_S * self._rate_hz, _SLACK * float(np.median(np.diff(reports.frame))) if len(reports.frame) > 1 else 0
-        )
-        away = reports.frame[last] - reports.frame
-        rows = (away >= 0) & (away <= reach) if frame >= reports.frame[last] else (away <= 0) & (-away <= reach)
+        usual = _SLACK * float(np.median(np.diff(reports.frame))) if len(reports.frame) > 1 else 0
+        gone = frame - reports.frame[last]
+        away = (reports.frame[last] - reports.frame) * (1 if gone >= 0 else -1)
+        rows = (away >= 0) & (away <= max(_PACE_S * self._rate_hz, usual))
         velocity = np.zeros(2)
         if rows.sum() > 1:
-            velocity = np.polyfit(reports.frame[rows] - reports.frame[last], reports.place[rows], 1)[0]
-        gone = frame - reports.frame[last]
-        return reports.place[last] + velocity * gone, self._grown(float(reports.sigma_m[last]), abs(gone))
+            velocity = np.polyfit(reports.frame[rows] - reports.frame[last], reports.values[:2, rows].T, 1)[0]
+        east_north, sigma_m = reports.values[:2, last], float(reports.values[2, last])
+        return east_north + velocity * gone, self._grown(sigma_m, abs(gone))
 
     def _grown(self, sigma_m: float, frames: float) -> float:
         return float(np.hypot(sigma_m, self._parameters.drift_m_s * frames / self._rate_hz))
-
-
-# Hysteresis: landmarks count as well detected again below this share of poor_speed_m_s.
-_CALM = 0.8
-# Other landmarks replace those in use once they are spread better by this factor.
-_BETTER = 1.25
-# Of more landmarks than this, only this many that lie far apart are tried.
-_TRIED = 12
 
 
 @dataclass(frozen=True)
@@ -203,37 +181,42 @@ def select_landmarks(
     view = np.flatnonzero(np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1))
     if parameters.rule == "all":
         return view, LandmarkUse(tuple(marks.landmark[view].tolist())), ()
+    least, limit, low = parameters.least, parameters.poor_speed_m_s, _CALM * parameters.poor_speed_m_s
     known = np.asarray(speed_m_s, float)[view]
-    speed = float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else None
+    speed = float(np.mean(known[np.isfinite(known)])) if np.isfinite(known).any() else np.nan
     poor, cause = now.poor, ""
-    if speed is not None and poor and speed < _CALM * parameters.poor_speed_m_s:
-        poor, cause = False, f"below {_CALM * parameters.poor_speed_m_s:.2g}: they are detected well"
-    elif speed is not None and not poor and speed > parameters.poor_speed_m_s and len(view) > parameters.least:
-        poor, cause = True, f"above {parameters.poor_speed_m_s:g}: they are detected poorly"
-    rows = view if poor or len(view) <= parameters.least else view[_best_spread(marks, view, now, parameters.least)]
+    if poor and speed < low:
+        poor, cause = False, f"below {low:.2g}: they are detected well"
+    elif not poor and speed > limit and len(view) > least:
+        poor, cause = True, f"above {limit:g}: they are detected poorly"
+    rows = view
+    if not poor and len(view) > least:
+        # Those used already, unless others are spread clearly better.
+        places = marks.east_north_m[view]
+        best = best_spread(places, least)
+        held = np.flatnonzero(np.isin(marks.landmark[view], now.landmark))
+        keep = len(held) == least and spread_m2(places[best]) <= _BETTER * spread_m2(places[held])
+        rows = view[held if keep else best]
     use = LandmarkUse(tuple(marks.landmark[rows].tolist()), poor)
     if not cause or len(rows) == len(now.landmark):
         return rows, use, ()
     why = f"{len(view)} landmarks in view go at {speed:.1f} m/s on average, {cause}"
-    return rows, use, (Adjustment(frame, "landmarks.used", len(now.landmark) or parameters.least, len(rows), why),)
-
-
-def _best_spread(marks: LandmarkObservations, view: np.ndarray, now: LandmarkUse, count: int) -> np.ndarray:
-    """Of the rows in view, those `count` that are used already, unless others are spread clearly better."""
-    places = marks.east_north_m[view]
-    best = best_spread(places, count)
-    held = np.flatnonzero(np.isin(marks.landmark[view], now.landmark))
-    if len(held) == count and spread_m2(places[best]) <= _BETTER * spread_m2(places[held]):
-        return held
-    return best
+    return rows, use, (Adjustment(frame, "landmarks.used", len(now.landmark) or least, len(rows), why),)
 
 
 def best_spread(places: np.ndarray, count: int) -> np.ndarray:
     """(count,) rows of (n, 2) places, sorted, whose smallest triangle is the largest: no three are near one line."""
-    tried = _far_apart(places, max(count, min(_TRIED, len(places))))
+    # Of many, those far apart are tried: each the one furthest from those before it.
+    most = min(max(count, _TRIED), len(places))
+    tried = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
+    nearest = np.full(len(places), np.inf)
+    while len(tried) < most:
+        nearest = np.minimum(nearest, np.linalg.norm(places - places[tried[-1]], axis=1))
+        nearest[tried] = -1.0  # where several are in one place, each is taken once
+        tried.append(int(nearest.argmax()))
     if len(tried) > _TRIED:
         return np.sort(tried[:count])
-    sets = np.array(list(combinations(np.sort(tried), count)))
+    sets = np.array(list(combinations(sorted(tried), count)))
     smallest = np.full(len(sets), np.inf)
     for triple in combinations(range(count), 3):
         smallest = np.minimum(smallest, _area(places[sets[:, triple]]))
@@ -253,14 +236,3 @@ def _area(corners: np.ndarray) -> np.ndarray:
     """(T,) of triangles (T, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-
-
-def _far_apart(places: np.ndarray, count: int) -> np.ndarray:
-    """(count,) rows of (n, 2) places, each the one furthest from those before it."""
-    rows = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
-    nearest = np.full(len(places), np.inf)
-    while len(rows) < min(count, len(places)):
-        nearest = np.minimum(nearest, np.linalg.norm(places - places[rows[-1]], axis=1))
-        nearest[rows] = -1.0  # where several are in one place, each is taken once
-        rows.append(int(nearest.argmax()))
-    return np.array(rows)

@@ -69,7 +69,7 @@ class LandmarkWatch:
         self.locator, self._colours, self._finder = locator, colours, finder
         names = locator.site.landmarks.names
         self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
-        self._tracker = LandmarkTracker(colours.names, locator.settings.landmarks) if colours else None
+        self._tracker = LandmarkTracker(len(colours), locator.settings.landmarks) if colours else None
         self._fix: Fix | None = None
 
     def restarted(self) -> "LandmarkWatch":
@@ -112,7 +112,7 @@ class LandmarkWatch:
             if which in place:
                 expected[place[which]] = pixels[row]
                 length[place[which]] = self.locator.settings.landmarks.length_m * scale[row]
-        masks = self._finder.masks(image, self._colours.low, self._colours.high)
+        masks = self._finder(image, self._colours.low, self._colours.high)
         seen = self._tracker.update(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
         pixels = np.full((len(marks), 2), np.nan)
         by = [""] * len(marks)
