@@ -13,7 +13,7 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import Engine, MotionDetector, Retune, detect_motion, load_engine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, check_colours, group_crowds
-from torchvision_dddas.geo.aerial_locator import tracked_targets
+from torchvision_dddas.geo.aerial_targets import tracked_targets
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
 from torchvision_dddas.types import (

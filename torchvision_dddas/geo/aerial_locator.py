@@ -16,18 +16,14 @@ from torchvision_dddas.geo.aerial_targets import (
     point_sigma_px,
     reference_points,
     remove_shadow,
+    seen_targets,
     shadow_m,
     sun_at,
+    tracked_targets,
 )
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, LandmarkUse, select_landmarks
-from torchvision_dddas.geo.plane_homography import (
-    LEAST,
-    PlaneSolver,
-    load_solver,
-    locate_pixels,
-    relative_width,
-)
+from torchvision_dddas.geo.plane_homography import LEAST, PlaneSolver, load_solver, locate_pixels, relative_width
 from torchvision_dddas.geo.projection import ground_height, surface_of
 from torchvision_dddas.geo.site import Site, build_site, resolve_camera
 from torchvision_dddas.types import (
@@ -93,8 +89,9 @@ class AerialLocator:
             raise InputError(f"rate_hz must be positive, got {rate_hz}")
         settings = settings or Settings()
         site = replace(build_site(landmarks, telemetry), elevation=elevation)
-        camera, focal_known, self.notes = resolve_camera(camera, size_px, site.telemetry, settings)
+        camera, focal_known, notes = resolve_camera(camera, size_px, site.telemetry, settings)
         self._begin(site, camera, settings, load_solver(backend), rate_hz, focal_known)
+        self.notes += notes
 
     @classmethod
     def from_site(
@@ -102,7 +99,6 @@ class AerialLocator:
     ) -> "AerialLocator":
         """A locator of prepared parts. Raises InputError for aerial.mode = paper with landmarks in metres."""
         locator = cls.__new__(cls)
-        locator.notes = []
         locator._begin(site, camera, settings, solver, rate_hz, focal_known)
         return locator
 
@@ -115,11 +111,11 @@ class AerialLocator:
                 "longitude_deg,latitude_deg, or take another mode"
             )
         self.camera, self.settings, self.rate_hz, self.focal_known = camera, settings, rate_hz, focal_known
+        self.notes: list[str] = []
         self.set_site(site)
         self._solver = solver
         self._georeferencer = Georeferencer(camera, settings, solver, focal_known, site.landmarks.names)
-        self._speeds = TargetSpeeds()
-        self._use = LandmarkUse()
+        self._speeds, self._use = TargetSpeeds(), LandmarkUse()
         self._ground = surface_of(site.elevation)
 
     def restarted(self) -> "AerialLocator":
@@ -129,16 +125,14 @@ class AerialLocator:
     def set_site(self, site: Site) -> None:
         """Take over what landmarks and vehicle have reported by now, in the metres of the site so far."""
         self.site = site
-        self.trajectories = LandmarkTrajectories(site.landmarks, self.settings.landmarks, self.rate_hz)
+        self._trajectories = LandmarkTrajectories(site.landmarks, self.settings.landmarks, self.rate_hz)
 
     def locate(self, tracks: Tracks | TrackedFrame) -> AerialLocations:
         """Where the targets of the next frame stand. Raises InputError for anything but Tracks or a TrackedFrame."""
         if isinstance(tracks, TrackedFrame):
             targets, frame = tracked_targets(tracks, bool(self.settings.crowds.join_m)), tracks.number
         elif isinstance(tracks, Tracks):
-            seen = tracks.row >= 0
-            targets = Targets(tracks.box_px[seen], tracks.identity[seen], seen[seen], tracks.score[seen].clip(0, 1))
-            frame = tracks.frame
+            targets, frame = seen_targets(tracks), tracks.frame
         else:
             raise InputError(f"locate wants Tracks or a TrackedFrame, got {type(tracks).__name__}")
         return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)
@@ -159,7 +153,7 @@ class AerialLocator:
 
     def landmarks_at(self, frame: int) -> LandmarkObservations:
         """The landmarks of a frame whose place and height are known."""
-        marks = self.trajectories.at(frame)
+        marks = self._trajectories.at(frame)
         if self._ground is None or not len(marks):
             return marks
         marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
@@ -171,13 +165,12 @@ class AerialLocator:
         flight = self.site.telemetry.at(time_s) if self.site.telemetry is not None else None
         if flight is None:
             return None
-        below, base = 0.0, 0.0
-        if self.site.elevation is not None:
-            base = self.site.elevation.base_m
-            below = float(ground_height(self.site.elevation, np.array([flight.place]))[0])
-        altitude = flight.altitude_m + below
-        if not math.isfinite(altitude) and self.site.elevation is not None:
-            altitude = flight.above_sea_m - base
+        below, altitude = 0.0, flight.altitude_m
+        if (elevation := self.site.elevation) is not None:
+            below = float(ground_height(elevation, np.array([flight.place]))[0])
+            altitude += below
+            if not math.isfinite(altitude):
+                altitude = flight.above_sea_m - elevation.base_m
         if not altitude > (below if math.isfinite(below) else 0.0):
             altitude = math.nan
         return replace(flight, altitude_m=altitude)
@@ -185,7 +178,7 @@ class AerialLocator:
     def fix_frame(self, frame: int, marks: LandmarkObservations) -> FrameFix:
         """How a frame maps to the ground. marks: those of `landmarks_at`, with their places in the picture."""
         start = time.perf_counter()
-        speeds = self.trajectories.speed_m_s(frame)[marks.landmark]
+        speeds = self._trajectories.speed_m_s(frame)[marks.landmark]
         rows, self._use, adjustments = select_landmarks(frame, self._use, marks, speeds, self.settings.landmarks)
         used = marks[rows]
         degrees = None
@@ -206,14 +199,17 @@ class AerialLocator:
 
         adjustments, seconds: of the stages before, for the record.
         """
-        fix = fixed.fix
-        start = time.perf_counter()
-        place, relative, own = self._placed(fix, targets)
+        start, fix, origin = time.perf_counter(), fixed.fix, self.site.origin_deg
+        # The covariance relative to the team has a part that is each box's own, and one that all share.
+        pixels, lift = self.target_points(fix, targets)
+        place, by_pixel = locate_pixels(fix, self.camera, pixels, 1.0, lift, self._ground)
+        shared = locate_pixels(fix, self.camera, pixels, 0.0, lift, self._ground)[1]
         rows = np.flatnonzero(np.isfinite(place).all(axis=1))
-        place, relative, own = place[rows], relative[rows], own[rows]
+        place = place[rows]
+        own = (by_pixel - shared)[rows] * (point_sigma_px(targets, self.settings.aerial)[rows] ** 2)[:, None, None]
+        relative = shared[rows] + own
         when, target = self.time_s(fix.frame), targets.target[rows]
         velocity = self._speeds.update(when, np.where(targets.lasting[rows], target, -1), place, own)
-        origin = self.site.origin_deg
         positions = Positions(
             np.full(len(rows), fix.frame),
             target,
@@ -231,7 +227,7 @@ class AerialLocator:
 
     def ground_places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
         """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
-        return locate_pixels(fix, self.camera, pixels, 0.0, np.zeros(len(pixels)), self._ground)[0]
+        return locate_pixels(fix, self.camera, pixels, 0.0, 0.0, self._ground)[0]
 
     def ground_radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
         """(N,) m, radii of circles as large as the ellipses within boxes (N, 4) on the ground; NaN where unknown."""
@@ -261,14 +257,6 @@ class AerialLocator:
                 return feet, np.zeros(len(feet))
         return pixels, lift
 
-    def _placed(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places (N, 2), their covariance relative to the team (N, 2, 2), and the part of it that is each box's own."""
-        pixels, lift = self.target_points(fix, targets)
-        place, by_pixel = locate_pixels(fix, self.camera, pixels, 1.0, lift, self._ground)
-        _, shared = locate_pixels(fix, self.camera, pixels, 0.0, lift, self._ground)
-        own = (by_pixel - shared) * (point_sigma_px(targets, self.settings.aerial) ** 2)[:, None, None]
-        return place, shared + own, own
-
     def _sun(self, time_s: float) -> tuple[float, float] | None:
         """Azimuth and height of the sun, rad; None where unknown, and at night."""
         parameters, site = self.settings.aerial, self.site
@@ -279,24 +267,6 @@ class AerialLocator:
             start = site.telemetry.start_utc_s
             sun = sun_at(*site.origin_deg, start + time_s) if math.isfinite(start) else None
         return sun if sun is not None and sun[1] > 0 else None
-
-
-def tracked_targets(tracked: TrackedFrame, with_middles: bool) -> Targets:
-    """The targets of a tracked frame that were seen: a box that bridges a gap has an identity, but no place.
-
-    with_middles: take the mean of a target's foreground for its place in the picture.
-    """
-    tracks = tracked.tracks
-    seen = tracks.row >= 0
-    middle = tracked.detections.middle_px[tracks.row[seen]] if with_middles else None
-    return Targets(
-        tracks.box_px[seen],
-        tracks.identity[seen],
-        seen[seen],
-        tracks.score[seen].clip(0, 1),
-        bodies=True,
-        middle_px=middle,
-    )
 
 
 def frames_to_locate(table: DetectionTable, landmarks: Landmarks) -> list[int]:
@@ -318,7 +288,14 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
         raise InputError(
             f"landmarks {landmarks.path} say no places in pictures; wanted columns u_px,v_px beside the places"
         )
-    _check_inside(locator)
+    away = is_outside(locator, landmarks.image_px)
+    if away.any():
+        k = int(np.where(away, landmarks.line, np.iinfo(np.int64).max).argmin())
+        (u, v), (columns, rows) = landmarks.image_px[k].tolist(), locator.camera.size_px
+        raise InputError(
+            f"landmarks {landmarks.path}, line {landmarks.line[k]}: u_px,v_px are {u:g}, {v:g}, far outside the "
+            f"camera's pictures of {columns} x {rows} px; give pixels, and the camera's file for this size"
+        )
     if not len(table):
         return
     frames = np.unique(table.frame).tolist()
@@ -339,7 +316,7 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
             f"locate needs {LEAST} landmarks not on one line; frame {frames[best]} has {counts[best]}, none more: "
             f"{missing} missing. Give --telemetry, or {missing} landmark{'s' * (missing > 1)} more"
         )
-    enough = [k for k, count in enumerate(counts.tolist()) if count >= LEAST]
+    enough = np.flatnonzero(counts >= LEAST).tolist()
     if all(relative_width(marks[k]) < parameters.least_spread for k in enough):
         raise InputError(
             f"the {counts[enough[0]]} landmarks of frame {frames[enough[0]]} lie on one line, as in all others; "
@@ -354,15 +331,3 @@ def is_outside(locator: AerialLocator, pixels: np.ndarray) -> np.ndarray:
     size = np.array(locator.camera.size_px, float)
     beyond: np.ndarray = (pixels < -_OUTSIDE * size) | (pixels > (1 + _OUTSIDE) * size)
     return np.any(beyond, axis=1)
-
-
-def _check_inside(locator: AerialLocator) -> None:
-    landmarks = locator.site.landmarks
-    away = is_outside(locator, landmarks.image_px)
-    if away.any():
-        k = int(np.where(away, landmarks.line, np.iinfo(np.int64).max).argmin())
-        (u, v), (columns, rows) = landmarks.image_px[k].tolist(), locator.camera.size_px
-        raise InputError(
-            f"landmarks {landmarks.path}, line {landmarks.line[k]}: u_px,v_px are {u:g}, {v:g}, far outside the "
-            f"camera's pictures of {columns} x {rows} px; give pixels, and the camera's file for this size"
-        )

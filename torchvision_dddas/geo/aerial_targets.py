@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.projection import project
-from torchvision_dddas.types import Camera, CameraPose, Float, Int
+from torchvision_dddas.types import Camera, CameraPose, Float, Int, TrackedFrame, Tracks
 
 # Width of a person from straight above, where no height shows.
 BODY_WIDTH_M = 0.5
@@ -38,21 +38,34 @@ class Targets:
     middle_px: np.ndarray | None = None
 
 
+def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | None = None) -> Targets:
+    """The targets of a frame that were seen: a box that bridges a gap has an identity, but no place.
+
+    middle_px: (M, 2) of the frame's detections.
+    """
+    seen = tracks.row >= 0
+    middle = None if middle_px is None else middle_px[tracks.row[seen]]
+    score = tracks.score[seen].clip(0, 1)
+    return Targets(tracks.box_px[seen], tracks.identity[seen], seen[seen], score, bodies=bodies, middle_px=middle)
+
+
+def tracked_targets(tracked: TrackedFrame, with_middles: bool) -> Targets:
+    """`seen_targets` of a tracked frame; with_middles: by the mean of the foreground, not by the centre of the box."""
+    return seen_targets(tracked.tracks, True, tracked.detections.middle_px if with_middles else None)
+
+
 def reference_points(targets: Targets, parameters: AerialParameters, posed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (N, 2) that stand for the targets, and how high above the ground they lie (N,) m.
 
     posed: whether the camera's pose is known. Only then is the middle of a body taken at half its height.
     """
-    centre = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
-    if targets.middle_px is not None:
-        centre = np.where(np.isfinite(targets.middle_px).all(axis=1)[:, None], targets.middle_px, centre)
-    lift = np.zeros(len(centre))
-    if parameters.point == "auto" and targets.feet_px is not None:
-        named = np.isfinite(targets.feet_px).all(axis=1)
-        return np.where(named[:, None], targets.feet_px, centre), lift
-    if posed and (parameters.point == "foot" or (parameters.point == "auto" and targets.bodies)):
-        lift += parameters.target_height_m / 2
-    return centre, lift
+    points = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
+    by_feet = parameters.point == "auto" and targets.feet_px is not None
+    for better in (targets.middle_px, targets.feet_px if by_feet else None):
+        if better is not None:
+            points = np.where(np.isfinite(better).all(axis=1)[:, None], better, points)
+    raised = posed and not by_feet and (parameters.point == "foot" or (parameters.point == "auto" and targets.bodies))
+    return points, np.full(len(points), parameters.target_height_m / 2 if raised else 0.0)
 
 
 def point_sigma_px(targets: Targets, parameters: AerialParameters) -> np.ndarray:
@@ -67,23 +80,18 @@ def sun_at(longitude_deg: float, latitude_deg: float, utc_s: float) -> tuple[flo
     utc_s: seconds since 1970. Accurate to about 0.02 degrees from 1950 to 2050.
     Source: the low-precision formulas of the Astronomical Almanac.
     """
+    sin, cos, radians = math.sin, math.cos, math.radians
     days = (utc_s - _J2000_S) / 86400
-    mean_longitude = math.radians(280.460 + 0.9856474 * days)
-    anomaly = math.radians(357.528 + 0.9856003 * days)
-    ecliptic = mean_longitude + math.radians(1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly))
-    tilt = math.radians(23.439 - 4e-7 * days)
-    ascension = math.atan2(math.cos(tilt) * math.sin(ecliptic), math.cos(ecliptic))
-    declination = math.asin(math.sin(tilt) * math.sin(ecliptic))
-    sidereal = math.radians(280.46062 + 360.98564737 * days + longitude_deg)
-    hour, latitude = sidereal - ascension, math.radians(latitude_deg)
-    height = math.asin(
-        math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(hour)
-    )
-    azimuth = math.atan2(
-        -math.sin(hour) * math.cos(declination),
-        math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.sin(latitude) * math.cos(hour),
-    )
-    return azimuth % (2 * math.pi), height
+    mean_longitude, anomaly = radians(280.460 + 0.9856474 * days), radians(357.528 + 0.9856003 * days)
+    ecliptic = mean_longitude + radians(1.915 * sin(anomaly) + 0.020 * sin(2 * anomaly))
+    tilt = radians(23.439 - 4e-7 * days)
+    ascension = math.atan2(cos(tilt) * sin(ecliptic), cos(ecliptic))
+    declination = math.asin(sin(tilt) * sin(ecliptic))
+    hour = radians(280.46062 + 360.98564737 * days + longitude_deg) - ascension
+    latitude = radians(latitude_deg)
+    height = math.asin(sin(latitude) * sin(declination) + cos(latitude) * cos(declination) * cos(hour))
+    north = sin(declination) * cos(latitude) - cos(declination) * sin(latitude) * cos(hour)
+    return math.atan2(-sin(hour) * cos(declination), north) % (2 * math.pi), height
 
 
 def shadow_m(sun_rad: tuple[float, float], height_m: float) -> Float[np.ndarray, "2"]:
@@ -108,14 +116,11 @@ def remove_shadow(
     """Pixels of the feet of bodies whose foreground, body and shadow together, has its mean at middle_px.
 
     From the air a walker's shadow is often larger than the walker. foot_m: about where the feet are. Body and shadow
-    are strips of one width, so each weighs as its length in the picture; from above at least a body's width shows.
+    are strips of one width, so each is weighted by its length in the picture; from above at least a body's width shows.
     """
     foot = project(foot_m, pose, camera)
-
-    def away(*step_m: float) -> np.ndarray:
-        return project(foot_m + np.array(step_m), pose, camera) - foot
-
-    head, tip, aside = away(0, 0, height_m), away(*shadow, 0), away(BODY_WIDTH_M, 0, 0)
+    steps_m = (0, 0, height_m), (*shadow, 0), (BODY_WIDTH_M, 0, 0)
+    head, tip, aside = (project(foot_m + np.array(step), pose, camera) - foot for step in steps_m)
     body, shade = np.hypot(np.linalg.norm(head, axis=1), np.linalg.norm(aside, axis=1)), np.linalg.norm(tip, axis=1)
     mean = (body[:, None] * head / 2 + shade[:, None] * tip / 2) / (body + shade)[:, None]
     return middle_px - mean
@@ -129,7 +134,8 @@ class TargetSpeeds:
     """
 
     def __init__(self) -> None:
-        self._tracks: dict[int, _SpeedTrack] = {}
+        # By identity: time in seconds, (4,) east, north and their velocities, and their covariance (4, 4).
+        self._tracks: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
 
     def update(
         self,
@@ -147,35 +153,22 @@ class TargetSpeeds:
         for row, name in enumerate(identity.tolist()):
             if name < 1:
                 continue
-            track = self._tracks.get(name)
-            if track is None or not 0 < time_s - track.time_s <= _FORGET_S:
-                self._tracks[name] = _SpeedTrack(time_s, east_north_m[row], covariance_m2[row])
+            place, noise = east_north_m[row], covariance_m2[row]
+            lapse = time_s - self._tracks[name][0] if name in self._tracks else 0.0
+            if not 0 < lapse <= _FORGET_S:
+                spread = np.diag([0.0, 0.0, _FASTEST_M_S**2, _FASTEST_M_S**2])
+                spread[:2, :2] = noise
+                self._tracks[name] = time_s, np.array([*place, 0.0, 0.0]), spread
                 continue
-            track.update(time_s, east_north_m[row], covariance_m2[row])
-            if track.covariance.diagonal()[2:].max() < _KNOWN_M_S**2:
-                velocity[row] = track.state[2:]
-        self._tracks = {name: track for name, track in self._tracks.items() if time_s - track.time_s <= _FORGET_S}
+            _, state, spread = self._tracks[name]
+            move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
+            drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
+            state, spread = move @ state, move @ spread @ move.T + drive
+            # A place that is said to be exact would leave nothing to invert.
+            gain = spread[:, :2] @ np.linalg.inv(spread[:2, :2] + noise + 1e-12 * np.eye(2))
+            state, spread = state + gain @ (place - state[:2]), spread - gain @ spread[:2]
+            self._tracks[name] = time_s, state, spread
+            if spread.diagonal()[2:].max() < _KNOWN_M_S**2:
+                velocity[row] = state[2:]
+        self._tracks = {name: track for name, track in self._tracks.items() if time_s - track[0] <= _FORGET_S}
         return velocity
-
-
-class _SpeedTrack:
-    """state: (4,) east, north and their velocities."""
-
-    def __init__(self, time_s: float, place: np.ndarray, covariance: np.ndarray) -> None:
-        self.time_s = time_s
-        self.state = np.array([*place, 0.0, 0.0])
-        self.covariance = np.zeros((4, 4))
-        self.covariance[:2, :2] = covariance
-        self.covariance[2:, 2:] = _FASTEST_M_S**2 * np.eye(2)
-
-    def update(self, time_s: float, place: np.ndarray, covariance: np.ndarray) -> None:
-        lapse = time_s - self.time_s
-        move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
-        drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
-        state, spread = move @ self.state, move @ self.covariance @ move.T + drive
-        # A place that is said to be exact would leave nothing to invert.
-        total = spread[:2, :2] + covariance + 1e-12 * np.eye(2)
-        gain = spread[:, :2] @ np.linalg.inv(total)
-        self.state = state + gain @ (place - state[:2])
-        self.covariance = spread - gain @ spread[:2]
-        self.time_s = time_s

@@ -6,6 +6,7 @@ the camera's. People of different heights average out; the scale is that of the 
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -90,14 +91,13 @@ def calibrate_pose(
         return (head[rows] - np.tan(np.arctan(slope) - pitch)) / (feet[rows] - head[rows])
 
     # Beyond the horizon the tangent turns round; the bounds keep feet of most people below it.
-    robust = {"loss": "soft_l1", "f_scale": max(height_sigma, 1e-3)}
     bounds = [-0.3, np.log(0.05)], [1.5, np.log(1000)]
+    fit = partial(least_squares, residual, bounds=bounds, loss="soft_l1", f_scale=max(height_sigma, 1e-3))
     everyone = np.ones(len(box), bool)
     starts = [np.array([pitch, np.log(height)]) for pitch in _PITCHES for height in _HEIGHTS]
-    fits = (least_squares(residual, start, args=(everyone,), bounds=bounds, **robust) for start in starts)
-    best = min(fits, key=lambda fit: fit.cost).x
+    best = min((fit(start, args=(everyone,)) for start in starts), key=lambda found: found.cost).x
     block = np.arange(len(box)) * _BLOCKS // len(box)
-    without = [least_squares(residual, best, args=(block != n,), bounds=bounds, **robust).x for n in range(_BLOCKS)]
+    without = [fit(best, args=(block != n,)).x for n in range(_BLOCKS)]
     sigma = np.sqrt((_BLOCKS - 1) * np.array(without).var(axis=0))
     height = float(np.exp(best[1])) * body_height_m
     if not sigma[1] < _UNSURE:

@@ -257,7 +257,7 @@ def _find_samples(hsv: np.ndarray, least_area_px: int, picture: int) -> list[Col
             fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
             long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
             compact = (fill >= _FILL) & (long <= _LONG) & (patches.area_px <= _MOST * mask.size)
-            found += [_sample(hsv, mask, patches, k, total, picture) for k in np.flatnonzero(compact)]
+            found += [_sample(hsv, mask, patches, k, total, picture) for k in np.flatnonzero(compact).tolist()]
     kept: list[ColourSample] = []
     for sample in sorted(found, key=lambda sample: -sample.score):
         if all(
@@ -321,8 +321,8 @@ def build_ranges(
             if others == 0:
                 break
         chosen.append(min(tried, key=lambda one: one[0]))
-    low, high = (np.array([one[side] for one in chosen], np.int64) for side in (1, 2))
-    return low, high, [one[0] for one in chosen]
+    lowest, highest = (np.array([one[side] for one in chosen], np.int64) for side in (1, 2))
+    return lowest, highest, [one[0] for one in chosen]
 
 
 def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:

@@ -287,7 +287,7 @@ class LandmarkTracker:
         """Choose the patches of this frame that are the landmarks."""
         for mask, colour in zip(masks, self._colours, strict=True):
             found = find_patches(mask, self._parameters.least_area_px)
-            colour.update(found, inside(found.centre_px, boxes).any(axis=1), now_from_before)
+            colour.update(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)), now_from_before)
         # Plates of one team are alike in size: those of others tell the usual size.
         usual = np.inf
         for _ in range(2):

@@ -1,4 +1,9 @@
-"""Landmarks in the pictures of a clip."""
+"""Landmarks in the pictures of a clip: found by their colours or given by the table, and removed from the targets.
+
+Then crowds: targets that are close together on the ground and move alike count as one target. Appendix A takes each
+crowd for one target of the aerial camera. How far its people may be apart is in metres here, not in pixels of a
+closing kernel, so that it is the same at every altitude.
+"""
 
 import time
 from dataclasses import dataclass, replace
@@ -12,7 +17,7 @@ from torchvision_dddas.geo.colours import ColourFinder
 from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
 from torchvision_dddas.geo.plane_homography import LEAST
 from torchvision_dddas.geo.projection import distort_pixels, project
-from torchvision_dddas.geometry import connected_parts, middles_of, transfer
+from torchvision_dddas.geometry import connected_parts, inside, middles_of, transfer
 from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, Int, LandmarkObservations, Landmarks, Scene
 
 # A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.
@@ -21,6 +26,8 @@ _REACH = 0.75
 _LEAST_M2 = 0.4
 # What is left of a vehicle's own blob must be this many times larger: as a rule it is the vehicle's shadow.
 _VEHICLE_REST = 4
+# A blob's centre so many standard deviations from where the landmark is expected gives way to a colour half as far.
+_ASTRAY_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -67,10 +74,13 @@ class LandmarkWatch:
     def __init__(self, locator: AerialLocator, colours: Colours | None, finder: ColourFinder | None) -> None:
         """colours, finder: None where the table of landmarks gives their pixels."""
         self.locator, self._colours, self._finder = locator, colours, finder
-        names = locator.site.landmarks.names
-        self._which = np.array([names.index(name) for name in colours.names], np.int64) if colours else np.zeros(0, int)
-        self._tracker = LandmarkTracker(len(colours), locator.settings.landmarks) if colours else None
         self._fix: Fix | None = None
+        if colours is not None:
+            names = locator.site.landmarks.names
+            # The colour of each landmark, -1 for none.
+            self._colour_of = np.full(len(names), -1)
+            self._colour_of[[names.index(name) for name in colours.names]] = np.arange(len(colours))
+            self._tracker = LandmarkTracker(len(colours), locator.settings.landmarks)
 
     def restarted(self) -> "LandmarkWatch":
         """The same watch as before its first scene."""
@@ -79,74 +89,72 @@ class LandmarkWatch:
     def update(self, scene: Scene) -> WatchedScene:
         """The next scene, without its landmarks, and its fix."""
         start = time.perf_counter()
-        frame = scene.frame.number
-        marks = self.locator.landmarks_at(frame)
-        if self._tracker is not None:
-            marks, scene, by = self._found(scene, marks)
+        marks = self.locator.landmarks_at(scene.frame.number)
+        if self._colours is not None and self._finder is not None:
+            marks, scene, by = self._find(scene, marks, self._colours, self._finder)
         else:
-            by = ("table",) * len(marks)
-            scene = without_detections(scene, _holding(scene.detections.box_px, marks.image_px))
+            by = np.full(len(marks), "table")
+            # The smallest box that holds a landmark is its own.
+            box_px, shown = scene.detections.box_px, np.isfinite(marks.image_px).all(axis=1)
+            area = np.where(inside(marks.image_px[shown], box_px), box_px[:, 2] * box_px[:, 3], np.inf)
+            own = np.zeros(len(box_px), bool)
+            own[[row.argmin() for row in area if np.isfinite(row).any()]] = True
+            scene = without_detections(scene, own)
         spent = time.perf_counter() - start
-        fixed = self.locator.fix_frame(frame, marks)
+        fixed = self.locator.fix_frame(scene.frame.number, marks)
         self._fix = fixed.fix
-        used = dict(zip(marks.landmark.tolist(), by, strict=True))
+        found_by = dict(zip(marks.landmark.tolist(), by.tolist(), strict=True))
         return WatchedScene(
             scene,
             replace(fixed, seconds={"landmarks": spent, **fixed.seconds}),
-            tuple(used[which] for which in fixed.marks.landmark.tolist()),
+            tuple(found_by[which] for which in fixed.marks.landmark.tolist()),
         )
 
-    def _found(self, scene: Scene, marks: LandmarkObservations) -> tuple[LandmarkObservations, Scene, tuple[str, ...]]:
+    def _find(
+        self, scene: Scene, marks: LandmarkObservations, colours: Colours, finder: ColourFinder
+    ) -> tuple[LandmarkObservations, Scene, np.ndarray]:
         """The landmarks with their pixels, the scene without them, and by what each was found."""
-        assert self._tracker is not None
-        assert self._finder is not None
-        assert self._colours is not None
-        image = scene.frame.image
+        image, step = scene.frame.image, scene.camera_motion
         if image.ndim == 2:
             raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
-        step = scene.camera_motion
-        place = {which: k for k, which in enumerate(self._which.tolist())}
-        expected, length = np.full((len(self._colours), 2), np.nan), np.full(len(self._colours), np.nan)
-        pixels, scale = self._expected(marks, step)
-        for row, which in enumerate(marks.landmark.tolist()):
-            if which in place:
-                expected[place[which]] = pixels[row]
-                length[place[which]] = self.locator.settings.landmarks.length_m * scale[row]
-        masks = self._finder(image, self._colours.low, self._colours.high)
+        colour = self._colour_of[marks.landmark]
+        rows = np.flatnonzero(colour >= 0)
+        colour = colour[rows]
+        expected, length = np.full((len(colours), 2), np.nan), np.full(len(colours), np.nan)
+        should_px, px_per_m = self._expected(marks, step)
+        expected[colour] = should_px[rows]
+        length[colour] = self.locator.settings.landmarks.length_m * px_per_m[rows]
+        masks = finder(image, colours.low, colours.high)
         seen = self._tracker.update(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
-        pixels = np.full((len(marks), 2), np.nan)
-        by = [""] * len(marks)
-        for row, which in enumerate(marks.landmark.tolist()):
-            if which in place:
-                k = place[which]
-                pixels[row], by[row] = seen.image_px[k], seen.by[k]
-                if by[row] == "motion" and _astray(pixels[row], seen.colour_px[k], expected[k], marks.pixel_sigma[row]):
-                    pixels[row], by[row] = seen.colour_px[k], "colour"
-        marks = self._from_bodies(replace(marks, image_px=pixels), np.array([how == "motion" for how in by], bool))
-        return marks, self._cut(scene, seen, length), tuple(by)
-
-    def _from_bodies(self, marks: LandmarkObservations, moving: np.ndarray) -> LandmarkObservations:
-        """Move pixels of blobs, which include shadows, to the vehicle's feet; colours stay at height_m."""
-        height = self.locator.settings.landmarks.height_m
-        if not height or not moving.any():
-            return marks
-        up_m, pixels = marks.up_m.copy(), marks.image_px.copy()
-        feet = None if self._fix is None else self.locator.feet_px(pixels[moving], self._fix, height)
-        up_m[moving] -= height / 2 if feet is None else height
-        if feet is not None:
-            pixels[moving] = feet
-        return replace(marks, up_m=up_m, image_px=pixels)
+        pixels, by = np.full((len(marks), 2), np.nan), np.full(len(marks), "", "<U6")
+        pixels[rows], by[rows] = seen.image_px[colour], np.array(seen.by, "<U6")[colour]
+        # Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the
+        # vehicle's: where the colour is clearly nearer to where the landmark is expected, it counts.
+        worn = np.full((len(marks), 2), np.nan)
+        worn[rows] = seen.colour_px[colour]
+        off, colour_off = (np.linalg.norm(at - should_px, axis=1) for at in (pixels, worn))
+        astray = (by == "motion") & (off > _ASTRAY_SIGMAS * marks.pixel_sigma) & (colour_off < 0.5 * off)
+        pixels[astray], by[astray] = worn[astray], "colour"
+        # Blobs include shadows: their pixels are moved to the vehicle's feet. Colours stay at height_m.
+        height, moving, up_m = self.locator.settings.landmarks.height_m, by == "motion", marks.up_m.copy()
+        if height and moving.any():
+            feet = None if self._fix is None else self.locator.feet_px(pixels[moving], self._fix, height)
+            up_m[moving] -= height / 2 if feet is None else height
+            if feet is not None:
+                pixels[moving] = feet
+        return replace(marks, up_m=up_m, image_px=pixels), self._cut(scene, seen, length), by
 
     def _cut(self, scene: Scene, seen: TrackedLandmarks, length_px: np.ndarray) -> Scene:
         """The scene without the landmarks' own blobs, and without their part of shared ones."""
-        parameters = self.locator.settings.landmarks
+        settings = self.locator.settings
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
             return without_detections(scene, seen.rows)
-        metre = np.nanmedian(length_px) / parameters.length_m if np.isfinite(length_px).any() else np.nan
-        least = max(self.locator.settings.small.min_area_px, _LEAST_M2 * metre**2) if np.isfinite(metre) else np.inf
-        found, mask = cut_out_landmarks(
-            scene.detections, scene.mask, seen.rows, seen.colour_px, _REACH * length_px, least
-        )
+        least = np.inf
+        if np.isfinite(length_px).any():
+            metre = np.nanmedian(length_px) / settings.landmarks.length_m
+            least = max(settings.small.min_area_px, _LEAST_M2 * metre**2)
+        radius_px = _REACH * length_px
+        found, mask = cut_out_landmarks(scene.detections, scene.mask, seen.rows, seen.colour_px, radius_px, least)
         return replace(scene, detections=found, mask=mask)
 
     def _expected(self, marks: LandmarkObservations, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -154,49 +162,26 @@ class LandmarkWatch:
 
         NaN where unknown.
         """
-        fix, n = self._fix, len(marks)
-        if fix is None or step is None or (fix.pose is None and fix.image_from_ground is None):
-            return np.full((n, 2), np.nan), np.full(n, np.nan)
+        fix, camera = self._fix, self.locator.camera
         beside = np.concatenate([marks.east_north_m + metre for metre in ((0, 0), (1, 0), (0, 1))])
-        if fix.pose is not None:
-            before = project(np.c_[beside, np.tile(marks.up_m, 3)], fix.pose, self.locator.camera)
-        else:
-            assert fix.image_from_ground is not None
+        if fix is not None and step is not None and fix.pose is not None:
+            before = project(np.c_[beside, np.tile(marks.up_m, 3)], fix.pose, camera)
+        elif fix is not None and step is not None and fix.image_from_ground is not None:
             before = transfer(fix.image_from_ground, beside)
-            before = before if fix.by == "paper" else distort_pixels(before, self.locator.camera)
+            before = before if fix.by == "paper" else distort_pixels(before, camera)
+        else:
+            return np.full((len(marks), 2), np.nan), np.full(len(marks), np.nan)
         here, east, north = np.split(transfer(step, before), 3)
         return here, np.maximum(*(np.linalg.norm(there - here, axis=1) for there in (east, north)))
 
 
-def _astray(
-    blob_px: np.ndarray, colour_px: np.ndarray, expected_px: np.ndarray, sigma_px: float, least_sigmas: float = 3.0
-) -> bool:
-    """Whether a landmark's colour is clearly nearer to where the landmark is expected than the centre of its blob.
-
-    Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the vehicle's.
-    """
-    blob, colour = (float(np.linalg.norm(at - expected_px)) for at in (blob_px, colour_px))
-    return blob > least_sigmas * sigma_px and colour < 0.5 * blob
-
-
-def _holding(box_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether a box is the smallest that holds one of the points."""
-    held = np.zeros(len(box_px), bool)
-    for point in points_px[np.isfinite(points_px).all(axis=1)]:
-        inside = ((point >= box_px[:, :2] - 0.5) & (point <= box_px[:, :2] + box_px[:, 2:] - 0.5)).all(axis=1)
-        if inside.any():
-            held[np.where(inside, box_px[:, 2] * box_px[:, 3], np.inf).argmin()] = True
-    return held
-
-
-def without_detections(scene: Scene, rows: np.ndarray) -> Scene:
-    """A scene without some of its detections. rows: (N,) bool."""
+def without_detections(scene: Scene, rows: Bool[np.ndarray, " N"]) -> Scene:
+    """A scene without some of its detections."""
     if not rows.any():
         return scene
-    kept = ~rows
     value = np.zeros(len(rows) + 1, np.uint16)
-    value[1:][kept] = np.arange(1, kept.sum() + 1)
-    return replace(scene, detections=scene.detections[kept], mask=value[scene.mask])
+    value[1:][~rows] = np.arange(1, (~rows).sum() + 1)
+    return replace(scene, detections=scene.detections[~rows], mask=value[scene.mask])
 
 
 def cut_out_landmarks(
@@ -219,35 +204,26 @@ def cut_out_landmarks(
         cv2.circle(outside, (round(float(u)), round(float(v))), max(round(float(radius)), 1), 0, cv2.FILLED)
     rows, boxes, areas = [], [], []
     numbered = np.zeros_like(mask)
-    for row in range(len(found)):
-        x, y, width, height = (int(side) for side in found.box_px[row])
+    for row, (x, y, width, height) in enumerate(found.box_px.astype(int).tolist()):
         # Boxes of blobs lie within the picture; a vehicle that no disc is known for goes whole.
-        window = np.s_[max(y, 0) : y + height, max(x, 0) : x + width]
-        left, whole = outside[window] == row + 1, mask[window] == row + 1
-        touched = left.sum() < whole.sum()
-        if vehicles[row] and not touched:
-            continue
-        # What a vehicle's own blob leaves outside is as a rule its shadow.
-        least = max(least_px * (_VEHICLE_REST if vehicles[row] else 1), 1)
-        parts = connected_parts(left, (max(x, 0), max(y, 0), width, height), least) if touched else []
-        if not touched:
-            parts = [((x, y, width, height), whole)]
+        left, top = max(x, 0), max(y, 0)
+        window = np.s_[top : y + height, left : x + width]
+        rest, whole = outside[window] == row + 1, mask[window] == row + 1
+        if rest.sum() < whole.sum():
+            least = max(least_px * (_VEHICLE_REST if vehicles[row] else 1), 1)
+            parts = connected_parts(rest, (left, top, width, height), least)
+            areas += [float(part.sum()) for _, part in parts]
+        else:
+            parts = [] if vehicles[row] else [((x, y, width, height), whole)]
+            areas += [float(found.area_px[row])] * len(parts)
         for box, part in parts:
             rows.append(row)
             boxes.append(box)
-            areas.append(float(part.sum()) if touched else float(found.area_px[row]))
-            there = numbered[max(box[1], 0) : box[1] + box[3], max(box[0], 0) : box[0] + box[2]]
-            there[part] = len(rows)
-    kept = np.array(rows, np.int64)
-    left_over = Detections(
-        np.array(boxes, float).reshape(-1, 4),
-        found.score[kept],
-        np.array(areas, float),
-        found.heading_rad[kept],
-        found.speed_px[kept],
-        found.kind,
-    )
-    return left_over, numbered
+            numbered[max(box[1], 0) : box[1] + box[3], max(box[0], 0) : box[0] + box[2]][part] = len(rows)
+    kept = found[np.array(rows, np.int64)]
+    unknown = np.full((len(rows), 2), np.nan)
+    box_px = np.array(boxes, float).reshape(-1, 4)
+    return replace(kept, box_px=box_px, area_px=np.array(areas, float), middle_px=unknown), numbered
 
 
 def group_crowds(watched: WatchedScene, locator: AerialLocator, rate_hz: float) -> WatchedScene:
@@ -293,10 +269,11 @@ def group_targets(
     near = (apart <= join_m) & ~(away > speed_m_s) | np.eye(count, dtype=bool)
     leader = np.arange(count)
     while True:
-        lower = np.array([leader[row].min() for row in near], np.int64)
-        if (lower == leader).all():
-            return np.unique(leader, return_inverse=True)[1].astype(np.int64)
+        lower = np.where(near, leader, count).min(axis=1, initial=count)
+        if np.array_equal(lower, leader):
+            break
         leader = lower
+    return np.unique(leader, return_inverse=True)[1].astype(np.int64)
 
 
 def merge_detections(
@@ -304,7 +281,7 @@ def merge_detections(
 ) -> tuple[Detections, np.ndarray]:
     """The crowds as detections, and the (H, W) mask with their numbers. crowd: as by `group_targets`.
 
-    The velocity of a crowd is the mean of its parts', weighed by area; its middle is the mean of their foreground.
+    The velocity of a crowd is the mean of its parts', weighted by area; its middle is the mean of their foreground.
     """
     size = int(crowd.max(initial=-1)) + 1
     area = np.maximum(found.area_px, 1e-9)
@@ -312,27 +289,18 @@ def merge_detections(
     def total(values: np.ndarray) -> np.ndarray:
         return np.bincount(crowd, values, size)
 
-    low, high = np.full((size, 2), np.inf), np.full((size, 2), -np.inf)
+    low, high, score = np.full((size, 2), np.inf), np.full((size, 2), -np.inf), np.zeros(size)
     np.minimum.at(low, crowd, found.box_px[:, :2])
     np.maximum.at(high, crowd, found.box_px[:, :2] + found.box_px[:, 2:])
-    score = np.zeros(size)
     np.maximum.at(score, crowd, found.score)
-    known = np.isfinite(found.speed_px) & np.isfinite(found.heading_rad)
-    weight = np.where(known, area, 0.0)
-    speed, heading = np.where(known, found.speed_px, 0.0), np.where(known, found.heading_rad, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        across = total(weight * speed * np.cos(heading)) / total(weight)
-        down = total(weight * speed * np.sin(heading)) / total(weight)
+        velocity = found.speed_px * np.exp(1j * found.heading_rad)
+        known = np.isfinite(velocity)
+        weight, velocity = np.where(known, area, 0.0), np.where(known, velocity, 0.0)
+        across, down = total(weight * velocity.real) / total(weight), total(weight * velocity.imag) / total(weight)
         middle = np.stack([total(area * found.middle_px[:, k]) / total(area) for k in range(2)], axis=1)
-    number = np.zeros(len(crowd) + 1, mask.dtype)
-    number[1:] = crowd + 1
-    crowds = Detections(
-        np.c_[low, high - low].reshape(-1, 4),
-        score,
-        total(found.area_px),
-        np.where(np.hypot(across, down) > 0, np.arctan2(down, across), np.nan),
-        np.hypot(across, down),
-        found.kind,
-        middle,
-    )
-    return crowds, number[mask]
+    speed = np.hypot(across, down)
+    heading = np.where(speed > 0, np.arctan2(down, across), np.nan)
+    box_px = np.c_[low, high - low].reshape(-1, 4)
+    number = np.r_[0, crowd + 1].astype(mask.dtype)
+    return Detections(box_px, score, total(found.area_px), heading, speed, found.kind, middle), number[mask]

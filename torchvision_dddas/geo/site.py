@@ -10,17 +10,16 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import ground_height
-from torchvision_dddas.geometry import great_circle_m
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)
 
 # Telemetry holds this long before its first and after its last sample.
-HOLDS_S = 1.0
+_HOLDS_S = 1.0
 # A camera that looks higher above the horizon shows no landmarks as a rule: its angles have the other sign.
 _HIGHEST_DEG = 20.0
 # No vehicle sees landmarks from further away: then the files are of two flights.
-FARTHEST_M = 100_000.0
+_FARTHEST_M = 100_000.0
 
 
 @dataclass(frozen=True)
@@ -40,68 +39,73 @@ class Site:
     @property
     def places(self) -> np.ndarray:
         """(N, 2) where landmarks and vehicle were, local metres."""
-        known = [self.landmarks.place, *([self.telemetry.place] if self.telemetry is not None else [])]
-        return np.concatenate([place[np.isfinite(place).all(axis=1)] for place in known])
+        return np.concatenate([_known(self.landmarks), _known(self.telemetry)])
+
+
+def _known(reports: Landmarks | Telemetry | None) -> np.ndarray:
+    """(N, 2) the places that are reported."""
+    place = np.zeros((0, 2)) if reports is None else reports.place
+    return place[np.isfinite(place).all(axis=1)]
 
 
 def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site:
     """Everything in local metres: those of the landmarks, or east and north of their first place.
 
     Without landmarks the metres are those of the telemetry, or east and north of the vehicle's first place.
-    Raises InputError where neither gives a place, degrees and metres are mixed, longitude and latitude look swapped, or
-    the vehicle's altitude is below the ground throughout.
+    Raises InputError where neither gives a place, degrees and metres are mixed, longitude and latitude look swapped,
+    the vehicle's altitude is below the ground throughout, its camera looks into the sky, or it is far from landmarks.
     """
     if telemetry is not None:
         _check_telemetry(telemetry)
-    flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)] if telemetry is not None else np.zeros((0, 2))
+    flown = _known(telemetry)
     if landmarks is None:
-        return _without_landmarks(telemetry, flown)
-    known = np.isfinite(landmarks.place).all(axis=1)
-    if not known.any():
+        if telemetry is None or not len(flown):
+            raise InputError("locating needs landmarks, or telemetry that says where the vehicle is; got neither")
+        places, rows = np.zeros((0, 2)), np.zeros(0)
+        none = rows.astype(np.int64)
+        landmarks = Landmarks((), rows, none, places, places, rows, rows.astype(bool), none, telemetry.geographic)
+        first = flown[0]
+    elif not len(_known(landmarks)):
         raise InputError(f"landmarks {landmarks.path}: no row has a place; wanted longitude_deg,latitude_deg or metres")
-    if telemetry is not None and len(flown) and telemetry.geographic != landmarks.geographic:
-        kinds = ("longitude and latitude", "local metres")
-        first, second = kinds if landmarks.geographic else kinds[::-1]
-        raise InputError(f"the landmarks are in {first}, the telemetry in {second}; give both in one kind")
-    origin = None
-    if landmarks.geographic:
-        if len(flown):
-            longitude, latitude = (float(v) for v in np.median(flown, axis=0))
+    else:
+        first = _known(landmarks)[0]
+        if telemetry is not None and len(flown) and telemetry.geographic != landmarks.geographic:
+            kinds = ("longitude and latitude", "local metres")
+            one, other = kinds if landmarks.geographic else kinds[::-1]
+            raise InputError(f"the landmarks are in {one}, the telemetry in {other}; give both in one kind")
+        if landmarks.geographic and len(flown):
+            longitude, latitude = np.median(flown, axis=0).tolist()
             if looks_swapped(landmarks, (longitude, latitude)):
                 raise InputError(
                     f"landmarks {landmarks.path}: longitude and latitude look swapped; the vehicle is at longitude "
                     f"{longitude:.5f}, latitude {latitude:.5f}"
                 )
-        longitude, latitude = landmarks.place[known][0].tolist()
-        origin = (longitude, latitude)
+    origin = None
+    if landmarks.geographic:
+        origin = float(first[0]), float(first[1])
         landmarks = to_local(landmarks, origin)
         telemetry = None if telemetry is None else to_local(telemetry, origin)
-    if telemetry is not None:
-        _check_near(landmarks, telemetry)
+    flown = _known(telemetry)
+    if len(flown) and len(landmarks):
+        away = np.linalg.norm(flown - np.nanmedian(landmarks.place, axis=0), axis=1).min()
+        if away > _FARTHEST_M:
+            raise InputError(
+                f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; "
+                f"wanted {_FARTHEST_M / 1000:g} km at most: give the telemetry of this flight, its places counted as "
+                "theirs"
+            )
     return Site(landmarks, telemetry, origin)
-
-
-def _without_landmarks(telemetry: Telemetry | None, flown: np.ndarray) -> Site:
-    if telemetry is None or not len(flown):
-        raise InputError("locating needs landmarks, or telemetry that says where the vehicle is; got neither")
-    empty = np.zeros((0, 2))
-    none = np.zeros(0, np.int64)
-    landmarks = Landmarks((), none.astype(float), none, empty, empty, np.zeros(0), none.astype(bool), none, False)
-    if not telemetry.geographic:
-        return Site(landmarks, telemetry, None)
-    origin = float(flown[0, 0]), float(flown[0, 1])
-    return Site(landmarks, to_local(telemetry, origin), origin)
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
     """Whether longitude and latitude are swapped, judged by a place in degrees that must be near, as the vehicle's."""
-    known = landmarks.place[np.isfinite(landmarks.place).all(axis=1)]
+    known = _known(landmarks)
     if not landmarks.geographic or not len(known) or not np.isfinite(near_lonlat).all():
         return False
     near, middle = np.array(near_lonlat, float), np.median(known, axis=0)
-    given, swapped = (float(great_circle_m(point[None], near)[0]) for point in (middle, middle[::-1]))
+    given, swapped = (float(geometry.great_circle_m(point[None], near)[0]) for point in (middle, middle[::-1]))
     # Where longitude and latitude are nearly alike, swapping them moves a place by little.
-    return swapped < FARTHEST_M and given > 10 * max(swapped, 300.0)
+    return swapped < _FARTHEST_M and given > 10 * max(swapped, 300.0)
 
 
 def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
@@ -110,7 +114,6 @@ def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
 
 
 def _check_telemetry(telemetry: Telemetry) -> None:
-    """Raises InputError for altitudes at or below the ground throughout, and for pitch angles counted upward."""
     altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
     if len(altitude) and (altitude <= 0).all():
         raise InputError(
@@ -125,23 +128,10 @@ def _check_telemetry(telemetry: Telemetry) -> None:
         )
 
 
-def _check_near(landmarks: Landmarks, telemetry: Telemetry) -> None:
-    """Raises InputError for a vehicle that is never near the landmarks; both in local metres."""
-    flown = telemetry.place[np.isfinite(telemetry.place).all(axis=1)]
-    if not len(flown):
-        return
-    away = np.linalg.norm(flown - np.nanmedian(landmarks.place, axis=0), axis=1).min()
-    if away > FARTHEST_M:
-        raise InputError(
-            f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; wanted "
-            f"{FARTHEST_M / 1000:g} km at most: give the telemetry of this flight, its places counted as theirs"
-        )
-
-
 def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> None:
     """Raises InputError, with both spans, for telemetry that does not overlap the clip or table."""
     first, last = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
-    if last < from_s - HOLDS_S or first > to_s + HOLDS_S:
+    if last < from_s - _HOLDS_S or first > to_s + _HOLDS_S:
         raise InputError(
             f"the telemetry covers {first:.1f} to {last:.1f} s, the {what} {from_s:.1f} to {to_s:.1f} s; they do not "
             "overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
@@ -151,27 +141,23 @@ def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> N
 def describe_unknown_heights(site: Site) -> list[str]:
     """Notes on unknown heights of the vehicle, and of the ground below it or at landmarks."""
     telemetry, notes = site.telemetry, []
-    if site.elevation is None:
-        level = telemetry is not None and not np.isfinite(telemetry.altitude_m).any()
-        if telemetry is not None and level and np.isfinite(telemetry.above_sea_m).any():
+    if site.elevation is not None:
+        for reports, what in (
+            (site.landmarks, "at {} of {} places of landmarks: they are not used there"),
+            (telemetry, "below the vehicle in {} of {} samples: its altitude is not used there"),
+        ):
+            places = _known(reports)
+            if missing := int(np.isnan(ground_height(site.elevation, places)).sum()):
+                notes.append("the elevation has no height " + what.format(missing, len(places)))
+    elif telemetry is not None:
+        if not np.isfinite(telemetry.altitude_m).any() and np.isfinite(telemetry.above_sea_m).any():
             notes.append("the telemetry says heights above sea alone: give --dem, the ground's, or they are of no use")
-        if telemetry is not None and (below := int((telemetry.altitude_m <= 0).sum())):
+        low = telemetry.altitude_m <= 0
+        if low.any():
             notes.append(
-                f"the altitude is at or below ground in {below} of {len(telemetry.time_s)} samples, the first at "
-                f"{telemetry.time_s[(telemetry.altitude_m <= 0).argmax()]:.1f} s: it is not used there"
+                f"the altitude is at or below ground in {low.sum()} of {len(low)} samples, the first at "
+                f"{telemetry.time_s[low.argmax()]:.1f} s: it is not used there"
             )
-        return notes
-    for places, what in (
-        (site.landmarks.place, "at {} of {} places of landmarks: they are not used there"),
-        (
-            np.zeros((0, 2)) if telemetry is None else telemetry.place,
-            "below the vehicle in {} of {} samples: its altitude is not used there",
-        ),
-    ):
-        known = places[np.isfinite(places).all(axis=1)]
-        missing = int(np.isnan(ground_height(site.elevation, known)).sum())
-        if missing:
-            notes.append("the elevation has no height " + what.format(missing, len(known)))
     return notes
 
 
@@ -186,9 +172,10 @@ def resolve_camera(
 
     camera: as its file says, None without one. size: (width, height) of the pictures where the camera does not say.
     extent: (width, height) that holds the boxes: it stands for the size where nothing depends on that, as when
-    landmarks alone lay pictures on the ground.
+    landmarks alone map pictures to the ground.
     Raises InputError where the size is not known, or the camera's is another than that of the pictures.
     """
+    parameters = settings.aerial
     if camera is not None:
         if size is not None and tuple(camera.size_px) != tuple(size):
             raise InputError(
@@ -198,25 +185,23 @@ def resolve_camera(
         notes = []
         if math.isfinite(camera.height_m) and telemetry is None:
             notes.append(f"where camera {camera.name} stands is not looked at from the air: give --telemetry")
-        if settings.aerial.mode == "paper" and (camera.k1 or camera.k2):
+        if parameters.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
-        sigma = settings.aerial.focal_sigma
         # A value set by hand overrides the file.
-        return camera if sigma == Settings().aerial.focal_sigma else replace(camera, focal_sigma=sigma), True, notes
-    if size is None and settings.aerial.mode != "pose":
+        if parameters.focal_sigma != Settings().aerial.focal_sigma:
+            camera = replace(camera, focal_sigma=parameters.focal_sigma)
+        return camera, True, notes
+    if size is None and parameters.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:
         raise InputError(
             "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
             "--set aerial.mode=homography, which needs neither"
         )
-    parameters = settings.aerial
     wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
     hfov = float(np.median(wide)) if len(wide) else math.radians(parameters.hfov_deg)
-    focal = size[0] / 2 / math.tan(hfov / 2)
-    made = Camera(
-        "camera", size, (focal, focal), ((size[0] - 1) / 2, (size[1] - 1) / 2), focal_sigma=parameters.focal_sigma
-    )
+    focal, middle = size[0] / 2 / math.tan(hfov / 2), ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    made = Camera("camera", size, (focal, focal), middle, focal_sigma=parameters.focal_sigma)
     if len(wide) or parameters.mode != "pose":
         return made, bool(len(wide)), []
     note = f"neither the camera file nor telemetry gives the field of view: using {parameters.hfov_deg:g} degrees"
