@@ -24,7 +24,6 @@ import torch
 
 from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.evaluation.metrics import accuracy_ratio as ratio_metrics
 from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.matching import pair
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
@@ -82,14 +81,14 @@ def measure_ratio(options: bench.Options) -> tuple[str, Any]:
 
 def score_phases(truth: TrackTable, tracks: list[TrackTable], interval: int) -> list[str]:
     """The cells of a row."""
-    links, switches, idf1 = [ratio_metrics.Windows(), ratio_metrics.Windows()], [], []
+    links, switches, idf1 = [tracking.Windows(), tracking.Windows()], [], []
     for phase, found in enumerate(tracks):
         both = pair(truth.at((truth.frame - 1) % interval == phase), found)
         links = [
-            add_counts(known, ratio_metrics.count(both, interval, size))
+            add_counts(known, tracking.Windows.of(tracking.link_ratios(both, interval, size)))
             for known, size in zip(links, (2, 3), strict=True)
         ]
-        switches.append(tracking.count_clear(both, SAME_IOU).switches)
+        switches.append(tracking.count_clear(both, SAME_IOU)[0].switches)
         idf1.append(100 * tracking.identity_measures(tracking.count_identity(both, SAME_IOU))["idf1"])
     ratios = [f"{100 * known.mean:.2f}" for known in links]
     spread = f"{np.mean(switches):.1f} ({max(switches)})", f"{np.mean(idf1):.1f} ({min(idf1):.1f})"
@@ -222,7 +221,7 @@ def window_ratios(windows: Windows, parameters: PaperParameters, weight: float |
     parts = zip(windows.location, windows.appearance, windows.identities, chosen, strict=True)
     return np.array(
         [
-            ratio_metrics.accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
+            tracking.accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
             for location, appearance, identities, w in parts
         ]
     )

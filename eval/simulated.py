@@ -26,8 +26,7 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control import StartedSource, build_mission, fit_settings
 from torchvision_dddas.control.rules import every_least
 from torchvision_dddas.detection import detect_motion, load_engine, pixels_per_metre
-from torchvision_dddas.evaluation.metrics.crowd_frames import shown
-from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer, TrueFrame
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
@@ -160,7 +159,7 @@ def locate_clip(scenario: Scenario, gps95_m: Mapping[str, float]) -> Case:
         truth = truths.pop(scene.frame.number, None)
         if truth is None:
             continue
-        true = shown(truth)
+        true = TrueFrame(truth)
         for name, one in locators.items():
             scorers[name].feed(true)
             errors[name].append(one.locate(scene, scorers[name], truth))

@@ -181,7 +181,7 @@ def by_clip(sequences: list[Sequence], tracks: list[TrackTable], interval: int) 
         assert sequence.truth.tracks is not None
         clip = pair(sequence.truth.tracks.every(interval), found)
         idf1 = tracking.identity_measures(tracking.count_identity(clip, SAME))["idf1"]
-        scores[sequence.name] = [tracking.count_clear(clip, SAME).switches, 100 * idf1]
+        scores[sequence.name] = [tracking.count_clear(clip, SAME)[0].switches, 100 * idf1]
     return scores
 
 
@@ -223,7 +223,7 @@ def pooled(sequences: list[Sequence], tracks: list[TrackTable]) -> dict:
     for sequence, found in zip(sequences, tracks, strict=True):
         assert sequence.truth.tracks is not None
         clip = pair(sequence.truth.tracks, found)
-        counts = TrackCounts(tracking.count_clear(clip), tracking.count_identity(clip), tracking.count_hota(clip))
+        counts = TrackCounts(tracking.count_clear(clip)[0], tracking.count_identity(clip), tracking.count_hota(clip))
         clips[sequence.name] = figures_of(counts)
         total = add_counts(total, counts)
     return {**figures_of(total), "clips": clips}

@@ -22,8 +22,8 @@ from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError
 from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Source
-from torchvision_dddas.evaluation.evaluate import evaluate
-from torchvision_dddas.evaluation.metrics import clip, truth
+from torchvision_dddas.evaluation.evaluate import evaluate, load_result
+from torchvision_dddas.evaluation.metrics import truth
 from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.geo.site import looks_swapped
 from torchvision_dddas.geometry import poses_at
@@ -143,7 +143,7 @@ def _detections(path: Path) -> None:
 
 def _truth(path: Path) -> None:
     _ = truth.load_truth(path).frames
-    clip.load(path)
+    load_result(path)
 
 
 def _evaluated(path: Path) -> None:
@@ -157,7 +157,7 @@ def _clip(without: str) -> Mapping[str, bytes]:
 
 def _record(path: Path) -> None:
     read_run_record(path.parent)
-    clip.load(path.parent)
+    load_result(path.parent)
 
 
 def _positions(path: Path) -> None:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.accuracy_ratio import accuracy_ratio, mismatches
+from torchvision_dddas.evaluation.metrics.tracking import accuracy_ratio, mismatches
 
 FRAME = np.array([7, 8])
 

@@ -4,16 +4,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.evaluation.metrics.crowd_frames import (
-    Told,
-    bodies_held,
+from torchvision_dddas.evaluation.metrics.crowds import (
+    CAP_M,
+    HOLD_S,
+    CrowdScorer,
+    FoundTargets,
+    TrueFrame,
     covering,
     crowds,
-    pixels_held,
-    shown,
-    touched,
 )
-from torchvision_dddas.evaluation.metrics.crowds import CAP_M, HOLD_S, CrowdScorer
 from torchvision_dddas.types import (
     AerialLocations,
     Bodies,
@@ -175,18 +174,18 @@ def test_only_blobs_that_touch_nothing_are_false():
 
 
 def test_a_body_lies_in_the_box_that_has_half_of_its_pixels():
-    truth = shown(world((1, "person", [(0, 0)])))
+    truth = TrueFrame(world((1, "person", [(0, 0)])))
     u, v = truth.u.min(), truth.v.min()
     boxes = np.array([[u, v, 3, 5], [u, v, 2, 5]], float)
-    assert bodies_held(truth, pixels_held(truth, boxes)).tolist() == [[True], [False]]
+    assert truth.bodies_in(truth.pixels_in(boxes)).tolist() == [[True], [False]]
 
 
 def test_pixels_of_what_is_no_body_touch_and_belong_to_nobody():
     truth = world((1, "person", [(0, 0)]))
     truth.mask[:4, :4] = 3
-    frame = shown(truth)
+    frame = TrueFrame(truth)
     assert frame.pixels.sum() == 25
-    assert touched(frame, np.array([[0, 0, 9, 9.0]])).all()
+    assert frame.untouched(np.array([[0, 0, 9, 9.0]])) == 0
 
 
 def test_the_error_of_a_target_is_that_from_the_people_in_its_box():
@@ -287,8 +286,10 @@ def test_places_told_in_degrees_are_taken_to_the_truths_metres():
 
 
 def test_an_empty_world_has_no_crowds():
-    truth = shown(world())
-    told = Told(np.zeros((1, 4)), np.ones(1, int), np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2)), ("human",))
-    held = bodies_held(truth, pixels_held(truth, told.box_px))
+    truth = TrueFrame(world())
+    told = FoundTargets(
+        np.zeros((1, 4)), np.ones(1, int), np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2)), ("human",)
+    )
+    held = truth.bodies_in(truth.pixels_in(told.box_px))
     assert crowds(truth) == []
     assert covering(truth, [], told, held).shape == (0, 1)

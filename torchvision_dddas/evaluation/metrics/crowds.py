@@ -1,38 +1,44 @@
-"""How well crowds were found, followed, located and told from vehicles in a simulated run, from truth and results.
+"""How well crowds were detected, tracked, located and confirmed in a simulated run, from truth and results.
 
-Every measure is defined at its field of CrowdScore; what lies in a box and what covers a crowd in crowd_frames.
+Every measure is defined at its field of CrowdScore. Boxes are x, y of the top left pixel, width, height; a pixel is in
+a box that holds its centre. Metres are the truth's.
 """
 
 import math
 from array import array
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 
+import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.crowd_frames import (
-    LEAST_VISIBLE,
-    Crowd,
-    Shown,
-    Told,
-    bodies_held,
-    box_about,
-    covering,
-    crowds,
-    pixels_held,
-    shown,
-    touched,
-)
+from torchvision_dddas.evaluation.metrics.boxes import areas
 from torchvision_dddas.evaluation.metrics.matching import pair
+from torchvision_dddas.evaluation.metrics.metres import inside
 from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.types import FrameResult, Truth
 
-INSIDE = 5.991
-"""Of chi-square with two degrees of freedom, in 95 %."""
+LEAST_VISIBLE = 0.5
+"""A crowd counts in frames that show at least this share of its people."""
+
+COVERING = 0.3
+"""A box over a crowd shares at least so much of the smaller of the two boxes."""
+
+NEAR_M = 2.0
+"""A target this near to a small crowd's middle is it, wherever its box lies."""
+
+LARGEST, MARGIN_PX = 10.0, 10.0
+"""A box of more than so many times the area of what it holds, grown by a margin on every side, covers nothing."""
+
+TOUCHING_PX = 5.0
+"""A blob this near to a pixel of something that can move is no false one: it may be its shadow or its edge."""
+
+STILL_M_S = 0.2
+"""People slower than this on average stand."""
 
 STAYS = 0.25
 """A crowd keeps its identity until another target holds this share of its pixels more than the one that has it."""
@@ -45,6 +51,184 @@ HOLD_S = 1.0
 
 IOU_LEAST = 0.3
 """From which a box is the target's, for IDF1: blobs fit crowds less tightly than labels do people."""
+
+ToLocal = Callable[[np.ndarray], np.ndarray]
+"""(N, 2) longitude, latitude to the truth's metres."""
+
+
+class TrueFrame:
+    """What a frame truly shows, without its picture: some kilobytes.
+
+    u, v: (P,) int32 the pixels of all that can move; body: (P,) whose they are, a row of the bodies, -1 for none.
+    place_m: (N, 2) of the bodies. pixels: (N,) that show each; low_px, high_px: (N, 2) the first and the last column
+    and row of them.
+    """
+
+    def __init__(self, truth: Truth) -> None:
+        self.frame, self.time_s, self.bodies = truth.frame, truth.time_s, truth.bodies
+        self.place_m = np.asarray(self.bodies.place_m, float)[:, :2]
+        there = cv2.findNonZero(truth.mask | truth.people)  # a third of np.nonzero's time
+        self.u: np.ndarray
+        self.v: np.ndarray
+        self.u, self.v = np.zeros((2, 0), np.int32) if there is None else there[:, 0].T
+        number, count = truth.people[self.v, self.u].astype(np.int64), len(self.bodies)
+        self.body = np.full(len(self.u), -1)
+        if count:
+            order = np.argsort(self.bodies.number)
+            row = order[np.searchsorted(self.bodies.number[order], number).clip(max=count - 1)]
+            self.body = np.where(self.bodies.number[row] == number, row, -1)
+        known = self.body >= 0
+        self.pixels = np.bincount(self.body[known], minlength=count)
+        self.low_px, self.high_px = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+        at_px = np.stack([self.u, self.v], axis=1)[known].astype(float)
+        np.minimum.at(self.low_px, self.body[known], at_px)
+        np.maximum.at(self.high_px, self.body[known], at_px)
+
+    def box_about(self, bodies: np.ndarray) -> np.ndarray:
+        """(4,) the box about the pixels of some bodies, rows or a mask of them; NaN where none shows."""
+        visible = self.pixels > 0
+        chosen = np.zeros(len(visible), bool)
+        chosen[bodies] = True
+        chosen &= visible
+        if not chosen.any():
+            return np.full(4, np.nan)
+        low, high = self.low_px[chosen].min(axis=0), self.high_px[chosen].max(axis=0)
+        return np.concatenate([low, high - low + 1])
+
+    def _within(self, box_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """(P,) bool, which of the pixels lie in a box (4,), grown by a margin."""
+        x, y, width, height = box_px.tolist()
+        low_u, low_v = x - 0.5 - margin_px, y - 0.5 - margin_px
+        within: np.ndarray = (self.u >= low_u) & (self.u <= low_u + width + 2 * margin_px)
+        return within & (self.v >= low_v) & (self.v <= low_v + height + 2 * margin_px)
+
+    def pixels_in(self, box_px: np.ndarray) -> np.ndarray:
+        """(T, N) int64, how many pixels of each body lie in each of the boxes (T, 4)."""
+        held = np.zeros((len(box_px), len(self.pixels)), np.int64)
+        for row, box in enumerate(box_px):
+            body = self.body[self._within(box)]
+            held[row] = np.bincount(body[body >= 0], minlength=held.shape[1])
+        return held
+
+    def bodies_in(self, pixels: np.ndarray) -> np.ndarray:
+        """(T, N) bool, which bodies have half of their visible pixels in each box. pixels: (T, N) of `pixels_in`."""
+        lies: np.ndarray = (self.pixels > 0) & (2 * pixels >= self.pixels)
+        return lies
+
+    def untouched(self, box_px: np.ndarray) -> int:
+        """How many boxes (B, 4) have nothing that can move in them or within TOUCHING_PX of them."""
+        return sum(not self._within(box, TOUCHING_PX).any() for box in box_px)
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A crowd in a frame. people, visible: rows of the bodies, all of it and those that the picture shows.
+
+    place_m: (2,) mean of all its people. middle_m: (2,) mean of those that show, radius_m that of a disc that is evenly
+    filled with them. box_px: (4,) about their pixels. counts: whether enough of them show.
+    """
+
+    number: int
+    people: np.ndarray
+    visible: np.ndarray
+    place_m: np.ndarray
+    middle_m: np.ndarray
+    radius_m: float
+    box_px: np.ndarray
+    counts: bool
+    still: bool
+
+
+def crowds(frame: TrueFrame, least_visible: float = LEAST_VISIBLE) -> list[Crowd]:
+    """The crowds of the world at a frame, in the picture or not."""
+    found, bodies = [], frame.bodies
+    for number in np.unique(bodies.target[bodies.kind == "person"]).tolist():
+        people = np.flatnonzero((bodies.target == number) & (bodies.kind == "person"))
+        visible = people[frame.pixels[people] > 0]
+        place = frame.place_m[people].mean(axis=0)
+        middle, radius = np.full(2, np.nan), 0.0
+        if len(visible):
+            middle = frame.place_m[visible].mean(axis=0)
+            radius = float(np.sqrt(2 * ((frame.place_m[visible] - middle) ** 2).sum(axis=1).mean()))
+        counts = len(visible) > 0 and len(visible) >= least_visible * len(people)
+        speed_m_s = np.linalg.norm(np.asarray(bodies.velocity_m_s, float)[people, :2], axis=1)
+        still = float(speed_m_s.mean()) < STILL_M_S
+        box = frame.box_about(visible)
+        found.append(Crowd(number, people, visible, place, middle, radius, box, counts, still))
+    return found
+
+
+@dataclass(frozen=True)
+class FoundTargets:
+    """The targets of a frame in the results, one row a target.
+
+    box_px: (T, 4). identity: (T,) int64. place_m: (T, 2), NaN where it is not located. covariance_m2: (T, 2, 2).
+    velocity_m_s: (T, 2), NaN where unknown. kind: (T,) human, not_human or unseen.
+    blob_px: (B, 4) boxes of all that was detected, whether tracked or not.
+    """
+
+    box_px: np.ndarray
+    identity: np.ndarray
+    place_m: np.ndarray
+    covariance_m2: np.ndarray
+    velocity_m_s: np.ndarray
+    kind: tuple[str, ...]
+    blob_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    @classmethod
+    def of(cls, result: FrameResult, local: ToLocal | None = None) -> "FoundTargets":
+        """Those that were seen, located or not. local: as in CrowdScorer."""
+        tracks = result.tracked.tracks
+        seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is where nothing was found
+        place, velocity = np.full((2, len(seen), 2), np.nan)
+        covariance, kind = np.full((len(seen), 2, 2), np.nan), ["unseen"] * len(seen)
+        if (located := result.locations) is not None:
+            positions, row = located.positions, located.row
+            degrees = positions.lonlat_deg
+            place[row] = positions.east_north_m if local is None or degrees is None else local(degrees)
+            covariance[row], velocity[row] = positions.covariance_m2, located.velocity_m_s
+            if (confirmed := result.confirmed) is not None:
+                for which, what in zip(row[confirmed.row].tolist(), confirmed.kind, strict=True):
+                    kind[which] = what
+        boxes = np.asarray(tracks.box_px, float).reshape(-1, 4)[seen]
+        blobs = np.asarray(result.tracked.detections.box_px, float).reshape(-1, 4)
+        return cls(boxes, tracks.identity[seen], place, covariance, velocity, tuple(kind), blobs)
+
+    @property
+    def located(self) -> np.ndarray:
+        """(T,) bool."""
+        known: np.ndarray = np.isfinite(self.place_m).all(axis=1)
+        return known
+
+    def mean_place(self, rows: np.ndarray) -> np.ndarray:
+        """(2,) the mean of some located targets, weighted by the areas of their boxes."""
+        area = np.maximum(self.box_px[rows, 2] * self.box_px[rows, 3], 1e-9)
+        place: np.ndarray = np.average(self.place_m[rows], axis=0, weights=area)
+        return place
+
+
+def covering(frame: TrueFrame, found: list[Crowd], targets: FoundTargets, held: np.ndarray) -> np.ndarray:
+    """(C, T) bool, which targets stand for which crowds. held: (T, N) bool, `bodies_in` the targets' boxes.
+
+    A target covers a crowd if its box holds someone of it and shares COVERING of the smaller of the two boxes; or if it
+    is located within the crowd's radius, at least NEAR_M, of the middle of its visible people. So a blob over two
+    crowds that cross covers both, and each of the parts in which a crowd was found covers it. A box more than LARGEST
+    times as large as what it holds covers nothing by its pixels.
+    """
+    about = np.array([frame.box_about(row) for row in held]).reshape(-1, 4)
+    size = targets.box_px[:, 2] * targets.box_px[:, 3]
+    fits = size <= LARGEST * np.prod(about[:, 2:] + 2 * MARGIN_PX, axis=1)  # False where a box holds nobody
+    covers = np.zeros((len(found), len(size)), bool)
+    for row, crowd in enumerate(found):
+        if not len(crowd.visible):
+            continue
+        shared, _ = areas(targets.box_px, crowd.box_px)
+        smaller = np.minimum(size, np.prod(crowd.box_px[2:]))
+        share = np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
+        over = held[:, crowd.visible].any(axis=1) & fits & (share >= COVERING)
+        away = np.linalg.norm(targets.place_m - crowd.middle_m, axis=1)
+        covers[row] = over | (away <= max(crowd.radius_m, NEAR_M))  # False where a place is NaN
+    return covers
 
 
 @dataclass(frozen=True)
@@ -73,9 +257,9 @@ class CrowdScore:
     crowds to targets by pixels held in which an identity stays with its crowd until another target holds STAYS more;
     switches_a_minute: for each crowd and minute in which it counts. idf1: of crowds and cars, boxes at IoU IOU_LEAST.
     kind_right: share of identities that some ground vehicle saw whose last kind, human or not_human, is right; a target
-    is truly human if most of its boxes hold people. blob_kind_right: the same for each frame and target told.
+    is truly human if most of its boxes hold people. blob_kind_right: the same for each frame and target.
     knowledge_m: the error of what is known at every moment of the clip, in looked-at frames and between, of every crowd
-    of the world, in the picture or not: the place last told within HOLD_S, moved on at its velocity; CAP_M where there
+    of the world, in the picture or not: the last known place within HOLD_S, moved on at its velocity; CAP_M where there
     is none, and at most. known: share of those moments with one.
     """
 
@@ -103,49 +287,35 @@ class CrowdScore:
     def by_name(self) -> dict[str, object]:
         """All figures by name, as JSON has them: None where there is none."""
 
-        def plain(value: object) -> object:
-            if isinstance(value, dict):
-                return {name: plain(part) for name, part in value.items()}
-            return None if isinstance(value, float) and math.isnan(value) else value
+        def plain(pairs: list[tuple[str, object]]) -> dict[str, object]:
+            return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in pairs}
 
-        named = plain(asdict(self))
-        assert isinstance(named, dict)
-        return named
+        return asdict(self, dict_factory=plain)
 
     def lines(self) -> list[str]:
         """The figures in words, one line a subject; none of subjects without a figure."""
-        of, told = self.crowd_error_m, []
+        crowd, target, lines = self.crowd_error_m, self.target_error_m, []
         if self.crowd_frames:
-            told.append(
+            lines.append(
                 f"crowds: {100 * self.recall:.1f} % of {self.crowd_frames} seen and located, "
                 f"{self.false_blobs:.2f} false blobs a frame"
             )
-        if of.count:
-            told.append(f"error of a crowd's place: mean {of.mean:.2f} m, median {of.median:.2f}, 95 % {of.p95:.2f}")
-        if (of := self.target_error_m).count:
-            told.append(f"error of a target from its people: mean {of.mean:.2f} m, median {of.median:.2f}")
+        if crowd.count:
+            spread = f"mean {crowd.mean:.2f} m, median {crowd.median:.2f}, 95 % {crowd.p95:.2f}"
+            lines.append(f"error of a crowd's place: {spread}")
+        if target.count:
+            lines.append(f"error of a target from its people: mean {target.mean:.2f} m, median {target.median:.2f}")
         if not math.isnan(self.inside):
-            told.append(f"95 % ellipses hold the truth in {100 * self.inside:.1f} %")
+            lines.append(f"95 % ellipses hold the truth in {100 * self.inside:.1f} %")
         if not math.isnan(self.switches_a_minute):
-            told.append(
-                f"identities: {self.switches_a_minute:.2f} switches a crowd and minute, IDF1 {100 * self.idf1:.1f} %"
-            )
+            switches = f"{self.switches_a_minute:.2f} switches a crowd and minute"
+            lines.append(f"identities: {switches}, IDF1 {100 * self.idf1:.1f} %")
         if self.kinds:
-            told.append(f"human or not: right for {100 * self.kind_right:.1f} % of {self.kinds} targets seen close up")
+            lines.append(f"human or not: right for {100 * self.kind_right:.1f} % of {self.kinds} targets seen close up")
         if not math.isnan(self.knowledge_m):
-            told.append(
-                f"what is known of all crowds at all times: {self.knowledge_m:.2f} m off, {CAP_M:g} where nothing is"
-            )
-        return told
-
-
-@dataclass
-class _Known:
-    """What was last told of a crowd."""
-
-    time_s: float
-    place_m: np.ndarray
-    velocity_m_s: np.ndarray
+            known = f"{self.knowledge_m:.2f} m off, {CAP_M:g} where nothing is"
+            lines.append(f"what is known of all crowds at all times: {known}")
+        return lines
 
 
 class CrowdScorer:
@@ -155,53 +325,61 @@ class CrowdScorer:
     not yet settled, without their pictures, and some numbers for each target and frame.
     """
 
-    def __init__(
-        self, local: Callable[[np.ndarray], np.ndarray] | None = None, least_visible: float = LEAST_VISIBLE
-    ) -> None:
-        """local: takes (N, 2) longitude, latitude to the truth's metres; None: places are told in those."""
+    def __init__(self, local: ToLocal | None = None, least_visible: float = LEAST_VISIBLE) -> None:
+        """local: None where the results are in the truth's metres."""
         self._local, self._least = local, least_visible
-        self._waiting: dict[int, Shown] = {}
-        self._before: tuple[Shown, list[Crowd]] | None = None
+        self._waiting: dict[int, TrueFrame] = {}
+        self._before: tuple[TrueFrame, list[Crowd]] | None = None
         self._counts: Counter[str] = Counter()
         self._target_error, self._crowd_error = array("d"), array("d")
-        self._carrier: dict[int, tuple[frozenset[int], int]] = {}
-        self._minutes = 0.0
+        self._carrier: dict[int, tuple[frozenset[int], int]] = {}  # the people and the identity of each crowd
+        self._minutes = self._cost = 0.0
         self._true_rows: list[tuple[int, int, np.ndarray]] = []
         self._found_rows: list[tuple[int, int, np.ndarray]] = []
-        self._holds: defaultdict[int, int] = defaultdict(int)
+        self._human_boxes: Counter[int] = Counter()  # boxes of an identity that hold people, less those that do not
         self._kind: dict[int, str] = {}
-        self._known: dict[int, _Known] = {}
-        self._cost = 0.0
+        self._known: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}  # last time, place and velocity of each crowd
 
-    def feed(self, item: Truth | Shown | FrameResult) -> None:
+    def feed(self, item: Truth | TrueFrame | FrameResult) -> None:
         """The truth of a frame, or what was found in one whose truth was fed before."""
         if not isinstance(item, FrameResult):
-            self._waiting[item.frame] = shown(item) if isinstance(item, Truth) else item
+            self._waiting[item.frame] = TrueFrame(item) if isinstance(item, Truth) else item
             return
-        number = item.tracked.number
+        number, frame = item.tracked.number, item.tracked.frame
         truth = self._waiting.get(number)
-        for old in [frame for frame in self._waiting if frame <= number]:
-            del self._waiting[old]
-        frame = item.tracked.frame
-        if truth is not None and (frame is None or frame.image.any()):
-            self._judge(truth, told_of(item, self._local))
+        self._waiting = {n: later for n, later in self._waiting.items() if n > number}
+        if truth is None or (frame is not None and not frame.image.any()):
+            return
+        targets = FoundTargets.of(item, self._local)
+        found, bodies, n = crowds(truth, self._least), truth.bodies, self._counts
+        held = truth.pixels_in(targets.box_px)
+        lies = truth.bodies_in(held)
+        covers = covering(truth, found, targets, lies)
+        in_blob, vehicle = truth.bodies_in(truth.pixels_in(targets.blob_px)), bodies.kind == "ugv"
+        n["frames"] += 1
+        n["false_blobs"] += truth.untouched(targets.blob_px)
+        n["false_targets"] += truth.untouched(targets.box_px)
+        n["landmark_blobs"] += int((in_blob[:, vehicle].any(axis=1) & ~in_blob[:, ~vehicle].any(axis=1)).sum())
+        people_in = lies & (bodies.kind == "person")
+        self._judge_places(truth, targets, found, people_in, covers)
+        self._judge_identities(truth, targets, found, held, covers)
+        self._judge_kinds(targets, people_in.any(axis=1))
+        self._judge_knowledge(truth, targets, found, covers)
+        self._before = truth, found
 
     def score(self) -> CrowdScore:
         """The measures of what was fed until now."""
         n, frames = self._counts, self._counts["frames"]
-        moving = n["crowd_frames"] - n["still"], n["found"] - n["still_found"]
-        truth, found = (_table(rows) for rows in (self._true_rows, self._found_rows))
-        idf1 = (
-            tracking.identity_measures(tracking.count_identity(pair(truth, found), IOU_LEAST))["idf1"]
-            if frames
-            else math.nan
-        )
-        right = sum((self._holds[which] > 0) == (kind == "human") for which, kind in self._kind.items())
+        idf1 = math.nan
+        if frames:
+            paired = pair(_table(self._true_rows), _table(self._found_rows))
+            idf1 = tracking.identity_measures(tracking.count_identity(paired, IOU_LEAST))["idf1"]
+        right = sum((self._human_boxes[which] > 0) == (kind == "human") for which, kind in self._kind.items())
         return CrowdScore(
             frames=frames,
             crowd_frames=n["crowd_frames"],
             recall=ratio(n["found"], n["crowd_frames"]),
-            recall_moving=ratio(moving[1], moving[0]),
+            recall_moving=ratio(n["found"] - n["still_found"], n["crowd_frames"] - n["still"]),
             detected=ratio(n["detected"], n["crowd_frames"]),
             false_blobs=ratio(n["false_blobs"], frames),
             false_targets=ratio(n["false_targets"], frames),
@@ -220,130 +398,81 @@ class CrowdScorer:
             known=ratio(n["known"], n["moments"]),
         )
 
-    def _judge(self, truth: Shown, told: Told) -> None:
-        found = crowds(truth, self._least)
-        held = pixels_held(truth, told.box_px)
-        lies = bodies_held(truth, held)
-        covers = covering(truth, found, told, lies)
-        self._counts["frames"] += 1
-        self._judge_blobs(truth, told)
-        self._judge_places(truth, told, found, lies, covers)
-        self._judge_identities(truth, told, found, held, covers)
-        self._judge_kinds(truth, told, lies)
-        self._judge_knowledge(truth, told, found, covers)
-        self._before = truth, found
-
-    def _judge_blobs(self, truth: Shown, told: Told) -> None:
-        self._counts["false_blobs"] += int((~touched(truth, told.blob_px)).sum())
-        self._counts["false_targets"] += int((~touched(truth, told.box_px)).sum())
-        lies = bodies_held(truth, pixels_held(truth, told.blob_px))
-        vehicle = truth.kind == "ugv"
-        self._counts["landmark_blobs"] += int((lies[:, vehicle].any(axis=1) & ~lies[:, ~vehicle].any(axis=1)).sum())
-
-    def _judge_places(self, truth: Shown, told: Told, found: list[Crowd], lies: np.ndarray, covers: np.ndarray) -> None:
-        located = np.isfinite(told.place_m).all(axis=1)
-        person = truth.kind == "person"
-        for row in np.flatnonzero(located & lies[:, person].any(axis=1)):
-            off = told.place_m[row] - truth.place_m[lies[row] & person].mean(axis=0)
-            self._target_error.append(float(np.linalg.norm(off)))
-            covariance = told.covariance_m2[row]
-            if np.isfinite(covariance).all() and np.linalg.det(covariance) > 0:
-                self._counts["ellipses"] += 1
-                self._counts["inside"] += int(off @ np.linalg.solve(covariance, off) <= INSIDE)
+    def _judge_places(
+        self, truth: TrueFrame, targets: FoundTargets, found: list[Crowd], people_in: np.ndarray, covers: np.ndarray
+    ) -> None:
+        rows = np.flatnonzero(targets.located & people_in.any(axis=1))
+        people_m = np.array([truth.place_m[people_in[row]].mean(axis=0) for row in rows]).reshape(-1, 2)
+        off = targets.place_m[rows] - people_m
+        self._target_error.extend(np.linalg.norm(off, axis=1))
+        in_ellipse = inside(off, targets.covariance_m2[rows])
+        self._counts.update(ellipses=int(np.isfinite(in_ellipse).sum()), inside=int(np.nansum(in_ellipse)))
         for crowd, over in zip(found, covers, strict=True):
             if not crowd.counts:
                 continue
-            by: np.ndarray = over & located
+            by: np.ndarray = over & targets.located
             self._counts.update(crowd_frames=1, found=int(by.any()), detected=int(over.any()))
             self._counts.update(still=int(crowd.still), still_found=int(crowd.still and by.any()))
             if by.any():
-                self._crowd_error.append(float(np.linalg.norm(_mean_place(told, by) - crowd.middle_m)))
+                self._crowd_error.append(float(np.linalg.norm(targets.mean_place(by) - crowd.middle_m)))
 
     def _judge_identities(
-        self, truth: Shown, told: Told, found: list[Crowd], held: np.ndarray, covers: np.ndarray
+        self, truth: TrueFrame, targets: FoundTargets, found: list[Crowd], held: np.ndarray, covers: np.ndarray
     ) -> None:
-        counting = [k for k, crowd in enumerate(found) if crowd.counts]
-        self._minutes += len(counting) * (truth.time_s - self._before[0].time_s) / 60 if self._before else 0.0
-        worth = np.zeros((len(counting), len(told)))
+        bodies, counting = truth.bodies, [k for k, crowd in enumerate(found) if crowd.counts]
+        if self._before is not None:
+            self._minutes += len(counting) * (truth.time_s - self._before[0].time_s) / 60
+        worth = np.zeros((len(counting), len(targets.identity)))
         for line, k in enumerate(counting):
             mine = held[:, found[k].people].sum(axis=1) / max(truth.pixels[found[k].people].sum(), 1)
             had = self._carrier.get(found[k].number)
-            stays = STAYS * (told.identity == had[1]) if had is not None else 0.0
+            stays = STAYS * (targets.identity == had[1]) if had is not None else 0.0
             worth[line] = covers[k] * (1e-3 + mine + stays)
         for row, column in zip(*linear_sum_assignment(worth, maximize=True), strict=True):
             if not worth[row, column]:
                 continue
-            crowd, now = found[counting[row]], int(told.identity[column])
-            people = frozenset(truth.number[crowd.people].tolist())
+            crowd, now = found[counting[row]], int(targets.identity[column])
+            people = frozenset(bodies.number[crowd.people].tolist())
             had = self._carrier.get(crowd.number)
             self._counts["switches"] += int(had is not None and had[0] == people and had[1] != now)
             self._carrier[crowd.number] = people, now
-        for number in np.unique(truth.target[(truth.pixels > 0) & (truth.kind != "ugv")]).tolist():
-            box = box_about(truth, np.flatnonzero(truth.target == number))
-            self._true_rows.append((truth.frame, number, box))
-        self._found_rows += [(truth.frame, int(i), box) for i, box in zip(told.identity, told.box_px, strict=True)]
+        for number in np.unique(bodies.target[(truth.pixels > 0) & (bodies.kind != "ugv")]).tolist():
+            self._true_rows.append((truth.frame, number, truth.box_about(bodies.target == number)))
+        pairs = zip(targets.identity.tolist(), targets.box_px, strict=True)
+        self._found_rows += [(truth.frame, identity, box) for identity, box in pairs]
 
-    def _judge_kinds(self, truth: Shown, told: Told, lies: np.ndarray) -> None:
-        human = np.asarray(lies[:, truth.kind == "person"].any(axis=1))
-        for row, kind in enumerate(told.kind):
-            which = int(told.identity[row])
-            self._holds[which] += 1 if human[row] else -1
+    def _judge_kinds(self, targets: FoundTargets, is_human: np.ndarray) -> None:
+        for which, kind, human in zip(targets.identity.tolist(), targets.kind, is_human.tolist(), strict=True):
+            self._human_boxes[which] += 1 if human else -1
             if kind != "unseen":
                 self._kind[which] = kind
-                self._counts.update(kinds=1, kinds_right=int((kind == "human") == bool(human[row])))
+                self._counts.update(kinds=1, kinds_right=int((kind == "human") == human))
 
-    def _judge_knowledge(self, truth: Shown, told: Told, found: list[Crowd], covers: np.ndarray) -> None:
-        now = {crowd.number: crowd.place_m for crowd in found}
+    def _judge_knowledge(self, truth: TrueFrame, targets: FoundTargets, found: list[Crowd], covers: np.ndarray) -> None:
         if self._before is not None:
-            last, crowds_then = self._before
-            before = {crowd.number: crowd.place_m for crowd in crowds_then}
+            last, crowds_before = self._before
+            before = {crowd.number: crowd.place_m for crowd in crowds_before}
             for share in np.arange(1, truth.frame - last.frame) / (truth.frame - last.frame):
                 moment = last.time_s + share * (truth.time_s - last.time_s)
-                for number in before.keys() & now.keys():
-                    self._charge(number, moment, before[number] + share * (now[number] - before[number]))
-        located = np.isfinite(told.place_m).all(axis=1)
+                for crowd in found:
+                    if (then := before.get(crowd.number)) is not None:
+                        self._charge(crowd.number, moment, then + share * (crowd.place_m - then))
         for crowd, over in zip(found, covers, strict=True):
-            by: np.ndarray = over & located
+            by: np.ndarray = over & targets.located
             if by.any():
-                velocity = np.nan_to_num(told.velocity_m_s[by]).mean(axis=0)
-                self._known[crowd.number] = _Known(truth.time_s, _mean_place(told, by), velocity)
+                velocity = np.nan_to_num(targets.velocity_m_s[by]).mean(axis=0)
+                self._known[crowd.number] = truth.time_s, targets.mean_place(by), velocity
             self._charge(crowd.number, truth.time_s, crowd.place_m)
 
     def _charge(self, number: int, time_s: float, place_m: np.ndarray) -> None:
-        known, cost = self._known.get(number), CAP_M
-        if known is not None and (age := time_s - known.time_s) <= HOLD_S + 1e-9:
-            cost = min(float(np.linalg.norm(known.place_m + age * known.velocity_m_s - place_m)), CAP_M)
+        """Add the error of what is known of a crowd at a moment. place_m: (2,) its true one."""
+        known_s, known_m, velocity_m_s = self._known.get(number, (-math.inf, place_m, place_m))
+        age_s, cost = time_s - known_s, CAP_M
+        if age_s <= HOLD_S + 1e-9:
+            cost = min(float(np.linalg.norm(known_m + age_s * velocity_m_s - place_m)), CAP_M)
             self._counts["known"] += 1
         self._counts["moments"] += 1
         self._cost += cost
-
-
-def told_of(surveyed: FrameResult, local: Callable[[np.ndarray], np.ndarray] | None = None) -> Told:
-    """What a run says of a frame: its targets that were seen, located or not. local: as in CrowdScorer."""
-    tracks = surveyed.tracked.tracks
-    seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is where nothing was found
-    count = len(seen)
-    place, velocity = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
-    covariance, kind = np.full((count, 2, 2), np.nan), ["unseen"] * count
-    grounded = surveyed.locations
-    if grounded is not None:
-        positions, row = grounded.positions, grounded.row
-        told = positions.east_north_m
-        place[row] = told if local is None or positions.lonlat_deg is None else local(positions.lonlat_deg)
-        covariance[row], velocity[row] = positions.covariance_m2, grounded.velocity_m_s
-        if surveyed.confirmed is not None:
-            for which, what in zip(row[surveyed.confirmed.row].tolist(), surveyed.confirmed.kind, strict=True):
-                kind[which] = what
-    boxes = np.asarray(tracks.box_px, float).reshape(-1, 4)[seen]
-    blobs = np.asarray(surveyed.tracked.detections.box_px, float).reshape(-1, 4)
-    return Told(boxes, tracks.identity[seen], place, covariance, velocity, tuple(kind), blobs)
-
-
-def _mean_place(told: Told, rows: np.ndarray) -> np.ndarray:
-    """(2,) the mean of some located targets, weighted by the areas of their boxes."""
-    area = np.maximum(told.box_px[rows, 2] * told.box_px[rows, 3], 1e-9)
-    place: np.ndarray = np.average(told.place_m[rows], axis=0, weights=area)
-    return place
 
 
 def _spread(errors: array) -> Spread:

@@ -1,6 +1,6 @@
 """True and found boxes matched frame by frame, and found boxes that count neither as right nor as false."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -50,15 +50,22 @@ def pair(
     box change no measure. Raises InputError if an identity has two boxes in a frame.
     """
     for table, what in ((truth, "truth"), (found, "result")):
-        _check_unique(table, what)
+        both, counts = np.unique(np.stack([table.frame, table.identity], axis=1), axis=0, return_counts=True)
+        if (counts > 1).any():
+            frame, identity = both[counts > 1][0]
+            raise InputError(
+                f"the {what} has identity {identity} twice in frame {frame}; an identity has one box a frame"
+            )
     if ignoring == "removed" and ignored is not None and len(ignored.frame):
-        found = found.at(~_is_on_ignored(truth, found, ignored))
+        on_ignored, _ = _match_labels(found.frame, found.box_px, [truth.boxes_by_frame()], ignored.boxes_by_frame())
+        found = found.at(~on_ignored)
     _, true_id, true_boxes = np.unique(truth.identity, return_inverse=True, return_counts=True)
     _, found_id, found_boxes = np.unique(found.identity, return_inverse=True, return_counts=True)
+    true_rows, found_rows, nothing = rows_by_frame(truth.frame), rows_by_frame(found.frame), np.zeros(0, np.int64)
     frames, numbers = [], np.union1d(truth.frame, found.frame)
-    for true_rows, found_rows in _rows_of_each(truth.frame, found.frame):
-        overlap = iou(truth.box_px[true_rows], found.box_px[found_rows])
-        frames.append(FramePair(true_id[true_rows], found_id[found_rows], overlap))
+    for number in numbers.tolist():
+        i, j = true_rows.get(number, nothing), found_rows.get(number, nothing)
+        frames.append(FramePair(true_id[i], found_id[j], iou(truth.box_px[i], found.box_px[j])))
     return Paired(numbers, frames, true_boxes, found_boxes)
 
 
@@ -77,21 +84,18 @@ def counted(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     is an ignored one, where `truth.ignoring` is "removed"; and of those that match none, boxes that lie by more than
     half of their area in one of the regions. TrackEval does so for MOTChallenge from 2016 on and for KITTI.
     """
-    counts: np.ndarray = np.ones(len(frame), bool)
     ignored = truth.ignored if truth.ignoring == "removed" else None
     if ignored is None and truth.regions is None:
-        return counts
-    other, distracting, unlabelled = (
+        return np.ones(len(frame), bool)
+    others, distracting, unlabelled = (
         {} if table is None else table.boxes_by_frame() for table in (truth.others, ignored, truth.regions)
     )
-    nothing = np.zeros((0, 4))
+    on_ignored, matched = _match_labels(frame, box_px, [truth.boxes, others], distracting)
+    counts = ~on_ignored
     for number, rows in rows_by_frame(frame).items():
-        before = [truth.boxes.get(number, nothing), other.get(number, nothing)]
-        labelled = np.concatenate([*before, distracting.get(number, nothing)])
-        i, j = match(iou(labelled, box_px[rows]))
-        counts[rows[j[i >= sum(map(len, before))]]] = False
-        rest = np.setdiff1d(rows, rows[j])
-        counts[rest[lie_within(box_px[rest], unlabelled.get(number, nothing))]] = False
+        if number in unlabelled:
+            rest = rows[~matched[rows]]
+            counts[rest[lie_within(box_px[rest], unlabelled[number])]] = False
     return counts
 
 
@@ -104,27 +108,17 @@ def lie_within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
     return np.asarray((share > WITHIN + EPSILON).any(axis=1))
 
 
-def _check_unique(table: TrackTable, what: str) -> None:
-    both, counts = np.unique(np.stack([table.frame, table.identity], axis=1), axis=0, return_counts=True)
-    if (counts > 1).any():
-        frame, identity = both[counts > 1][0]
-        raise InputError(f"the {what} has identity {identity} twice in frame {frame}; an identity has one box a frame")
-
-
-def _rows_of_each(*frames: np.ndarray) -> Iterable[tuple[np.ndarray, ...]]:
-    """For each frame number that any table has, in order, the rows of each table in their order."""
-    orders = [np.argsort(f, kind="stable") for f in frames]
-    numbers = np.unique(np.concatenate(frames))
-    cuts = [np.searchsorted(f[o], [numbers, numbers + 1]) for f, o in zip(frames, orders, strict=True)]
-    for i in range(len(numbers)):
-        yield tuple(order[cut[0, i] : cut[1, i]] for order, cut in zip(orders, cuts, strict=True))
-
-
-def _is_on_ignored(truth: TrackTable, found: TrackTable, ignored: TrackTable) -> np.ndarray:
-    """(M,) bool: which found boxes match a true box that does not count."""
-    gone = np.zeros(len(found.frame), bool)
-    for true_rows, found_rows, ignored_rows in _rows_of_each(truth.frame, found.frame, ignored.frame):
-        labelled = np.concatenate([truth.box_px[true_rows], ignored.box_px[ignored_rows]])
-        i, j = match(iou(labelled, found.box_px[found_rows]))
-        gone[found_rows[j[i >= len(true_rows)]]] = True
-    return gone
+def _match_labels(
+    frame: np.ndarray,
+    box_px: np.ndarray,
+    counting: Sequence[Mapping[int, np.ndarray]],
+    ignored: Mapping[int, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """(M,) bool: which found boxes match an ignored label, and which match any. Labels are boxes (n, 4) by frame."""
+    on_ignored, matched, nothing = np.zeros(len(frame), bool), np.zeros(len(frame), bool), np.zeros((0, 4))
+    for number, rows in rows_by_frame(frame).items():
+        labelled = [boxes.get(number, nothing) for boxes in (*counting, ignored)]
+        i, j = match(iou(np.concatenate(labelled), box_px[rows]))
+        matched[rows[j]] = True
+        on_ignored[rows[j]] = i >= sum(map(len, labelled[:-1]))
+    return on_ignored, matched

@@ -1,15 +1,16 @@
-"""Measures of tracks: HOTA, CLEAR (MOTA) and identity (IDF1), pooled over clips."""
+"""Measures of tracks: HOTA, CLEAR (MOTA), identity (IDF1) and the source's accuracy ratio AR_K, pooled over clips."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchvision_dddas.evaluation.metrics import accuracy_ratio
-from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, Paired, pair
 from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.evaluation.metrics.truth import Ignoring, TrackTable
+from torchvision_dddas.types import Int
 
 ONE_TARGET_LEAST = 0.3
 """IoU from which a box counts as the one labelled target: moving-target detections seldom fit as tightly as labels."""
@@ -69,6 +70,23 @@ class Identity(NamedTuple):
     idfp: int = 0
 
 
+class Windows(NamedTuple):
+    """Windows that hold any found target, and the sum of their accuracy ratios."""
+
+    windows: int = 0
+    total: float = 0.0
+
+    @classmethod
+    def of(cls, ratios: dict[int, float]) -> "Windows":
+        """The windows of a clip together, in the order of their frames."""
+        return cls(len(ratios), sum(ratios.values(), 0.0))
+
+    @property
+    def mean(self) -> float:
+        """Mean accuracy ratio; NaN without windows."""
+        return ratio(self.total, self.windows)
+
+
 class TrackCounts(NamedTuple):
     """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are.
 
@@ -95,42 +113,29 @@ def count(
     ignored: TrackTable | None = None,
     ignoring: Ignoring = "dropped",
     interval: int = 1,
-) -> TrackCounts:
-    """Count one clip's tracks, of every interval-th frame, against the truth.
-
-    `matching.pair` tells what becomes of boxes that do not count.
-    """
-    return by_frame(truth, found, ignored, ignoring, interval)[0]
-
-
-def by_frame(
-    truth: TrackTable,
-    found: TrackTable,
-    ignored: TrackTable | None = None,
-    ignoring: Ignoring = "dropped",
-    interval: int = 1,
 ) -> tuple[TrackCounts, Each]:
-    """The same, and what of it belongs to single frames, of frames with any box.
+    """Count one clip's tracks, of every interval-th frame, against the truth; also by frame that has any box.
 
-    Of CLEAR the counts; windows_K: whether a window of K looks ends there, ar_K: its ratio. What HOTA and IDF1 count
-    belongs to whole tracks.
+    By frame: the counts of CLEAR; windows_K: whether a window of K frames ends there, ar_K: its ratio. What HOTA and
+    IDF1 count belongs to whole tracks. ignored, ignoring: see `matching.pair`.
     """
     clip = pair(truth, found, ignored, ignoring)
-    sizes = len(clip.true_boxes), len(clip.found_boxes)
-    whole, each = clear_by_frame(clip)
-    ratios = {size: accuracy_ratio.by_frame(clip, interval, size) for size in (2, 3)}
-    links = [accuracy_ratio.summed(by) for by in ratios.values()]
+    clear, each = count_clear(clip)
     columns: Each = {"frame": clip.numbers, **dict(zip(PER_FRAME, each.T, strict=True))}
-    for size, by in ratios.items():
-        ends = [by.get(frame) for frame in clip.numbers.tolist()]
-        columns[f"windows_{size}"] = np.array([ratio is not None for ratio in ends], float)
-        columns[f"ar_{size}"] = np.array([ratio or 0.0 for ratio in ends], float)
-    return TrackCounts(whole, count_identity(clip), count_hota(clip), *sizes, *links), columns
+    links = []
+    for size in (2, 3):
+        ratios = link_ratios(clip, interval, size)
+        links.append(Windows.of(ratios))
+        columns[f"windows_{size}"] = np.array([frame in ratios for frame in clip.numbers.tolist()], float)
+        columns[f"ar_{size}"] = np.array([ratios.get(frame, 0.0) for frame in clip.numbers.tolist()], float)
+    sizes = len(clip.true_boxes), len(clip.found_boxes)
+    return TrackCounts(clear, count_identity(clip), count_hota(clip), *sizes, *links), columns
 
 
 def measures(counts: TrackCounts) -> dict[str, float]:
     """HOTA, CLEAR and identity measures by name, and the source's AR_2 and AR_3."""
-    field = {**hota_measures(counts.hota), **clear_measures(counts.clear), **identity_measures(counts.identity)}
+    hota = {name: float(curve.mean()) for name, curve in curves(counts.hota).items()}
+    field = {**hota, **clear_measures(counts.clear), **identity_measures(counts.identity)}
     return {**field, "ar_2": counts.links_2.mean, "ar_3": counts.links_3.mean}
 
 
@@ -144,15 +149,13 @@ class TargetTrack(NamedTuple):
     same: int = 0
 
 
-def count_one_target(truth: TrackTable, found: TrackTable) -> TargetTrack:
-    """Follow the one labelled target (IoU ≥ 0.3). Boxes elsewhere say nothing: other targets are not labelled."""
-    return one_target_by_frame(truth, found)[0]
+def count_one_target(truth: TrackTable, found: TrackTable) -> tuple[TargetTrack, Each]:
+    """Count the track of the one labelled target (IoU ≥ 0.3); boxes elsewhere may be of targets without a label.
 
-
-def one_target_by_frame(truth: TrackTable, found: TrackTable) -> tuple[TargetTrack, Each]:
-    """The same, and of frames with any box whether the target is there, is found, and is found under a new identity."""
+    By frame that has any box: whether the target is there, is found, and is found under a new identity.
+    """
     clip = pair(truth, found)
-    counts, each = clear_by_frame(clip, ONE_TARGET_LEAST)
+    counts, each = count_clear(clip, ONE_TARGET_LEAST)
     right = count_identity(clip, ONE_TARGET_LEAST)
     tp, fn, _, switches, _ = each.T
     columns = {"frame": clip.numbers, "frames": tp + fn, "found": tp, "switches": switches}
@@ -169,22 +172,17 @@ PER_FRAME = ("tp", "fn", "fp", "switches", "overlap")
 """The counts that are those of single frames."""
 
 
-def count_clear(clip: Paired, least: float = LEAST) -> Clear:
-    """Match each frame's boxes at an IoU of at least `least`: pairs of the frame before are kept, then IoU decides.
+def count_clear(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarray]:
+    """The counts, and (F, 5) what of them each of the clip's frames adds, in the order of PER_FRAME.
 
-    The frame before is the last in which there were both true and found boxes, as TrackEval has it; a switch is seen
-    over any gap. Source: Bernardin and Stiefelhagen, 2008, with TrackEval's matching.
+    Matches each frame's boxes at an IoU of at least `least`: pairs of the frame before are kept, then IoU decides. The
+    frame before is the last in which there were both true and found boxes, as TrackEval has it; a switch is seen over
+    any gap. Source: Bernardin and Stiefelhagen, 2008, with TrackEval's matching.
     """
-    return clear_by_frame(clip, least)[0]
-
-
-def clear_by_frame(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarray]:
-    """The same, and (F, 5) what of it each of the clip's frames adds, in the order of PER_FRAME."""
     targets = len(clip.true_boxes)
     last = np.full(targets, -1)  # the identity that each target was last found under, whenever that was
     before = np.full(targets, -1)  # the same, of the frame before alone
     found_boxes, begun = np.zeros(targets, int), np.zeros(targets, int)
-    switches, overlap = 0, 0.0
     each = np.zeros((len(clip.frames), len(PER_FRAME)))
     for row, (true, found, score) in zip(each, clip.frames, strict=True):
         row[1:3] = len(true), len(found)
@@ -197,15 +195,12 @@ def clear_by_frame(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarra
         i, j = i[hit], j[hit]
         target, identity = true[i], found[j]
         switched = int(((last[target] >= 0) & (last[target] != identity)).sum())
-        switches += switched
         begun[target] += before[target] < 0
         last[target] = identity
         before[:] = -1
         before[target] = identity
         found_boxes[target] += 1
-        shared = float(score[i, j].sum())
-        overlap += shared
-        row[:] = len(i), len(true) - len(i), len(found) - len(i), switched, shared
+        row[:] = len(i), len(true) - len(i), len(found) - len(i), switched, score[i, j].sum()
     share = found_boxes / clip.true_boxes
     mostly, hardly = int((share > 0.8).sum()), int((share < 0.2).sum())
     tp = int(found_boxes.sum())
@@ -213,12 +208,12 @@ def clear_by_frame(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarra
         tp=tp,
         fn=int(clip.true_boxes.sum()) - tp,
         fp=int(clip.found_boxes.sum()) - tp,
-        switches=switches,
+        switches=int(each[:, 3].sum()),
         fragmentations=int(np.maximum(begun - 1, 0).sum()),
         mostly_tracked=mostly,
         partly_tracked=targets - mostly - hardly,
         mostly_lost=hardly,
-        overlap=overlap,
+        overlap=sum(each[:, 4].tolist(), 0.0),
     )
     return whole, each
 
@@ -272,7 +267,10 @@ def count_hota(clip: Paired) -> Hota:
 
 
 def curves(sums: Hota) -> dict[str, np.ndarray]:
-    """Each measure (19,) over ALPHA. LocA is 1 where nothing is found, as in TrackEval; all are NaN without truth."""
+    """HOTA, its parts DetA and AssA, LocA, recall and precision of both parts, (19,) each over ALPHA.
+
+    The measures are their means. LocA is 1 where nothing is found, as in TrackEval; all are NaN without truth.
+    """
     tp, fn, fp, association, recall, precision, overlap = sums
     known = np.where(tp + fn > 0, 1.0, np.nan)
     some = np.maximum(tp, 1)
@@ -287,11 +285,6 @@ def curves(sums: Hota) -> dict[str, np.ndarray]:
         "assre": known * recall / some,
         "asspr": known * precision / some,
     }
-
-
-def hota_measures(sums: Hota) -> dict[str, float]:
-    """HOTA, its parts DetA and AssA, LocA, and recall and precision of both parts: means over ALPHA."""
-    return {name: float(curve.mean()) for name, curve in curves(sums).items()}
 
 
 def count_identity(clip: Paired, least: float = LEAST) -> Identity:
@@ -317,3 +310,75 @@ def identity_measures(counts: Identity) -> dict[str, float]:
         "idp": ratio(idtp, max(idtp + idfp, min(1, true))),
         "idr": ratio(idtp, true),
     }
+
+
+def accuracy_ratio(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray, "N"]]) -> float:
+    """1 - mismatches / ((K - 1) · the largest number of targets in a frame), in [0, 1]; 1 for empty frames.
+
+    rows: what was associated, newest frame first, counted from 1, 0 for the dummy. identities: the true ones of each
+    frame's targets, newest frame first.
+    """
+    most = max(len(known) for known in identities)
+    return 1.0 - mismatches(rows, identities) / ((len(identities) - 1) * most) if most else 1.0
+
+
+def mismatches(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray, "N"]]) -> int:
+    """The number of mismatches, mme; at most one for each target of an older frame and the link from it to the next.
+
+    A target is mismatched when its successor is another one, when it has the dummy although it is there, or when the
+    frame between is bridged to another one. A bridge that was not made is no mismatch.
+    Raises InputError if a row has not one column a frame, or if a frame's real target is not in exactly one row.
+    """
+    if rows.ndim != 2 or rows.shape[1] != len(identities):
+        raise InputError(f"an association of {len(identities)} frames needs as many columns; got shape {rows.shape}.")
+    for column, known in enumerate(identities):
+        real = np.sort(rows[rows[:, column] > 0, column])
+        if not np.array_equal(real, np.arange(1, len(known) + 1)):
+            raise InputError(
+                f"frame {column} of the window, newest first, has {len(known)} targets, each in one row; "
+                f"got rows for {real.tolist()}."
+            )
+    total = 0
+    for older in range(1, len(identities)):
+        known, newer = identities[older], identities[older - 1]
+        row = np.zeros(len(known), np.int64)
+        of_older = rows[rows[:, older] > 0]
+        row[of_older[:, older] - 1] = np.arange(len(of_older))
+        follower = of_older[row, older - 1]
+        named = np.append(newer, 0)[follower - 1]
+        wrong = np.where(follower > 0, named != known, np.isin(known, newer))
+        for skipped in range(older - 2, -1, -1):
+            far = of_older[row, skipped]
+            bridged = (far > 0) & (of_older[row, skipped + 1 : older] == 0).all(axis=1)
+            wrong |= bridged & (np.append(identities[skipped], 0)[far - 1] != known)
+        total += int(wrong.sum())
+    return total
+
+
+def link_ratios(clip: Paired, interval: int, size: int) -> dict[int, float]:
+    """AR_K by the newest frame, in order, of all windows of `size` looks, `interval` frames apart, with a target.
+
+    A frame's targets are the true boxes that were found (IoU ≥ 0.5): the ratio is about links, not about boxes. Boxes
+    of one found identity are linked; one that is absent from a look within the window is a bridge.
+    Source: appendix C, eq. 11.
+    """
+    looks = {}
+    for frame, (true, found, score) in zip(clip.numbers.tolist(), clip.frames, strict=True):
+        i, j = linear_sum_assignment(np.where(score >= LEAST, score, 0.0), maximize=True)
+        hit = score[i, j] >= LEAST
+        looks[frame] = true[i[hit]] + 1, found[j[hit]]
+    nobody = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    whole = range(min(looks, default=1) + (size - 1) * interval, max(looks, default=0) + 1, interval)
+    # Frame numbers may be any, and far apart: only the windows that hold a look are gone through.
+    held = {frame + age * interval for frame in looks for age in range(size)}
+    ratios = {}
+    for newest in sorted(frame for frame in held if frame in whole):
+        window = [looks.get(newest - age * interval, nobody) for age in range(size)]
+        if not any(len(true) for true, _ in window):
+            continue
+        names = np.unique(np.concatenate([found for _, found in window]))
+        rows = np.zeros((len(names), size), np.int64)
+        for column, (_, found) in enumerate(window):
+            rows[np.searchsorted(names, found), column] = np.arange(len(found)) + 1
+        ratios[newest] = accuracy_ratio(rows, [true for true, _ in window])
+    return ratios

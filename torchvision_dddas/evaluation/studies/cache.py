@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.metrics.accuracy_ratio import Windows
 from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
-from torchvision_dddas.evaluation.metrics.tracking import Clear, Hota, Identity, TargetTrack, TrackCounts
+from torchvision_dddas.evaluation.metrics.tracking import Clear, Hota, Identity, TargetTrack, TrackCounts, Windows
 from torchvision_dddas.evaluation.studies.records import Found, Scored, ScoredCase, ScoredStudy
 from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
 from torchvision_dddas.runtime import VERSION

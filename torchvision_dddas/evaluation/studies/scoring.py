@@ -10,9 +10,9 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
+from torchvision_dddas.evaluation.evaluate import Result, score_clip
 from torchvision_dddas.evaluation.metrics import boxes, metres
 from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.clip import How, Result, score_clip
 from torchvision_dddas.evaluation.metrics.matching import WITHIN, counted
 from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Still
@@ -63,7 +63,7 @@ def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
         clip.name,
     )
     notes: list[str] = []
-    scored = score_clip(truth, result, How(interval if is_tracked else 1), notes)
+    scored = score_clip(truth, result, notes, interval if is_tracked else 1)
     # Tracks are scored on frames without any box too: they count nothing, which is a result.
     whole = 1 + interval * np.arange(scored.frames) if is_tracked else np.zeros(0, np.int64)
     frames = np.unique(np.concatenate([whole, *(columns["frame"] for columns in scored.each.values())]))
