@@ -2,13 +2,11 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from tests.io.ground import DOWN, NAMES, positions, tracks
 from torchvision_dddas.geo.projection import axes_of, rays
-from torchvision_dddas.io.maps.ground_tracks import Gathered
 from torchvision_dddas.io.maps.map_picture import (
     FINE,
     LEFT,
@@ -28,41 +26,40 @@ CAMERA = Camera("uav", (1920, 1080), (1400.0, 1400.0), (959.5, 539.5))
 NONE = tracks([])
 
 
-def walk(count=30, offset=(0.0, 0.0), target=None):
-    return tracks(
-        [positions(k + 1, [np.array([k, -k]) + offset], [[4, 0], [0, 1]], None, target) for k in range(count)]
-    )
+def walk(offset=(0.0, 0.0), frames=range(1, 31)):
+    """A target that goes south-east, a metre each way a frame."""
+    return tracks([positions(k, [np.array([k - 1, 1 - k]) + offset], [[4, 0], [0, 1]], None) for k in frames])
+
+
+def landmarks(*places):
+    return tracks([positions(1, places, origin=None, target=range(len(places)))])
 
 
 def pixel(frame, east_north):
     return (frame.pixels(np.array(east_north)) / FINE + (LEFT, TOP)).round().astype(int)
 
 
-def coloured(picture):
-    """Pixels that are no shade of grey."""
-    return np.ptp(picture.astype(int), axis=2) > 40
+def is_coloured(picture, frame, east_north, reach=3):
+    """Whether there are pixels about a place that are no shade of grey."""
+    x, y = pixel(frame, east_north)
+    part = picture[y - reach : y + reach + 1, x - reach : x + reach + 1]
+    return bool((np.ptp(part.astype(int), axis=2) > 40).any())
 
 
-def test_a_target_lies_where_its_metres_are():
-    found, marks = walk(), tracks([positions(1, [[-40, -60], [60, 20]], origin=None, target=[0, 1])])
-    picture = map_picture(found, marks, NAMES)
+def test_a_target_and_its_landmarks_lie_where_their_metres_are():
+    picture = map_picture(walk(), landmarks([-40, -60], [60, 20]), NAMES)
     assert picture.dtype == np.uint8 and picture.shape[1] == WIDTH
     frame = frame_around(np.array([[-40, -60], [60, 20]]))
-    for east_north in ([29, -29], [0, 0], [15, -15], [-40, -60], [60, 20]):
-        x, y = pixel(frame, east_north)
-        assert coloured(picture[y - 2 : y + 3, x - 2 : x + 3]).any(), east_north
-    x, y = pixel(frame, [-15, 10])
-    assert not coloured(picture[y - 9 : y + 10, x - 9 : x + 10]).any()
+    assert all(is_coloured(picture, frame, at) for at in ([29, -29], [0, 0], [15, -15], [-40, -60], [60, 20]))
+    assert not is_coloured(picture, frame, [-15, 10], 9)
 
 
 def test_the_ellipse_has_its_size_in_metres():
     still = tracks([positions(1, [[0, 0]], [[100, 0], [0, 25]], None)])
-    marks = tracks([positions(1, [[-50, -30], [50, 30]], origin=None, target=[0, 1])])
     frame = frame_around(np.array([[-50, -30], [50, 30]]))
-    picture = map_picture(still, marks, NAMES)
+    picture = map_picture(still, landmarks([-50, -30], [50, 30]), NAMES).astype(int)
     x, y = pixel(frame, [0, 0])
-    colour = picture[y, x].astype(int)
-    same = np.abs(picture.astype(int) - colour).max(axis=2) < 30
+    same = np.abs(picture - picture[y, x]).max(axis=2) < 30
     along, up = np.flatnonzero(same[y]), np.flatnonzero(same[:, x])
     assert np.ptp(along) * frame.metres_a_pixel == pytest.approx(2 * 24.48, abs=0.5)
     assert np.ptp(up) * frame.metres_a_pixel == pytest.approx(2 * 12.24, abs=0.5)
@@ -83,32 +80,26 @@ def test_steps_of_a_grid_are_round_and_not_too_many(span):
 
 
 def test_places_far_from_all_others_do_not_stretch_the_map():
-    lost = positions(31, [[50_000, 0]], None, None)
     near = [positions(k + 1, [[k, -k]], None, None) for k in range(90)]
+    lost = positions(31, [[50_000, 0]], None, None)
     alone, together = map_picture(tracks(near), NONE), map_picture(tracks([*near, lost]), NONE)
-    assert alone.shape == together.shape
     # Only the label of the last place, and the count below, differ.
-    assert (alone != together).any(axis=2).mean() < 0.01
+    assert alone.shape == together.shape and (alone != together).any(axis=2).mean() < 0.01
 
 
 def test_a_track_is_broken_where_the_target_was_not_located():
-    frames = [positions(k + 1, [[k, 0]], None, None) for k in range(100) if not 40 <= k < 60]
-    picture = map_picture(tracks(frames), NONE)
-    frame = frame_around(np.array([[0, 0], [99, 0.0]]))
-    x, y = pixel(frame, [49, 0])
-    assert not coloured(picture[y - 4 : y + 5, x - 4 : x + 5]).any()
-    x, y = pixel(frame, [20, 0])
-    assert coloured(picture[y - 4 : y + 5, x - 4 : x + 5]).any()
+    picture = map_picture(walk(frames=[*range(1, 41), *range(61, 101)]), NONE)
+    frame = frame_around(np.array([[0, 0], [99, -99.0]]))
+    assert is_coloured(picture, frame, [20, -20]) and not is_coloured(picture, frame, [49, -49])
 
 
 def test_a_photo_lies_under_the_map_where_its_metres_are():
     """Half a metre a pixel, a green square of 10 m whose middle is 20 m east and 10 m north."""
     image = np.full((200, 240, 3), 255, np.uint8)
-    photo = Ortho(image, np.array([[0.5, 0, -60.0], [0, -0.5, 50.0]]))
     u, v = int((20 + 60) / 0.5), int((50 - 10) / 0.5)
     image[v - 10 : v + 11, u - 10 : u + 11] = (0, 255, 0)
-    found = walk(offset=(-20, 0))
-    picture = map_picture(found, tracks([positions(1, [[40, 30]], origin=None, target=[0])]), NAMES, photo=photo)
+    photo = Ortho(image, np.array([[0.5, 0, -60.0], [0, -0.5, 50.0]]))
+    picture = map_picture(walk((-20, 0)), landmarks([40, 30]), NAMES, photo=photo)
     frame = frame_around(np.array([[-20, -29], [40, 30.0]]))
     green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
     x, y = pixel(frame, [20, 10])
@@ -122,27 +113,24 @@ def test_a_photo_finer_than_the_map_is_averaged():
     image = np.zeros((4000, 4000, 3), np.uint8)
     image[::2, ::2] = image[1::2, 1::2] = 255
     photo = Ortho(image, np.array([[0.05, 0, -100.0], [0, -0.05, 100.0]]))
-    picture = map_picture(walk(), tracks([positions(1, [[-60, 60]], origin=None, target=[0])]), NAMES, photo=photo)
-    frame = frame_around(np.array([[-60, 60], [29, -29.0]]))
-    x, y = pixel(frame, [13, 33])
+    picture = map_picture(walk(), landmarks([-60, 60]), NAMES, photo=photo)
+    x, y = pixel(frame_around(np.array([[-60, 60], [29, -29.0]])), [13, 33])
     assert picture[y - 8 : y + 8, x - 8 : x + 8].std() < 5
 
 
 def test_the_camera_is_drawn_unless_it_was_far_away():
-    near = map_picture(walk(), NONE, camera=CameraPath(np.array([[0, -10], [5, -10.0]])))
-    assert (near != map_picture(walk(), NONE)).any()
-    far = map_picture(walk(), NONE, camera=CameraPath(np.array([[5000, 0.0]])))
-    assert far.shape == map_picture(walk(), NONE).shape
+    plain = map_picture(walk(), NONE)
+    assert (map_picture(walk(), NONE, camera=CameraPath(np.array([[0, -10], [5, -10.0]]))) != plain).any()
+    assert map_picture(walk(), NONE, camera=CameraPath(np.array([[5000, 0.0]]))).shape == plain.shape
 
 
 @pytest.mark.parametrize("lens", [(0.0, 0.0), (-0.1, 0.02)])
 def test_the_view_is_where_the_rays_of_the_border_meet_the_ground(lens):
-    camera = Camera("uav", (1920, 1080), (1400.0, 1400.0), (959.5, 539.5), k1=lens[0], k2=lens[1])
+    camera = replace(CAMERA, k1=lens[0], k2=lens[1])
     pose = CameraPose(np.array([3.0, 4.0, 60.0]), axes_of(0.4, 1.1, 0.1), 1.02)
-    found = view_of(Fix(1, "pose", pose), camera)
     corners = rays(np.array([[0, 0], [1919, 0], [1919, 1079], [0, 1079.0]]), pose, camera)
     wanted = pose.place_m[:2] - corners[:, :2] * (60 / corners[:, 2:])
-    assert np.allclose(found[::8], wanted, atol=0.05)
+    assert np.allclose(view_of(Fix(1, "pose", pose), camera)[::8], wanted, atol=0.05)
 
 
 def test_a_view_above_the_horizon_ends_where_rays_come_down_at_three_degrees():
@@ -153,78 +141,69 @@ def test_a_view_above_the_horizon_ends_where_rays_come_down_at_three_degrees():
 
 def test_the_view_of_a_homography_is_its_border_on_the_ground():
     image_from_ground = np.array([[20, 0, 960], [0, -20, 540], [0, 0, 1.0]])
-    found = view_of(Fix(1, "homography", image_from_ground=image_from_ground), CAMERA)
+    fix = Fix(1, "homography", image_from_ground=image_from_ground)
+    found = view_of(fix, CAMERA)
     assert np.allclose(found[0], (-48, 27)) and np.allclose(found[16], (47.95, -26.95))
-    bent = view_of(Fix(1, "homography", image_from_ground=image_from_ground), replace(CAMERA, k1=-0.1))
-    assert bent[0, 0] < found[0, 0] - 1  # a barrel shows more than a straight lens
+    assert view_of(fix, replace(CAMERA, k1=-0.1))[0, 0] < found[0, 0] - 1  # a barrel shows more than a straight lens
     horizon = np.array([[20, 0, 960], [0, -20, 540], [0, -0.1, 1.0]])
-    assert len(view_of(Fix(1, "homography", image_from_ground=horizon), CAMERA)) == 0
-    assert len(view_of(Fix(1, "homography", image_from_ground=np.zeros((3, 3))), CAMERA)) == 0
-    assert len(view_of(Fix(1, ""), CAMERA)) == 0
+    for unknown in (horizon, np.zeros((3, 3)), None):
+        assert len(view_of(replace(fix, image_from_ground=unknown), CAMERA)) == 0
 
 
-@pytest.mark.parametrize("found", [NONE, walk(1), tracks([positions(1, [[7, 7]], np.full((2, 2), np.nan), None)])])
+@pytest.mark.parametrize("found", [NONE, walk(frames=[1]), tracks([positions(1, [[7, 7]], np.full((2, 2), np.nan))])])
 def test_a_map_of_little_or_nothing_is_drawn(found):
-    picture = map_picture(found, NONE)
-    assert picture.shape[1] == WIDTH and cv2.imencode(".png", picture)[0]
+    assert map_picture(found, NONE).shape[1] == WIDTH
 
 
 def test_names_beyond_ascii_and_crowds_do_not_break_it():
-    rng = np.random.default_rng(1)
-    crowd = tracks([positions(1, rng.normal(0, 1, (150, 2)), None, None)])
-    marks = tracks([positions(1, [[0, 0]], origin=None, target=[0])])
-    assert map_picture(crowd, marks, ("Żółw 🐢",), CameraPath(np.zeros((1, 2)), DOWN[:, :2])).shape[1] == WIDTH
+    crowd = tracks([positions(1, np.random.default_rng(1).normal(0, 1, (150, 2)), None, None)])
+    camera = CameraPath(np.zeros((1, 2)), DOWN[:, :2])
+    assert map_picture(crowd, landmarks([0, 0]), ("Żółw 🐢",), camera).shape[1] == WIDTH
 
 
-def shown(signs):
-    """A map of a target that walks from west to east, with signs."""
-    walk = tracks([positions(k, [(k, 0.0)]) for k in range(40)])
-    return map_picture(walk, Gathered().tracks(True), signs=signs)
+# --------------------------------------------------------------------------------------------------------------------
+# Signs of ground vehicles.
 
 
-def near(picture, colour):
-    """Pixels of a colour above the legend."""
-    return int((np.abs(picture[:-100].astype(int) - colour).max(axis=2) < 12).sum())
+def with_signs(*verdicts, looks=()):
+    """The map of a target that walks from west to east, above the legend, int."""
+    signs = Signs()
+    for place, kind in verdicts:
+        signs.add_verdict(1, kind, np.array(place))
+    for from_m, at_m in looks:
+        signs.add_look("ugv1", np.array(from_m), np.array(at_m))
+    east = tracks([positions(k, [(k, 0.0)]) for k in range(40)])
+    return map_picture(east, NONE, signs=signs)[:-100].astype(int)
 
 
 def test_the_map_shows_where_a_target_was_told_human_and_where_not():
-    signs = Signs()
-    bare = shown(Signs())
-    signs.add_verdict(1, "human", np.array([10.0, 0]))
-    human = shown(signs)
-    assert near(human, VERDICTS["human"]) > near(bare, VERDICTS["human"]) + 60
-    assert near(human, VERDICTS["not_human"]) == near(bare, VERDICTS["not_human"])
-    signs.add_verdict(1, "not_human", np.array([30.0, 0]))
-    assert near(shown(signs), VERDICTS["not_human"]) > near(bare, VERDICTS["not_human"]) + 60
+    def count(picture, kind):
+        return int((np.abs(picture - VERDICTS[kind]).max(axis=2) < 12).sum())
+
+    bare, human = with_signs(), with_signs(([10.0, 0], "human"))
+    both = with_signs(([10.0, 0], "human"), ([30.0, 0], "not_human"))
+    assert count(human, "human") > count(bare, "human") + 60
+    assert count(human, "not_human") == count(bare, "not_human") < count(both, "not_human") - 60
 
 
 def test_a_wedge_opens_from_the_vehicle_towards_what_it_saw():
-    signs = Signs()
-    bare = shown(Signs())
-    signs.add_look("ugv1", np.array([10.0, 4.0]), np.array([10.0, 0.0]))
-    changed = (np.abs(shown(signs)[:-100].astype(int) - bare[:-100]) > 8).any(axis=2)
+    changed = (np.abs(with_signs(looks=[([10.0, 4.0], [10.0, 0.0])]) - with_signs()) > 8).any(axis=2)
     rows, columns = np.nonzero(changed)
     widths = [np.ptp(columns[rows == row]) for row in (rows.min() + 3, rows.max() - 3)]
     assert len(rows) > 100 and widths[1] > 2 * widths[0]
 
 
-def test_looks_from_all_but_one_place_are_one_and_those_from_nowhere_none():
+def test_signs_far_outside_the_map_do_no_harm():
+    picture = with_signs(([1e7, -1e7], "human"), looks=[([-1e7, 1e7], [0.0, 0.0])])
+    assert picture.shape == with_signs().shape
+
+
+def test_looks_from_one_place_are_one_those_from_nowhere_none_and_memory_is_bounded():
     signs = Signs()
     for k in range(100):
         signs.add_look("ugv1", np.array([0.01 * k, 0.0]), np.zeros(2))
     signs.add_look("ugv2", np.full(2, np.nan), np.zeros(2))
     assert len(signs.looks) == 1
-
-
-def test_signs_far_outside_the_map_do_no_harm():
-    signs = Signs()
-    signs.add_verdict(1, "human", np.array([1e7, -1e7]))
-    signs.add_look("ugv1", np.array([-1e7, 1e7]), np.zeros(2))
-    assert shown(signs).shape[1] == 1400
-
-
-def test_memory_is_bounded_however_much_is_told():
-    signs = Signs()
     for k in range(3000):
         signs.add_verdict(k, "human", np.zeros(2))
         signs.add_look("ugv1", np.array([10.0 * k, 0.0]), np.zeros(2))
