@@ -17,7 +17,7 @@ from torchvision_dddas.io.overlay import (
     draw_scene,
     identity_colour,
 )
-from torchvision_dddas.io.overlay.layers import CUT, PERSON, SEARCHED, UNLIKELY, UNTRACKED
+from torchvision_dddas.io.overlay.drawing import CUT, PERSON, SEARCHED, UNLIKELY, UNTRACKED
 from torchvision_dddas.io.overlay.video import ThreadedWriter
 from torchvision_dddas.types import Detections, Frame, People, PeopleFrame, Scene, TrackedFrame, Tracks
 
@@ -214,30 +214,24 @@ def test_an_overlay_is_written_whole_or_not_at_all(tmp_path, make):
     empty.close(complete=True)
     counts = [len(list((tmp_path / name).iterdir())) for name in ("kept", "dropped", "empty")]
     assert counts == [1, 0, 0]
+    read = cv2.imread(str(tmp_path / "kept/overlay.png"))
+    assert read is None or np.array_equal(read, draw_people(people()))
 
 
-def test_a_picture_is_saved_as_it_was_drawn(tmp_path):
-    overlay = OverlayPicture(tmp_path, draw_people)
-    overlay.write(people())
-    overlay.close(complete=True)
-    read = cv2.imread(str(tmp_path / "overlay.png"))
-    assert read is not None and np.array_equal(read, draw_people(people()))
-
-
-class Writer:
+class Writer(ThreadedWriter):
     """Keeps the levels of pictures once it may; refuses those in `bad`."""
 
-    def __init__(self, bad=()):
+    def __init__(self, waiting=5, bad=()):
         self.levels, self.bad, self.closed, self.may = [], bad, False, threading.Event()
-        self.may.set()
+        super().__init__(waiting)
 
-    def write(self, picture):
+    def encode(self, picture):
         self.may.wait(10)
         if int(picture[0, 0]) in self.bad:
             raise OSError("the disk is full")
         self.levels.append(int(picture[0, 0]))
 
-    def close(self):
+    def finish(self):
         self.closed = True
 
 
@@ -246,25 +240,23 @@ def level(value):
 
 
 def test_every_picture_is_written_in_order_once_the_writer_is_closed():
-    writer = Writer()
-    writer.may.clear()
-    threaded = ThreadedWriter(writer, waiting=30)
+    writer = Writer(waiting=30)
     for value in range(20):
-        threaded.write(level(value))
+        writer.write(level(value))
     assert writer.levels == []  # giving does not wait for the work
     writer.may.set()
-    threaded.close()
+    writer.close()
     assert (writer.levels, writer.closed) == (list(range(20)), True)
 
 
 def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
-    threaded = ThreadedWriter(Writer(bad=(0,)))
+    first, last = Writer(bad=(0,)), Writer(bad=(1,))
+    for writer in (first, last):
+        writer.may.set()
     with pytest.raises(OSError, match="full"):
-        list(map(threaded.write, [level(0)] * 100))
-    writer = Writer(bad=(1,))
-    threaded = ThreadedWriter(writer, waiting=5)
+        list(map(first.write, [level(0)] * 100))
     for value in (0, 1):
-        threaded.write(level(value))
+        last.write(level(value))
     with pytest.raises(OSError, match="full"):
-        threaded.close()
-    assert writer.closed
+        last.close()
+    assert last.closed

@@ -1,16 +1,20 @@
 """The overlay of a run: the clip with everything found drawn in."""
 
-from torchvision_dddas.io.overlay.drawing import Colour, colour_picture, drawable, identity_colour, label, rectangle
-from torchvision_dddas.io.overlay.layers import (
+from torchvision_dddas.io.overlay.drawing import (
     LETTERS,
     LIKELY,
+    Colour,
     RunPictures,
     ToMetres,
     TrackPictures,
     Trails,
+    colour_picture,
     command_metres,
     draw_people,
     draw_scene,
+    drawable,
+    identity_colour,
+    label,
 )
 from torchvision_dddas.io.overlay.video import OverlayPicture, OverlayVideo
 
@@ -31,5 +35,4 @@ __all__ = [
     "drawable",
     "identity_colour",
     "label",
-    "rectangle",
 ]

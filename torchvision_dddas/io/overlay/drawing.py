@@ -1,16 +1,34 @@
-"""Boxes, labels and captions that OpenCV draws, wherever they lie; the colours of overlays and maps."""
+"""What overlays show: targets with tint and heading, tracks with trails, people, landmarks and orders."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
+
+from torchvision_dddas.types import AerialLocations, Command, FrameResult, PeopleFrame, Scene, TrackedFrame
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
 
 TEXT: Colour = (255, 255, 255)
 WARNING: Colour = (60, 60, 255)
+TARGET: Colour = (40, 190, 255)
+UNTRACKED: Colour = (150, 150, 150)
+PERSON: Colour = (80, 220, 80)
+CUT: Colour = (60, 160, 255)
+UNLIKELY: Colour = (150, 150, 150)
+SEARCHED: Colour = (200, 170, 90)
+ORDER: Colour = (255, 255, 255)
+LANDMARK: dict[str, Colour] = {"used": (90, 230, 90), "reassigned": (60, 220, 255), "excluded": WARNING}
+"""The colour of a landmark by its state in the fix."""
+LETTERS = {"human": "H", "not_human": "N"}
+"""What ground vehicles say of a target, in one letter."""
+LIKELY = 0.5
+"""The least probability of a person that is drawn as one."""
 _GOLDEN_DEG = 137.508  # neighbours in number are far apart in hue, for any count of them
+_TRAIL_LENGTH = 12
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_colour(identity: int) -> Colour:
@@ -45,23 +63,281 @@ def rectangle(picture: np.ndarray, box: np.ndarray, colour: Colour, thick: int) 
 def label(picture: np.ndarray, box: np.ndarray, text: str, colour: Colour) -> None:
     """Write a text on a patch of a colour, above the box where there is room."""
     scale, thick = max(picture.shape[0] / 1200, 0.35), line_width(picture)
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
+    (width, height), _ = cv2.getTextSize(text, _FONT, scale, thick)
     x, y = drawable(box[:2]).tolist()
     top = y - height - 4 if y >= height + 4 else y
     cv2.rectangle(picture, (x, top), (x + width + 3, top + height + 3), colour, -1)
-    place = x + 2, top + height + 1
-    cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick, cv2.LINE_AA)
+    cv2.putText(picture, text, (x + 2, top + height + 1), _FONT, scale, (0, 0, 0), thick, cv2.LINE_AA)
 
 
-def caption(picture: np.ndarray, lines: Sequence[tuple[str, Colour]]) -> None:
-    """Write lines, each in its colour, along the lower edge, shortened to fit the width."""
+def _caption(picture: np.ndarray, *lines: tuple[str, Colour]) -> None:
+    """Write lines that are not empty, each in its colour, along the lower edge, shortened to fit the width."""
+    shown = [(text, colour) for text, colour in lines if text]
     height, width = picture.shape[:2]
-    scale, row, thick = height / 1000, max(12, round(height / 28)), line_width(picture)
-    top = max(height - row * len(lines) - row // 3, 0)
+    size, row, thick = max(height / 1000, 0.35), max(12, round(height / 28)), line_width(picture)
+    top = max(height - row * len(shown) - row // 3, 0)
     picture[top:] = picture[top:] // 3
-    for i, (line, colour) in enumerate(lines):
-        plain = line.replace("×", "x").replace("−", "-").encode("ascii", "replace").decode()  # OpenCV's font is ASCII
-        size = max(scale, 0.35)
-        while len(plain) > 8 and cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, size, thick)[0][0] > width - 8:
+    for i, (text, colour) in enumerate(shown):
+        plain = text.replace("×", "x").replace("−", "-").encode("ascii", "replace").decode()  # OpenCV's font is ASCII
+        while len(plain) > 8 and cv2.getTextSize(plain, _FONT, size, thick)[0][0] > width - 8:
             plain = plain.removesuffix("...")[:-1] + "..." if len(plain) > 12 else plain[:-1]
-        cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), 0, size, colour, thick, cv2.LINE_AA)
+        cv2.putText(picture, plain, (4, top + row * (i + 1) - row // 5), _FONT, size, colour, thick, cv2.LINE_AA)
+
+
+def _arrow(picture: np.ndarray, start: np.ndarray, tip: np.ndarray, colour: Colour, thick: int, head: float) -> None:
+    ends = drawable(np.stack([start, tip])).tolist()
+    cv2.arrowedLine(picture, ends[0], ends[1], colour, thick, cv2.LINE_AA, tipLength=head)
+
+
+def draw_scene(scene: Scene) -> np.ndarray:
+    """The frame with its targets, (H, W, 3) uint8 BGR; the caption says when not to trust it."""
+    picture = colour_picture(scene.frame.image)
+    thick = line_width(picture)
+    foreground = scene.mask > 0
+    if foreground.any():
+        picture[foreground] = (0.7 * picture[foreground] + 0.3 * np.array(TARGET)).astype(np.uint8)
+        outlines = cv2.findContours(foreground.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+        cv2.drawContours(picture, outlines, -1, TARGET, 1)
+    found = scene.detections
+    for box, heading, speed in zip(found.box_px, found.heading_rad, found.speed_px, strict=True):
+        rectangle(picture, box, TARGET, thick)
+        if not math.isnan(heading):
+            length = 14 * thick + 4 * min(float(np.nan_to_num(speed)), 12.0)
+            middle = box[:2] + box[2:] / 2
+            _arrow(picture, middle, middle + length * np.array([np.cos(heading), np.sin(heading)]), TEXT, thick, 0.35)
+    text = f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(found)}"
+    doubt = "" if scene.reliable else f"registration unreliable: {scene.cause}"
+    _caption(picture, (text, TEXT), (doubt, WARNING))
+    return picture
+
+
+def draw_people(found: PeopleFrame) -> np.ndarray:
+    """The frame with its people, (H, W, 3) uint8 BGR.
+
+    A person whom the border cuts has another colour and a `?`. People below LIKELY have thin grey boxes underneath.
+    """
+    picture, people = colour_picture(found.frame.image), found.people
+    thick = line_width(picture)
+    for region in found.regions_px if found.regions_px is not None else ():
+        rectangle(picture, region, SEARCHED, 1)
+    worst_first = np.argsort(people.score, kind="stable").tolist()
+    likely = [i for i in worst_first if people.score[i] >= LIKELY]
+    colours = [CUT if cut else PERSON for cut in people.cut]
+    for i in worst_first:
+        sure = people.score[i] >= LIKELY
+        rectangle(picture, people.box_px[i], colours[i] if sure else UNLIKELY, thick if sure else max(1, thick // 2))
+        feet, radius = drawable(people.feet_px[i]).tolist(), 3 * thick if sure else thick
+        cv2.circle(picture, feet, radius, colours[i] if sure else UNLIKELY, -1, cv2.LINE_AA)
+        if sure:
+            cv2.circle(picture, feet, radius, (0, 0, 0), 1, cv2.LINE_AA)
+    for i in likely:  # above all boxes
+        label(picture, people.box_px[i], f"{people.score[i]:.2f}{'?' if people.cut[i] else ''}", colours[i])
+    searched = "everywhere" if found.regions_px is None else f"in {found.share:.0%} of the windows"
+    unlikely = f" + {len(people) - len(likely)} unlikely" if len(likely) < len(people) else ""
+    text = f"frame {found.frame.number}  people {len(likely)}{unlikely}  searched {searched}"
+    _caption(picture, (text, TEXT), (found.cause, WARNING))
+    return picture
+
+
+class Trails:
+    """The last places of every identity, moved along with the camera's motion. Frames are added in order.
+
+    length: places kept per identity. memory_frames: an identity unseen for so long is forgotten.
+    places: identity -> frame number, u_px, v_px of each place.
+    """
+
+    def __init__(self, length: int, memory_frames: int = 250) -> None:
+        self.length, self.memory = length, memory_frames
+        self.places: dict[int, list[tuple[int, float, float]]] = {}
+
+    def add(self, tracked: TrackedFrame) -> None:
+        """Carry all places to this frame, and add the centres of its boxes."""
+        if tracked.now_from_before is not None and self.places:
+            points = np.array([place[1:] for trail in self.places.values() for place in trail], float)
+            moved = iter(cv2.perspectiveTransform(points[None], tracked.now_from_before)[0].tolist())
+            for trail in self.places.values():
+                trail[:] = [(place[0], *next(moved)) for place in trail]
+        number, tracks = tracked.number, tracked.tracks
+        for identity, (x, y, w, h) in zip(tracks.identity.tolist(), tracks.box_px.tolist(), strict=True):
+            trail = self.places.setdefault(identity, [])
+            trail.append((number, x + w / 2, y + h / 2))
+            del trail[: -self.length]
+        for identity in [i for i, trail in self.places.items() if number - trail[-1][0] > self.memory]:
+            del self.places[identity]
+
+
+class TrackPictures:
+    """Draws frames with tracks and trails, given in order."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        """size: (width, height) of the pictures, for frames that could not be read."""
+        self._size = size
+        self._trails = Trails(_TRAIL_LENGTH)
+
+    def skip(self, tracked: TrackedFrame) -> None:
+        """Add a frame to the trails without drawing it."""
+        self._trails.add(tracked)
+
+    def __call__(
+        self,
+        tracked: TrackedFrame,
+        remarks: Sequence[tuple[str, Colour]] = (),
+        kinds: Mapping[int, str] | None = None,
+    ) -> np.ndarray:
+        """The frame with boxes, numbers and trails, (H, W, 3) uint8 BGR; black where it could not be read.
+
+        remarks: further lines of the caption with their colours. kinds: text behind the number of an identity.
+        """
+        self._trails.add(tracked)
+        width, height = self._size
+        black = np.zeros((height, width, 3), np.uint8)
+        picture = black if tracked.frame is None else colour_picture(tracked.frame.image)
+        thick = line_width(picture)
+        tracks, given = tracked.tracks, tracked.detections
+        for row in tracked.untracked:
+            rectangle(picture, given.box_px[row], UNTRACKED, 1)
+        for identity, box, row in zip(tracks.identity.tolist(), tracks.box_px, tracks.row, strict=True):
+            colour = identity_colour(identity)
+            way = drawable(np.array([place[1:] for place in self._trails.places[identity]]))
+            cv2.polylines(picture, [way], False, colour, thick, cv2.LINE_AA)
+            rectangle(picture, box, colour, thick + 1 if row >= 0 else 1)
+            label(picture, box, f"{identity} {(kinds or {}).get(identity, '')}".rstrip(), colour)
+        text = f"frame {tracked.number}  identities {len(tracks)}  detections {len(given)}"
+        _caption(picture, (text, TEXT), (tracked.cause, WARNING), *remarks)
+        return picture
+
+
+class RunPictures:
+    """Draws frames of a run with tracks, landmarks, what ground vehicles say, and what they were asked to do.
+
+    Frames are shown in order; each is drawn once however many callers want it, and not at all if none does.
+    """
+
+    def __init__(self, size: tuple[int, int], names: Sequence[str]) -> None:
+        """size: (width, height) of the pictures. names: of the landmarks."""
+        self._tracks, self._names = TrackPictures(size), tuple(names)
+        self._shown: FrameResult | None = None
+        self._picture: np.ndarray | None = None
+
+    def show(self, result: FrameResult) -> None:
+        """Go on to the next frame, if it is not the same."""
+        if result is self._shown:
+            return
+        if self._shown is not None and self._picture is None:
+            self._tracks.skip(self._shown.tracked)
+        self._shown, self._picture = result, None
+
+    def __call__(self, result: FrameResult) -> np.ndarray:
+        """The picture of a frame, (H, W, 3) uint8 BGR. The caller must not draw on it."""
+        self.show(result)
+        if self._picture is None:
+            self._picture = self._draw(result)
+        return self._picture
+
+    def _draw(self, result: FrameResult) -> np.ndarray:
+        located, confirmed = result.locations, result.confirmed
+        command = ("" if result.command is None else _summarize_command(result.command), TEXT)
+        if located is None:
+            return self._tracks(result.tracked, [command])
+        letters = {}
+        if confirmed is not None:
+            targets = located.positions.target[confirmed.row].tolist()
+            letters = {t: LETTERS.get(kind, "?") for t, kind in zip(targets, confirmed.kind, strict=True)}
+        picture = self._tracks(result.tracked, [_summarize_location(located), command], letters)
+        states = dict(zip(located.fix.landmark.tolist(), located.fix.state, strict=True))
+        thick = line_width(picture)
+        arm = 6 * thick
+        for which, place in zip(located.marks.landmark.tolist(), located.marks.image_px, strict=True):
+            if not np.isfinite(place).all():
+                continue
+            state = states.get(which, "excluded")
+            colour, middle = LANDMARK.get(state, WARNING), drawable(place).tolist()
+            cv2.circle(picture, middle, 2 * arm, colour, thick, cv2.LINE_AA)
+            cv2.drawMarker(picture, middle, colour, cv2.MARKER_CROSS, arm, thick)
+            name = self._names[which] + ("" if state == "used" else f" {state}")
+            label(picture, np.array([place[0] + 2 * arm, place[1] - arm, 0, 0]), name, colour)
+        self._draw_orders(picture, result, located)
+        return picture
+
+    def _draw_orders(self, picture: np.ndarray, result: FrameResult, located: AerialLocations) -> None:
+        """Draw an arrow from each vehicle towards its goal, at most a tenth of the picture long."""
+        to_metres, marks = command_metres(result), located.marks
+        if result.command is None or to_metres is None or not result.command.orders:
+            return
+        to_pixels = _pixels_per_metre(located)
+        if to_pixels is None:
+            return
+        rows = {self._names[k]: row for row, k in enumerate(marks.landmark.tolist())}
+        for order in result.command.orders:
+            row = rows.get(order.vehicle)
+            if row is None or not np.isfinite(marks.image_px[row]).all():
+                continue
+            way = to_pixels @ (to_metres(order.goal) - marks.east_north_m[row])
+            length = float(np.hypot(*way))
+            if length > 4 * line_width(picture):
+                tip = marks.image_px[row] + way * min(1.0, picture.shape[0] / 10 / length)
+                _arrow(picture, marks.image_px[row], tip, ORDER, line_width(picture) + 1, 0.3)
+
+
+def _summarize_location(located: AerialLocations) -> tuple[str, Colour]:
+    """By what the frame was located and how well."""
+    fix = located.fix
+    if not fix.by:
+        return f"not located: {fix.cause}", WARNING
+    used = len(fix.state) - fix.state.count("excluded")
+    text = f"located by {fix.by}, {used} of {len(fix.state)} landmarks, {len(located.positions)} targets"
+    sigma_m = np.sqrt(np.trace(located.positions.covariance_m2, axis1=1, axis2=2))
+    if np.isfinite(sigma_m).any():
+        text += f" to {np.nanmedian(sigma_m):.2f} m"
+    remarks = "; ".join([*fix.changes, fix.cause]).strip("; ")
+    return (f"{text}; {remarks}", WARNING) if remarks else (text, TEXT)
+
+
+def _summarize_command(command: Command) -> str:
+    words = [f"every {command.every}"] if command.every > 1 else []
+    if command.orders:
+        words.append(f"sent: {', '.join(order.vehicle for order in command.orders)}")
+    if command.altitude_m is not None and math.isfinite(command.altitude_m):
+        words.append(f"fly at {command.altitude_m:.0f} m")
+    return "; ".join(words)
+
+
+ToMetres = Callable[[np.ndarray], np.ndarray]
+"""(2,) local metres of a place in a command."""
+
+
+def command_metres(result: FrameResult) -> ToMetres | None:
+    """A function from the places of a frame's commands to local metres; None where the frame does not tell enough.
+
+    Commands are in degrees where landmarks have degrees, else in local metres. The scale follows from the landmarks.
+    """
+    located, degrees = result.locations, result.mark_lonlat_deg
+    if located is None:
+        return None
+    if degrees is None:
+        return lambda place: np.asarray(place, float)
+    metres = located.marks.east_north_m
+    both = np.isfinite(degrees).all(axis=1) & np.isfinite(metres).all(axis=1)
+    # Less than some metres apart, rounding would dominate the scale.
+    if both.sum() < 2 or (np.ptp(metres[both], axis=0) < 1.0).any():
+        return None
+    middle_deg, middle_m = degrees[both].mean(axis=0), metres[both].mean(axis=0)
+    scale = np.ptp(metres[both], axis=0) / np.ptp(degrees[both], axis=0)
+
+    def to_metres(place: np.ndarray) -> np.ndarray:
+        place = np.asarray(place, float)
+        # A place that is no such longitude and latitude is in local metres already.
+        return place if np.abs(place - middle_deg).max() > 1.0 else middle_m + (place - middle_deg) * scale
+
+    return to_metres
+
+
+def _pixels_per_metre(located: AerialLocations) -> np.ndarray | None:
+    """(2, 2) pixels to the right and down of a metre to the east and north about the landmarks; None where unknown."""
+    marks = located.marks
+    both = np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1)
+    place, pixel = marks.east_north_m[both], marks.image_px[both]
+    apart = place - place.mean(axis=0) if len(place) >= 3 else np.zeros((2, 2))
+    if np.linalg.svd(apart, compute_uv=False)[-1] < 1.0:  # fewer than three, or all but on one line
+        return None
+    return np.asarray(np.linalg.lstsq(apart, pixel - pixel.mean(axis=0), rcond=None)[0].T)

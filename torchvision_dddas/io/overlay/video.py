@@ -6,7 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 from queue import Queue
 from threading import Thread
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ class OverlayVideo(Generic[Item]):
         self._path = folder / name
         self._part = temporary(self._path)
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
-        self._writer: Writer | None = None
+        self._writer: ThreadedWriter | None = None
         self._draw = draw
 
     def write(self, item: Item) -> None:
@@ -37,7 +37,7 @@ class OverlayVideo(Generic[Item]):
         if height % 2 or width % 2:
             picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         if self._writer is None:
-            self._writer = ThreadedWriter(open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0])))
+            self._writer = _open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0]))
         self._writer.write(picture)
 
     def close(self, complete: bool) -> None:
@@ -70,8 +70,7 @@ class OverlayPicture(Generic[Item]):
 
     def write(self, item: Item) -> None:
         """Draw it. Raises OSError if the disk refuses."""
-        _, content = cv2.imencode(".png", self._draw(item))
-        self._part.write_bytes(content.tobytes())
+        self._part.write_bytes(cv2.imencode(".png", self._draw(item))[1].tobytes())
 
     def close(self, complete: bool) -> None:
         """Put it in its place, if there is one."""
@@ -83,32 +82,28 @@ class OverlayPicture(Generic[Item]):
         remove(self._part)
 
 
-class Writer(Protocol):
-    """Writes pictures into a video file."""
-
-    def write(self, picture: np.ndarray) -> None:
-        """Add a picture, (H, W, 3) uint8 BGR with even H and W."""
-
-    def close(self) -> None:
-        """Finish the file."""
-
-
 class ThreadedWriter:
-    """A writer that works in a thread: on two cores the slower of the two sets the pace.
+    """Encodes pictures in a thread: on two cores the slower of the two sets the pace.
 
     A picture must not be changed after it was given. An error of the work is raised by the next call.
     """
 
-    def __init__(self, writer: Writer, waiting: int = 2) -> None:
+    def __init__(self, waiting: int = 2) -> None:
         """waiting: pictures held at most; `write` waits for room."""
-        self._writer = writer
         self._queue: Queue[np.ndarray | None] = Queue(waiting)
         self._error: Exception | None = None
         self._thread = Thread(target=self._work, daemon=True)
         self._thread.start()
 
+    def encode(self, picture: np.ndarray) -> None:
+        """Add a picture, (H, W, 3) uint8 BGR with even H and W, to the file."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Finish the file."""
+
     def write(self, picture: np.ndarray) -> None:
-        """Add a picture."""
+        """Hand over a picture."""
         self._raise()
         self._queue.put(picture)
 
@@ -116,14 +111,14 @@ class ThreadedWriter:
         """Finish the file when all pictures are in it."""
         self._queue.put(None)
         self._thread.join()
-        self._writer.close()
+        self.finish()
         self._raise()
 
     def _work(self) -> None:
         while (picture := self._queue.get()) is not None:
             if self._error is None:
                 try:
-                    self._writer.write(picture)
+                    self.encode(picture)
                 except Exception as error:
                     self._error = error
 
@@ -132,16 +127,15 @@ class ThreadedWriter:
             raise self._error
 
 
-def open_writer(path: Path, rate: Fraction, size: tuple[int, int]) -> Writer:
+def _open_writer(path: Path, rate: Fraction, size: tuple[int, int]) -> ThreadedWriter:
     """A writer of H.264 if PyAV is there, else of mp4v. size: (width, height). Raises OSError if it cannot begin."""
     try:
-        import av  # noqa: F401
+        return _H264(path, rate, size)
     except ImportError:
         return _OpenCv(path, rate, size)
-    return _H264(path, rate, size)
 
 
-class _H264:
+class _H264(ThreadedWriter):
     def __init__(self, path: Path, rate: Fraction, size: tuple[int, int]) -> None:
         import av
 
@@ -154,30 +148,31 @@ class _H264:
         # No look-ahead: it would hold tens of frames in memory. The preset: 3.1 ms of processor time a frame at 768x576
         # instead of `veryfast`'s 7.5, for a file 1.5 times the size.
         self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "22"}
+        super().__init__()
 
-    def write(self, picture: np.ndarray) -> None:
+    def encode(self, picture: np.ndarray) -> None:
         # OpenCV's conversion is as quick as FFmpeg's and needs no second copy of the picture in colour.
         planes = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420).astype(np.uint8, copy=False)
-        frame = self._av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        self._container.mux(self._stream.encode(frame))
+        self._container.mux(self._stream.encode(self._av.VideoFrame.from_ndarray(planes, format="yuv420p")))
 
-    def close(self) -> None:
+    def finish(self) -> None:
         try:
             self._container.mux(self._stream.encode(None))
         finally:
             self._container.close()
 
 
-class _OpenCv:
+class _OpenCv(ThreadedWriter):
     def __init__(self, path: Path, rate: Fraction, size: tuple[int, int]) -> None:
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
         if not self._writer.isOpened():
             raise OSError(
                 "OpenCV cannot write mp4v video here; install the extra `video`, or leave overlay out of --save"
             )
+        super().__init__()
 
-    def write(self, picture: np.ndarray) -> None:
+    def encode(self, picture: np.ndarray) -> None:
         self._writer.write(picture)
 
-    def close(self) -> None:
+    def finish(self) -> None:
         self._writer.release()
