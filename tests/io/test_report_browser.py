@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from tests.browser import evaluate, needs_browser
 from tests.evaluation.report.studied import HOSTILE, study
 from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite
-from torchvision_dddas.io.report import Axis, Column, Line, chart, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report import Axis, Column, Line, chart, number_cell, table, text_cell
+from torchvision_dddas.io.report.page import environment
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, needs_browser]
 
@@ -49,11 +51,16 @@ def study_page(tmp_path_factory):
     return study_report(finite(summarize(results)), results)
 
 
+def page_of(*parts):
+    template = '{% extends "base.html" %}{% block body %}{{ parts | join }}{% endblock %}'
+    return environment().from_string(template).render(title="many", parts=[Markup(part) for part in parts])
+
+
 def many_rows(count):
     rows = [[text_cell(f"clip {k}"), number_cell(k / count if k else None)] for k in range(count)]
     parts = table("many", [Column("clip", text=True), Column("F")], rows, [[text_cell("pooled"), number_cell(0.5)]])
     svg = chart("t", Axis("x"), Axis("y"), [Line("l", np.arange(9.0), np.arange(9.0))])
-    return render_page("page.html", title="many", parts=[f"<div>{parts}</div>", svg])
+    return page_of(f"<div>{parts}</div>", svg)
 
 
 def test_a_table_sorts_by_number_and_by_word_in_both_directions_with_unknown_values_last(tmp_path):

@@ -22,7 +22,6 @@ from torchvision_dddas.io.report.charts import (
 from torchvision_dddas.io.report.page import (
     Cell,
     Column,
-    data_url,
     format_count,
     format_number,
     number_cell,
@@ -42,7 +41,6 @@ __all__ = [
     "Line",
     "Panel",
     "chart",
-    "data_url",
     "format_count",
     "format_number",
     "interval_chart",

@@ -1,7 +1,7 @@
 """Charts as inline SVG: curves and points over two axes, one value per row with its interval, panels over time."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 
@@ -55,7 +55,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Dots:
-    """(N,) points, each with a text that is shown under the pointer. sign: disc, cross or ring."""
+    """(N,) points, each with a text that is shown under the pointer. sign: disc or ring."""
 
     name: str
     x: np.ndarray
@@ -96,9 +96,8 @@ def chart(
     """Draw lines and points over two axes. equal: one scale for both, as on a map. Values beyond the axes are cut."""
     series: list[Line | Dots] = [*lines, *dots]
     named = [one for one in series if one.name]
-    legend, legend_high = _legend(named, 8, 30, WIDTH) if len(named) > 1 else ([], 0)
-    x = _limits(across, np.concatenate([one.x for one in series]) if series else np.zeros(0))
-    y = _limits(up, np.concatenate([one.y for one in series]) if series else np.zeros(0))
+    legend, legend_high = _legend(named if len(named) > 1 else [], 8, 30, WIDTH)
+    x, y = (_limits(axis, [getattr(one, name) for one in series]) for axis, name in ((across, "x"), (up, "y")))
     plot = _Plot(58, 28 + legend_high, WIDTH - 76, HEIGHT - 68, x, y, across.log, up.log)
     if equal:
         plot = _with_equal_scales(plot)
@@ -109,7 +108,7 @@ def chart(
         f'<text x="13" y="{middle}" text-anchor="middle" transform="rotate(-90 13 {middle})">{escape(up.name)}</text>',
         *plot.grid(max(2, int(plot.high // 45))),
         *plot.base(6),
-        _text(plot.left + plot.wide / 2, plot.top + plot.high + 34, across.name, "middle"),
+        _text(plot.left + plot.wide / 2, plot.low + 34, across.name, "middle"),
     ]
     for line in lines:
         kept = np.unique(np.linspace(0, len(line.x) - 1, min(len(line.x), MOST_POINTS)).round().astype(int))
@@ -117,17 +116,13 @@ def chart(
     for one in dots:
         for k, (a, b) in enumerate(zip(*plot.place(one.x, one.y), strict=True)):
             if math.isfinite(a) and math.isfinite(b):
-                parts.append(_sign(one.sign, one.colour, a, b, one.texts[k] if k < len(one.texts) else ""))
+                parts.append(_sign(one, a, b, one.texts[k] if k < len(one.texts) else ""))
     label = f"{title}: {up.name} against {across.name}" + "".join(f", {one.name}" for one in named[:8])
-    return _svg(WIDTH, plot.top + plot.high + 40, label, parts)
+    return _svg(WIDTH, plot.low + 40, label, parts)
 
 
 def interval_chart(
-    title: str,
-    rows: Sequence[Interval],
-    whole: Interval | None = None,
-    limits: tuple[float, float] = (0.0, 1.0),
-    colour: int = 1,
+    title: str, rows: Sequence[Interval], whole: Interval | None = None, limits: tuple[float, float] = (0.0, 1.0)
 ) -> Markup:
     """Draw a row per value with its interval: the first MOST_ROWS known ones, in their order.
 
@@ -138,26 +133,31 @@ def interval_chart(
     low, high = min([limits[0], *ends]), max([limits[1], *ends])
     high = high if high > low else low + 1
     plot = _Plot(150, 30, WIDTH - 196, 19 * len(shown), (low, high), (0, 1))
-    below = plot.top + plot.high
     parts = [_text(6, 16, title, "start", "title")]
     for x, text in plot.numbers_across(5):
-        parts += [f'<path d="M{x:.1f} {plot.top}v{plot.high}" class="grid"/>', _text(x, below + 16, text, "middle")]
+        parts += [f'<path d="M{x:.1f} {plot.top}v{plot.high}" class="grid"/>', _text(x, plot.low + 16, text, "middle")]
     if whole is not None and math.isfinite(whole.value):
         if math.isfinite(whole.low) and math.isfinite(whole.high):
-            left, right = plot.across([max(whole.low, low), min(whole.high, high)])
-            parts.append(
-                f'<rect x="{left:.1f}" y="{plot.top}" width="{max(right - left, 1):.1f}" height="{plot.high}" '
-                'class="band f2"/>'
-            )
+            parts.append(plot.shade(max(whole.low, low), min(whole.high, high), 1.0, "band f2"))
         (x,) = plot.across([whole.value])
         said = f"{whole.name} {format_number(whole.value)}"
         parts.append(f'<path d="M{x:.1f} {plot.top - 3}v{plot.high + 6}" class="line c2"{_DASHES}>{_hint(said)}</path>')
         anchor = "end" if x > WIDTH - 120 else "start" if x < plot.left + 60 else "middle"
-        parts.append(_text(x, below + 31, said if whole.value else whole.name, anchor, "f2"))
+        parts.append(_text(x, plot.low + 31, said if whole.value else whole.name, anchor, "f2"))
     for k, row in enumerate(shown):
-        parts += _interval_row(row, plot.top + 19 * k + 9.5, plot.across, colour)
+        y = plot.top + 19 * k + 9.5
+        name = _text(142, y + 4, row.name if len(row.name) <= 21 else f"{row.name[:20]}…", "end", "name")
+        parts.append(f'<a href="{escape(row.link)}">{name}</a>' if row.link else name)
+        said = f"{row.name} {format_number(row.value)}"
+        if math.isfinite(row.low) and math.isfinite(row.high):
+            said += f", 95 %: {format_number(row.low)} to {format_number(row.high)}"
+            a, b = plot.across([row.low, row.high])
+            parts.append(f'<path d="M{a:.1f} {y - 4:g}v8m0-4H{b:.1f}m0-4v8" class="line c1"/>')
+        (x,) = plot.across([row.value])
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:g}" r="4.5" class="f1">{_hint(said)}</circle>')
+        parts.append(_text(WIDTH - 4, y + 4, format_number(row.value), "end"))
     values = "; ".join(f"{row.name} {format_number(row.value)}" for row in shown[:12])
-    return _svg(WIDTH, below + 36, f"{title}, clip by clip: {values}", parts)
+    return _svg(WIDTH, plot.low + 36, f"{title}, clip by clip: {values}", parts)
 
 
 def time_chart(panels: Sequence[Panel], at: np.ndarray, has_gap: np.ndarray, unit: str) -> Markup:
@@ -166,21 +166,23 @@ def time_chart(panels: Sequence[Panel], at: np.ndarray, has_gap: np.ndarray, uni
     at: (N,) places of the frames on the axis, growing; each line has a value for each of them. has_gap: (N,) bool,
     frames that are shaded. unit: what the axis counts. Panels without a known value are left out.
     """
-    panels = [(title, lines) for title, lines in panels if any(_is_known(one) for one in lines)]
+    panels = [(title, series) for title, series in panels if any(map(_is_known, series))]
     if len(at) < 2 or not panels:
         return Markup("")
     parts: list[str] = []
     top = 0.0
+    gaps = [at[[gap.start, gap.stop - 1]] for gap in _runs(has_gap)]
     for title, series in panels:
         lines = [one for one in series if isinstance(one, Line)]
         events = [one for one in series if isinstance(one, Events)]
         high = 20.0 * len(events) if events else 70.0 if all(line.steps for line in lines) else 130.0
-        legend, more = _legend([line for line in lines if line.name], 90 + 7 * len(title), top + 13, 1160)
-        top += more - 17 if more else 0
+        legend, legend_high = _legend([line for line in lines if line.name], 90 + 7 * len(title), top + 13, 1160)
+        top += legend_high - 17 if legend_high else 0
         plot = _Plot(TIME_LEFT, top + 26, TIME_WIDTH, high, (float(at[0]), max(float(at[-1]), at[0] + 1e-9)), (0, 1))
-        parts += [_text(TIME_LEFT, plot.top - 9, title, "start", "title"), *legend, *_shading(has_gap, at, plot)]
+        parts += [_text(TIME_LEFT, plot.top - 9, title, "start", "title"), *legend]
+        parts += [plot.shade(west, east, 1.5, "gap") for west, east in gaps]
         parts += _event_rows(events, plot) if events else _panel(lines, at, plot)
-        parts += [*plot.base(10), _text(TIME_LEFT + TIME_WIDTH, plot.top + high + 31, unit, "end")]
+        parts += [*plot.base(10), _text(TIME_LEFT + TIME_WIDTH, plot.low + 31, unit, "end")]
         top += high + 60
     label = "plots over time of " + ", ".join(title for title, _ in panels)
     return _svg(TIME_LEFT + TIME_WIDTH + 16, top, label, parts)
@@ -199,11 +201,15 @@ class _Plot:
     log_x: bool = False
     log_y: bool = False
 
+    @property
+    def low(self) -> float:
+        return self.top + self.high
+
     def across(self, x: Sequence[float] | np.ndarray) -> list[float]:
         return (self.left + _share(np.asarray(x, float), self.x, self.log_x) * self.wide).tolist()
 
     def place(self, x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:
-        return self.across(x), (self.top + self.high - _share(y, self.y, self.log_y) * self.high).tolist()
+        return self.across(x), (self.low - _share(y, self.y, self.log_y) * self.high).tolist()
 
     def grid(self, count: int) -> list[str]:
         parts = []
@@ -217,17 +223,26 @@ class _Plot:
         return [(self.across([value])[0], text) for value, text in _ticks(self.x, self.log_x, count)]
 
     def base(self, count: int) -> list[str]:
-        bottom = self.top + self.high
         parts = [f'<path d="M{self.left} {self.top:g}v{self.high:g}h{self.wide}" class="axis"/>']
         for x, text in self.numbers_across(count):
-            parts += [f'<path d="M{x:.1f} {bottom:g}v4" class="axis"/>', _text(x, bottom + 17, text, "middle")]
+            parts += [f'<path d="M{x:.1f} {self.low:g}v4" class="axis"/>', _text(x, self.low + 17, text, "middle")]
         return parts
+
+    def shade(self, west: float, east: float, least_px: float, style: str) -> str:
+        left, right = self.across([west, east])
+        place = f'x="{left:.1f}" y="{self.top:g}" width="{max(right - left, least_px):.1f}" height="{self.high:g}"'
+        return f'<rect {place} class="{style}"/>'
 
     def curve(self, line: Line) -> list[str]:
         """The path of a line, with the area below it where that is filled."""
         pieces, areas = [], []
         for piece in _runs(np.isfinite(line.x) & np.isfinite(line.y)):
-            x, y = (_stairs if line.steps else lambda *xy: xy)(line.x[piece], line.y[piece])
+            x, y = line.x[piece], line.y[piece]
+            if line.steps:
+                # The corners of a line whose values hold until they change.
+                jumps = np.flatnonzero(np.diff(y)) + 1
+                corner_y = np.stack([y[jumps - 1], y[jumps]], axis=1).ravel()
+                x, y = np.r_[x[0], np.repeat(x[jumps], 2), x[-1]], np.r_[y[0], corner_y, y[-1]]
             way = _way(*self.place(x, y))
             pieces.append(f"M{way}" + ("h1.5" if len(x) == 1 else ""))  # a single point would be no line
             if line.area and len(x) > 1:
@@ -237,7 +252,8 @@ class _Plot:
         return [*([f'<path d="{"".join(areas)}" class="area f{line.colour}"/>'] if areas else []), drawn]
 
 
-def _limits(axis: Axis, values: np.ndarray) -> tuple[float, float]:
+def _limits(axis: Axis, series: Sequence[np.ndarray]) -> tuple[float, float]:
+    values = np.concatenate([np.zeros(0), *series])
     known = values[np.isfinite(values) & ((values > 0) | (not axis.log))]
     low = axis.low if math.isfinite(axis.low) else float(known.min(initial=math.inf))
     high = axis.high if math.isfinite(axis.high) else float(known.max(initial=-math.inf))
@@ -265,9 +281,7 @@ def _with_equal_scales(plot: _Plot) -> _Plot:
 def _share(values: np.ndarray, limits: tuple[float, float], log: bool) -> np.ndarray:
     """Where values lie between the limits, 0 to 1."""
     if log:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values = np.log10(np.maximum(values, 1e-30))
-        limits = math.log10(limits[0]), math.log10(limits[1])
+        values, limits = np.log10(np.maximum(values, 1e-30)), (math.log10(limits[0]), math.log10(limits[1]))
     return np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
 
 
@@ -281,15 +295,23 @@ def _ticks(limits: tuple[float, float], log: bool, count: int) -> list[tuple[flo
 
 
 def _panel(lines: Sequence[Line], at: np.ndarray, plot: _Plot) -> list[str]:
+    """Lines as the medians of bins of successive frames."""
     values = np.concatenate([line.y for line in lines])
     low, high = np.percentile(values[np.isfinite(values)], [0.5, 99.5]) * 1.12  # a few outliers flatten nothing
     plot = replace(plot, y=(min(float(low), 0.0), max(float(high) or 1.0, 0.0)))
     parts = plot.grid(4)
+    size = math.ceil(len(at) / _MOST_BINS)
+    count = math.ceil(len(at) / size)
+    middle = at[np.minimum(np.arange(count) * size + size // 2, len(at) - 1)]
     for line in lines:
-        middle, lowest, median, highest = _binned(at, line.y)
+        bins = np.full(count * size, np.nan)
+        bins[: len(at)] = np.where(np.isfinite(line.y), line.y, np.nan)
+        ordered = np.sort(bins.reshape(count, size), axis=1)  # unknown values come last
+        known, row = np.maximum(np.isfinite(ordered).sum(axis=1), 1), np.arange(count)
+        median = (ordered[row, (known - 1) // 2] + ordered[row, known // 2]) / 2
         for piece in _runs(np.isfinite(median)) if line.band else ():
-            upper = _way(*plot.place(middle[piece], highest[piece]))
-            lower = _way(*plot.place(middle[piece][::-1], lowest[piece][::-1]))
+            upper = _way(*plot.place(middle[piece], ordered[row, known - 1][piece]))
+            lower = _way(*plot.place(middle[piece][::-1], ordered[piece, 0][::-1]))
             parts.append(f'<path d="M{upper}L{lower}Z" class="band f{line.colour}"/>')
         parts += plot.curve(replace(line, x=middle, y=median))
     return parts
@@ -310,28 +332,6 @@ def _event_rows(events: Sequence[Events], plot: _Plot) -> list[str]:
     return parts
 
 
-def _shading(has_gap: np.ndarray, at: np.ndarray, plot: _Plot) -> list[str]:
-    parts = []
-    for piece in _runs(has_gap):
-        west, east = plot.across(at[[piece.start, piece.stop - 1]])
-        wide = max(east - west, 1.5)
-        parts.append(f'<rect x="{west:.1f}" y="{plot.top:g}" width="{wide:.1f}" height="{plot.high:g}" class="gap"/>')
-    return parts
-
-
-def _interval_row(row: Interval, y: float, across: Callable[[list[float]], list[float]], colour: int) -> list[str]:
-    name = _text(142, y + 4, row.name if len(row.name) <= 21 else f"{row.name[:20]}…", "end", "name")
-    value, said = format_number(row.value), f"{row.name} {format_number(row.value)}"
-    parts = [f'<a href="{escape(row.link)}">{name}</a>' if row.link else name]
-    if math.isfinite(row.low) and math.isfinite(row.high):
-        said += f", 95 %: {format_number(row.low)} to {format_number(row.high)}"
-        a, b = across([row.low, row.high])
-        parts.append(f'<path d="M{a:.1f} {y - 4:g}v8m0-4H{b:.1f}m0-4v8" class="line c{colour}"/>')
-    (x,) = across([row.value])
-    parts.append(f'<circle cx="{x:.1f}" cy="{y:g}" r="4.5" class="f{colour}">{_hint(said)}</circle>')
-    return [*parts, _text(WIDTH - 4, y + 4, value, "end")]
-
-
 def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float) -> tuple[list[str], int]:
     """A sign and a name for each series in rows between left and right, and the height of these rows."""
     parts, x, row = [], left, 0
@@ -344,16 +344,14 @@ def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float
         if isinstance(one, Line):
             parts.append(f'<path d="M{x:.1f} {y:g}h16" class="line c{one.colour}"{_DASHES if one.dashed else ""}/>')
         else:
-            parts.append(_sign(one.sign, one.colour, x + 8, y))
+            parts.append(_sign(one, x + 8, y))
         parts.append(_text(x + 21, y + 4, name, "start"))
         x += wide
     return parts, 17 * (row + 1) if series else 0
 
 
-def _sign(kind: str, colour: int, x: float, y: float, hint: str = "") -> str:
-    if kind == "cross":
-        return f'<path d="M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6" class="line c{colour}">{_hint(hint)}</path>'
-    style = f"line c{colour}" if kind == "ring" else f"f{colour}"
+def _sign(dots: Dots, x: float, y: float, hint: str = "") -> str:
+    style = f"line c{dots.colour}" if dots.sign == "ring" else f"f{dots.colour}"
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="{style}">{_hint(hint)}</circle>'
 
 
@@ -379,28 +377,6 @@ def _runs(flags: np.ndarray) -> list[slice]:
     """Each run of True."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0])).reshape(-1, 2)
     return [slice(first, last) for first, last in edges.tolist()]
-
-
-def _stairs(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The corners of a line whose values hold until they change."""
-    jumps = np.flatnonzero(np.diff(y)) + 1
-    corner_y = np.stack([y[jumps - 1], y[jumps]], axis=1).ravel()
-    return np.r_[x[0], np.repeat(x[jumps], 2), x[-1]], np.r_[y[0], corner_y, y[-1]]
-
-
-def _binned(at: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The middle of each bin of successive frames, and the lowest, median and highest of the known values in it."""
-    size = max(1, math.ceil(len(at) / _MOST_BINS))
-    full = np.full(math.ceil(len(at) / size) * size, np.nan)
-    full[: len(at)] = values
-    bins = full.reshape(-1, size)
-    known = np.isfinite(bins).any(axis=1)
-    found = np.full((3, len(bins)), np.nan)
-    found[0, known] = np.nanmin(bins[known], axis=1)
-    found[1, known] = np.nanmedian(bins[known], axis=1)
-    found[2, known] = np.nanmax(bins[known], axis=1)
-    middle = at[np.minimum(np.arange(len(bins)) * size + size // 2, len(at) - 1)]
-    return middle, found[0], found[1], found[2]
 
 
 def _is_known(one: Line | Events) -> bool:

@@ -44,12 +44,8 @@ class Column:
 
 
 def render_page(template: str, **context: Any) -> str:
-    """Fill a template of this kit. All text is escaped, except Markup such as charts and tables.
-
-    A template extends `base.html`, which holds the stylesheet and the script, and fills its block `body`;
-    `parts.html` has macros for cards, plots, lists and key frames.
-    """
-    return _environment().get_template(template).render(context)
+    """Fill a template of this kit. All text is escaped, except Markup such as charts and tables."""
+    return environment().get_template(template).render(context)
 
 
 def table(
@@ -66,10 +62,8 @@ def table(
     for row in (*rows, *foot):
         if len(row) != len(columns):
             raise ValueError(f"a row of table {caption!r} must have {len(columns)} cells, got {len(row)}")
-    tall = len(rows) > TALL_ROWS
-    macros: Any = _environment().get_template("parts.html").module
-    found: Markup = macros.table(caption, columns, rows, foot, sorts, tall)
-    return found
+    macros: Any = environment().get_template("parts.html").module
+    return Markup(macros.table(caption, columns, rows, foot, sorts, len(rows) > TALL_ROWS))
 
 
 def text_cell(text: str, link: str = "") -> Cell:
@@ -110,7 +104,8 @@ def data_url(picture: bytes) -> str:
 
 
 @cache
-def _environment() -> "Environment":
+def environment() -> "Environment":
+    """The templates of this kit, with filters for numbers and pictures."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # here, as loading it takes 60 ms
 
     environment = Environment(
@@ -120,7 +115,5 @@ def _environment() -> "Environment":
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    environment.filters["number"] = format_number
-    environment.filters["data_url"] = data_url
-    environment.filters["format_count"] = format_count
+    environment.filters |= {"number": format_number, "data_url": data_url, "format_count": format_count}
     return environment
