@@ -9,13 +9,10 @@ import re
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
-from torchvision_dddas.io.telemetry.misb import KEY, read_misb
-from torchvision_dddas.io.telemetry.nmea import read_nmea
-from torchvision_dddas.io.telemetry.srt import read_subtitles
+from torchvision_dddas.io.telemetry.autopilots import MAGIC, looks_like_tlog, read_tlog, read_ulog
+from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
 from torchvision_dddas.io.telemetry.tables import read_telemetry_table
-from torchvision_dddas.io.telemetry.transport import spacing
-from torchvision_dddas.io.telemetry.ulog import MAGIC, read_ulog
+from torchvision_dddas.io.telemetry.text_logs import read_nmea, read_subtitles
 from torchvision_dddas.types import Telemetry
 
 __all__ = ["read_telemetry"]
@@ -25,7 +22,6 @@ _OTHERS = {
     b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
     b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
 }
-_SENTENCE = re.compile(r"\$[A-Z]{2}[A-Z]{3},")
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
 
@@ -55,7 +51,7 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
     if looks_like_tlog(head) or suffix == ".tlog":
         return read_tlog(path, clock_offset_s)
     text = _text(head)
-    if text is not None and _SENTENCE.search(text):
+    if text is not None and re.search(r"\$[A-Z]{2}[A-Z]{3},", text):
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
         return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
@@ -63,10 +59,8 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
         return read_telemetry_table(path, clock_offset_s, clip)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
-    for mark, words in _OTHERS.items():
-        if mark in head[:12]:
-            raise InputError(f"telemetry {path} {words}")
-    raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
+    known = (words for mark, words in _OTHERS.items() if mark in head[:12])
+    raise InputError(f"telemetry {path} {next(known, f'is none of the kinds that can be read; wanted {KINDS}')}")
 
 
 def _text(content: bytes) -> str | None:

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchvision_dddas.io.telemetry.attitude import angles, axes
-from torchvision_dddas.io.telemetry.log import Log, assemble
-from torchvision_dddas.io.telemetry.transport import Piece, Stream, read_stream
+from torchvision_dddas.io.telemetry.record import Log, build_record
 from torchvision_dddas.types import Telemetry
 
 KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -20,8 +19,7 @@ KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
 
 # No set of any version is longer; a damaged length would swallow the sets behind it.
 _LONGEST = 1 << 16
-_CHECKSUM = 1
-_STAMP = 2
+_CHECKSUM, _STAMP = 1, 2
 
 
 class LocalSet(NamedTuple):
@@ -32,6 +30,14 @@ class LocalSet(NamedTuple):
     whole: bool
 
 
+class Piece(NamedTuple):
+    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the last video."""
+
+    time_s: float
+    seen_s: float
+    content: bytes
+
+
 def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float) -> Telemetry:
     """Read MISB ST 0601 metadata. layout: the transport stream's `spacing`; None for bare local sets.
 
@@ -40,18 +46,9 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
     """
     log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0)
     content = path.read_bytes()
-    if layout is None:
-        pieces = [Piece(math.nan, 0.0, content)]
-    else:
-        stream = read_stream(content, *layout)
-        _note_damage(log, stream, len(content))
-        if stream.metadata is None:
-            kinds = ", ".join(f"0x{kind:02x}" for kind in stream.kinds) or "none"
-            raise log.refuse(f"this MPEG-TS carries no KLV metadata; its streams are of the types {kinds}")
-        pieces = stream.pieces
-    joined = b"".join(piece.content for piece in pieces)
+    pieces = [Piece(math.nan, 0.0, content)] if layout is None else _read_stream(log, content, *layout)
     starts = [0, *accumulate(len(piece.content) for piece in pieces)]
-    found = list(local_sets(joined))
+    found = list(local_sets(b"".join(piece.content for piece in pieces)))
     whole = [one for one in found if one.whole]
     if not found:
         raise log.refuse("its metadata has no MISB ST 0601 packet, nothing begins with the key of one")
@@ -59,79 +56,62 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
         raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: their checksums are wrong")
     if len(whole) < len(found):
         log.note(f"{len(found) - len(whole)} of {len(found)} packets are damaged or cut off and left out")
-    belonging = [pieces[bisect.bisect_right(starts, one.place) - 1] for one in whole]
-    times, start_utc_s = _times(log, whole, belonging)
-    _say(log, times, whole)
-    return assemble(log, clock_offset_s, start_utc_s)
+    times, start_utc_s = _times(log, whole, [pieces[bisect.bisect_right(starts, one.place) - 1] for one in whole])
+    timed = np.isfinite(times)
+    places = np.array([one.place for one in whole])
+    values = {name: column[timed] for name, column in _quantities(log, whole).items()}
+    log.moments = np.column_stack([times, times, places])[timed]
+    log.add_all(times[timed], places[timed], values, known=True)
+    return build_record(log, clock_offset_s, start_utc_s)
 
 
-def _note_damage(log: Log, stream: Stream, size: int) -> None:
-    if stream.damaged is not None:
-        log.note(f"byte {stream.damaged[0]}: the transport stream is out of step, {stream.damaged[1]} times in all")
-    if stream.cut:
-        log.note(f"the file ends within a transport packet, at byte {size}: it was cut off")
-
-
-def _times(log: Log, whole: list[LocalSet], belonging: list[Piece]) -> tuple[np.ndarray, float]:
-    """Seconds since the first picture, and the clock at it."""
-    told = np.array([piece.time_s for piece in belonging])
+def _times(log: Log, whole: list[LocalSet], pieces: list[Piece]) -> tuple[np.ndarray, float]:
+    """Seconds since the first picture, and the clock at it. pieces: where each set is from."""
+    stream_s = np.array([piece.time_s for piece in pieces])
     stamps = np.array([stamp_s(one.tags.get(_STAMP)) for one in whole])
     clocked = np.isfinite(stamps)
-    if np.isfinite(told).mean() > 0.5:
-        apart = (stamps - told)[clocked & np.isfinite(told)]
-        return told, float(np.median(apart)) if len(apart) else math.nan
+    if np.isfinite(stream_s).mean() > 0.5:
+        apart = (stamps - stream_s)[clocked & np.isfinite(stream_s)]
+        return stream_s, float(np.median(apart)) if len(apart) else math.nan
     if not clocked.any():
         raise log.refuse("neither the stream nor its metadata has times")
     first = int(np.argmax(clocked))
-    start = float(stamps[first]) - belonging[first].seen_s
-    if belonging[first].seen_s:
+    start = float(stamps[first]) - pieces[first].seen_s
+    if pieces[first].seen_s:
         log.note("the stream has no times for its metadata: the first is aligned with the picture before it")
     return stamps - start, start
 
 
-def _say(log: Log, times: np.ndarray, whole: list[LocalSet]) -> None:
+def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
     def column(tag: int, low: float, high: float, signed: bool = False) -> np.ndarray:
         return np.array([mapped(one.tags.get(tag), low, high, signed) for one in whole])
 
-    above_sea = column(15, -900, 19000)
-    ground = column(25, -900, 19000)
-    agl = np.array([imap(one.tags.get(113), -900, 40000) for one in whole])
-    if not np.isfinite(agl).any() and np.isfinite(ground).any():
+    def first_known(best: np.ndarray, other: np.ndarray | float) -> np.ndarray:
+        return np.where(np.isfinite(best), best, other)
+
+    above_sea, ground = column(15, -900, 19000), column(25, -900, 19000)
+    above_ground = np.array([imap(one.tags.get(113), -900, 40000) for one in whole])
+    if not np.isfinite(above_ground).any() and np.isfinite(ground).any():
         log.note("the altitude above ground is that above the ground in the picture's middle")
-    full = [column(tag, -90, 90, True) for tag in (90, 91)]
-    platform = [
-        column(5, 0, 360),
-        np.where(np.isfinite(full[0]), full[0], column(6, -20, 20, True)),
-        np.where(np.isfinite(full[1]), full[1], column(7, -50, 50, True)),
-    ]
-    roll = column(20, 0, 360)
-    sensor = [column(18, 0, 360), column(19, -180, 180, True), np.where(np.isfinite(roll), roll, 0.0)]
-    heading, pitch, rolled = angles(_turned(platform) @ _turned(sensor))
-    longitude, latitude = column(14, -180, 180, True), column(13, -90, 90, True)
-    said = {
-        "longitude_deg": longitude,
-        "latitude_deg": latitude,
+    vehicle_heading = np.radians(column(5, 0, 360))
+    vehicle_pitch = np.radians(first_known(column(90, -90, 90, True), column(6, -20, 20, True)))
+    vehicle_roll = np.radians(first_known(column(91, -90, 90, True), column(7, -50, 50, True)))
+    sensor_heading, sensor_pitch = np.radians(column(18, 0, 360)), np.radians(column(19, -180, 180, True))
+    sensor_roll = np.radians(first_known(column(20, 0, 360), 0.0))
+    vehicle = axes(vehicle_heading, -vehicle_pitch, vehicle_roll)  # the standard counts pitch up
+    heading, pitch, roll = angles(vehicle @ axes(sensor_heading, -sensor_pitch, sensor_roll))
+    return {
+        "longitude_deg": column(14, -180, 180, True),
+        "latitude_deg": column(13, -90, 90, True),
         "above_sea_m": above_sea,
-        "altitude_m": np.where(np.isfinite(agl), agl, above_sea - ground),
+        "altitude_m": first_known(above_ground, above_sea - ground),
         "speed_m_s": column(56, 0, 255),
         "heading_rad": heading,
         "pitch_rad": pitch,
-        "roll_rad": rolled,
+        "roll_rad": roll,
         "hfov_rad": np.radians(column(16, 0, 180)),
-        "vehicle_heading_rad": np.radians(platform[0]),
+        "vehicle_heading_rad": vehicle_heading,
     }
-    for number, (time_s, one) in enumerate(zip(times.tolist(), whole, strict=True)):
-        if math.isfinite(time_s):
-            log.moments.append((time_s, one.place))
-            for name, values in said.items():
-                if math.isfinite(values[number]):
-                    log.add(name, time_s, float(values[number]), one.place)
-
-
-def _turned(degrees: list[np.ndarray]) -> np.ndarray:
-    """The axes of heading, pitch up and roll."""
-    heading, pitch_up, roll = (np.radians(part) for part in degrees)
-    return axes(heading, -pitch_up, roll)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -142,69 +122,64 @@ def local_sets(content: bytes) -> Iterator[LocalSet]:
     """All that begin with the universal key, in order; one that is cut off or garbled is not whole and has no tags."""
     place = content.find(KEY)
     while place >= 0:
-        size = _length(content, place + len(KEY))
-        if size is None or size[0] > _LONGEST or size[1] + size[0] > len(content):
-            yield LocalSet(place, {}, False)
-            place = content.find(KEY, place + len(KEY))
-            continue
-        end = size[1] + size[0]
-        tags = _tags(content, size[1], end)
-        whole = tags is not None and _summed(content, place, end, tags.get(_CHECKSUM))
-        yield LocalSet(place, tags if tags is not None and whole else {}, whole)
-        place = content.find(KEY, end if whole else place + len(KEY))
+        following = place + len(KEY)
+        tags = None
+        size, begin = _length(content, following)
+        if size <= _LONGEST and begin + size <= len(content):
+            tags = _tags(content[begin : begin + size])
+            if tags is not None and not _is_checksum(content[place : begin + size], tags.get(_CHECKSUM)):
+                tags = None
+            following = begin + size if tags is not None else following
+        yield LocalSet(place, tags or {}, tags is not None)
+        place = content.find(KEY, following)
 
 
-def _length(content: bytes, place: int) -> tuple[int, int] | None:
-    """A length in BER, short or long, and where its value begins."""
-    if place >= len(content):
-        return None
-    first = content[place]
+def _length(content: bytes, place: int) -> tuple[int, int]:
+    """A length in BER, short or long, and where its value begins; a length without end where it is cut off."""
+    first = content[place] if place < len(content) else 0xFF
     if first < 0x80:
         return first, place + 1
-    count = first & 0x7F
-    if not 1 <= count <= 8 or place + 1 + count > len(content):
-        return None
-    return int.from_bytes(content[place + 1 : place + 1 + count], "big"), place + 1 + count
+    end = place + 1 + (first & 0x7F)
+    if not 1 <= first & 0x7F <= 8 or end > len(content):
+        return 1 << 64, place
+    return int.from_bytes(content[place + 1 : end], "big"), end
 
 
-def _tags(content: bytes, place: int, end: int) -> dict[int, bytes] | None:
+def _tags(content: bytes) -> dict[int, bytes] | None:
     tags: dict[int, bytes] = {}
-    while place < end:
+    place = 0
+    while place < len(content):
         tag = 0
-        while place < end:  # a tag in BER-OID: seven bits a byte, the last one's highest bit is 0
+        while place < len(content):  # a tag in BER-OID: seven bits a byte, the last one's highest bit is 0
             byte = content[place]
             place += 1
             tag = tag << 7 | byte & 0x7F
             if byte < 0x80:
                 break
-        size = _length(content, place)
-        if size is None or size[1] + size[0] > end:
+        size, begin = _length(content, place)
+        if begin + size > len(content):
             return None
-        tags[tag] = content[size[1] : size[1] + size[0]]
-        place = size[1] + size[0]
+        tags[tag] = content[begin : begin + size]
+        place = begin + size
     return tags
 
 
-def _summed(content: bytes, place: int, end: int, told: bytes | None) -> bool:
-    """Whether the 16-bit sum over all but the last two bytes is the one told."""
-    if told is None or len(told) != 2:
+def _is_checksum(packet: bytes, checksum: bytes | None) -> bool:
+    """Whether a checksum is at the packet's end and the 16-bit sum over all before it."""
+    if checksum is None or len(checksum) != 2 or packet[-2:] != checksum:
         return False
-    packet = content[place : end - 2]
-    total = (sum(packet[0::2]) << 8) + sum(packet[1::2])
-    return total & 0xFFFF == int.from_bytes(told, "big") and content[end - 2 : end] == told
+    total = (sum(packet[0:-2:2]) << 8) + sum(packet[1:-2:2])
+    return total & 0xFFFF == int.from_bytes(checksum, "big")
 
 
 def mapped(value: bytes | None, low: float, high: float, signed: bool = False) -> float:
     """An integer spread over a range; a signed one's lowest value says out of range. NaN where there is none."""
     if not value or len(value) > 8:
         return math.nan
-    number = int.from_bytes(value, "big", signed=signed)
-    bits = 8 * len(value)
+    number, most = int.from_bytes(value, "big", signed=signed), 2 ** (8 * len(value) - signed) - 1
     if not signed:
-        return low + number / (2**bits - 1) * (high - low)
-    if number == -(2 ** (bits - 1)):
-        return math.nan
-    return number / (2 ** (bits - 1) - 1) * high
+        return low + number / most * (high - low)
+    return number / most * high if number >= -most else math.nan
 
 
 def imap(value: bytes | None, low: float, high: float) -> float:
@@ -222,3 +197,130 @@ def imap(value: bytes | None, low: float, high: float) -> float:
 def stamp_s(value: bytes | None) -> float:
     """Seconds since 1970 of a precision time stamp; NaN where there is none."""
     return struct.unpack(">Q", value)[0] / 1e6 if value is not None and len(value) == 8 else math.nan
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# MPEG transport streams: metadata packets and their times.
+
+_SYNC = b"G"
+_PACKET = 188
+# Packets alone, with a time code of 4 bytes before each (.m2ts), or with check bytes behind.
+_SPACINGS = ((188, 0), (192, 4), (204, 0))
+_VIDEO_TYPES = {0x01, 0x02, 0x10, 0x1B, 0x24, 0x33}
+_METADATA_IN_PES, _PRIVATE = 0x15, 0x06
+_WRAP = 1 << 33
+_HZ = 90_000
+
+
+def spacing(head: bytes) -> tuple[int, int] | None:
+    """Packet spacing and offset of the first sync byte, bytes; None if it is no transport stream."""
+    for size, before in _SPACINGS:
+        # A recording may begin within a packet.
+        for first in range(before, min(before + size, len(head))):
+            marks = head[first::size]
+            if len(marks) >= 3 and marks.count(_SYNC) >= 0.8 * len(marks):
+                return size, first
+    return None
+
+
+def _read_stream(log: Log, content: bytes, size: int, first: int) -> list[Piece]:
+    """Every metadata packet of the first programme that has any. Raises InputError if there is none."""
+    programmes: set[int] = set()
+    streams: list[tuple[int, int, bytes]] = []
+    video = metadata = None
+    packets: list[tuple[int | None, int, bytearray]] = []  # time stamp, the video's last one, payload
+    last_video, earliest = 0, None
+    for pid, starts, payload in _packets(log, content, size, first):
+        if pid == 0 and starts and not programmes:
+            programmes = _programmes(payload)
+        elif pid in programmes and starts and metadata is None:
+            added = list(_streams(payload))
+            streams += added
+            videos = [n for kind, n, _ in streams if kind in _VIDEO_TYPES]
+            video = videos[0] if videos else None
+            klv = [n for kind, n, text in added if kind == _METADATA_IN_PES or (kind == _PRIVATE and b"KLVA" in text)]
+            metadata = klv[0] if klv else None
+        elif pid == video and starts:
+            if (stamp := _stamp(payload)) is not None:
+                # Pictures are not sent in display order.
+                earliest = stamp if earliest is None else min(earliest, _near(stamp, earliest))
+                last_video = stamp
+        elif pid == metadata:
+            if starts and payload[:3] == b"\0\0\1" and len(payload) > 8:
+                packets.append((_stamp(payload), last_video, bytearray(payload[9 + payload[8] :])))
+            elif packets:
+                packets[-1][2].extend(payload)
+    if metadata is None:
+        kinds = ", ".join(f"0x{kind:02x}" for kind, *_ in streams) or "none"
+        raise log.refuse(f"this MPEG-TS carries no KLV metadata; its streams are of the types {kinds}")
+    origin = earliest if earliest is not None else next((p[0] for p in packets if p[0] is not None), 0)
+
+    def since_origin(stamp: int | None) -> float:
+        return math.nan if stamp is None else (_near(stamp, origin) - origin) / _HZ
+
+    return [Piece(since_origin(stamp), since_origin(seen), bytes(payload)) for stamp, seen, payload in packets]
+
+
+def _near(stamp: int, other: int) -> int:
+    """A 33-bit time stamp, unwrapped to be near another."""
+    return other + (stamp - other + _WRAP // 2) % _WRAP - _WRAP // 2
+
+
+def _packets(log: Log, content: bytes, size: int, first: int) -> Iterator[tuple[int, bool, bytes]]:
+    """Stream number, whether a unit starts, and payload of each unscrambled packet; damage is noted at the end."""
+    place = first
+    damaged: list[int] = []
+    while place + _PACKET <= len(content):
+        if content[place : place + 1] != _SYNC:
+            damaged.append(place)
+            # The next byte that begins a packet and that another one follows.
+            while (place := content.find(_SYNC, place + 1)) >= 0 and content[place + size : place + size + 1] not in (
+                b"",
+                _SYNC,
+            ):
+                pass
+            if place < 0:
+                break
+            continue
+        flags = content[place + 3]
+        if flags & 0x10 and not flags & 0xC0 and not content[place + 1] & 0x80:
+            begin = place + 4 + (content[place + 4] + 1 if flags & 0x20 else 0)
+            pid = (content[place + 1] & 0x1F) << 8 | content[place + 2]
+            if begin < place + _PACKET:
+                yield pid, bool(content[place + 1] & 0x40), content[begin : place + _PACKET]
+        place += size
+    if damaged:
+        log.note(f"byte {damaged[0]}: the transport stream is out of step, {len(damaged)} times in all")
+    if 0 <= place < len(content):
+        log.note(f"the file ends within a transport packet, at byte {len(content)}: it was cut off")
+
+
+def _programmes(payload: bytes) -> set[int]:
+    """Stream numbers of the programme tables."""
+    table = payload[1 + payload[0] :] if payload else b""
+    length = ((table[1] & 0x0F) << 8 | table[2]) if len(table) > 8 else 0
+    entries = table[8 : min(3 + length - 4, len(table))]
+    quads = zip(entries[0::4], entries[1::4], entries[2::4], entries[3::4], strict=False)
+    return {(c & 0x1F) << 8 | d for a, b, c, d in quads if a or b}
+
+
+def _streams(payload: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Type, number and description of a programme's streams."""
+    table = payload[1 + payload[0] :] if payload else b""
+    if len(table) < 12 or table[0] != 0x02:
+        return
+    end = min(3 + ((table[1] & 0x0F) << 8 | table[2]) - 4, len(table))
+    place = 12 + ((table[10] & 0x0F) << 8 | table[11])
+    while place + 5 <= end:
+        size = (table[place + 3] & 0x0F) << 8 | table[place + 4]
+        number = (table[place + 1] & 0x1F) << 8 | table[place + 2]
+        yield table[place], number, table[place + 5 : place + 5 + size]
+        place += 5 + size
+
+
+def _stamp(payload: bytes) -> int | None:
+    """The presentation time of a PES packet, 33 bits at 90 kHz."""
+    if payload[:3] != b"\0\0\1" or len(payload) < 14 or not payload[7] & 0x80:
+        return None
+    a, b, c, d, e = payload[9:14]
+    return (a >> 1 & 7) << 30 | b << 22 | (c >> 1) << 15 | d << 7 | e >> 1

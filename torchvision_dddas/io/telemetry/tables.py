@@ -2,15 +2,17 @@
 
 import math
 import re
+from datetime import UTC, datetime, timedelta
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.io.tables import Column, CsvText, Schema, read_csv, read_table
-from torchvision_dddas.io.telemetry.log import OWN, Log, assemble
-from torchvision_dddas.io.telemetry.quantities import QUANTITY, dated, hfov_of_focal, understood
+from torchvision_dddas.io.telemetry.record import OWN, Log, build_record
 from torchvision_dddas.types import Telemetry
 
 COLUMNS = ("time_s", "altitude_m", "speed_m_s")
@@ -18,30 +20,30 @@ COLUMNS = ("time_s", "altitude_m", "speed_m_s")
 
 PAIRS = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
 _COMPASS = (-360.0, 360.0, "clockwise from true north, -360 to 360")
+_LOCAL = (-1e7, 1e7, "metres from the origin, -1e7 to 1e7")
+_OPTIONAL: dict[str, tuple[Any, ...]] = {
+    "altitude_m": (),
+    "speed_m_s": (0.0, math.inf, "the speed over ground, 0 or more"),
+    "longitude_deg": (),
+    "latitude_deg": (),
+    "east_m": _LOCAL,
+    "north_m": _LOCAL,
+    "above_sea_m": (),
+    "heading_deg": _COMPASS,
+    # A gimbal that looks straight down reports 90.2 as well as 89.8.
+    "pitch_deg": (-180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
+    "roll_deg": (-180.0, 180.0, "clockwise, -180 to 180"),
+    "hfov_deg": (0.0, 180.0, "the width of the field of view, 0 to 180"),
+    "vehicle_heading_deg": _COMPASS,
+}
 SCHEMA = Schema(
     "telemetry",
     Column("time_s", "g", -1e10, 1e10, wanted="seconds since the clip's first frame"),
     *(
-        Column(name, "g", low, high, may_be_empty=True, wanted=wanted)
-        for name, low, high, wanted in (
-            ("altitude_m", -math.inf, math.inf, ""),
-            ("speed_m_s", 0.0, math.inf, "the speed over ground, 0 or more"),
-            ("longitude_deg", -math.inf, math.inf, ""),
-            ("latitude_deg", -math.inf, math.inf, ""),
-            ("east_m", -1e7, 1e7, "metres from the origin, -1e7 to 1e7"),
-            ("north_m", -1e7, 1e7, "metres from the origin, -1e7 to 1e7"),
-            ("above_sea_m", -math.inf, math.inf, ""),
-            ("heading_deg", *_COMPASS),
-            # A gimbal that looks straight down reports 90.2 as well as 89.8.
-            ("pitch_deg", -180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
-            ("roll_deg", -180.0, 180.0, "clockwise, -180 to 180"),
-            ("hfov_deg", 0.0, 180.0, "the width of the field of view, 0 to 180"),
-            ("vehicle_heading_deg", *_COMPASS),
-        )
+        Column(name, "g", *limits[:2], may_be_empty=True, wanted="".join(limits[2:]))
+        for name, limits in _OPTIONAL.items()
     ),
 )
-_TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds", "flytime", "elapsed", "elapsedtime"}
-_PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
 
 def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None) -> Telemetry:
@@ -50,7 +52,8 @@ def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None) -
     Raises InputError with file and line: as read_table, no rows, half a place, a time before the one above it.
     """
     text = read_csv(path, "telemetry")
-    if "time_s" in text.header or not _is_program_table(text.header):
+    names = {_plain(name)[0] for name in text.header}
+    if "time_s" in text.header or not (names & (_TIMES | {"frame"}) and names & set(QUANTITY)):
         return _read_own(path, text, clock_offset_s)
     return _read_program_table(Log(path, "flight log table"), text, clock_offset_s, clip)
 
@@ -67,31 +70,113 @@ def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
         raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind, leave the other out")
     if not len(table):
         raise InputError(f"telemetry {path} has a header but no rows")
-    time_s, number = table["time_s"], table.line.astype(float)
+    time_s = table["time_s"]
     if (is_back := np.diff(time_s) < 0).any():
         row = int(np.argmax(is_back)) + 1
         raise table.error(f"time_s runs back from {time_s[row - 1]:g} to {time_s[row]:g}; sort it by time", row)
-    log = Log(path, OWN)
-    log.moments += zip(time_s.tolist(), number.tolist(), strict=True)
+    log = Log(path, OWN, moments=np.column_stack([time_s, time_s, table.line]))
     for name in known[1:]:
-        values = table[name]
-        is_known = np.isfinite(values)
         is_angle = name.endswith("_deg") and name not in PAIRS[0]
-        quantity = name.replace("_deg", "_rad") if is_angle else name
-        log.add_all(
-            quantity, time_s[is_known], (np.radians(values) if is_angle else values)[is_known], number[is_known]
-        )
-    return assemble(log, clock_offset_s)
+        values = {name.replace("_deg", "_rad"): np.radians(table[name])} if is_angle else {name: table[name]}
+        log.add_all(time_s, table.line, values, known=True)
+    return build_record(log, clock_offset_s)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# What makers call the same thing: from a key and its unit to a quantity of the record.
+
+_KEYS = {
+    "latitude_deg": "latitude lat gpslatitude gpslat",
+    "longitude_deg": "longitude longtitude lon lng long gpslongitude gpslon",
+    "altitude_m": "relalt relativealtitude relativeheight heightabovetakeoff altitudeagl heightagl altagl agl "
+    "altitudem height barometer baro hb h",
+    "above_sea_m": "absalt absolutealtitude altitudeabovesealevel abovesea amsl altitudemsl altmsl msl gpsaltitude "
+    "gpsalt altitude alt",
+    "speed_m_s": "h.s speed groundspeed hspeed horizontalspeed velocity",
+    "heading_rad": "gbyaw gimbalyaw gimbalheading",
+    "pitch_rad": "gbpitch gimbalpitch",
+    "roll_rad": "gbroll gimbalroll",
+    "vehicle_heading_rad": "heading yaw compassheading flightyaw uavyaw",
+    "hfov_rad": "hfov horizontalfov",
+}
+QUANTITY = {key: quantity for quantity, keys in _KEYS.items() for key in keys.split()}
+"""Quantity by key, without capitals, blanks, dashes and underscores; of several, what stands first tells it best."""
+
+_UNITS = {
+    "ft": 0.3048, "feet": 0.3048, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600,
+    "knots": 1852 / 3600, "kt": 1852 / 3600, "kts": 1852 / 3600, "cm": 0.01, "mm": 0.001,
+}  # fmt: skip
+_DATE = re.compile(
+    r"(\d{4})[./-](\d{1,2})[./-](\d{1,2})[ T]+(\d{1,2}):(\d{1,2}):(\d{1,2})"
+    r"(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*(Z|[+-]\d{2}:?\d{2})?"
+)
+# Half the width of the picture whose focal length is said as that of a 36 mm wide one.
+_HALF_WIDTH_MM = 18.0
+
+
+@cache
+def quantity_of(key: str) -> str | None:
+    """What a key tells, however it is written; None for one that tells nothing of the flight."""
+    return QUANTITY.get(re.sub(r"[\s_-]", "", key.lower()))
+
+
+def convert(key: str, value: float, unit: str = "") -> tuple[str, float] | None:
+    """The quantity and its value in the record's units and signs; None for a key that tells none."""
+    quantity = quantity_of(key)
+    if quantity is None:
+        return None
+    unit = unit.lower()
+    value *= _UNITS.get(unit, 1.0)
+    if quantity.endswith("_rad") and unit not in ("rad", "radians"):
+        value = math.radians(value)
+    # A gimbal's pitch is counted up from the horizon, the record's down.
+    return quantity, 0.0 - value if quantity == "pitch_rad" else value
+
+
+def parse_date(text: str) -> tuple[float, bool] | None:
+    """Seconds since 1970 of the first date with a time in a text, and whether its zone is told; else it is as if UTC.
+
+    None without a date. Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`.
+    """
+    found = _DATE.search(text)
+    if found is None:
+        return None
+    *whole, fraction, micro, zone = found.groups(default="")
+    try:
+        moment = datetime(*map(int, whole), tzinfo=UTC)
+    except ValueError:
+        return None
+    seconds = moment.timestamp() + float(f"0.{fraction}{micro if len(fraction) == 3 else ''}0")
+    if zone not in ("", "Z"):
+        away = timedelta(hours=int(zone[1:3]), minutes=int(zone[-2:])).total_seconds()
+        seconds -= math.copysign(away, float(zone[0] + "1"))
+    return seconds, bool(zone)
+
+
+def hfov_of_focal(focal_text: str, fnum_text: str, zoom_text: str) -> float | None:
+    """Width of the field of view, rad, from a focal length as that of a 36 mm wide picture; None if it is none.
+
+    Some write both it and the aperture times ten and a hundred: 240 beside 280 is 24 mm at f/2.8.
+    """
+    focal, fnum, zoom = map(_to_float, (focal_text, fnum_text, zoom_text))
+    if "." not in focal_text and focal >= 100 and not fnum < 100:
+        focal /= 10
+    focal *= zoom if 1 <= zoom <= 100 else 1.0
+    return 2 * math.atan(_HALF_WIDTH_MM / focal) if 8 <= focal <= 2000 else None
+
+
+def _to_float(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Tables of other programs.
 
-
-def _is_program_table(header: list[str]) -> bool:
-    """Whether a header has a column of times or frames, and one that tells something of a flight."""
-    names = {_plain(name)[0] for name in header}
-    return bool(names & _TIMES or "frame" in names) and bool(names & set(QUANTITY))
+_TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds", "flytime", "elapsed", "elapsedtime"}
+_PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
 
 def _plain(name: str) -> tuple[str, str]:
@@ -106,77 +191,61 @@ def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Pa
 
     Raises InputError with the line for a time that is none, and where frames are counted and no clip is given.
     """
-    names = [_plain(name) for name in text.header]
-    timed = next((i for i, (name, _) in enumerate(names) if name in _TIMES), None)
-    focal, fnum, zoom, frame = (_index(names, key) for key in ("focallen", "fnum", "dzoomratio", "frame"))
+    names, units = zip(*map(_plain, text.header), strict=True)
+    is_timed = not _TIMES.isdisjoint(names)
+    clock = next(i for i, name in enumerate(names) if name in (_TIMES if is_timed else ("frame",)))
     rate_hz = math.nan
-    if timed is None:
+    if not is_timed:
         if clip is None:
             raise InputError(f"telemetry {log.path} has frames and no times; give its clip, or a column time_s")
         rate_hz = open_source(clip).rate_hz
-    used = _best_columns(names)
-    if {names[i][0] for i in used} & {"altitude", "alt"}:
+    # For each quantity the column with the best of its names.
+    ranks = {key: rank for rank, key in enumerate(QUANTITY)}
+    best: dict[str, tuple[int, int]] = {}
+    for i, name in enumerate(names):
+        if name in QUANTITY:
+            best[QUANTITY[name]] = min(best.get(QUANTITY[name], (len(ranks), i)), (ranks[name], i))
+    used = sorted(i for _, i in best.values())
+    if {names[i] for i in used} & {"altitude", "alt"}:
         log.note("the file does not say where the altitude is zero; above the sea is assumed")
+    optics = [names.index(key) if key in names else None for key in ("focallen", "fnum", "dzoomratio")]
     first = begin = math.nan
-    zoned = False
+    is_zoned = False
     for number, row in zip(text.line, text.rows, strict=True):
         cells = row + [""] * (len(names) - len(row))
-        if timed is not None:
-            moment, told = _moment(cells[timed], names[timed][1])
-            zoned = zoned or told
+        if is_timed:
+            moment, has_zone = _moment(cells[clock], units[clock])
+            is_zoned = is_zoned or has_zone
         else:
-            count = _float(cells[frame or 0])
+            count = _to_float(cells[clock])
             begin = min(count, 1.0) if math.isnan(begin) else begin  # frames are counted from 0 or from 1
             moment = (count - begin) / rate_hz
         if not math.isfinite(moment):
-            cell = cells[timed] if timed is not None else cells[frame or 0]
-            raise log.refuse(f"'{cell}' is no time; wanted a date with a time, or seconds", number)
-        first = (moment if timed is not None else 0.0) if math.isnan(first) else first
-        log.moments.append((moment - first, number))
+            raise log.refuse(f"'{cells[clock]}' is no time; wanted a date with a time, or seconds", number)
+        first = (moment if is_timed else 0.0) if math.isnan(first) else first
+        log.moments.append((moment - first, 0.0, number))
         for i in used:
-            value = _float(cells[i])
-            if math.isfinite(value) and (said := understood(names[i][0], value, names[i][1])):
-                log.add(said[0], moment - first, said[1], number)
-        if focal is not None and math.isfinite(_float(cells[focal])):
-            numbers = [_float(cells[i]) if i is not None else math.nan for i in (fnum, zoom)]
-            if (hfov := hfov_of_focal(cells[focal], *numbers)) is not None:
-                log.add("hfov_rad", moment - first, hfov, number)
-                log.note("the field of view is that of a focal length for a picture 36 mm wide")
+            value = _to_float(cells[i])
+            if math.isfinite(value) and (found := convert(names[i], value, units[i])):
+                log.add(found[0], moment - first, found[1], number)
+        hfov = hfov_of_focal(*("" if i is None else cells[i] for i in optics))
+        if hfov is not None:
+            log.add("hfov_rad", moment - first, hfov, number)
+            log.note("the field of view is that of a focal length for a picture 36 mm wide")
     if not log.moments:
         raise InputError(f"telemetry {log.path} has a header but no rows")
-    return assemble(log, clock_offset_s, first if zoned else math.nan)
-
-
-def _best_columns(names: list[tuple[str, str]]) -> list[int]:
-    """For each quantity the column with the best of its names."""
-    best: dict[str, tuple[int, int]] = {}
-    for i, (name, _) in enumerate(names):
-        if name in QUANTITY:
-            rank = (list(QUANTITY).index(name), i)
-            best[QUANTITY[name]] = min(best.get(QUANTITY[name], rank), rank)
-    return sorted(i for _, i in best.values())
+    return build_record(log, clock_offset_s, first if is_zoned else math.nan)
 
 
 def _moment(text: str, unit: str) -> tuple[float, bool]:
     """Seconds of a date, a time of day or a number, and whether they are since 1970 in UTC."""
-    if date := dated(text):
+    if date := parse_date(text):
         return date[0], date[1] or unit == "utc"
     if clock := re.fullmatch(r"(\d+):(\d+):(\d+(?:\.\d+)?)", text):
         return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]), False
-    value = _float(text)
-    since_1970 = value > 1e9
-    if unit in _PER_SECOND:
-        return value / _PER_SECOND[unit], since_1970 and value / _PER_SECOND[unit] > 1e9
+    value = _to_float(text)
+    is_since_1970 = value > 1e9
     # Without a unit the size tells: of times since 1970, 10 digits are seconds, 13 milli- and 16 microseconds.
-    return value / (1e6 if value > 1e14 else 1e3 if value > 1e11 else 1.0), since_1970
-
-
-def _index(names: list[tuple[str, str]], key: str) -> int | None:
-    return next((i for i, (name, _) in enumerate(names) if name == key), None)
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+    per_second = _PER_SECOND.get(unit, 1e6 if value > 1e14 else 1e3 if value > 1e11 else 1.0)
+    value /= per_second
+    return value, is_since_1970 and (unit not in _PER_SECOND or value > 1e9)

@@ -1,4 +1,4 @@
-"""The samples of a log, checked and resampled at common times as one telemetry record."""
+"""One record of a flight from the samples of any log: checked, and resampled at common times."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.types import Telemetry
 
 OWN = "table"
@@ -19,10 +20,9 @@ _POSSIBLE = {"altitude_m": (-1e4, 1e5), "above_sea_m": (-1e4, 1e5), "speed_m_s":
 _GAP_SHARE, _GAP_S = 10.0, 5.0
 # A log with nothing but these is refused.
 _NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad"}
-_TURNING = ("heading_rad", "roll_rad", "vehicle_heading_rad")
+# Angles that turn all the way round, and the lower end of their range.
+_TURNING = {"heading_rad": 0.0, "roll_rad": -np.pi, "vehicle_heading_rad": 0.0}
 _FULL = {"longitude_deg": 360.0} | dict.fromkeys(_TURNING, 2 * np.pi)
-# Metres a degree of latitude; right to half a per cent, better than a smoothed speed.
-_DEGREE_M = 111_320.0
 # Half the time span over which a line is fitted to the places: lowest and highest.
 _LEAST_S, _MOST_S = 1.0, 10.0
 # Places are rounded: the span is long enough for a step of the last digit to change the speed by no more than this.
@@ -33,12 +33,13 @@ _WANDER_M = 0.1
 
 @dataclass
 class Log:
-    """What was read so far. path: of the file. kind: in words, for messages. where: unit of places in the file.
+    """The samples of a log. path: of the file. kind: in words, for messages. where: unit of places in the file.
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
     jitter_s: how far time may run back; more is another recording, or damage.
-    samples: quantity -> (time, value, place in the file). columns: quantity -> the same as an array (N, 3).
-    moments: time and place of each row of a log whose rows hold all quantities, also of empty rows.
+    samples: column of the record -> rows of time, value (NaN where unknown) and place in the file. A place is
+    longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any value, of each row of a log whose
+    rows hold all quantities, also of empty rows.
     """
 
     path: Path
@@ -47,33 +48,33 @@ class Log:
     bridge_s: float = 0.0
     jitter_s: float = 1.0
     notes: list[str] = field(default_factory=list)
-    samples: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
-    moments: list[tuple[float, int]] = field(default_factory=list)
-    columns: dict[str, np.ndarray] = field(default_factory=dict)
+    samples: dict[str, list[tuple[float, float, int]] | np.ndarray] = field(default_factory=dict)
+    moments: list[tuple[float, float, int]] | np.ndarray = field(default_factory=list)
 
     def add(self, quantity: str, time_s: float, value: float, where: int) -> None:
-        """Add a value at a time, NaN where it is unknown. where: its place in the file.
+        """Add a sample."""
+        rows = self.samples.setdefault(quantity, [])
+        assert isinstance(rows, list)
+        rows.append((time_s, value, where))
 
-        quantity: a column of the record; a place is longitude_deg and latitude_deg, or east_m and north_m.
-        """
-        self.samples.setdefault(quantity, []).append((time_s, value, where))
-
-    def add_all(self, quantity: str, times: np.ndarray, values: np.ndarray, where: np.ndarray) -> None:
-        """Add all samples of a quantity, each argument (N,)."""
-        self.columns[quantity] = np.stack([times, values, where], axis=1).astype(float)
+    def add_all(self, times: np.ndarray, where: np.ndarray, values: dict[str, np.ndarray], known: bool = False) -> None:
+        """Set all samples of some quantities, each argument (N,). known: whether to leave out unknown values."""
+        for quantity, column in values.items():
+            rows = np.column_stack([times, column, where]).astype(float)
+            self.samples[quantity] = rows[~np.isnan(rows[:, 1])] if known else rows
 
     def note(self, text: str) -> None:
         """Note what the user should know, once."""
         if text not in self.notes:
             self.notes.append(text)
 
-    def refuse(self, text: str, where: int | None = None) -> InputError:
+    def refuse(self, text: str, where: float | None = None) -> InputError:
         """The error to raise, with the file and the place."""
-        place = f", {self.where} {where}" if where is not None else ""
+        place = f", {self.where} {where:.0f}" if where is not None else ""
         return InputError(f"telemetry {self.path}{place}: {text}")
 
 
-def assemble(
+def build_record(
     log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float("nan"), from_first: bool = False
 ) -> Telemetry:
     """The record of a log: a row for each time of any sample, every column linear between its own samples.
@@ -82,9 +83,8 @@ def assemble(
     Raises InputError where neither altitude, place nor attitude is known, where a place is off the globe, and where
     time runs back.
     """
-    rows_of = {name: np.array(rows, float).reshape(-1, 3) for name, rows in log.samples.items()} | log.columns
-    samples = {name: _sort(log, rows) for name, rows in rows_of.items()}
-    moments = _sort(log, np.insert(np.array(log.moments, float).reshape(-1, 2), 1, 0.0, axis=1))
+    samples = {name: _sort(log, np.array(rows, float).reshape(-1, 3)) for name, rows in log.samples.items()}
+    moments = _sort(log, np.array(log.moments, float).reshape(-1, 3))
     start = min((rows[0, 0] for rows in (*samples.values(), moments) if len(rows)), default=0.0) if from_first else 0.0
     for rows in (*samples.values(), moments):
         rows[:, 0] -= start
@@ -93,14 +93,13 @@ def assemble(
     samples = {name: rows for name, rows in samples.items() if np.isfinite(rows[:, 1]).any()}
     if not set(samples) - _NOT_ALONE:
         raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
-    _note_missing(log, samples)
+    _note_altitude(log, samples)
     _note_silence(log, samples)
-    times = _with_gaps(log, np.unique(np.concatenate([moments[:, 0], *(rows[:, 0] for rows in samples.values())])))
+    times = _with_gaps(log, np.unique(np.concatenate([rows[:, 0] for rows in (moments, *samples.values())])))
     columns = {name: _column(times, rows, log.bridge_s, _FULL.get(name)) for name, rows in samples.items()}
-    for name in _TURNING:
+    for name, low in _TURNING.items():
         if name in columns:
-            around = np.pi if name == "roll_rad" else 0.0
-            columns[name] = (columns[name] + around) % (2 * np.pi) - around
+            columns[name] = (columns[name] - low) % (2 * np.pi) + low
     unknown = np.full(len(times), np.nan)
     geographic = "longitude_deg" in samples or "east_m" not in samples
     pair = ("longitude_deg", "latitude_deg") if geographic else ("east_m", "north_m")
@@ -131,10 +130,9 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
     most = max(_GAP_SHARE * float(np.median(steps)), _GAP_S, log.bridge_s)
     gaps = np.flatnonzero(steps > most)
     if len(gaps):
-        first = gaps[0]
         log.note(
             f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s without samples, the first after "
-            f"{times[first]:.1f} s for {steps[first]:.1f} s: nothing is known within"
+            f"{times[gaps[0]]:.1f} s for {steps[gaps[0]]:.1f} s: nothing is known within"
         )
     return np.sort(np.concatenate([times, (times[gaps] + times[gaps + 1]) / 2]))
 
@@ -142,31 +140,26 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
 def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | None) -> np.ndarray:
     """One quantity at all times: linear between two samples that are near each other, else NaN.
 
-    A quantity that is sampled more rarely than others is interpolated; one with a long pause is unknown in it.
+    A quantity that is sampled more rarely than others is interpolated; one with a long pause is unknown in it. Outside
+    its span a column holds for bridge_s.
     """
     known, values = rows[:, 0], rows[:, 1]
-    if len(known) == len(times) and np.array_equal(known, times):
+    if np.array_equal(known, times):
         return values
-    steps = np.diff(known)
-    if len(steps) == 0:
+    if len(known) == 1:
         return np.where(times == known[0], values[0], np.nan)
-    most = _longest_silence_s(known, bridge_s)
     after = np.searchsorted(known, times).clip(1, len(known) - 1)
     before = after - 1
-    share = (times - known[before]) / steps[before]
+    step_s = known[after] - known[before]
+    share = (times - known[before]) / step_s
     way = values[after] - values[before]
     if full is not None:
         way = (way + full / 2) % full - full / 2
-    found = values[before] + share * way
-    # Outside its span a column holds for bridge_s; on a sample it has the value of the sample.
-    found = np.where(share < 0, values[before], np.where(share > 1, values[after], found))
-    outside = np.maximum(known[0] - times, times - known[-1])
-    found[(outside > 0) & (outside > bridge_s)] = np.nan
-    found[(outside <= 0) & (steps[before] > most) & (share > 0) & (share < 1)] = np.nan
-    found = np.where(share == 0, values[before], np.where(share == 1, values[after], found))
-    if full == 360.0:
-        return (found + 180) % 360 - 180
-    return found
+    column = np.where(share <= 0, values[before], np.where(share >= 1, values[after], values[before] + share * way))
+    outside_s = np.maximum(known[0] - times, times - known[-1])
+    is_in_pause = (share > 0) & (share < 1) & (step_s > _longest_silence_s(known, bridge_s))
+    column[(outside_s > bridge_s) | is_in_pause] = np.nan
+    return (column + 180) % 360 - 180 if full == 360.0 else column
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -177,12 +170,11 @@ def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
     """Sorted by time; of samples at the same time the last. Single damaged times are left out."""
     rows = rows[np.isfinite(rows[:, 0])]
     rows = rows[~_stray(rows[:, 0], log.jitter_s)]
-    back = np.diff(rows[:, 0])
-    if len(back) and back.min() < -log.jitter_s:
-        i = int(np.argmax(back < -log.jitter_s))
+    is_back = np.diff(rows[:, 0]) < -log.jitter_s
+    if is_back.any():
+        before, after = rows[int(is_back.argmax()) :][:2]
         raise log.refuse(
-            f"time runs back from {rows[i, 0]:.3f} to {rows[i + 1, 0]:.3f} s; are these two recordings in one file?",
-            int(rows[i + 1, 2]),
+            f"time runs back from {before[0]:.3f} to {after[0]:.3f} s; are these two recordings in one file?", after[2]
         )
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     return rows[np.append(np.diff(rows[:, 0]) > 0, True)] if len(rows) else rows
@@ -193,9 +185,8 @@ def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
     stray = np.zeros(len(times), bool)
     if len(times) < 3 or not np.isfinite(jitter_s):
         return stray
-    before, after = times[:-2], times[2:]
-    around = (before <= after) & ((times[1:-1] < before - jitter_s) | (times[1:-1] > after + jitter_s))
-    stray[1:-1] = around
+    before, middle, after = times[:-2], times[1:-1], times[2:]
+    stray[1:-1] = (before <= after) & ((middle < before - jitter_s) | (middle > after + jitter_s))
     stray[0] = times[0] > times[1] + jitter_s and times[1] <= times[2]
     stray[-1] = times[-1] < times[-2] - jitter_s and times[-3] <= times[-2]
     # A day without a sample, then one: its time is damaged.
@@ -206,41 +197,35 @@ def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
 def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Set impossible values to NaN."""
     for name, rows in samples.items():
-        if (endless := np.isinf(rows[:, 1])).any():
-            where = int(rows[np.argmax(endless), 2])
-            log.note(f"{log.where} {where}: {name} is infinite, which cannot be; {endless.sum()} left out")
-            rows[endless, 1] = np.nan
-    for name, (least, most) in _POSSIBLE.items():
-        if name in samples:
-            rows = samples[name]
-            with np.errstate(invalid="ignore"):
-                wrong = ~((rows[:, 1] >= least) & (rows[:, 1] <= most)) & ~np.isnan(rows[:, 1])
+        low, high = _POSSIBLE.get(name, (-np.inf, np.inf))
+        is_infinite = np.isinf(rows[:, 1])
+        is_beyond = ((rows[:, 1] < low) | (rows[:, 1] > high)) & ~is_infinite
+        for wrong in (is_infinite, is_beyond):
             if wrong.any():
-                _, value, where = rows[np.argmax(wrong)]
-                log.note(f"{log.where} {int(where)}: {name} is {value:g}, which cannot be; {wrong.sum()} left out")
+                _, value, where = rows[wrong.argmax()]
+                what = "infinite" if np.isinf(value) else f"{value:g}"
+                log.note(f"{log.where} {where:.0f}: {name} is {what}, which cannot be; {wrong.sum()} left out")
                 rows[wrong, 1] = np.nan
 
 
 def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Raises InputError for degrees that are none; longitude and latitude 0 stand for no fix."""
     for name, most in (("latitude_deg", 90.0), ("longitude_deg", 180.0)):
-        if name not in samples:
-            continue
-        wrong = np.abs(samples[name][:, 1]) > most
+        rows = samples.get(name, np.zeros((0, 3)))
+        wrong = np.abs(rows[:, 1]) > most
         if wrong.any():
-            _, value, where = samples[name][np.argmax(wrong)]
+            _, value, where = rows[wrong.argmax()]
             hint = "; are longitude and latitude swapped?" if name == "latitude_deg" and abs(value) <= 180 else ""
-            raise log.refuse(f"{name} is {value:g}; wanted -{most:g} to {most:g}{hint}", int(where))
-    if {"longitude_deg", "latitude_deg"} <= set(samples):
-        longitude, latitude = samples["longitude_deg"], samples["latitude_deg"]
-        if len(longitude) == len(latitude):
-            nowhere = (longitude[:, 1] == 0) & (latitude[:, 1] == 0)
-            longitude[nowhere, 1] = latitude[nowhere, 1] = np.nan
-            if nowhere.any():
-                log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
+            raise log.refuse(f"{name} is {value:g}; wanted -{most:g} to {most:g}{hint}", where)
+    longitude, latitude = (samples.get(name, np.zeros((0, 3))) for name in ("longitude_deg", "latitude_deg"))
+    if len(longitude) == len(latitude):
+        nowhere = (longitude[:, 1] == 0) & (latitude[:, 1] == 0)
+        longitude[nowhere, 1] = latitude[nowhere, 1] = np.nan
+        if nowhere.any():
+            log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
 
 
-def _note_missing(log: Log, samples: dict[str, np.ndarray]) -> None:
+def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Note where there is no place or no altitude, or one below the ground."""
     if not {"latitude_deg", "east_m"} & set(samples) and log.kind != OWN:
         log.note("the log holds no place")
@@ -249,30 +234,31 @@ def _note_missing(log: Log, samples: dict[str, np.ndarray]) -> None:
         return
     deep = samples["altitude_m"][:, 1] < _DEEP_M
     if deep.any():
-        _, value, where = samples["altitude_m"][np.argmax(deep)]
+        _, value, where = samples["altitude_m"][deep.argmax()]
         log.note(
-            f"{log.where} {int(where)}: the altitude above ground is {value:g} m, below the ground; "
+            f"{log.where} {where:.0f}: the altitude above ground is {value:g} m, below the ground; "
             f"{deep.sum()} of {len(deep)} are below {_DEEP_M:g} m; is its zero elsewhere?"
         )
 
 
-def _longest_silence_s(known: np.ndarray, bridge_s: float) -> float:
-    """The longest pause between samples over which a quantity is interpolated."""
-    return max(1.5 * float(np.median(np.diff(known))), bridge_s) if len(known) > 1 else bridge_s
-
-
 def _note_silence(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Note long pauses between the samples of the place."""
-    for name in ("latitude_deg", "east_m"):
-        known = samples[name][np.isfinite(samples[name][:, 1]), 0] if name in samples else np.zeros(0)
+    for name in {"latitude_deg", "east_m"} & set(samples):
+        times, values, _ = samples[name].T
+        known = times[np.isfinite(values)]
         steps = np.diff(known)
-        gaps = np.flatnonzero(steps > _longest_silence_s(samples[name][:, 0], log.bridge_s)) if len(steps) else steps
+        gaps = np.flatnonzero(steps > _longest_silence_s(times, log.bridge_s))
         if len(gaps):
             longest = gaps[np.argmax(steps[gaps])]
             log.note(
                 f"the place is unknown for a while {len(gaps)} time{'s' * (len(gaps) > 1)}, the longest for "
                 f"{steps[longest]:.1f} s after {known[longest]:.1f} s"
             )
+
+
+def _longest_silence_s(known: np.ndarray, bridge_s: float) -> float:
+    """The longest pause between samples over which a quantity is interpolated."""
+    return max(1.5 * float(np.median(np.diff(known))), bridge_s) if len(known) > 1 else bridge_s
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -291,7 +277,7 @@ def _speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) 
     metres = place[known] - place[known][0]
     if geographic:
         metres[:, 0] = (metres[:, 0] + 180) % 360 - 180
-        metres *= _DEGREE_M * np.array([np.cos(np.radians(place[known][0, 1])), 1.0])
+        metres *= DEGREE_M * np.array([np.cos(np.radians(place[known][0, 1])), 1.0])
     wanted_s = min(_step_m(place[known], geographic) / _STEP_M_S, _MOST_S)
     half_s = max(wanted_s, _LEAST_S, 2.0 * float(np.median(np.diff(times))))
     low = np.searchsorted(times, times - half_s - 1e-6)
@@ -310,7 +296,7 @@ def _speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) 
 
 def _step_m(place: np.ndarray, geographic: bool) -> float:
     """The step of the last written digit of the places, m."""
-    metres, least = (_DEGREE_M, _WANDER_M) if geographic else (1.0, 0.0)
+    metres, least = (DEGREE_M, _WANDER_M) if geographic else (1.0, 0.0)
     for digits in range(8):
         shifted = place * 10.0**digits
         if np.allclose(shifted, np.round(shifted), rtol=0, atol=1e-4):

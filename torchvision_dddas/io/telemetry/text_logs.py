@@ -1,0 +1,241 @@
+"""Telemetry in text: DJI's subtitle files in any dialect, and NMEA 0183 sentences of a receiver."""
+
+import math
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry.record import Log, build_record
+from torchvision_dddas.io.telemetry.tables import convert, hfov_of_focal, parse_date, quantity_of
+from torchvision_dddas.types import Telemetry
+
+Numbers = list[tuple[float, str]]
+"""The numbers in a pair of brackets, each with the letters beside it."""
+
+_TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
+_MARKUP = re.compile(r"<[^>]*>")
+_NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
+_TUPLE = re.compile(r"([A-Za-z][A-Za-z.]*)\s*:?\s*\(([^)]*)\)?")
+_PAIR = re.compile(
+    rf"([A-Za-z][A-Za-z_.]*)\s*[:=]?\s*({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])",
+    re.IGNORECASE,
+)
+_OPTICS = ("focal_len", "fnum", "dzoom_ratio")
+_AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
+
+
+def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
+    """Raises InputError without any position, height or attitude, or if times decrease."""
+    log = Log(path, "DJI subtitles", bridge_s=2.0)
+    subtitles = _subtitles(text)
+    tuples = [_tuples(words) for *_, words in subtitles]
+    is_swapped = _is_latitude_first(log, *([t[name] for t in tuples if name in t] for name in ("gps", "home")))
+    dates = [parse_date(words) for *_, words in subtitles]
+    first_s, is_zoned = next((date for date in dates if date), (math.nan, False))
+    lacking: dict[str, list[int]] = {}
+    for (line, time_s, words), numbers, date in zip(subtitles, tuples, dates, strict=True):
+        if math.isnan(time_s):
+            time_s = date[0] - first_s if date else math.nan
+        if math.isnan(time_s):
+            log.note(f"line {line}: a subtitle without time is left out")
+            continue
+        values = _quantities(log, words, numbers, is_swapped)
+        log.moments.append((time_s, 0.0, line))
+        for name in [name for name in log.samples if name not in values]:
+            lacking.setdefault(name, []).append(line)
+            values[name] = math.nan
+        for name, value in values.items():
+            log.add(name, time_s, value, line)
+    _note_lacking(log, lacking, subtitles[-1][0] if subtitles else 0, len(subtitles))
+    if not is_zoned and math.isfinite(first_s):
+        log.note("the dates are in an unknown time zone, so the clock is not known")
+    return build_record(log, clock_offset_s, first_s - log.moments[0][0] if is_zoned and log.moments else math.nan)
+
+
+def _subtitles(text: str) -> list[tuple[int, float, str]]:
+    """Line, time (NaN without a timing) and text without markup of each subtitle.
+
+    Subtitles begin with a timing; in a file without timings they lie between blank lines.
+    """
+    lines = [line.strip() for line in text.splitlines()]
+    is_timed = any(_TIMING.match(line) for line in lines)
+    blocks: list[tuple[int, float, list[str]]] = []
+    is_between = not is_timed
+    for number, line in enumerate(lines, 1):
+        if timing := _TIMING.match(line):
+            hours, minutes, seconds, fraction = timing.groups()
+            time_s = int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{fraction}")
+            blocks.append((number, time_s, []))
+        elif not line or line.isdigit():
+            is_between = not is_timed
+        elif is_between or blocks:
+            if is_between:
+                blocks.append((number, math.nan, []))
+                is_between = False
+            blocks[-1][2].append(line)
+    return [(number, time_s, _MARKUP.sub(" ", "\n".join(words))) for number, time_s, words in blocks]
+
+
+def _tuples(text: str) -> dict[str, Numbers]:
+    """Numbers in brackets by the name before them."""
+    found: dict[str, Numbers] = {}
+    for name, inside in _TUPLE.findall(text) if "(" in text else ():
+        cells = re.split(r"[;,]\s+|;", inside) if re.search(r"[;,]\s|;", inside) else inside.split(",")
+        if "." not in inside and len(cells) >= 4 and len(cells) == inside.count(",") + 1:
+            cells = [",".join(cells[i : i + 2]) for i in range(0, len(cells), 2)]  # decimal commas
+        matches = [re.search(_NUMBER, cell) for cell in cells]
+        values = [float(match[0].replace(",", ".")) if match else math.nan for match in matches]
+        letters = [re.sub(rf"{_NUMBER}|[\s:°]", "", cell).upper() for cell in cells]
+        found["gps" if name.lower() == "rtk" else name.lower()] = list(zip(values, letters, strict=True))
+    return found
+
+
+def _is_latitude_first(log: Log, gps: list[Numbers], home: list[Numbers]) -> bool:
+    """Whether GPS(...) has the latitude first: by values beyond 90 degrees, else by dialect.
+
+    DJI writes longitude, latitude and the number of satellites; if the third is in metres, latitude comes first.
+    """
+    pairs = np.array([[a[0][0], a[1][0]] for a in gps + home if len(a) > 1 and not a[0][1] and not a[1][1]])
+    if not len(pairs):
+        return False
+    is_first_longitude, is_second_longitude = (np.abs(pairs) > 90).any(axis=0)
+    if is_first_longitude or is_second_longitude:
+        return bool(is_second_longitude and not is_first_longitude)
+    is_metres = any(len(a) > 2 and a[2][1] == "M" for a in gps)
+    log.note(
+        f"GPS(...) is taken as {'latitude, longitude' if is_metres else 'longitude, latitude'}, as this dialect has "
+        "it: the numbers would fit either order"
+    )
+    return is_metres
+
+
+def _quantities(log: Log, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> dict[str, float]:
+    """Values of one subtitle by quantity."""
+    values = _place(tuples.get("gps", []), is_swapped)
+    for name, keys in _AXES.items():
+        for key, (value, _) in zip(keys, tuples.get(name, ()), strict=False):
+            if found := convert(key, value):
+                values[found[0]] = found[1]
+    optics: dict[str, str] = {}
+    for key, number, unit in _PAIR.findall(_TUPLE.sub(" ", text) if tuples else text):
+        if key in _OPTICS:
+            optics[key] = number
+        # Only with a unit the letter h means the height.
+        if quantity_of(key) is None or (key.lower() == "h" and not unit):
+            continue
+        found = convert(key, float(number.replace(",", ".")), unit)
+        if found and found[0] not in values:
+            values[found[0]] = found[1]
+            if key.lower() in ("altitude", "alt"):
+                log.note("the file does not say where the altitude is zero; above the sea is assumed")
+    hfov = hfov_of_focal(*(optics.get(name, "").replace(",", ".") for name in _OPTICS))
+    if hfov is not None:
+        values["hfov_rad"] = hfov
+        log.note("the field of view is that of a focal length for a picture 36 mm wide")
+    if values.get("longitude_deg") == values.get("latitude_deg") == values.get("above_sea_m") == 0.0:
+        values["above_sea_m"] = math.nan  # no fix
+    return values
+
+
+def _place(gps: Numbers, is_swapped: bool) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for value, letter in gps[:2]:
+        if letter in ("N", "S", "E", "W"):
+            name = "latitude_deg" if letter in "NS" else "longitude_deg"
+            values[name] = -abs(value) if letter in "SW" else value
+    if not values and len(gps) > 1:
+        names = ("latitude_deg", "longitude_deg") if is_swapped else ("longitude_deg", "latitude_deg")
+        values = {name: value for name, (value, _) in zip(names, gps, strict=False)}
+    # A third number with a unit is a height, without one the number of satellites; 0.0 m stands for none.
+    if len(gps) > 2 and gps[2][1] == "M" and gps[2][0] != 0:
+        values["above_sea_m"] = gps[2][0]
+    return values
+
+
+def _note_lacking(log: Log, lacking: dict[str, list[int]], last: int, count: int) -> None:
+    """Note quantities that some subtitles lack and earlier ones have. last: line of the last of `count` subtitles."""
+    together: dict[tuple[int, ...], list[str]] = {}
+    for name, lines in lacking.items():
+        together.setdefault(tuple(lines), []).append(name)
+    for lines, names in together.items():
+        what = f"lacks {', '.join(sorted(names))}"
+        if lines == (last,):
+            log.note(f"line {last}: the last subtitle {what}: the file is incomplete; unknown there")
+        else:
+            others = f", as do {len(lines) - 1} more of {count}" if len(lines) > 1 else ""
+            log.note(f"line {lines[0]}: the subtitle {what}{others}; unknown there")
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# NMEA 0183: sentences of a receiver, one a line.
+
+_KNOT = 1852 / 3600
+_DAY_S = 86_400.0
+_KINDS = {"GGA", "RMC", "GLL", "VTG", "HDT", "THS"}
+
+
+def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
+    """GGA, RMC and GLL for places, RMC and VTG for the speed, HDT and THS for the vehicle's heading.
+
+    A receiver's height is above the sea: above ground nothing is known. Times since the first sentence that has one.
+    Raises InputError where no sentence is whole or none has a time.
+    """
+    try:
+        import pynmea2
+    except ImportError:
+        raise InputError(
+            f"telemetry {path} is NMEA 0183, which needs pynmea2: pip install 'torchvision-dddas[telemetry]'"
+        ) from None
+    log = Log(path, "NMEA 0183", bridge_s=1.0)
+    bad: list[int] = []
+    first_s = last_s = utc_s = math.nan  # times of day of the first and the latest sentence; the clock at the first
+    days = 0
+    for number, line in enumerate(text.splitlines(), 1):
+        begin = line.find("$")
+        if begin < 0 or line[begin + 3 : begin + 6] not in _KINDS:
+            continue
+        try:
+            sentence = pynmea2.parse(line[begin:].strip(), check="*" in text)
+            time = getattr(sentence, "timestamp", None)
+            if time is not None and not isinstance(time, str):
+                now_s = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
+                days += now_s < last_s - _DAY_S / 2  # time goes on over midnight
+                first_s, last_s = now_s if math.isnan(first_s) else first_s, now_s
+                date = getattr(sentence, "datestamp", None)
+                if date is not None and math.isnan(utc_s):
+                    midnight_s = datetime(date.year, date.month, date.day, tzinfo=UTC).timestamp()
+                    utc_s = midnight_s + first_s - days * _DAY_S
+            if not math.isnan(first_s):
+                for name, value in _sentence_values(sentence).items():
+                    log.add(name, last_s + days * _DAY_S - first_s, value, number)
+        except (pynmea2.ParseError, ValueError, TypeError, AttributeError):
+            bad.append(number)
+    if bad:
+        log.note(f"line {bad[0]}: not a whole sentence or its checksum is wrong; {len(bad)} lines are left out")
+    if not log.samples:
+        raise log.refuse("no NMEA sentence tells a place or a heading together with a time")
+    return build_record(log, clock_offset_s, utc_s)
+
+
+def _sentence_values(sentence: Any) -> dict[str, float]:
+    kind = sentence.sentence_type
+    values: dict[str, float] = {}
+    if kind in ("GGA", "RMC", "GLL"):
+        is_fixed = int(sentence.gps_qual or 0) > 0 if kind == "GGA" else sentence.status == "A"
+        is_fixed = is_fixed and bool(sentence.lat) and bool(sentence.lon)
+        values["longitude_deg"] = sentence.longitude if is_fixed else math.nan
+        values["latitude_deg"] = sentence.latitude if is_fixed else math.nan
+        if kind == "GGA":
+            is_known = is_fixed and sentence.altitude is not None
+            values["above_sea_m"] = float(sentence.altitude) if is_known else math.nan
+        if kind == "RMC" and sentence.spd_over_grnd is not None:
+            values["speed_m_s"] = float(sentence.spd_over_grnd) * _KNOT if is_fixed else math.nan
+    elif kind == "VTG" and sentence.spd_over_grnd_kmph is not None:
+        values["speed_m_s"] = float(sentence.spd_over_grnd_kmph) / 3.6
+    elif kind in ("HDT", "THS") and sentence.heading:
+        values["vehicle_heading_rad"] = math.radians(float(sentence.heading))
+    return values
