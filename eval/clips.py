@@ -17,8 +17,8 @@ from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.stages import find
 from torchvision_dddas.evaluation.studies.summary import measures
-from torchvision_dddas.io.images import ImageSource, read_image
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.images import read_image
+from torchvision_dddas.io.sources import ImageSource, open_source
 
 sys.path.insert(0, str(bench.ROOT))
 from tests.synthetic_clip import RATE_HZ, film_into, flight, render

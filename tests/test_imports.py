@@ -105,8 +105,8 @@ def test_only_torch_modules_import_torch_at_the_top(module: str) -> None:
         ("geo.plane", f"from {OWN}.detection.engine import View", ["detection.engine"]),
         ("types", f"def f():\n    from {OWN}.config import Settings", []),
         ("detection.blobs", f"from {OWN} import pipeline", ["pipeline"]),
-        ("control.rules", f"import {OWN}.io.video", ["io.video"]),
-        ("cli.detect", f"from {OWN}.io.video import VideoSource", []),
+        ("control.rules", f"import {OWN}.io.sources", ["io.sources"]),
+        ("cli.detect", f"from {OWN}.io.sources import VideoSource", []),
         ("helpers.misc", "", ["helpers.misc is in no room: give it a place in ORDER and in docs/architecture.md"]),
     ],
 )

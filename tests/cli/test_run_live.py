@@ -15,7 +15,7 @@ import pytest
 from tests.cli.conftest import bad
 from tests.synthetic_clip import render
 from torchvision_dddas.io.run_inputs import prepare_run
-from torchvision_dddas.io.video import without_secrets
+from torchvision_dddas.io.sources import without_secrets
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.

@@ -40,10 +40,9 @@ from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
 from torchvision_dddas.io.images import natural_order
 from torchvision_dddas.io.output.run_record import read_run_record
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.sources import open_source, stream_target, without_secrets
 from torchvision_dddas.io.streams import About, open_stream
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.io.video import stream_target, without_secrets
 from torchvision_dddas.live.server import parse_address
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.onnx_scorer import find_graphs

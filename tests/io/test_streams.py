@@ -7,13 +7,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from torchvision_dddas.io.streams.tool_messages import PEOPLE_FROM, CotEvents, mot_rows
 
 from tests.io.ground import tracks
 from tests.io.streamed import ABOUT, Clock, FlakyOutlet, Told, followed, surveyed
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.maps.formats import cot
 from torchvision_dddas.io.streams import Stream, open_stream, open_streams
-from torchvision_dddas.io.streams.tool_messages import PEOPLE_FROM, CotEvents, mot_rows
 
 
 @pytest.mark.parametrize("text", ["", "json", "json:", "xml:-", "JSON:-", "-", "json:tcp://127.0.0.1:5", ":-"])

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torchvision_dddas.io.streams.json_lines import json_lines
 
 from tests.io.streamed import ABOUT, NAMES, followed, surveyed
 from torchvision_dddas.io.streams import About
-from torchvision_dddas.io.streams.json_lines import json_lines
 from torchvision_dddas.types import Adjustment, FrameResult, TrackedFrame, Tracks
 
 PAGE = Path(__file__).parents[2] / "docs" / "stream.md"

@@ -6,10 +6,10 @@ import resource
 import threading
 
 import pytest
+from torchvision_dddas.io.streams.line_outlet import KEPT_BYTES, LineOutlet
 
 from tests.io.streamed import ABOUT, Told, surveyed
 from torchvision_dddas.io.streams import open_stream
-from torchvision_dddas.io.streams.line_outlet import KEPT_BYTES, LineOutlet
 
 
 @pytest.fixture

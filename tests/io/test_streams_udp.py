@@ -6,11 +6,11 @@ import socket
 from xml.etree import ElementTree
 
 import pytest
+from torchvision_dddas.io.streams.datagrams import MOST_BYTES, Address, DatagramOutlet, parse_address
 
 from tests.io.streamed import ABOUT, Told, surveyed
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams import open_stream
-from torchvision_dddas.io.streams.datagrams import MOST_BYTES, Address, DatagramOutlet, parse_address
 
 
 @pytest.fixture

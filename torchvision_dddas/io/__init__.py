@@ -1,7 +1,7 @@
 """Files in and out: video, telemetry, tables, maps, overlays, streams, reports.
 
 Other rooms use:
-`sources.open_source` (clips), `images.decode_image`, `video` (live streams);
+`sources` (`open_source` for clips; live streams), `images.decode_image`;
 `telemetry.read_telemetry`, `elevation.read_elevation` and `read_ortho`;
 `detection_tables`, `ground_tables`, `camera_files`, `colour_files` (`read_...` and `check_...`), `tables` (schemas);
 `run_inputs.prepare_run` and `read_locator` (the inputs of a run);

@@ -19,7 +19,7 @@ import numpy as np
 
 from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.tables import Column, Schema, read_csv, read_table
+from torchvision_dddas.io.tables import PLACES, Column, Schema, read_csv, read_table
 from torchvision_dddas.types import Camera, PoseTable
 
 LIMITS: dict[str, tuple[float, float]] = {
@@ -47,21 +47,14 @@ LIMITS: dict[str, tuple[float, float]] = {
 """Range of every key that is a number. `centre_px` is a pair; `name` is text.
 
 focal_v_px: along the columns, where pixels are not square. centre_px: u, v of the optical axis. pitch_deg: positive
-down. roll_deg: turned clockwise. k1, k2: radial distortion as OpenCV has it. The sigmas are standard deviations; of the
-focal length as a share.
+down. roll_deg: turned clockwise. k1, k2: radial distortion as OpenCV has it. The sigmas are standard deviations, of the
+focal length as a share: 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %) where not given.
 """
 
-SIGMAS = {
-    "focal_sigma": "focal_sigma",
-    "height_sigma_m": "height_sigma_m",
-    "pitch_sigma_deg": "pitch_sigma_rad",
-    "heading_sigma_deg": "heading_sigma_rad",
-    "position_sigma_m": "position_sigma_m",
-}
-"""Fields of Camera by key. Defaults: 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %)."""
-
 KEYS = (*LIMITS, "centre_px", "name")
-PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
+_SIZE = ("width_px", "height_px")
+# Keys that are fields of Camera; degrees become radians.
+_FIELDS = ("height_m", "pitch_deg", "roll_deg", "heading_deg", "k1", "k2", *(key for key in LIMITS if "sigma" in key))
 
 
 def read_camera_keys(path: str | Path) -> dict[str, Any]:
@@ -73,31 +66,36 @@ def read_camera_keys(path: str | Path) -> dict[str, Any]:
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)
-            raise InputError(
-                f"camera {path} has the key {key}, which no camera has; "
-                + (f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}")
-            )
-    for key in LIMITS.keys() & content.keys():
-        _number(content[key], key, path)
-    if "centre_px" in content:
-        _pair(content["centre_px"], path)
+            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}"
+            raise InputError(f"camera {path} has the key {key}, which no camera has; {hint}")
+    for key, (low, high) in LIMITS.items():
+        value = content.get(key, low)
+        if not (_is_number(value) and low <= value <= high) or (key in _SIZE and value != int(value)):
+            kind = "whole number" if key in _SIZE else "number"
+            shown = "far too large" if isinstance(value, int) and abs(value) > 10**40 else repr(value)[:40]
+            raise InputError(f"camera {path}: {key} is {shown}; wanted a {kind} from {low:g} to {high:g}")
+    centre = content.get("centre_px", [0, 0])
+    if not (isinstance(centre, list) and len(centre) == 2 and all(_is_number(v) and abs(v) <= 1e5 for v in centre)):
+        raise InputError(f"camera {path}: centre_px is {centre!r}; wanted [u, v] of the optical axis, in pixels")
     if not isinstance(content.get("name", ""), str):
         raise InputError(f"camera {path}: name is {content['name']!r}; wanted a text in quotes")
     return content
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def describe_missing(camera: str | Path, poses: PoseTable | None = None) -> str:
     """The keys that a camera's file and its poses lack, and what is assumed instead, in words; "" where none lacks."""
     given = {*read_camera_keys(camera), *(poses.values if poses is not None else ())}
-    gaps = []
-    if "height_m" not in given:
-        gaps.append("no height_m: distances by the foot row are unknown")
-    if "pitch_deg" not in given:
-        gaps.append("no pitch_deg: level is assumed")
-    if "heading_deg" not in given:
-        gaps.append("no heading_deg: north is assumed")
-    if not given & {"east_m", "longitude_deg"}:
-        gaps.append("no place: 0, 0 is assumed")
+    assumed = {
+        "no height_m: distances by the foot row are unknown": {"height_m"},
+        "no pitch_deg: level is assumed": {"pitch_deg"},
+        "no heading_deg: north is assumed": {"heading_deg"},
+        "no place: 0, 0 is assumed": {"east_m", "longitude_deg"},
+    }
+    gaps = [words for words, keys in assumed.items() if not given & keys]
     return f"{camera} has {'; '.join(gaps)}" if gaps else ""
 
 
@@ -105,66 +103,34 @@ def read_camera(path: str | Path) -> Camera:
     """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
     content = read_camera_keys(path)
     numbers = {key: float(content[key]) for key in LIMITS if key in content}
-    if missing := [key for key in ("width_px", "height_px") if key not in numbers]:
+    if missing := [key for key in _SIZE if key not in numbers]:
         raise InputError(f"camera {path} lacks {', '.join(missing)}: the size of its pictures")
-    size = int(numbers["width_px"]), int(numbers["height_px"])
-    focal = _focal(numbers, size, path)
-    place, geographic = _place(numbers, path)
-    angles = {
-        f"{name}_rad": math.radians(numbers[f"{name}_deg"])
-        for name in ("heading", "pitch", "roll")
-        if f"{name}_deg" in numbers
-    }
-    sigmas = {
-        SIGMAS[key]: math.radians(numbers[key]) if key.endswith("_deg") else numbers[key]
-        for key in SIGMAS
-        if key in numbers
-    }
-    return Camera(
-        name=content.get("name", Path(path).stem),
-        size_px=size,
-        focal_px=focal,
-        centre_px=_pair(content.get("centre_px", [(size[0] - 1) / 2, (size[1] - 1) / 2]), path),
-        place=place,
-        geographic=geographic,
-        height_m=numbers.get("height_m", math.nan),
-        k1=numbers.get("k1", 0.0),
-        k2=numbers.get("k2", 0.0),
-        **angles,
-        **sigmas,
-    )
-
-
-def _number(value: Any, key: str, path: str | Path) -> None:
-    low, high = LIMITS[key]
-    whole = key in ("width_px", "height_px")
-    if not (_is_number(value) and low <= value <= high) or (whole and value != int(value)):
-        kind = "whole number" if whole else "number"
-        shown = "far too large" if isinstance(value, int) and abs(value) > 10**40 else repr(value)[:40]
-        raise InputError(f"camera {path}: {key} is {shown}; wanted a {kind} from {low:g} to {high:g}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _focal(numbers: dict[str, float], size: tuple[int, int], path: str | Path) -> tuple[float, float]:
+    width, height = (int(numbers[key]) for key in _SIZE)
     if ("focal_px" in numbers) == ("hfov_deg" in numbers):
         given = "both focal_px and hfov_deg; give one" if "focal_px" in numbers else "no focal length (focal_px)"
         raise InputError(
             f"camera {path} has {given}. `dddas calibrate` finds it from a person of known height at a known distance"
         )
     if "focal_px" in numbers:
-        along = numbers["focal_px"]
+        focal = numbers["focal_px"]
     else:
-        along = size[0] / 2 / math.tan(math.radians(numbers["hfov_deg"]) / 2)
-    return along, numbers.get("focal_v_px", along)
-
-
-def _pair(centre: Any, path: str | Path) -> tuple[float, float]:
-    if not (isinstance(centre, list) and len(centre) == 2 and all(_is_number(v) and abs(v) <= 1e5 for v in centre)):
-        raise InputError(f"camera {path}: centre_px is {centre!r}; wanted [u, v] of the optical axis, in pixels")
-    return float(centre[0]), float(centre[1])
+        focal = width / 2 / math.tan(math.radians(numbers["hfov_deg"]) / 2)
+    place, geographic = _place(numbers, path)
+    u, v = content.get("centre_px", [(width - 1) / 2, (height - 1) / 2])
+    fields = {
+        key.replace("_deg", "_rad"): math.radians(numbers[key]) if key.endswith("_deg") else numbers[key]
+        for key in _FIELDS
+        if key in numbers
+    }
+    return Camera(
+        name=content.get("name", Path(path).stem),
+        size_px=(width, height),
+        focal_px=(focal, numbers.get("focal_v_px", focal)),
+        centre_px=(float(u), float(v)),
+        place=place,
+        geographic=geographic,
+        **fields,
+    )
 
 
 def _place(numbers: dict[str, float], path: str | Path) -> tuple[tuple[float, float], bool]:
@@ -174,8 +140,8 @@ def _place(numbers: dict[str, float], path: str | Path) -> tuple[tuple[float, fl
     for kind, keys in zip(PLACES, given, strict=True):
         if len(keys) == 1:
             raise InputError(f"camera {path} has {keys[0]} alone; wanted {' and '.join(kind)}")
-    kind = PLACES[0] if given[0] else PLACES[1]
-    return (numbers.get(kind[0], 0.0), numbers.get(kind[1], 0.0)), bool(given[0])
+    first, second = PLACES[0] if given[0] else PLACES[1]
+    return (numbers.get(first, 0.0), numbers.get(second, 0.0)), bool(given[0])
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -205,8 +171,7 @@ def read_poses(path: str | Path) -> PoseTable:
     if PLACES[0][0] in wanted and PLACES[1][0] in wanted:
         raise InputError(f"poses {path} has longitude_deg and east_m; give places in degrees or in metres")
     table = read_table(path, Schema("poses", *(c for c in POSES.columns if c.name in (clock, *wanted))), (), True, text)
-    if not len(table):
-        raise InputError(f"poses {path} has a header but no rows")
+    table.require_rows()
     at = table[clock]
     if (is_back := np.diff(at) <= 0).any():
         row = int(is_back.argmax()) + 1
@@ -232,6 +197,5 @@ def has_measurements(path: str | Path) -> bool:
 def read_measurements(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """A person's distances (N,) in metres and heights (N,) in pixels. Raises InputError as read_table; no rows."""
     table = read_table(path, MEASUREMENTS, MEASUREMENTS.names, is_ragged=True)
-    if not len(table):
-        raise InputError(f"measurements {path} has a header but no rows")
+    table.require_rows()
     return table["distance_m"], table["height_px"]

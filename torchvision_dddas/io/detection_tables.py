@@ -53,24 +53,20 @@ def read_detections(path: str | Path) -> DetectionTable:
     """
     text, is_named = _read_cells(path, "detections")
     if not is_named:
-        short = next((place for place, row in enumerate(text.rows) if len(row) < 6), None)
-        if short is not None:
-            count = len(text.rows[short])
-            raise InputError(
-                f"detections {path}, line {text.line[short]}: {count} column{'s' * (count != 1)}; "
-                "wanted frame,id,x,y,w,h[,score]"
-            )
+        for line, row in zip(text.line, text.rows, strict=True):
+            if len(row) < 6:
+                count = f"{len(row)} column{'s' * (len(row) != 1)}"
+                raise InputError(f"detections {path}, line {line}: {count}; wanted frame,id,x,y,w,h[,score]")
         text = CsvText([*MOT_NAMES], text.line, [[*row[:7], ""][:7] for row in text.rows])
     table = read_table(path, SCHEMA, REQUIRED, text=text)
     score = np.where(np.isnan(table["score"]), 1.0, table["score"])
     is_outside = (score < 0) | (score > 1)
     # One score of 1.3 among thousands of probabilities must not make all of these certain.
     if 0 < is_outside.sum() < FEW_SHARE * len(score):
-        first = int(is_outside.argmax())
-        raise table.error(
-            f"score is {score[first]:g}; {is_outside.sum()} of {len(score)} scores lie outside [0, 1]. Wanted "
+        table.refuse(
+            is_outside,
+            f"score is {score[is_outside][0]:g}; {is_outside.sum()} of {len(score)} scores lie outside [0, 1]. Wanted "
             "probabilities in [0, 1], or scores on another scale throughout",
-            first,
         )
     identity = parse_numbers(table.columns.get("identity", [""] * len(table)))
     is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
@@ -104,8 +100,7 @@ def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str],
     (header, _, rows), _ = _read_cells(path)
     frame = header.index("frame")
     kept = [place for place, name in enumerate(header) if name not in without]
-    rows = [[*row, *[""] * (len(header) - len(row))] for row in rows]
-    rows.sort(key=lambda row: float(row[frame]))  # a stable sort
+    rows = [[*row, *[""] * (len(header) - len(row))] for row in sorted(rows, key=lambda row: float(row[frame]))]
     return [header[place] for place in kept], [[row[place] for place in kept] for row in rows]
 
 
@@ -113,21 +108,13 @@ def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
     """The cells of a table, and whether its first line names the columns; else they get the names of MOTChallenge."""
     _, line, rows = read_csv(path, what, has_header=False)
     # The first name may be empty: so a table with an index begins.
-    first = next((word for word in " ".join(rows[0]).split()), "") if rows else ""
-    if first[:1].isalpha() and not _is_number(first):
+    first, *_ = [*" ".join(rows[0]).split(), ""] if rows else [""]
+    if first[:1].isalpha() and first.lower() not in ("nan", "inf", "infinity"):
         return CsvText(rows[0], line[1:], rows[1:]), True
     rows = [row if len(row) > 1 else row[0].split() for row in rows]
     widest = max((len(row) for row in rows), default=len(MOT_NAMES))
     header = [*MOT_NAMES, *(f"column_{place}" for place in range(len(MOT_NAMES) + 1, widest + 1))]
     return CsvText(header[:widest], line, rows), False
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -188,9 +175,5 @@ def check_birth_score(table: DetectionTable, birth_score: float) -> list[str]:
     """A note where no row's score is high enough to begin a track."""
     if not len(table) or table.certain or float(table.score.max()) >= birth_score:
         return []
-    return [
-        (
-            f"no score of {table.path} reaches track.birth_score = {birth_score:g}, so no track begins: lower it with "
-            "--set, or give the detections.csv if dddas detect wrote them"
-        )
-    ]
+    note = f"no score of {table.path} reaches track.birth_score = {birth_score:g}, so no track begins: lower it with "
+    return [note + "--set, or give the detections.csv if dddas detect wrote them"]

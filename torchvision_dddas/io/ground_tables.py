@@ -16,21 +16,17 @@ from torchvision_dddas.io.tables import (
     EAST_NORTH,
     FARTHEST,
     FRAME,
+    PLACES,
     TARGET,
     Column,
     CsvTable,
-    CsvText,
     Schema,
     read_csv,
     read_table,
 )
 from torchvision_dddas.types import Landmarks, Positions
 
-PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
-"""The two kinds of place that a table may have."""
-
 IMAGE = ("u_px", "v_px")
-
 LANDMARKS = Schema(
     "landmarks",
     Column("frame", "d", 1, FRAME.high, True, wanted="a whole number from 1; between two pictures, give time_s"),
@@ -55,13 +51,12 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
     Raises InputError with file and line: as read_table, times without a rate, longitude and latitude swapped, degrees
     and metres mixed, half a place, a landmark twice in a frame, places further apart than FARTHEST_M.
     """
-    header, line, rows = read_csv(path, "landmarks")
-    _check_header(header, path, rate_hz)
-    names = header.index("landmark")
-    rows = [["" if cell.lower() == "nan" and k != names else cell for k, cell in enumerate(row)] for row in rows]
-    table = read_table(path, LANDMARKS, text=CsvText(header, line, rows))
-    if not len(table):
-        raise InputError(f"landmarks {path} has a header but no rows")
+    text = read_csv(path, "landmarks")
+    _check_header(text.header, path, rate_hz)
+    names = text.header.index("landmark")
+    rows = [["" if cell.lower() == "nan" and k != names else cell for k, cell in enumerate(row)] for row in text.rows]
+    table = read_table(path, LANDMARKS, text=text._replace(rows=rows))
+    table.require_rows()
     _check_degrees(table)
     place, is_geographic = _places(table)
     image = _pair(table, IMAGE)
@@ -77,21 +72,11 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
         frame = np.round(np.where(is_seen, np.round(frame), frame), 6)
     index: dict[str, int] = {}
     landmark = np.array([index.setdefault(name, len(index)) for name in table.columns["landmark"]], np.int64)
-    if "" in index:
-        table.refuse(landmark == index[""], "landmark is empty; wanted its name or number")
-    order = np.argsort(frame, kind="stable")
-    found = Landmarks(
-        tuple(index),
-        frame[order],
-        landmark[order],
-        image[order],
-        place[order],
-        table["sigma_m"][order],
-        planned[order],
-        table.line[order],
-        is_geographic,
-        str(path),
-    )
+    table.refuse(landmark == index.get("", -1), "landmark is empty; wanted its name or number")
+    columns = (frame, landmark, image, place, table["sigma_m"], planned, table.line)
+    found = Landmarks(tuple(index), *columns, geographic=is_geographic, path=str(path))[
+        np.argsort(frame, kind="stable")
+    ]
     _check_once_a_frame(found)
     _check_far(found)
     return found
@@ -99,8 +84,7 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
 
 def _check_header(header: list[str], path: str | Path, rate_hz: float | None) -> None:
     missing = ["frame or time_s"] if not {"frame", "time_s"} & set(header) else []
-    if "landmark" not in header:
-        missing.append("landmark")
+    missing += ["landmark"] if "landmark" not in header else []
     halves = [name for pair in (*PLACES, IMAGE) if len(set(pair) & set(header)) == 1 for name in pair]
     missing += [name for name in halves if name not in header]
     if not halves and not any(set(kind) <= set(header) for kind in PLACES):
@@ -126,13 +110,13 @@ def _check_degrees(table: CsvTable) -> None:
                 hint = "; longitude and latitude look swapped"
             elif abs(table[name][row]) > 180:
                 hint = "; if these are metres, name the columns east_m,north_m"
-            raise table.error(f"{name} is '{table.text[name][row]}'; wanted -{most} to {most}{hint}", row)
+            raise table.error(f"{name} is '{table.cell(name, row)}'; wanted -{most} to {most}{hint}", row)
 
 
 def _places(table: CsvTable) -> tuple[np.ndarray, bool]:
     """(N, 2) places, and whether they are longitudes and latitudes."""
     degrees, metres = (_pair(table, kind) for kind in PLACES)
-    in_degrees, in_metres = (np.isfinite(place[:, 0]) for place in (degrees, metres))
+    in_degrees, in_metres = np.isfinite(degrees[:, 0]), np.isfinite(metres[:, 0])
     table.refuse(
         in_degrees & in_metres,
         "a place in degrees and in metres; give one kind in all rows and leave the columns of the other out",
@@ -149,9 +133,8 @@ def _pair(table: CsvTable, names: tuple[str, str]) -> np.ndarray:
     pair = table.stack(*names)
     is_half = np.isnan(pair).sum(axis=1) == 1
     if is_half.any():
-        row = int(is_half.argmax())
-        here = names[int(np.isnan(pair[row, 0]))]
-        raise table.error(f"{here} alone; wanted {' and '.join(names)}, or neither", row)
+        given = names[int(np.isnan(pair[is_half.argmax(), 0]))]
+        table.refuse(is_half, f"{given} alone; wanted {' and '.join(names)}, or neither")
     return pair
 
 
@@ -162,10 +145,10 @@ def _check_once_a_frame(found: Landmarks) -> None:
     if is_same.any():
         # The first in the file, whatever the order of frames.
         k = int(np.where(is_same, found.line[order][1:], np.iinfo(np.int64).max).argmin())
-        first, again = (int(found.line[order[k + i]]) for i in (0, 1))
+        row, again = order[k : k + 2]
         raise InputError(
-            f"landmarks {found.path}, line {again}: {found.names[found.landmark[order[k]]]} is in frame "
-            f"{found.frame[order[k]]:g} already, by line {first}; wanted each landmark once in a frame"
+            f"landmarks {found.path}, line {found.line[again]}: {found.names[found.landmark[row]]} is in frame "
+            f"{found.frame[row]:g} already, by line {found.line[row]}; wanted each landmark once in a frame"
         )
 
 
@@ -179,8 +162,7 @@ def _check_far(found: Landmarks) -> None:
         from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # both sides of 180 degrees are near each other
     middle = start + np.median(from_start[is_known], axis=0)
     away = great_circle_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
-    away = np.where(is_known, away, 0.0)
-    k = int(away.argmax())
+    k = int(np.where(is_known, away, 0.0).argmax())
     if away[k] > FARTHEST_M:
         first, second = found.place[k]
         fix = "a receiver without a fix says so: leave the place empty" if first == second == 0 else "check the digits"
@@ -216,19 +198,18 @@ def read_positions(path: str | Path) -> Positions:
             "var_north_m2 of 0 or more, and cov_east_north_m2 squared below their product",
             row,
         )
-    degrees = table.stack(*(column.name for column in DEGREES))
+    degrees = table.stack(*PLACES[0])
     is_known = np.isfinite(degrees).all(axis=1)
     if is_known.any():
         table.refuse(
             ~is_known,
             "no longitude_deg or latitude_deg, which other rows have; wanted both in all rows or in none",
         )
-    order = np.argsort(table["frame"], kind="stable")
     return Positions(
-        table["frame"][order].astype(np.int64),
-        table["target"][order].astype(np.int64),
-        table.stack("east_m", "north_m")[order],
-        np.stack([east, both, both, north], axis=1).reshape(-1, 2, 2)[order],
-        table["score"][order] if "score" in table else np.ones(len(table)),
-        lonlat_deg=degrees[order] if "longitude_deg" in table and is_known.all() else None,
-    )
+        table["frame"].astype(np.int64),
+        table["target"].astype(np.int64),
+        table.stack("east_m", "north_m"),
+        np.stack([east, both, both, north], axis=1).reshape(-1, 2, 2),
+        table["score"] if "score" in table else np.ones(len(table)),
+        lonlat_deg=degrees if "longitude_deg" in table and is_known.all() else None,
+    )[np.argsort(table["frame"], kind="stable")]

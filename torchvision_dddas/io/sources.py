@@ -1,11 +1,21 @@
 """Where frames come from: video files, folders and globs of images, cameras, network streams."""
 
+import os
+import re
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Protocol
+
+# FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+import cv2
+import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource, images_of_folder, images_of_glob
-from torchvision_dddas.io.video import VideoSource, stream_target
-from torchvision_dddas.types import Source
+from torchvision_dddas.io.images import IMAGE_SUFFIXES, images_of_folder, images_of_glob, quiet_opencv, read_image
+from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
 _WANTED = "a video file, a folder or glob of images, camera:0, rtsp://... or sim:SCENARIO"
 
@@ -50,3 +60,349 @@ def open_source(
     else:
         raise InputError(f"{path} does not exist; wanted {_WANTED}")
     return ImageSource(files, text, rate_hz or 10.0, full_scale)
+
+
+class _Clip:
+    """What recordings share. tolerant: a frame of another size or depth is left out, else it raises InputError."""
+
+    exact = True
+    tolerant = False
+    count: int | None
+
+    def __init__(self, name: str) -> None:
+        self.name, self.last = name, 0
+        self.problems: list[Problem] = []
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self.every(1)
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
+        raise NotImplementedError
+
+    def _note(self, number: int, what: str) -> None:
+        self.problems.append(Problem(number, what))
+
+    def _leave_out(self, number: int, what: str, must: str) -> None:
+        if not self.tolerant:
+            raise InputError(f"{what}; all frames of a clip must have one {must}")
+        self._note(number, f"{what}: it was left out")
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Images.
+
+_SENSOR_BITS = (8, 10, 12, 14, 16)
+_SAMPLES = 9
+
+
+class ImageSource(_Clip):
+    """The files of a folder or glob in natural order (frame2 before frame10), one a frame.
+
+    rate_hz: images carry no frame rate, so the caller gives one.
+    full_scale: the 16-bit value that becomes white (255). One value serves the whole clip, so that brightness does not
+    flicker. By default nine images spread over the clip are read, and it is the top of the smallest sensor (8, 10,
+    12, 14 or 16 bits) that holds their brightest pixel. Brighter pixels elsewhere saturate, which is recorded once.
+    The first image decides whether the clip is grey or colour; the others follow it.
+    Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
+    """
+
+    def __init__(self, files: Sequence[Path], name: str, rate_hz: float = 10.0, full_scale: int | None = None) -> None:
+        super().__init__(name)
+        if not files:
+            raise InputError(f"{name} holds no images")
+        self.files, self.count, self.rate_hz = list(files), len(files), rate_hz
+        first = read_image(self.files[0])
+        if first is None:
+            raise InputError(f"the first image, {self.files[0]}, cannot be decoded; repair it or leave it out")
+        if first.dtype not in (np.uint8, np.uint16):
+            raise InputError(f"{self.files[0]} holds {first.dtype} pixels; wanted 8 or 16 bits")
+        self.size = (first.shape[1], first.shape[0])
+        self._depth, self._grey = first.dtype, first.ndim == 2
+        self.full_scale = (full_scale or self._sensor_top()) if self._depth == np.uint16 else 255
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Frames 1, 1 + interval, ...: the other files are not opened."""
+        self.problems.clear()
+        saturated = False
+        for number, file in enumerate(self.files, start=1):
+            self.last = number
+            if not is_sampled(number, interval):
+                continue
+            image = read_image(file)
+            if image is None:
+                self._note(number, f"frame {number} ({file.name}) could not be decoded and was left out")
+                continue
+            if (size := (image.shape[1], image.shape[0])) != self.size:
+                what = f"{file} is {size[0]}x{size[1]} but {self.files[0].name} is {self.size[0]}x{self.size[1]}"
+                self._leave_out(number, what, "size")
+                continue
+            if image.dtype != self._depth:
+                what = f"{file} holds {image.dtype} pixels but {self.files[0].name} {self._depth}"
+                self._leave_out(number, what, "depth")
+                continue
+            if self._depth == np.uint16:
+                if not saturated and image.max() > self.full_scale:
+                    saturated = True
+                    what = f"frame {number} ({file.name}) holds {image.max()}; above {self.full_scale} all is white"
+                    self._note(number, what)
+                image = cv2.convertScaleAbs(image, alpha=255.0 / self.full_scale)
+            if self._grey != (image.ndim == 2):
+                image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if self._grey else cv2.COLOR_GRAY2BGR)
+            yield Frame(number, (number - 1) / self.rate_hz, image)
+
+    def _sensor_top(self) -> int:
+        samples = np.unique(np.linspace(0, len(self.files) - 1, _SAMPLES).astype(int))
+        images = (read_image(self.files[i]) for i in samples)
+        brightest = max(int(image.max()) for image in images if image is not None)
+        return next(2**bits - 1 for bits in _SENSOR_BITS if brightest < 2**bits)
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Videos through OpenCV.
+
+# FFmpeg draws any text file as an old terminal would; nobody means that.
+_TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}
+# These containers count their frames; others guess from the duration, often one off.
+_EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}
+# Reads that may fail in a row before the clip counts as ended, however many frames it announced.
+_MOST_LOST, _MOST_LOST_LIVE = 1000, 10
+# How far a time stamp may lie from its place on a constant frame rate, in frames.
+_REGULAR = 0.25
+
+
+class VideoSource(_Clip):
+    """A video file, a camera's index or a stream's address. Frames are BGR, also those of grey videos.
+
+    A file's rotation is applied, so size is that of the upright picture. rate_hz: the file's own, unless the caller
+    gives one. Frames that cannot be decoded leave a gap in the numbers. A clip of constant rate is numbered by its time
+    stamps, which stay true when a damaged stretch comes out short or out of order; other clips are numbered by
+    counting. Time is the file's, a live stream's is the clock's.
+    Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
+    """
+
+    def __init__(self, target: str | int, name: str, rate_hz: float | None = None) -> None:
+        super().__init__(name)
+        self._target = target
+        self._live = _is_live(target)
+        capture = self._open()
+        try:
+            own_hz = _announced_hz(capture)
+            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            decoded, first = capture.read()
+        finally:
+            capture.release()
+        if not decoded:
+            raise InputError(f"the first frame of {name} cannot be decoded; the file is damaged or its codec unknown")
+        self.size = (first.shape[1], first.shape[0])
+        self._own_hz, self._given_hz = own_hz or 10.0, rate_hz
+        self.rate_hz = rate_hz or self._own_hz
+        self.count = int(count) if not self._live and 0 < count < 1e8 else None
+        self.exact = self.count is not None and Path(str(target)).suffix.lower() in _EXACT_COUNT
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
+        self.problems.clear()
+        capture = self._open()
+        try:
+            yield from self._read_live(capture, interval) if self._live else self._read_file(capture, interval)
+        finally:
+            capture.release()
+
+    def _read_file(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
+        number, lost, start_s, time_s, regular, damaged = 0, 0, 0.0, 0.0, True, False
+        # As many reads in a row may fail as frames are still announced, and a few where none are.
+        while lost < min(max((self.count or 0) - number, 0) + 4, _MOST_LOST):
+            if not capture.grab():
+                lost += 1
+                continue
+            damaged = damaged or lost > 0
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            start_s = start_s if number else stamp_s
+            stamp_s -= start_s
+            place = round(stamp_s * self._own_hz)
+            # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
+            on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR
+            regular = regular and on_rate and (damaged or place == number)
+            following = place + 1 if regular else number + lost + 1
+            lost = 0
+            if following <= number:
+                self._note(number, f"after frame {number} a frame came out of order and was left out")
+                continue
+            self._note_lost(number + 1, following - 1)
+            self.last = number = following
+            if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
+                stamp_s = max((number - 1) / self.rate_hz, time_s)
+            time_s = stamp_s
+            if not is_sampled(number, interval):
+                continue
+            decoded, image = capture.retrieve()
+            if not decoded:
+                self._note_lost(number, number)
+            elif self._fits(image, number):
+                yield Frame(number, time_s, image)
+        if self.exact and self.count and self.count > number:
+            # Of the frames announced, those whose data are in the file belong to the clip.
+            self.last = max(number, min(self.count, self._stored()))
+            self._note_lost(number + 1, self.last)
+        # A count guessed from the duration means something only where the rate is constant.
+        allowed = 0 if self.exact else max(2, number // 50) if regular else number
+        if self.count and self.count - self.last > allowed:
+            what = f"the clip ends after frame {self.last} but announces {self.count}: it is cut short or damaged"
+            self._note(self.last + 1, what)
+
+    def _read_live(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
+        number, lost, start_s = 0, 0, time.monotonic()
+        while lost < _MOST_LOST_LIVE:
+            number += 1
+            is_wanted = is_sampled(number, interval)
+            decoded, image = capture.read() if is_wanted else (capture.grab(), np.zeros((0, 0), np.uint8))
+            if not decoded:
+                lost += 1
+                continue
+            self._note_lost(number - lost, number - 1)
+            lost, self.last = 0, number
+            start_s = start_s if number > 1 else time.monotonic()
+            if is_wanted and self._fits(image, number):
+                yield Frame(number, time.monotonic() - start_s, image)
+
+    def _note_lost(self, first: int, last: int) -> None:
+        if first == last:
+            self._note(first, f"frame {first} could not be decoded and was left out")
+        elif first < last:
+            self._note(first, f"frames {first} to {last} could not be decoded and were left out")
+
+    def _stored(self) -> int:
+        """How many frames a file holds the data of, whether or not they can be decoded."""
+        capture = cv2.VideoCapture(str(self._target), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        try:
+            count = 0
+            while capture.grab():
+                count += 1
+        finally:
+            capture.release()
+        return count
+
+    def _open(self) -> cv2.VideoCapture:
+        return open_capture(self._target, self.name)
+
+    def _fits(self, image: np.ndarray, number: int) -> bool:
+        width, height = image.shape[1], image.shape[0]
+        if (width, height) != self.size:
+            what = f"frame {number} of {self.name} is {width}x{height} but the first is {self.size[0]}x{self.size[1]}"
+            self._leave_out(number, what, "size")
+        return (width, height) == self.size
+
+
+def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | None = None) -> cv2.VideoCapture:
+    """A file, a camera's index or a stream's address through OpenCV.
+
+    limits_s: after which opening a stream, and later reading from it, fails; None: after FFmpeg's own 30 s.
+    Raises InputError: cannot be opened, is no video.
+    """
+    names = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+    limits = [n for name, limit_s in zip(names, limits_s or (), strict=False) for n in (name, int(1000 * limit_s))]
+    with quiet_opencv():
+        if isinstance(target, int):
+            capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
+        else:  # other back ends than FFmpeg take a numbered image or a text file for a video
+            capture = cv2.VideoCapture(target, cv2.CAP_FFMPEG, limits)
+    if not capture.isOpened():
+        live = _is_live(target)
+        what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
+        raise InputError(f"cannot open {what}; " + ("is it there?" if live else "it is damaged or no video file"))
+    if int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True) in _TEXT_AS_VIDEO:
+        capture.release()
+        raise InputError(f"{name} is a text file, not a video")
+    return capture
+
+
+def _is_live(target: str | int) -> bool:
+    return isinstance(target, int) or "://" in target
+
+
+def _announced_hz(capture: cv2.VideoCapture) -> float | None:
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+    return rate_hz if 0 < rate_hz <= 1000 else None
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Live streams, picture by picture: the camera or the sender may fall silent at any time.
+
+_SECRETS = re.compile(r"(?<=://)[^/\s]*@")
+# Pictures in a row that may fail to be decoded at the start: a stream is joined in the middle.
+_MOST_UNDECODED = 100
+
+
+class Stream(Protocol):
+    """What a live run needs of an open camera or stream; the calls may take as long as they like."""
+
+    rate_hz: float | None  # as announced; None where nothing credible is
+
+    def grab(self) -> bool:
+        """Wait for the next picture; False: none came."""
+        ...
+
+    def retrieve(self) -> np.ndarray | None:
+        """The picture grabbed last, uint8 (H, W) or (H, W, 3) BGR; None where it cannot be decoded."""
+        ...
+
+    def release(self) -> None:
+        """Let go of the camera or the connection."""
+        ...
+
+
+class OpenedStream:
+    """A Stream through OpenCV. limits_s: an opening, or a read, that takes longer fails, where the driver heeds it.
+
+    Raises InputError: cannot be opened, is no video.
+    """
+
+    def __init__(self, target: str | int, name: str, limits_s: tuple[float, float]) -> None:
+        self._capture = open_capture(target, name, limits_s)
+        # What goes wrong from now on is told by who reads; OpenCV would write a line for each time.
+        cv2.utils.logging.setLogLevel(0)
+        self.rate_hz = _announced_hz(self._capture)
+
+    def grab(self) -> bool:
+        """Wait for the next picture; False: none came."""
+        return bool(self._capture.grab())
+
+    def retrieve(self) -> np.ndarray | None:
+        """The picture grabbed last; None where it cannot be decoded."""
+        decoded, image = self._capture.retrieve()
+        return image if decoded else None
+
+    def release(self) -> None:
+        """Let go of the camera or the connection."""
+        self._capture.release()
+
+
+def stream_target(spec: str) -> str | int | None:
+    """What OpenCV is to open for `camera:0` or an address; None for anything else. Raises InputError."""
+    if spec.startswith("camera:"):
+        index = spec.removeprefix("camera:")
+        if not index.isdecimal() or len(index) > 4:
+            raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
+        return int(index)
+    return spec if "://" in spec else None
+
+
+def without_secrets(spec: str) -> str:
+    """An address as it may be told to anyone: without a user's name and password."""
+    return _SECRETS.sub("", spec)
+
+
+def first_picture(stream: Stream, name: str) -> np.ndarray:
+    """The first picture that can be decoded. Raises InputError where there is none."""
+    for _ in range(_MOST_UNDECODED):
+        if not stream.grab():
+            raise InputError(f"no picture comes from {name}; is it sending, in a codec that FFmpeg knows?")
+        if (image := stream.retrieve()) is not None:
+            return image
+    raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection too poor")
+
+
+def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A picture brought to (width, height)."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -46,11 +46,10 @@ class Column:
         """What a cell may hold, in words."""
         if self.wanted:
             return self.wanted
-        kind = "a whole number" if self.is_whole else "a number"
-        text = f"{kind} from {self.low:g} to {self.high:g}" if math.isfinite(self.high - self.low) else f"finite {kind}"
-        if self.is_whole and math.isfinite(self.high):
-            text = f"a whole number from {self.low:.0f} to {self.high:.0f}"
-        return text.replace("finite a", "a finite") + (", or nothing" if self.may_be_empty else "")
+        kind, form = ("whole number", ".0f") if self.is_whole else ("number", "g")
+        is_bounded = math.isfinite(self.high - self.low)
+        text = f"a {kind} from {self.low:{form}} to {self.high:{form}}" if is_bounded else f"a finite {kind}"
+        return text + (", or nothing" if self.may_be_empty else "")
 
 
 class Schema:
@@ -194,11 +193,10 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
 class CsvTable:
     """A table that was read. columns: name -> (N,) float64, or a list of text. line: (N,) int64, in the file from 1."""
 
-    def __init__(self, path: str | Path, what: str, header: Sequence[str], line: Sequence[int]) -> None:
-        self.path, self.what, self.header = str(path), what, tuple(header)
-        self.line = np.array(line, np.int64)
+    def __init__(self, path: str | Path, what: str, text: CsvText) -> None:
+        self.what, self.header, self._path, self._rows = what, tuple(text.header), path, text.rows
+        self.line = np.array(text.line, np.int64)
         self.columns: dict[str, Any] = {}
-        self.text: dict[str, list[str]] = {}
 
     def __len__(self) -> int:
         return len(self.line)
@@ -215,15 +213,24 @@ class CsvTable:
         """Several columns side by side, (N, K)."""
         return np.stack([self[name] for name in names], axis=1)
 
+    def cell(self, name: str, row: int) -> str:
+        """The text of a number."""
+        return self._rows[row][self.header.index(name)]
+
     def error(self, message: str, row: int | None = None) -> InputError:
         """The error to raise, with the file and the line of a row."""
         place = "" if row is None else f", line {self.line[row]}"
-        return InputError(f"{self.what} {self.path}{place}: {message}")
+        return InputError(f"{self.what} {self._path}{place}: {message}")
 
     def refuse(self, is_wrong: np.ndarray, message: str) -> None:
         """Raises InputError at the first of the rows that are wrong, (N,) bool."""
         if is_wrong.any():
             raise self.error(message, int(is_wrong.argmax()))
+
+    def require_rows(self) -> None:
+        """Raises InputError for a table without rows."""
+        if not len(self):
+            raise InputError(f"{self.what} {self._path} has a header but no rows")
 
 
 def read_table(
@@ -236,26 +243,25 @@ def read_table(
     Raises InputError with file and line: unreadable, a column missing or named twice, too many or too few cells, not a
     number, out of range.
     """
-    header, lines, rows = text or read_csv(path, schema.what)
-    table = CsvTable(path, schema.what, header, lines)
-    columns = ", ".join(filter(None, header)) or "none"
+    text = text or read_csv(path, schema.what)
+    header, _, rows = text
+    table = CsvTable(path, schema.what, text)
     if missing := [name for name in required if name not in header]:
+        columns = ", ".join(filter(None, header)) or "none"
         raise InputError(
             f"{schema.what} {path} lacks {', '.join(missing)}; its columns are {columns}, wanted {','.join(required)}"
         )
     if twice := [name for name in schema.names if header.count(name) > 1]:
         raise table.error(f"column {twice[0]} is named twice; wanted each name once")
-    for row, cells in enumerate(rows):
-        if len(cells) != len(header) and not is_ragged:
-            count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
-            raise table.error(f"{count}; the first line names {len(header)}", row)
+    counts = np.array([len(cells) for cells in rows], int)
+    if not is_ragged and (is_odd := counts != len(header)).any():
+        count = int(counts[is_odd][0])
+        table.refuse(is_odd, f"{count} column{'s' * (count != 1)}; the first line names {len(header)}")
     for column in schema.columns:
         if column.name in header:
             place = header.index(column.name)
-            short = next((row for row, cells in enumerate(rows) if len(cells) <= place), None)
-            if short is not None:
-                raise table.error(f"{column.name} is missing: the line ends before it", short)
-            table.text[column.name] = cells = [cells[place] for cells in rows]
+            table.refuse(counts <= place, f"{column.name} is missing: the line ends before it")
+            cells = [cells[place] for cells in rows]
             table.columns[column.name] = _numbers(table, column, cells) if column.format else cells
     return table
 
@@ -282,15 +288,15 @@ def parse_numbers(cells: Sequence[str]) -> np.ndarray:
             return values
     except ValueError:
         pass
-    return np.array([_parse_number(cell) for cell in cells], float)
+    return np.array([_parse_number(cell) if cell else math.nan for cell in cells], float)
 
 
 def _parse_number(cell: str) -> float:
     try:
-        value = math.inf if "_" in cell else float(cell or "nan")  # 1_0 is a number to Python alone
+        value = math.inf if "_" in cell else float(cell)  # 1_0 is a number to Python alone
     except ValueError:
         return math.inf
-    return math.inf if math.isnan(value) and cell else value
+    return math.inf if math.isnan(value) else value
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -316,6 +322,8 @@ DEGREES = tuple(
     Column(name, ".9f", -most, most, may_be_empty=True) for name, most in (("longitude_deg", 180), ("latitude_deg", 90))
 )
 TARGET = Column("target", "d", 1, 2**53, is_whole=True)
+PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
+"""The two kinds of place that a table may have."""
 
 MOT = Schema("boxes", FRAME, IDENTITY, *BOX, SCORE, *(Column(n, "d") for n in ("x", "y", "z")), has_header=False)
 """MOTChallenge text: `frame,identity,x,y,width,height,score,-1,-1,-1`, frames from 1, pixels from 0.
@@ -346,22 +354,19 @@ def compass_deg(heading_rad: float) -> float:
 
 def detection_tables(folder: Path) -> TableFiles[Scene]:
     """detections.txt and detections.csv of a clip's frames."""
-    return TableFiles(
-        {folder / "detections.txt": (MOT, _mot_of_scene), folder / "detections.csv": (DETECTIONS, _of_scene)}
-    )
 
+    def mot(scene: Scene) -> Rows:
+        return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)
 
-def _mot_of_scene(scene: Scene) -> Rows:
-    return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)
+    def named(scene: Scene) -> Rows:
+        found = scene.detections
+        return {
+            **mot(scene),
+            "target": np.arange(1, len(found) + 1),
+            "kind": found.kind,
+            "area_px": found.area_px,
+            "heading_deg": [compass_deg(heading) for heading in found.heading_rad.tolist()],
+            "speed_px_per_frame": found.speed_px,
+        }
 
-
-def _of_scene(scene: Scene) -> Rows:
-    found = scene.detections
-    return {
-        **mot_rows(scene.frame.number, found.box_px, found.score),
-        "target": np.arange(1, len(found) + 1),
-        "kind": found.kind,
-        "area_px": found.area_px,
-        "heading_deg": [compass_deg(heading) for heading in found.heading_rad.tolist()],
-        "speed_px_per_frame": found.speed_px,
-    }
+    return TableFiles({folder / "detections.txt": (MOT, mot), folder / "detections.csv": (DETECTIONS, named)})

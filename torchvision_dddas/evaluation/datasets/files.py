@@ -7,7 +7,7 @@ from pathlib import Path
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, natural_order, read_image
-from torchvision_dddas.io.video import VideoSource
+from torchvision_dddas.io.sources import VideoSource
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".ts", ".mpg", ".mpeg", ".wmv"})
 

@@ -21,9 +21,9 @@ from torchvision_dddas.evaluation.studies.records import Found, Task, round_as_w
 from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.detection_tables import check_table, read_detections
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, ImageSource
+from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.people.detector import detect_in_clip, load_scorer
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table

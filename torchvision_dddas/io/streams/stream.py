@@ -1,78 +1,39 @@
-"""A stream of messages: results in, messages out, with retries while they cannot be sent."""
+"""Streams of `--emit`, such as `json:-` or `cot:udp://239.2.3.1:6969`: results in, messages out, with retries."""
 
 import math
 import os
 import re
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
 
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.streams.messages import About, CotEvents, json_lines, mot_lines
+from torchvision_dddas.io.streams.outlets import LineOutlet, Outlet, open_datagrams
 from torchvision_dddas.types import FrameResult, TrackedFrame
 
 Notify = Callable[[str, str], object]
 """Called with the kind `sink` and a message for the user."""
 
+Encoder = Callable[[FrameResult | None, TrackedFrame | None, float, int], Sequence[bytes]]
+"""Messages with line ends of targets and people of a frame. Third: its age, s. Fourth: their longest length, 0: any."""
+
+WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
+
+_BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
+_MOST_WAIT_S = 2.0  # a datagram costs nothing to try
 _NOTIFY_S, _SELDOM_S = 30.0, 3600.0  # between two messages on the same loss, at first and at last
 _NUMBER = re.compile(r"\d+")
-
-
-@dataclass
-class About:
-    """What messages need to know of the run.
-
-    start_utc_s: seconds since 1970 at time_s = 0, NaN while no clock is known. A live run sets it with its first
-    picture, and again when the machine's clock is set. clock: whether it will be known. geographic: whether targets get
-    longitudes and latitudes. landmarks: their names. source: what the run is called in Cursor-on-Target events.
-    """
-
-    start_utc_s: float = float("nan")
-    geographic: bool = False
-    landmarks: tuple[str, ...] = ()
-    source: str = "dddas"
-    clock: bool = True
-
-
-class Outlet(Protocol):
-    """Takes messages one after another and never waits long.
-
-    most_bytes: of a message, 0 for any. lost: messages lost so far. reason: why the last of them was lost.
-    """
-
-    most_bytes: int
-    lost: int
-    reason: str
-
-    def put(self, messages: Sequence[bytes]) -> None:
-        """Keep messages until they can be sent; beyond a limit the oldest are lost."""
-
-    def flush(self) -> None:
-        """Send as much as is accepted now, each message whole or not at all. Raises OSError on trouble."""
-
-    def mend(self) -> None:
-        """Reopen after trouble. Raises OSError if that fails."""
-
-    def handle(self) -> int | None:
-        """A new descriptor of the file to be synced, which the caller closes; None if there is no file."""
-
-    def close(self) -> None:
-        """Send what can be sent soon and count the rest as lost. Never raises."""
-
-
-class Encoder(Protocol):
-    """Makes messages of a frame."""
-
-    def __call__(
-        self, result: FrameResult | None, people: TrackedFrame | None, age_s: float, most_bytes: int
-    ) -> Sequence[bytes]:
-        """Messages with line ends, of at most most_bytes where possible; 0: of any length."""
 
 
 class Stream:
     """Sends results, given in order. Trouble of the outlet never ends the run: it is reported once and retried later.
 
-    name: as the user wrote it. sent: number of messages given to the outlet. One thread writes and closes.
+    name: as the user wrote it. One thread writes and closes.
     """
 
     def __init__(
@@ -87,11 +48,10 @@ class Stream:
     ) -> None:
         """retry_s: a broken outlet is tried again after this, then twice that, up to retry_most_s."""
         self.name = name
-        self.sent = 0
         self._encode, self._outlet, self._notify, self._clock = encode, outlet, notify, clock
         self._retry_s, self._retry_most_s = retry_s, retry_most_s
         self._lock = threading.Lock()
-        self._trouble = ""
+        self._trouble = ""  # why nothing can be sent at the moment
         self._wait_s = self._due_s = 0.0
         self._mended_s = -math.inf
         self._failed = self._reported_lost = 0
@@ -103,35 +63,29 @@ class Stream:
         """Messages lost for good."""
         return self._outlet.lost + self._failed
 
-    @property
-    def trouble(self) -> str:
-        """Why nothing can be sent at the moment; empty if it can."""
-        return self._trouble
-
     def write(self, result: FrameResult | None, people: TrackedFrame | None = None) -> None:
         """Send a frame: its targets and people, each None if it has none to send. Never raises."""
-        followed = result.tracked if result is not None else people
-        if followed is None:
+        tracked = result.tracked if result is not None else people
+        if tracked is None:
             return
-        age_s = float("nan") if followed.frame is None else self._clock() - followed.frame.taken_s
+        age_s = math.nan if tracked.frame is None else self._clock() - tracked.frame.taken_s
         messages: Sequence[bytes] = ()
         defect = ""
         try:
             messages = self._encode(result, people, age_s, self._outlet.most_bytes)
         except Exception as error:  # a defect of this package must not end a run
-            defect = f"frame {followed.number} cannot be told, {type(error).__name__}: {error}"
+            defect = f"frame {tracked.number} cannot be told, {type(error).__name__}: {error}"
         with self._lock:
             if defect:
                 self._failed += 1
                 self._reason = defect
             lost = self._outlet.lost
-            self.sent += len(messages)
             self._outlet.put(messages)
             self._flush()
             if self._outlet.lost > lost:
                 self._reason = self._outlet.reason
             if not self._trouble and self.lost > self._reported_lost:
-                self._report_lost(self._reason)
+                self._report_lost()
 
     def sync(self) -> None:
         """Flush what was sent to the disk while `write` goes on. Never raises; another thread may call it."""
@@ -143,7 +97,7 @@ class Stream:
                 os.fsync(file)
         except OSError as error:
             with self._lock:
-                self._broke(error)
+                self._retry_later(error)
         finally:
             if file is not None:
                 os.close(file)
@@ -163,13 +117,13 @@ class Stream:
                 self._outlet.mend()
             self._outlet.flush()
         except OSError as error:
-            self._broke(error)
+            self._retry_later(error)
             return
         if self._trouble:
             self._trouble, self._mended_s = "", self._clock()
             self._notify("sink", f"{self.name} works again; {self._newly_lost()}")
 
-    def _broke(self, error: OSError) -> None:
+    def _retry_later(self, error: OSError) -> None:
         trouble, now_s = error.strerror or str(error), self._clock()
         # An outlet that works for a moment only is not tried more often.
         steady = not self._trouble and now_s > self._mended_s + self._retry_most_s
@@ -179,16 +133,106 @@ class Stream:
             self._notify("sink", f"{self.name}: {trouble}; trying again in {self._wait_s:g} s")
         self._trouble = trouble
 
-    def _report_lost(self, reason: str) -> None:
+    def _report_lost(self) -> None:
         """Report losses, less and less often while the reason stays the same."""
-        now_s, key = self._clock(), _NUMBER.sub("", reason)
-        if key == self._reported_reason and now_s < self._lost_due_s:
-            return
+        now_s, key = self._clock(), _NUMBER.sub("", self._reason)
         again = key == self._reported_reason
+        if again and now_s < self._lost_due_s:
+            return
         self._lost_wait_s = min(2 * self._lost_wait_s, _SELDOM_S) if again else _NOTIFY_S
         self._lost_due_s, self._reported_reason = now_s + self._lost_wait_s, key
-        self._notify("sink", f"{self.name}: {reason}; {self._newly_lost()}")
+        self._notify("sink", f"{self.name}: {self._reason}; {self._newly_lost()}")
 
     def _newly_lost(self) -> str:
         lost, self._reported_lost = self.lost - self._reported_lost, self.lost
         return f"{lost or 'no'} message{'' if lost == 1 else 's'} lost"
+
+
+def open_streams(
+    texts: Sequence[str],
+    about: About,
+    notify: Notify,
+    retry_s: float = 0.5,
+    retry_most_s: float = 30.0,
+    option: str = "--emit",
+) -> list[Stream]:
+    """Open all streams or none. Raises InputError as open_stream does, and if two would write to one file."""
+    places: dict[str, str] = {}
+    for text in texts:
+        place = text.partition(":")[2]
+        if _is_address(place):
+            continue
+        real = place if place == "-" else os.path.realpath(_path(place, f"{option} {text}"))
+        if real in places:
+            raise InputError(
+                f"{option} {places[real]} and {option} {text} go to the same place; choose another for one"
+            )
+        places[real] = text
+    with ExitStack() as opened:
+        streams = []
+        for text in texts:
+            streams.append(open_stream(text, about, notify, retry_s, retry_most_s, option))
+            opened.callback(streams[-1].close)
+        opened.pop_all()
+    return streams
+
+
+def open_stream(
+    text: str, about: About, notify: Notify, retry_s: float = 0.5, retry_most_s: float = 30.0, option: str = "--emit"
+) -> Stream:
+    """Open a stream. notify: called when it breaks and when it works again. retry_s, retry_most_s: as in Stream.
+
+    Raises InputError: an unknown kind, a file that cannot be written or holds something else, an unknown host, or
+    events without places.
+    """
+    kind, colon, place = text.partition(":")
+    asked = f"{option} {text}"
+    is_address = _is_address(place)
+    if kind not in _BEGINS or not colon or not place or ("://" in place and not is_address):
+        raise InputError(f"{option} {text!r} is no stream; {WANTED}")
+    encode: Encoder
+    if kind == "json":
+        encode = partial(json_lines, about)
+    elif kind == "mot":
+        encode = mot_lines
+    elif about.geographic:
+        encode = CotEvents(about)
+    else:
+        raise InputError(
+            f"{asked}: such events need longitudes and latitudes; give --landmarks or --telemetry in degrees, or "
+            "emit json instead"
+        )
+    try:
+        outlet: Outlet = open_datagrams(place, asked) if is_address else _open_lines(place, kind, asked)
+    except OSError as error:
+        raise InputError(f"{asked}: {error.strerror or error}; choose another place") from None
+    return Stream(
+        text, encode, outlet, notify, retry_s, min(retry_most_s, _MOST_WAIT_S) if is_address else retry_most_s
+    )
+
+
+def _is_address(place: str) -> bool:
+    return place.lower().startswith("udp:")
+
+
+def _path(place: str, asked: str) -> Path:
+    try:
+        if "\0" in place:
+            raise ValueError("a zero byte is in no file's name")
+        return Path(place).expanduser()
+    except (RuntimeError, ValueError) as error:  # ~nobody
+        raise InputError(f"{asked!r}: {error}; choose another place") from None
+
+
+def _open_lines(place: str, kind: str, asked: str) -> LineOutlet:
+    if place == "-":
+        if sys.__stdout__ is None:
+            raise OSError("standard output is closed")
+        return LineOutlet(None)
+    path = _path(place, asked)
+    if path.is_file() and os.access(path, os.R_OK):
+        with path.open("rb") as file:
+            first = file.read(1)
+        if first not in _BEGINS[kind]:  # of an empty file nothing is in all
+            raise InputError(f"{asked}: the file holds something else than {kind}; choose another file")
+    return LineOutlet(path)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Log:
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
     jitter_s: how far time may run back; more is another recording, or damage.
-    samples: column of the record -> rows of time, value (NaN where unknown) and place in the file. A place is
+    samples: column of the record -> rows (N, 3) of time, value (NaN where unknown) and place in the file. Positions are
     longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any value, of each row of a log whose
     rows hold all quantities, also of empty rows.
     """
@@ -48,14 +49,12 @@ class Log:
     bridge_s: float = 0.0
     jitter_s: float = 1.0
     notes: list[str] = field(default_factory=list)
-    samples: dict[str, list[tuple[float, float, int]] | np.ndarray] = field(default_factory=dict)
-    moments: list[tuple[float, float, int]] | np.ndarray = field(default_factory=list)
+    samples: dict[str, Any] = field(default_factory=dict)
+    moments: Any = field(default_factory=list)
 
     def add(self, quantity: str, time_s: float, value: float, where: int) -> None:
         """Add a sample."""
-        rows = self.samples.setdefault(quantity, [])
-        assert isinstance(rows, list)
-        rows.append((time_s, value, where))
+        self.samples.setdefault(quantity, []).append((time_s, value, where))
 
     def add_all(self, times: np.ndarray, where: np.ndarray, values: dict[str, np.ndarray], known: bool = False) -> None:
         """Set all samples of some quantities, each argument (N,). known: whether to leave out unknown values."""

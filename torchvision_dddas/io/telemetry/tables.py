@@ -5,7 +5,6 @@ import re
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,16 +18,17 @@ COLUMNS = ("time_s", "altitude_m", "speed_m_s")
 """The usual columns; the speed may be left out, and the altitude where above_sea_m is there."""
 
 PAIRS = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
+_ANY = (-math.inf, math.inf, "")
 _COMPASS = (-360.0, 360.0, "clockwise from true north, -360 to 360")
 _LOCAL = (-1e7, 1e7, "metres from the origin, -1e7 to 1e7")
-_OPTIONAL: dict[str, tuple[Any, ...]] = {
-    "altitude_m": (),
+_OPTIONAL = {
+    "altitude_m": _ANY,
     "speed_m_s": (0.0, math.inf, "the speed over ground, 0 or more"),
-    "longitude_deg": (),
-    "latitude_deg": (),
+    "longitude_deg": _ANY,
+    "latitude_deg": _ANY,
     "east_m": _LOCAL,
     "north_m": _LOCAL,
-    "above_sea_m": (),
+    "above_sea_m": _ANY,
     "heading_deg": _COMPASS,
     # A gimbal that looks straight down reports 90.2 as well as 89.8.
     "pitch_deg": (-180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
@@ -40,8 +40,8 @@ SCHEMA = Schema(
     "telemetry",
     Column("time_s", "g", -1e10, 1e10, wanted="seconds since the clip's first frame"),
     *(
-        Column(name, "g", *limits[:2], may_be_empty=True, wanted="".join(limits[2:]))
-        for name, limits in _OPTIONAL.items()
+        Column(name, "g", low, high, may_be_empty=True, wanted=wanted)
+        for name, (low, high, wanted) in _OPTIONAL.items()
     ),
 )
 
@@ -143,7 +143,8 @@ def parse_date(text: str) -> tuple[float, bool] | None:
         return None
     *whole, fraction, micro, zone = found.groups(default="")
     try:
-        moment = datetime(*map(int, whole), tzinfo=UTC)
+        year, month, day, hour, minute, second = map(int, whole)
+        moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return None
     seconds = moment.timestamp() + float(f"0.{fraction}{micro if len(fraction) == 3 else ''}0")

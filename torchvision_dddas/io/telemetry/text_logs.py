@@ -161,13 +161,13 @@ def _note_lacking(log: Log, lacking: dict[str, list[int]], last: int, count: int
     together: dict[tuple[int, ...], list[str]] = {}
     for name, lines in lacking.items():
         together.setdefault(tuple(lines), []).append(name)
-    for lines, names in together.items():
+    for (first, *others), names in together.items():
         what = f"lacks {', '.join(sorted(names))}"
-        if lines == (last,):
+        if first == last:
             log.note(f"line {last}: the last subtitle {what}: the file is incomplete; unknown there")
         else:
-            others = f", as do {len(lines) - 1} more of {count}" if len(lines) > 1 else ""
-            log.note(f"line {lines[0]}: the subtitle {what}{others}; unknown there")
+            also = f", as do {len(others)} more of {count}" if others else ""
+            log.note(f"line {first}: the subtitle {what}{also}; unknown there")
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,254 @@
+"""A frame as messages: a line of JSON (docs/stream.md has its fields), rows of MOTChallenge text, Cursor-on-Target."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.io.maps import iso_utc, semi_axes
+from torchvision_dddas.io.maps.cot import STALE_S, event, event_uid
+from torchvision_dddas.io.output.tables import track_rows
+from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
+from torchvision_dddas.types import FrameResult, TrackedFrame
+
+PEOPLE_FROM = 1_000_000
+"""Added to the identities of people, who are tracked apart from targets: MOT text has no column for a kind."""
+
+EVERY_S = 1.0
+"""Seconds between two events of a target."""
+
+_FARTHEST_PX = 1e7
+_LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four digits for a year
+
+
+@dataclass
+class About:
+    """What messages need to know of the run.
+
+    start_utc_s: seconds since 1970 at time_s = 0, NaN while no clock is known. A live run sets it with its first
+    picture, and again when the machine's clock is set. geographic: whether targets get longitudes and latitudes.
+    landmarks: their names.
+    """
+
+    start_utc_s: float = float("nan")
+    geographic: bool = False
+    landmarks: tuple[str, ...] = ()
+
+    def utc(self, time_s: float) -> str | None:
+        """ISO 8601 to the millisecond; None where no such time is known."""
+        utc_s = self.start_utc_s + time_s
+        return iso_utc(np.array([utc_s]))[0] if 0 <= utc_s < _LATEST_UTC_S else None
+
+
+def json_lines(
+    about: About,
+    result: FrameResult | None,
+    people: TrackedFrame | None,
+    age_s: float = math.nan,
+    most_bytes: int = 0,
+) -> list[bytes]:
+    """The lines of a frame, ASCII and with their line ends: one, or one each where the two are of different frames.
+
+    result, people: as in Stream.write. age_s: from the capture of the frame to now. most_bytes: a longer line is split
+    into parts, each with some of the targets and people, its number `part` from 1 and their count `parts`; 0: never.
+    A line of one target is never split. Numbers that are not finite are null.
+    """
+    apart = result is not None and people is not None and result.tracked.number != people.number
+    lines = []
+    for targets, persons in [(result, None), (None, people)] if apart else [(result, people)]:
+        fields = _frame(about, targets, persons, age_s)
+        line = _encode(fields)
+        lines += [line] if not 0 < most_bytes < len(line) else _split(fields, most_bytes)
+    return lines
+
+
+def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None, age_s: float) -> dict[str, Any]:
+    tracked = result.tracked if result is not None else people
+    assert tracked is not None
+    located = result.locations if result is not None else None
+    time_s = math.nan
+    if tracked.frame is not None:
+        time_s = tracked.frame.time_s
+    elif located is not None:
+        time_s = located.time_s
+    adjustments = (*tracked.adjustments, *(located.adjustments if located is not None else ()))
+    return {
+        "frame": tracked.number,
+        "time_s": _number(time_s, 4),
+        "utc": about.utc(time_s),
+        "age_s": _number(age_s, 4),
+        "cause": tracked.cause,
+        "targets": None if result is None else _targets(result),
+        "people": None if people is None else list(_boxes(people)),
+        "ground": None if result is None else _ground(result, about),
+        "adjustments": [
+            {
+                "frame": one.frame,
+                "knob": one.parameter,
+                "old": _number(one.old, 6),
+                "new": _number(one.new, 6),
+                "cause": one.cause,
+            }
+            for one in dict.fromkeys(adjustments)
+        ],
+    }
+
+
+def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
+    """The boxes that have an identity, then those that have none."""
+    tracks, found = tracked.tracks, tracked.detections
+    columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score)
+    identified = zip(*(column.tolist() for column in columns), strict=True)
+    loose = ((None, row, found.box_px[row].tolist(), float(found.score[row])) for row in tracked.untracked)
+    for identity, row, box, score in [*identified, *loose]:
+        fields = {
+            "id": identity,
+            "kind": found.kind,
+            "seen": row >= 0,
+            "box_px": _numbers(box, 2),
+            "score": _number(score, 4),
+        }
+        if row >= 0:
+            heading = float(found.heading_rad[row])
+            fields["heading_deg"] = _number(compass_deg(heading) if math.isfinite(heading) else math.nan, 1)
+            fields["speed_px_per_frame"] = _number(float(found.speed_px[row]), 3)
+        yield fields
+
+
+def _targets(result: FrameResult) -> list[dict[str, Any]]:
+    """The boxes with their places and confirmations."""
+    places: dict[int, dict[str, Any]] = {}
+    if (located := result.locations) is not None:
+        at = located.positions
+        for row, target in enumerate(at.target.tolist()):
+            covariance = at.covariance_m2[row]
+            places[target] = {
+                "east_north_m": _numbers(at.east_north_m[row], 3),
+                "covariance_m2": _numbers([covariance[0, 0], covariance[0, 1], covariance[1, 1]], 6),
+                "velocity_m_s": _numbers(located.velocity_m_s[row], 3),
+            }
+            if at.lonlat_deg is not None:
+                places[target]["lonlat_deg"] = _numbers(at.lonlat_deg[row], 9)
+        if (confirmed := result.confirmed) is not None:
+            for row, kind, human in zip(confirmed.row.tolist(), confirmed.kind, confirmed.probability, strict=True):
+                places[int(at.target[row])] |= {"confirmed": kind, "human": _number(human, 4)}
+    return [fields | places.get(fields["id"], {}) for fields in _boxes(result.tracked)]
+
+
+def _ground(result: FrameResult, about: About) -> dict[str, Any] | None:
+    if result.locations is None:
+        return None
+    fix, marks, degrees = result.locations.fix, result.locations.marks, result.mark_lonlat_deg
+    landmarks = []
+    for row, landmark in enumerate(marks.landmark.tolist()):
+        is_named = 0 <= landmark < len(about.landmarks)
+        fields: dict[str, Any] = {
+            "name": about.landmarks[landmark] if is_named else str(landmark),
+            "image_px": _numbers(marks.image_px[row], 2),
+            "east_north_m": _numbers(marks.east_north_m[row], 3),
+        }
+        if degrees is not None:
+            fields["lonlat_deg"] = _numbers(degrees[row], 9)
+        landmarks.append(fields)
+    return {
+        "by": fix.by,
+        "landmarks_used": sum(fix.is_used),
+        "cause": fix.cause,
+        "changes": list(fix.changes),
+        "landmarks": landmarks,
+    }
+
+
+def _number(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if math.isfinite(value) else None
+
+
+def _numbers(values: Sequence[float] | np.ndarray, digits: int) -> list[float] | None:
+    """None if any number is unknown."""
+    return [round(float(v), digits) for v in values] if all(map(math.isfinite, values)) else None
+
+
+def _encode(fields: dict[str, Any]) -> bytes:
+    # ASCII: special characters of names, also line ends, are escaped and cannot break a line.
+    return (json.dumps(fields, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
+
+
+def _split(fields: dict[str, Any], most_bytes: int) -> list[bytes]:
+    """The same in several lines; fields of the whole frame are in the first."""
+    lists = {name: fields[name] for name in ("targets", "people")}
+    rest = {name: fields[name] for name in ("frame", "time_s", "utc", "age_s", "cause")}
+
+    def empty() -> dict[str, Any]:
+        return {name: None if rows is None else [] for name, rows in lists.items()} | {"part": 10**6, "parts": 10**6}
+
+    parts = [fields | empty()]
+    room = most_bytes - len(_encode(parts[0]))
+    for name, rows in lists.items():
+        for row in rows or ():
+            size = len(_encode(row))
+            if size > room and (parts[-1]["targets"] or parts[-1]["people"] or len(parts) == 1):
+                parts.append(rest | empty())
+                room = most_bytes - len(_encode(parts[-1]))
+            parts[-1][name].append(row)
+            room -= size
+    return [_encode(part | {"part": k, "parts": len(parts)}) for k, part in enumerate(parts, 1)]
+
+
+def mot_lines(
+    result: FrameResult | None, people: TrackedFrame | None, age_s: float = math.nan, most_bytes: int = 0
+) -> list[bytes]:
+    """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line per box with an identity: targets, then people.
+
+    One message per frame, or several of whole lines if it is longer than most_bytes. Infinite boxes are left out.
+    """
+    text = ""
+    for tracked, first in ((None if result is None else result.tracked, 0), (people, PEOPLE_FROM)):
+        if tracked is not None:
+            tracks = tracked.tracks
+            shown = tracks[np.isfinite(tracks.score) & (np.abs(tracks.box_px) < _FARTHEST_PX).all(axis=1)]
+            shown = replace(shown, identity=shown.identity + first)
+            text += MOT_TRACKS.format_rows(track_rows(replace(tracked, tracks=shown)))
+    messages = [b""]
+    for line in text.encode("ascii").splitlines(keepends=True):
+        if messages[-1] and 0 < most_bytes < len(messages[-1]) + len(line):
+            messages.append(b"")
+        messages[-1] += line
+    return [message for message in messages if message]
+
+
+class CotEvents:
+    """Cursor-on-Target events of frames, given in order: at most one per target and second."""
+
+    def __init__(self, about: About) -> None:
+        self._about = about
+        self._sent_s: dict[int, float] = {}
+        self._begun_utc_s: float | None = None  # stays when the clock is set, so that targets keep their uid
+
+    def __call__(
+        self, result: FrameResult | None, people: TrackedFrame | None = None, age_s: float = 0.0, most_bytes: int = 0
+    ) -> list[bytes]:
+        """The events of a frame, a message with its line end each; none for places without longitude and latitude."""
+        located = None if result is None else result.locations
+        degrees = None if located is None else located.positions.lonlat_deg
+        if located is None or degrees is None or self._about.utc(located.time_s) is None:
+            return []
+        if self._begun_utc_s is None:
+            self._begun_utc_s = self._about.start_utc_s
+        at, now_s = located.positions, located.time_s
+        # Forget targets sent a second ago, all where time went back. Rounded time stamps must not skip an event.
+        self._sent_s = {target: sent for target, sent in self._sent_s.items() if 0 <= now_s - sent < EVERY_S - 1e-6}
+        axes, _ = semi_axes(at.covariance_m2, chi2=1.0)
+        time, stale = iso_utc(self._about.start_utc_s + np.array([now_s, now_s + STALE_S]))
+        messages = []
+        for row, target in enumerate(at.target.tolist()):
+            longitude, latitude = degrees[row].tolist()
+            if target in self._sent_s or not (abs(longitude) <= 180 and abs(latitude) <= 90):
+                continue
+            self._sent_s[target] = now_s
+            uid = event_uid("dddas", self._begun_utc_s, target)
+            sigma_m, velocity = axes[row, 0], located.velocity_m_s[row]
+            messages.append(event(uid, target, (time, stale), (longitude, latitude), sigma_m, velocity).encode())
+        return messages
