@@ -23,8 +23,6 @@ from torchvision_dddas.types import Colours
 HIGHEST = (180, 255, 255)
 """Of hue, saturation and value; the lowest is 0. A hue of 180 is that of 0."""
 
-_AXES = ("hue", "saturation", "value")
-
 
 def read_colours(path: str | Path) -> Colours:
     """Read the ranges, in the file's order.
@@ -35,7 +33,7 @@ def read_colours(path: str | Path) -> Colours:
     content = read_toml(path, "colours")
     if not content:
         raise InputError(f"colours {path} names no colour; wanted [name] with low and high, as `dddas colours` writes")
-    ends = np.array([_range(name, given, path) for name, given in content.items()], np.int64).reshape(-1, 2, 3)
+    ends = np.array([_range(name, given, path) for name, given in content.items()], np.int64)
     names, low, high = tuple(content), ends[:, 0], ends[:, 1]
     for a, b in find_overlaps(low, high):
         raise InputError(
@@ -50,21 +48,20 @@ def _range(name: str, given: Any, path: str | Path) -> list[list[int]]:
         raise InputError(f"colours {path}: {name} lacks low or high; wanted both, each [hue, saturation, value]")
     if more := sorted(given.keys() - {"low", "high"}):
         raise InputError(f"colours {path}: {name} has {more[0]}, which no colour has; there are low and high")
-    for end in ("low", "high"):
-        values = given[end]
+    low, high = given["low"], given["high"]
+    for end, values in (("low", low), ("high", high)):
         whole = isinstance(values, list) and all(type(v) is int for v in values)
-        if not whole or len(values) != 3 or not all(0 <= v <= h for v, h in zip(values, HIGHEST, strict=True)):
+        if not whole or len(values) != 3 or not all(0 <= v <= most for v, most in zip(values, HIGHEST, strict=True)):
             raise InputError(
                 f"colours {path}: {name}.{end} is {str(values)[:60]}; wanted [hue, saturation, value], whole numbers "
                 "from 0 to 180, 255 and 255"
             )
-    for axis in (1, 2):
-        if given["low"][axis] > given["high"][axis]:
+    for axis, first, last in zip(("saturation", "value"), low[1:], high[1:], strict=True):
+        if first > last:
             raise InputError(
-                f"colours {path}: {name}'s lowest {_AXES[axis]} {given['low'][axis]} is above its highest "
-                f"{given['high'][axis]}; only a hue may go over 0"
+                f"colours {path}: {name}'s lowest {axis} {first} is above its highest {last}; only a hue may go over 0"
             )
-    return [given["low"], given["high"]]
+    return [low, high]
 
 
 def format_colours(colours: Colours) -> str:
@@ -75,43 +72,31 @@ def format_colours(colours: Colours) -> str:
 
 
 def draw_calibration(images: Sequence[np.ndarray], found: CalibratedColours) -> bytes:
-    """A PNG of all pictures, one below the other, as `draw_colours` shows the ranges that were found in them."""
+    """A PNG of all pictures, one below the other: grey but where a range marks it, each landmark named.
+
+    A range is outlined in its colour.
+    """
+    ranges = found.ranges
+    # A bright BGR colour for each range: that of the middle of its hues.
+    low, high = ranges.low[:, 0], ranges.high[:, 0]
+    vivid = np.full((1, len(low), 3), 255, np.uint8)
+    vivid[0, :, 0] = (low + (high - low) % 180 / 2) % 180
+    shades = [(b, g, r) for b, g, r in cv2.cvtColor(vivid, cv2.COLOR_HSV2BGR)[0].tolist()]
     sheets = []
     for number, image in enumerate(images):
-        hsv, ranges = to_hsv(image), found.ranges
+        hsv = to_hsv(image)
         masks = np.stack([mask_range(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
-        own = [
-            np.array([s.box_px for s in group if s.picture == number], float).reshape(-1, 4) for group in found.groups
-        ]
-        sheet = draw_colours(image, masks, ranges, own)
+        is_marked, thick = masks.any(axis=0), line_width(image)
+        sheet = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) // 2 + 40, cv2.COLOR_GRAY2BGR)
+        sheet[is_marked] = image[is_marked]
+        for name, mask, shade, group in zip(ranges.names, masks, shades, found.groups, strict=True):
+            grown = cv2.dilate(mask, np.ones((2 * thick + 1,) * 2, np.uint8))
+            sheet[(grown > 0) & ~is_marked] = shade
+            for sighting in group:
+                if sighting.picture == number:
+                    around = np.array(sighting.box_px, float) + 4 * thick * np.array([-1, -1, 2, 2])
+                    rectangle(sheet, around, shade, thick)
+                    label(sheet, around, name, shade)
         width = images[0].shape[1]
         sheets.append(cv2.resize(sheet, (width, max(round(sheet.shape[0] * width / sheet.shape[1]), 1))))
     return cv2.imencode(".png", np.concatenate(sheets))[1].tobytes()
-
-
-def draw_colours(image: np.ndarray, masks: np.ndarray, colours: Colours, own_px: Sequence[np.ndarray]) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: grey but where a range marks it, outlined in the range's colour, its landmark named.
-
-    masks: (K, H, W) uint8 of the ranges. own_px: (P, 4) of each colour, the boxes of its landmark in this picture.
-    """
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) // 2 + 40
-    drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
-    thick = line_width(image)
-    drawn[masks.any(axis=0)] = image[masks.any(axis=0)]
-    for name, mask, shade, boxes in zip(colours.names, masks, _shades(colours), own_px, strict=True):
-        grown = cv2.dilate(mask, np.ones((2 * thick + 1,) * 2, np.uint8))
-        drawn[(grown > 0) & ~masks.any(axis=0)] = shade
-        for box in boxes:
-            around = box + 4 * thick * np.array([-1, -1, 2, 2])
-            rectangle(drawn, around, shade, thick)
-            label(drawn, around, name, shade)
-    return drawn
-
-
-def _shades(colours: Colours) -> list[tuple[int, int, int]]:
-    """A bright BGR colour for each range: that of the middle of its hues."""
-    low, high = colours.low[:, 0], colours.high[:, 0]
-    hue = (low + (high - low) % 180 / 2) % 180
-    vivid = np.stack([hue, np.full(len(hue), 255), np.full(len(hue), 255)], axis=1).astype(np.uint8)
-    blue_green_red = cv2.cvtColor(vivid[None], cv2.COLOR_HSV2BGR)[0].tolist()
-    return [(b, g, r) for b, g, r in blue_green_red]

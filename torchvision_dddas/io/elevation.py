@@ -4,13 +4,13 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.types import Elevation, Ortho
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
@@ -22,14 +22,17 @@ MOST_CELLS = 2000
 MOST_PX = 1600
 """Highest number of pixels along a side; a finer photo is averaged."""
 
+Degrees = tuple[float, float] | None
+"""Longitude and latitude of the origin of local metres; None where these are a raster's own coordinates."""
 
-def read_elevation(
-    path: str | Path, places: np.ndarray, origin_deg: tuple[float, float] | None, margin_m: float = 500.0
-) -> Elevation:
+Grid = tuple[np.ndarray, np.ndarray, float]
+"""Values (R, C) or (B, R, C), rows to the north, NaN where a raster has none; place of the first; metres a cell."""
+
+
+def read_elevation(path: str | Path, places: np.ndarray, origin_deg: Degrees, margin_m: float = 500.0) -> Elevation:
     """Heights about places (N, 2), relative to that at east = north = 0.
 
-    places: local metres; margin_m: how far around them. origin_deg: (longitude, latitude) of the local metres; None
-    where there is none: then they are taken for the raster's own coordinates.
+    places: local metres; margin_m: how far around them.
     Where the raster does not cover the origin, up = 0 is the mean height at those places that it does cover.
     Raises InputError where rasterio is missing, the file is no raster, of several bands, without CRS, not in metres, or
     covers none of the places.
@@ -37,60 +40,44 @@ def read_elevation(
     where = _known_places(places)
     if not len(where):
         raise InputError(f"elevation {path}: no place is known to look it up at; give landmarks with places")
-    with _open_raster(path, "elevation", origin_deg is not None) as raster:
+    with _open_raster(path, "elevation", origin_deg) as raster:
         if raster.count != 1:
             raise InputError(f"elevation {path} has {raster.count} bands; wanted one, of heights in metres")
         unit = (raster.units[0] or "m").lower()
         if unit not in ("m", "metre", "meter", "metres", "meters"):
             raise InputError(f"elevation {path} has heights in {unit}; wanted metres")
-        grid = _resample(raster, 1, where, origin_deg, margin_m, MOST_CELLS, (LOWEST_M, HIGHEST_M))
-        covers = _covered_text(raster, origin_deg is not None)
-    heights = grid.values
-    cells = np.rint((np.vstack([np.zeros((1, 2)), where]) - grid.corner_m) / grid.step_m).astype(int)
+        heights, corner, step = _resample(raster, 1, where, origin_deg, margin_m, MOST_CELLS, (LOWEST_M, HIGHEST_M))
+        area = _area_text(raster, where, origin_deg)
+    cells = np.rint((np.vstack([np.zeros((1, 2)), where]) - corner) / step).astype(int)
     inside = ((cells >= 0) & (cells < heights.shape[::-1])).all(axis=1)
     known = np.full(len(cells), np.nan)
     known[inside] = heights[cells[inside, 1], cells[inside, 0]]
     if not np.isfinite(known[1:]).any():
-        raise InputError(
-            f"elevation {path} covers {covers}, the landmarks lie at {_places_text(where, origin_deg)}; "
-            "it has no height there"
-        )
+        raise InputError(f"elevation {path} covers {area}; it has no height there")
     base = float(known[0] if np.isfinite(known[0]) else np.nanmean(known[1:]))
-    return Elevation(heights - base, grid.corner_m, grid.step_m, base)
+    return Elevation(heights - base, (float(corner[0]), float(corner[1])), step, base)
 
 
-def read_ortho(
-    path: str | Path, places: np.ndarray, origin_deg: tuple[float, float] | None, margin_m: float = 100.0
-) -> Ortho:
+def read_ortho(path: str | Path, places: np.ndarray, origin_deg: Degrees, margin_m: float = 100.0) -> Ortho:
     """A photo about places (N, 2); arguments and errors as for read_elevation, but one band of grey or three of colour.
 
     Where it shows nothing it is white.
     """
     where = _known_places(places)
-    with _open_raster(path, "background", origin_deg is not None) as raster:
+    with _open_raster(path, "background", origin_deg) as raster:
         if raster.count not in (1, 3, 4) or raster.dtypes[0] != "uint8":
             raise InputError(
                 f"background {path} has {raster.count} bands of {raster.dtypes[0]}; wanted a photo of red, green and "
                 "blue, or grey, in 8 bits"
             )
         bands = [1, 1, 1] if raster.count == 1 else [3, 2, 1]
-        grid = _resample(raster, bands, where, origin_deg, margin_m, MOST_PX)
-        covers = _covered_text(raster, origin_deg is not None)
-    if not np.isfinite(grid.values).any():
-        raise InputError(
-            f"background {path} covers {covers}, the landmarks lie at {_places_text(where, origin_deg)}; none shows"
-        )
-    picture = np.nan_to_num(grid.values, nan=255.0).round().clip(0, 255).astype(np.uint8)[:, ::-1]
-    top = grid.corner_m[1] + (picture.shape[1] - 1) * grid.step_m
-    step = grid.step_m
-    return Ortho(
-        np.ascontiguousarray(picture.transpose(1, 2, 0)),
-        np.array([[step, 0.0, grid.corner_m[0]], [0.0, -step, top]]),
-    )
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Rasters.
+        values, corner, step = _resample(raster, bands, where, origin_deg, margin_m, MOST_PX)
+        area = _area_text(raster, where, origin_deg)
+    if not np.isfinite(values).any():
+        raise InputError(f"background {path} covers {area}; none shows")
+    picture = np.nan_to_num(values, nan=255.0).round().clip(0, 255).astype(np.uint8)[:, ::-1].transpose(1, 2, 0)
+    top = corner[1] + (len(picture) - 1) * step
+    return Ortho(np.ascontiguousarray(picture), np.array([[step, 0.0, corner[0]], [0.0, -step, top]]))
 
 
 def _known_places(places: np.ndarray) -> np.ndarray:
@@ -98,21 +85,9 @@ def _known_places(places: np.ndarray) -> np.ndarray:
     return where[np.isfinite(where).all(axis=1)]
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """values: (R, C) or (B, R, C), rows to the north, NaN where the raster has none. corner_m: of the first; step_m."""
-
-    values: np.ndarray
-    corner_m: tuple[float, float]
-    step_m: float
-
-
 @contextmanager
-def _open_raster(path: str | Path, what: str, geographic: bool) -> Iterator[Any]:
-    """An open raster. geographic: whether local metres have a geographic origin, so that a CRS is needed.
-
-    Raises InputError where rasterio is missing, the file is no raster, or its CRS does not fit.
-    """
+def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[Any]:
+    """An open raster. Raises InputError where rasterio is missing, the file is no raster, or its CRS does not fit."""
     try:
         import rasterio
         from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -126,16 +101,16 @@ def _open_raster(path: str | Path, what: str, geographic: bool) -> Iterator[Any]
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             raster = rasterio.open(path)
         with raster:
-            if raster.crs is None and raster.transform.is_identity:
-                raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
             t = raster.transform
+            if raster.crs is None and t.is_identity:
+                raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
             if not (np.isfinite([*t]).all() and 0 < abs(t.a * t.e - t.b * t.d) < math.inf):
                 raise InputError(f"{what} {path} is damaged: its cells have no size")
-            if geographic and raster.crs is None:
+            if origin_deg is not None and raster.crs is None:
                 raise InputError(
                     f"{what} {path} has no CRS: where it lies is not known; wanted a georeferenced GeoTIFF"
                 )
-            if not geographic and raster.crs is not None and raster.crs.is_geographic:
+            if origin_deg is None and raster.crs is not None and raster.crs.is_geographic:
                 raise InputError(
                     f"{what} {path} is in degrees, the landmarks in local metres; give landmarks in longitude_deg,"
                     "latitude_deg, or a raster in the same metres"
@@ -149,15 +124,14 @@ def _resample(
     raster: Any,
     bands: int | list[int],
     where: np.ndarray,
-    origin_deg: tuple[float, float] | None,
+    origin_deg: Degrees,
     margin_m: float,
     most_cells: int,
     within: tuple[float, float] = (-math.inf, math.inf),
-) -> _Grid:
+) -> Grid:
     """Bands of a raster about places (N, 2) in local metres; a finer one is averaged down to most_cells a side.
 
-    within: values beyond are holes that the raster does not declare. origin_deg: (longitude, latitude) of the local
-    metres; None: they are the raster's own coordinates.
+    within: values beyond are holes that the raster does not declare.
     """
     from rasterio.crs import CRS
     from rasterio.transform import from_origin
@@ -175,8 +149,7 @@ def _resample(
         # On the ellipsoid the orthographic projection is the tangent plane's east and north, as in geometry.east_north.
         local = CRS.from_proj4(f"+proj=ortho +lat_0={origin_deg[1]!r} +lon_0={origin_deg[0]!r} +datum=WGS84 +units=m")
         bounds = transform_bounds(local, own, *bounds)
-    shape = (rows, columns) if isinstance(bands, int) else (len(bands), rows, columns)
-    values = np.full(shape, np.nan)
+    values = np.full((rows, columns) if isinstance(bands, int) else (len(bands), rows, columns), np.nan)
     source, transform = _read_part(raster, bands, bounds, 2 * most_cells)
     if source is not None:
         # Before they are mixed with their neighbours.
@@ -193,27 +166,21 @@ def _resample(
             dst_nodata=np.nan,
             resampling=Resampling.bilinear,
         )
-    return _Grid(values[..., ::-1, :], (float(low[0]), float(low[1])), step)
+    return values[..., ::-1, :], low, step
 
 
-def _covered_text(raster: Any, geographic: bool) -> str:
-    """Where a raster lies, in words."""
-    if not geographic or raster.crs is None:
-        west, south, east, north = raster.bounds
-        return f"east {west:.0f} to {east:.0f} m, north {south:.0f} to {north:.0f} m"
+def _area_text(raster: Any, where: np.ndarray, origin_deg: Degrees) -> str:
+    """Where a raster and places lie, in words."""
     from rasterio.warp import transform_bounds
 
-    west, south, east, north = transform_bounds(raster.crs, "EPSG:4326", *raster.bounds)
-    return f"longitude {west:.5f} to {east:.5f}, latitude {south:.5f} to {north:.5f}"
-
-
-def _places_text(where: np.ndarray, origin_deg: tuple[float, float] | None) -> str:
-    """Where places lie, in words."""
-    low, high = where.min(axis=0), where.max(axis=0)
-    text = f"east {low[0]:.0f} to {high[0]:.0f} m, north {low[1]:.0f} to {high[1]:.0f} m"
-    if origin_deg is None:
-        return text
-    return f"{text} of longitude {origin_deg[0]:.5f}, latitude {origin_deg[1]:.5f}"
+    covered = metres = "east {0:.0f} to {2:.0f} m, north {1:.0f} to {3:.0f} m"
+    bounds, of_origin = raster.bounds, ""
+    if origin_deg is not None:
+        bounds = transform_bounds(raster.crs, "EPSG:4326", *bounds)
+        covered = "longitude {0:.5f} to {2:.5f}, latitude {1:.5f} to {3:.5f}"
+        of_origin = f" of longitude {origin_deg[0]:.5f}, latitude {origin_deg[1]:.5f}"
+    places = metres.format(*where.min(axis=0), *where.max(axis=0))
+    return f"{covered.format(*bounds)}, the landmarks lie at {places}{of_origin}"
 
 
 def _read_part(
@@ -228,25 +195,22 @@ def _read_part(
         asked = from_bounds(*bounds, transform=raster.transform)
     if not np.isfinite([asked.col_off, asked.row_off, asked.width, asked.height]).all():
         return None, None
-    first = max(math.floor(asked.col_off) - 2, 0), max(math.floor(asked.row_off) - 2, 0)
-    last = (
-        min(math.ceil(asked.col_off + asked.width) + 2, raster.width),
-        min(math.ceil(asked.row_off + asked.height) + 2, raster.height),
-    )
-    width, height = last[0] - first[0], last[1] - first[1]
+    column, row = max(math.floor(asked.col_off) - 2, 0), max(math.floor(asked.row_off) - 2, 0)
+    width = min(math.ceil(asked.col_off + asked.width) + 2, raster.width) - column
+    height = min(math.ceil(asked.row_off + asked.height) + 2, raster.height) - row
     if width <= 0 or height <= 0:
         return None, None
-    window = Window(*first, width, height)
+    window = Window(column, row, width, height)
     shape = min(height, most), min(width, most)
     out = shape if isinstance(bands, int) else (len(bands), *shape)
     values = raster.read(bands, window=window, out_shape=out, masked=True, resampling=Resampling.average)
     wide, high, t = width / shape[1], height / shape[0], raster.window_transform(window)
-    scaled = Affine(t.a * wide, t.b * high, t.c, t.d * wide, t.e * high, t.f)
     holes = np.ma.getmaskarray(values)
     # Of a photo, a band that is white is no hole, though the file's value for holes be 255.
     holes = holes if values.ndim == 2 else np.broadcast_to(holes.all(axis=0), values.shape)
     with np.errstate(invalid="ignore"):  # where a raster is damaged a value may be any bits
-        return np.where(holes, np.nan, values.data.astype(np.float64)), scaled
+        part = np.where(holes, np.nan, values.data.astype(np.float64))
+    return part, Affine(t.a * wide, t.b * high, t.c, t.d * wide, t.e * high, t.f)
 
 
 def _resolution_m(raster: Any) -> float:
@@ -254,5 +218,5 @@ def _resolution_m(raster: Any) -> float:
     sides = abs(raster.transform.a), abs(raster.transform.e)
     if raster.crs is not None and raster.crs.is_geographic:
         middle = (raster.bounds.bottom + raster.bounds.top) / 2
-        return min(sides[0] * max(math.cos(math.radians(middle)), 0.01), sides[1]) * 111_320.0
+        return min(sides[0] * max(math.cos(math.radians(middle)), 0.01), sides[1]) * DEGREE_M
     return float(min(sides))

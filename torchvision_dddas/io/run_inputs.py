@@ -79,7 +79,18 @@ def prepare_run(
     clip: str,
 ) -> PreparedRun:
     """Read the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
-    watch, notes = (None, []) if given is None else _watch(given, settings, source, backend)
+    watch, notes = None, list[str]()
+    if given is not None:
+        colours = read_colours(given.colours) if given.colours is not None else None
+        frames = None if source.count is None else (1, source.count)
+        locator, notes = read_locator(
+            given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
+        )
+        landmarks = locator.site.landmarks
+        check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
+        if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
+            notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
+        watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
     flight = None
     if watch is not None:
         flight = watch.locator.site.telemetry
@@ -129,10 +140,8 @@ def read_locator(
     notes += describe_unknown_heights(site)
     known = read_camera(given.camera) if given.camera is not None else None
     camera, focal_known, more = resolve_camera(known, size, site.telemetry, settings, extent)
-    return AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known), [
-        *notes,
-        *more,
-    ]
+    locator = AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
+    return locator, [*notes, *more]
 
 
 def locator_facts(locator: AerialLocator) -> dict[str, Any]:
@@ -157,16 +166,3 @@ def map_site(locator: AerialLocator, background: Path | None) -> Site:
         camera=locator.camera,
         to_degrees=None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
     )
-
-
-def _watch(given: AerialInput, settings: Settings, source: Source, backend: str) -> tuple[LandmarkWatch, list[str]]:
-    colours = read_colours(given.colours) if given.colours is not None else None
-    frames = None if source.count is None else (1, source.count)
-    locator, notes = read_locator(
-        given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
-    )
-    helped = locator.site.telemetry is not None and settings.aerial.mode == "pose"
-    check_colours(locator.site.landmarks, colours, helped)
-    if colours is not None and (bare := [n for n in locator.site.landmarks.names if n not in colours.names]):
-        notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
-    return LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None), notes

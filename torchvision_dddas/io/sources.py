@@ -3,6 +3,7 @@
 import os
 import re
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -62,7 +63,7 @@ def open_source(
     return ImageSource(files, text, rate_hz or 10.0, full_scale)
 
 
-class _Clip:
+class _Clip(ABC):
     """What recordings share. tolerant: a frame of another size or depth is left out, else it raises InputError."""
 
     exact = True
@@ -76,9 +77,9 @@ class _Clip:
     def __iter__(self) -> Iterator[Frame]:
         return self.every(1)
 
+    @abstractmethod
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
-        raise NotImplementedError
 
     def _note(self, number: int, what: str) -> None:
         self.problems.append(Problem(number, what))

@@ -7,6 +7,7 @@ import socket
 import stat
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -39,7 +40,7 @@ _AT_ONCE = 4096  # Linux: a pipe that is ready takes so much without waiting, an
 _LAST_S = 1.0  # how long closing may wait for a reader
 
 
-class Outlet:
+class Outlet(ABC):
     """Takes messages one after another.
 
     most_bytes: of a message, 0 for any. lost: messages lost so far. reason: why the last of them was lost.
@@ -51,25 +52,25 @@ class Outlet:
         self.lost, self.reason = 0, ""
         self._kept: deque[bytes] = deque()
 
+    @abstractmethod
     def put(self, messages: Sequence[bytes]) -> None:
         """Keep messages until they can be sent; beyond a limit the oldest are lost."""
-        raise NotImplementedError
 
+    @abstractmethod
     def flush(self) -> None:
         """Send as much as is accepted now, each message whole or not at all. Raises OSError on trouble."""
-        raise NotImplementedError
 
+    @abstractmethod
     def mend(self) -> None:
         """Reopen after trouble. Raises OSError if that fails."""
-        raise NotImplementedError
 
     def handle(self) -> int | None:
         """A new descriptor of the file to be synced, which the caller closes; None if there is no file."""
         return None
 
+    @abstractmethod
     def close(self) -> None:
         """Send what can be sent soon and count the rest as lost. Never raises."""
-        raise NotImplementedError
 
     def _lose(self, messages: int, reason: str) -> None:
         if messages:

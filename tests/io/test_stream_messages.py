@@ -1,0 +1,189 @@
+"""Frames as lines of JSON and the page that documents them, rows of MOT text, and Cursor-on-Target events."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.io.ground import NAMES, tracks
+from tests.io.streamed import ABOUT, located, tracked
+from torchvision_dddas.io.maps.cot import cot
+from torchvision_dddas.io.streams import About
+from torchvision_dddas.io.streams.messages import PEOPLE_FROM, CotEvents, json_lines, mot_lines
+from torchvision_dddas.types import Adjustment, FrameResult, TrackedFrame, Tracks
+
+PAGE = (Path(__file__).parents[2] / "docs" / "stream.md").read_text(encoding="utf-8")
+
+
+def strict(line):
+    """As a reader takes it that knows no NaN."""
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(line, parse_constant=refuse)
+
+
+def one(*given, about=ABOUT, **rest):
+    (line,) = json_lines(about, *given, **rest)
+    assert line.endswith(b"\n") and line.count(b"\n") == 1
+    return strict(line)
+
+
+def with_positions(frame, **changes):
+    at = replace(frame.locations.positions, **changes)
+    return replace(frame, locations=replace(frame.locations, positions=at))
+
+
+def example():
+    """The frame of the page: a crowd that was located, and a person."""
+    moved = Adjustment(41, "interval_frames", 1.0, 2.0, "background flow 0.4 px a frame")
+    frame = located(42, rate=30.0)
+    marks = replace(frame.locations.marks, image_px=np.array([[40.0, 30], [120, 50], [99, 99], [7, 7]]))[:2]
+    states = ("used", "excluded", "used", "used")
+    fix = replace(frame.locations.fix, state=states, changes=("bravo excluded: 9.1 px off",))
+    ground = replace(frame.locations, marks=marks, fix=fix)
+    frame = replace(frame, locations=ground, tracked=replace(frame.tracked, adjustments=(moved,)))
+    return json_lines(ABOUT, frame, tracked(42, 0, kind="person", rate=30.0), 0.0612)[0].decode()
+
+
+def test_the_line_of_the_page_is_what_is_sent():
+    shown = re.search(r"```json\n(.*?)```", PAGE, re.DOTALL)
+    assert shown is not None and shown[1] == example()
+
+
+def test_the_page_names_every_field_and_no_other():
+    rows = [row for row in PAGE.splitlines() if row.startswith("| `")]
+    named = {name for row in rows for name in re.findall(r"`([a-z][a-z0-9_.\[\]]*)`", row.split("|")[1])}
+    sent = set()
+    for fields in map(strict, [*json_lines(ABOUT, located(), tracked(), most_bytes=512), example()]):
+        sent |= set(fields) | {f"targets[].{name}" for row in fields["targets"] for name in row}
+        sent |= {f"ground.{name}" for name in fields.get("ground") or {}}
+    assert {name for name in sent if not name.startswith(("ground.landmarks", "adjustments"))} <= named
+    first = {row.split("`")[1] for row in rows}
+    assert {name for name in first if re.fullmatch(r"[a-z]+_?[a-z]*|targets\[\]\..*|ground\.[a-z_]*", name)} <= sent
+
+
+def test_a_target_has_its_identity_its_box_and_its_place():
+    fields = one(located(3), None)
+    assert (fields["frame"], fields["time_s"], fields["utc"]) == (3, 0.2, "2020-09-13T12:26:40.450Z")
+    first, bridge, loose = fields["targets"]
+    box = {"id": 1, "kind": "moving", "seen": True, "box_px": [10, 20, 30, 40], "score": 0.875}
+    motion = {"heading_deg": 0.0, "speed_px_per_frame": 1.5, "velocity_m_s": [3, 4]}
+    place = {"east_north_m": [0, 0], "covariance_m2": [1, 0, 1], "lonlat_deg": [-110.95, 32.23]}
+    assert first == {**box, **motion, **place, "confirmed": "human", "human": 0.75}
+    assert bridge == {"id": 2, "kind": "moving", "seen": False, "box_px": [20, 20, 30, 40], "score": 0.875}
+    assert (loose["id"], loose["heading_deg"], loose["seen"]) == (None, None, True)
+    assert [mark["name"] for mark in fields["ground"]["landmarks"]] == list(NAMES)
+    assert "lonlat_deg" not in one(located(1, origin=None), None)["targets"][0]
+
+
+def test_what_was_not_searched_is_null_and_what_was_not_found_is_empty():
+    fields = one(located(1, 0, on_ground=False), None, about=About())
+    assert (fields["people"], fields["ground"], fields["utc"]) == (None, None, None)
+    unread = FrameResult(TrackedFrame(5, None, tracked(1, 0).detections, Tracks(5), cause="the picture cannot be read"))
+    fields = one(unread, None)
+    assert (fields["time_s"], fields["utc"], fields["cause"]) == (None, None, "the picture cannot be read")
+    assert one(None, tracked(1, 1, kind="person"))["targets"] is None
+    assert one(None, replace(tracked(1, 0), detections=type(tracked().detections)()))["people"] == []
+
+
+def test_targets_and_people_of_different_frames_are_lines_of_their_own():
+    lines = [strict(line) for line in json_lines(ABOUT, located(7), tracked(5, kind="person"))]
+    assert [(f["frame"], f["targets"] is None, f["people"] is None) for f in lines] == [
+        (7, False, True),
+        (5, True, False),
+    ]
+    assert {row["kind"] for row in lines[1]["people"]} == {"person"}
+
+
+@given(st.lists(st.floats(), min_size=12, max_size=12), st.floats(), st.text(max_size=20), st.text(max_size=8))
+def test_whatever_the_numbers_and_names_a_line_is_one_line_of_strict_json(values, start, cause, name):
+    a, b, c, d, *rest = values
+    frame = with_positions(
+        located(1),
+        east_north_m=np.array([rest[:2]]),
+        covariance_m2=np.array(rest[2:6]).reshape(1, 2, 2),
+        lonlat_deg=np.array([rest[6:8]]),
+    )
+    boxes = replace(frame.tracked.tracks, box_px=np.array([[a, b, c, d]] * 2), score=np.array([a, b]))
+    own = replace(frame.tracked, cause=cause, tracks=boxes, adjustments=(Adjustment(1, "track.gate", c, d, cause),))
+    frame = replace(frame, tracked=own, locations=replace(frame.locations, velocity_m_s=np.array([[a, d]])))
+    fields = one(frame, None, b, about=replace(ABOUT, start_utc_s=start, landmarks=(name,) * 4))
+    assert fields["cause"] == cause
+    assert fields["ground"]["landmarks"][0]["name"] == name
+    is_finite = all(map(math.isfinite, (a, b, c, d)))
+    assert fields["targets"][0]["box_px"] == (pytest.approx([a, b, c, d], abs=0.006) if is_finite else None)
+
+
+def test_a_frame_too_long_for_a_datagram_is_split_into_parts_that_fit():
+    frames = located(1, 300), tracked(1, 40, kind="person")
+    whole, lines = one(*frames), json_lines(ABOUT, *frames, most_bytes=1400)
+    parts = [strict(line) for line in lines]
+    assert max(map(len, lines)) <= 1400 and len(lines) > 10
+    assert [(part["part"], part["parts"]) for part in parts] == [(k + 1, len(parts)) for k in range(len(parts))]
+    for name in ("targets", "people"):
+        assert [row for part in parts for row in part[name]] == whole[name]
+    assert parts[0]["ground"] == whole["ground"] and all("ground" not in part for part in parts[1:])
+    assert all(part["frame"] == 1 and part["utc"] == whole["utc"] for part in parts)
+    short = json_lines(ABOUT, located(1), None)
+    assert json_lines(ABOUT, located(1), None, most_bytes=len(short[0])) == short and "part" not in strict(short[0])
+
+
+def test_people_have_mot_rows_with_identities_that_no_target_has():
+    (message,) = mot_lines(located(4), tracked(4, 3, kind="person"))
+    rows = [row.split(",") for row in message.decode().splitlines()]
+    assert [int(row[1]) for row in rows] == [1, 2, PEOPLE_FROM + 1, PEOPLE_FROM + 2, PEOPLE_FROM + 3]
+    assert all(row[0] == "4" and row[7:] == ["-1"] * 3 for row in rows)
+
+
+def test_mot_rows_are_split_between_lines_and_boxes_without_end_left_out():
+    (whole,) = mot_lines(located(1, 100), None)
+    parts = mot_lines(located(1, 100), None, most_bytes=512)
+    assert b"".join(parts) == whole and len(parts) > 5
+    assert all(len(part) <= 512 and part.endswith(b"\n") for part in parts)
+    odd = replace(tracked().tracks, box_px=np.array([[1e300, 0, 1, 1], [np.nan, 0, 1, 1]]))
+    assert mot_lines(FrameResult(replace(tracked(), tracks=odd)), None) == []
+
+
+def test_events_one_by_one_are_those_of_the_file():
+    events = CotEvents(ABOUT)
+    sent = [message.decode() for k in range(25) for message in events(located(k + 1, 3))]
+    kept = tracks([located(k + 1, 3).locations.positions for k in range(25)])
+    still = replace(kept, velocity_m_s=np.tile((3.0, 4.0), (len(kept), 1)))
+    assert sent == cot(still).splitlines(keepends=True)[2:-1]
+
+
+def test_a_target_keeps_its_uid_when_the_clock_is_set_and_is_sent_at_once_when_it_is_set_back():
+    about = replace(ABOUT)
+    events = CotEvents(about)
+    first = ElementTree.fromstring(events(located(30))[0])
+    about.start_utc_s += 3600
+    assert events(located(31)) == []
+    later = ElementTree.fromstring(events(located(2))[0])
+    assert first.get("uid") == later.get("uid") == "dddas-1600000000-1"
+    assert later.get("time").startswith("2020-09-13T13:26:40")
+
+
+def test_memory_of_targets_does_not_grow_with_time():
+    events = CotEvents(ABOUT)
+    for k in range(1, 300):
+        events(with_positions(located(k), target=np.array([k])))
+    assert len(events._sent_s) <= 10
+
+
+@pytest.mark.parametrize("lonlat", [(np.nan, 32.0), (np.inf, 32.0), (-110.0, 91.0), (1e300, 0.0)])
+def test_a_place_that_is_none_on_earth_is_no_event(lonlat):
+    assert CotEvents(ABOUT)(with_positions(located(1), lonlat_deg=np.array([lonlat]))) == []
+
+
+def test_without_degrees_clock_or_ground_there_are_no_events():
+    assert CotEvents(ABOUT)(located(1, origin=None)) == CotEvents(ABOUT)(located(1, on_ground=False)) == []
+    assert CotEvents(About(geographic=True))(located(1)) == CotEvents(ABOUT)(None) == []
