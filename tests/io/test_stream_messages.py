@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.io.ground import NAMES, tracks
 from tests.io.streamed import ABOUT, located, tracked
-from torchvision_dddas.io.maps.cot import cot
+from torchvision_dddas.io.maps.formats import cot
 from torchvision_dddas.io.streams import About
 from torchvision_dddas.io.streams.messages import PEOPLE_FROM, CotEvents, json_lines, mot_lines
 from torchvision_dddas.types import Adjustment, FrameResult, TrackedFrame, Tracks
@@ -169,7 +169,7 @@ def test_a_target_keeps_its_uid_when_the_clock_is_set_and_is_sent_at_once_when_i
     assert events(located(31)) == []
     later = ElementTree.fromstring(events(located(2))[0])
     assert first.get("uid") == later.get("uid") == "dddas-1600000000-1"
-    assert later.get("time").startswith("2020-09-13T13:26:40")
+    assert str(later.get("time")).startswith("2020-09-13T13:26:40")
 
 
 def test_memory_of_targets_does_not_grow_with_time():

@@ -13,7 +13,14 @@ import pytest
 from tests.io.streamed import ABOUT, located, tracked
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams import Stream, open_stream, open_streams
-from torchvision_dddas.io.streams.outlets import KEPT_BYTES, MOST_BYTES, DatagramOutlet, LineOutlet, open_datagrams
+from torchvision_dddas.io.streams.outlets import (
+    KEPT_BYTES,
+    MOST_BYTES,
+    DatagramOutlet,
+    LineOutlet,
+    Outlet,
+    open_datagrams,
+)
 
 
 class Notes(list):
@@ -97,14 +104,13 @@ def numbered(result, people, age_s, most_bytes):
     return [b"%d\n" % (result or people).tracked.number]
 
 
-class Bench:
+class Bench(Outlet):
     """A stream of frame numbers on an outlet that can be broken, and a clock that can be set. It is its own outlet."""
 
-    most_bytes, reason = 0, "it is read too slowly"
-
     def __init__(self, encode=numbered, most_kept=1000):
-        self.notes, self.now_s = Notes(), 100.0
-        self.most_kept, self.lost, self.trouble, self.is_read, self.path = most_kept, 0, None, True, None
+        super().__init__()
+        self.notes, self.now_s, self.reason = Notes(), 100.0, "it is read too slowly"
+        self.most_kept, self.trouble, self.is_read, self.path = most_kept, None, True, None
         self.kept, self.got, self.attempts = [], [], 0
         self.stream = Stream("json:x", encode, self, self.notes, 0.5, 8.0, lambda: self.now_s)
 
@@ -198,7 +204,12 @@ def test_a_frame_that_cannot_be_encoded_is_reported_and_the_next_one_goes_out():
 
 def test_the_age_of_a_frame_is_counted_from_its_capture():
     ages = []
-    bench = Bench(lambda result, people, age_s, most_bytes: ages.append(age_s) or [])
+
+    def encode(result, people, age_s, most_bytes):
+        ages.append(age_s)
+        return []
+
+    bench = Bench(encode)
     bench.stream.write(located(1, taken_s=99.75))
     bench.stream.write(None, tracked(1, taken_s=99.0))
     bench.stream.write(None, None)
@@ -376,7 +387,7 @@ def test_closing_waits_a_little_for_a_reader_that_is_at_work(pipe):
     (line,) = lines(500_000)
     outlet.put([line])
     outlet.flush()
-    got = []
+    got: list[bytes] = []
     os.set_blocking(reader, True)
     thread = threading.Thread(target=lambda: got.extend(iter(lambda: os.read(reader, 1 << 16), b"")))
     thread.start()
@@ -478,7 +489,9 @@ def test_an_address_of_version_6_works_too(notes):
 def test_all_who_listen_to_a_multicast_get_it_and_no_router_passes_it_on_unasked():
     for option, hops in (("", 1), ("&ttl=4", 4)):
         outlet = open_datagrams(f"udp://239.2.3.1:6969?interface=lo{option}", "")
-        assert outlet._socket.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == hops
+        assert (
+            outlet._socket is not None and outlet._socket.getsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL) == hops
+        )
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(("", 6969))

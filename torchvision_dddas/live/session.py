@@ -12,8 +12,8 @@ from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, make_session_folder
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
+from torchvision_dddas.io.sources import without_secrets
 from torchvision_dddas.io.streams import About, Stream, open_streams
-from torchvision_dddas.io.video import without_secrets
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot
 from torchvision_dddas.live.load_shedding import LoadShedding
