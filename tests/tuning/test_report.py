@@ -5,7 +5,7 @@ import math
 import pytest
 
 from tests.browser import evaluate, needs_browser
-from tests.evaluation.report.test_comparison_report import CLIPS, comparison
+from tests.evaluation.studies.test_comparison import CLIPS, comparison
 from tests.pages import Page
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.tuning.report import tuning_report

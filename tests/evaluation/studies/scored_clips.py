@@ -62,7 +62,7 @@ def png(mask) -> bytes:
     return cv2.imencode(".png", mask)[1].tobytes()
 
 
-def masked(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
+def masked(folder: Path, seed=0, frames=12):
     """A clip whose truth is masks of every second frame."""
     true, rows = walk(seed, frames)
     (folder / "masks").mkdir(parents=True)
@@ -72,7 +72,7 @@ def masked(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
     return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames, masks, identities=False)
 
 
-def targeted(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
+def targeted(folder: Path, seed=0, frames=12):
     """A clip with one labelled target, which is gone in a frame."""
     true, rows = walk(seed, frames)
     folder.mkdir(parents=True)
@@ -83,7 +83,7 @@ def targeted(folder: Path, seed=0, frames=12) -> tuple[Clip, Found]:
     return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames, masks)
 
 
-def tracked(folder: Path, seed=0, frames=30) -> tuple[Clip, Found]:
+def tracked(folder: Path, seed=0, frames=30):
     """A clip with true tracks, some of which do not count, and an end without anybody."""
     true, rows = walk(seed, frames)
     (folder / "gt").mkdir(parents=True)

@@ -1,16 +1,18 @@
+"""Two studies compared: what changed, whether it is beyond noise, and the page that says so."""
+
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.browser import evaluate, needs_browser
 from tests.evaluation.studies.scored_clips import found_of, masked, tracked, walk
-from torchvision_dddas.cli import app
+from tests.pages import Page
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.evaluation.studies import comparison
 from torchvision_dddas.evaluation.studies.cache import SCORES, read_scores, write_scores
-from torchvision_dddas.evaluation.studies.comparison import compare_studies
+from torchvision_dddas.evaluation.studies.comparison import compare_studies, comparison_report, verdict
 from torchvision_dddas.evaluation.studies.records import ScoredCase, ScoredStudy
 from torchvision_dddas.evaluation.studies.scoring import score
 
@@ -35,34 +37,29 @@ def of_tracks(folder, name, miss, clips=range(8)) -> ScoredStudy:
 def test_a_study_beside_itself_is_the_same(tmp_path):
     one = of_tracks(tmp_path, "one", 0.2, range(3))
     found = compare_studies(one, one)["tasks"]["tracking"]
-    assert found["same"] == ["clip-0", "clip-1", "clip-2"]
-    assert found["clips"] == {}
+    assert (found["same"], found["clips"]) == (["clip-0", "clip-1", "clip-2"], {})
     assert {entry["says"] for entry in found["pooled"]["tracks"].values()} == {"the same"}
 
 
-def test_what_got_worse_everywhere_is_worse_beyond_noise(tmp_path):
-    found = compare_studies(of_tracks(tmp_path, "one", 0.05), of_tracks(tmp_path, "two", 0.6))["tasks"]["tracking"]
+def test_a_loss_everywhere_is_worse_beyond_noise_and_other_noise_is_not(tmp_path):
+    one = of_tracks(tmp_path, "one", 0.05)
+    found = compare_studies(one, of_tracks(tmp_path, "two", 0.6))["tasks"]["tracking"]
     mota = found["pooled"]["tracks"]["mota"]
-    assert mota["says"] == "worse"
-    assert mota["change"] == mota["second"] - mota["first"] < 0
+    assert mota["says"] == "worse" and mota["change"] == mota["second"] - mota["first"] < 0
     assert mota["over_clips"]["p"] == pytest.approx(2 / 2**8)
     assert mota["over_clips"]["p"] < mota["over_clips"]["p_holm"] < 0.05
     assert mota["over_clips"]["interval"][0] < mota["change"] < mota["over_clips"]["interval"][1] < 0
     assert len(found["clips"]) == 8
-
-
-def test_other_noise_of_the_same_size_is_within_noise(tmp_path):
-    found = compare_studies(of_tracks(tmp_path, "one", 0.2), of_tracks(tmp_path, "two", 0.21))["tasks"]["tracking"]
+    found = compare_studies(one, of_tracks(tmp_path, "three", 0.06))["tasks"]["tracking"]
     assert {entry["says"] for entry in found["pooled"]["tracks"].values()} <= {"within noise", "the same"}
     assert found["pooled"]["tracks"]["mota"]["over_clips"]["enough"]
 
 
-def test_few_clips_are_said_to_tell_too_little_or_only_of_themselves(tmp_path):
+def test_few_clips_tell_too_little_or_only_of_themselves(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.05, range(2)), of_tracks(tmp_path, "two", 0.7, range(2))
     pooled = compare_studies(one, two)["tasks"]["tracking"]["pooled"]["tracks"]
-    assert pooled["mota"]["over_clips"] is None
-    assert pooled["mota"]["says"] == "worse on these clips"
-    assert pooled["hota"]["says"] == "too little to tell"  # of whole tracks: frames say nothing of it
+    assert pooled["mota"]["over_clips"] is None and pooled["mota"]["says"] == "worse on these clips"
+    assert pooled["hota"]["says"] == "too little to tell"  # of whole tracks, about which frames say nothing
 
 
 def test_the_order_of_cases_changes_nothing(tmp_path):
@@ -71,10 +68,9 @@ def test_the_order_of_cases_changes_nothing(tmp_path):
     assert json.dumps(compare_studies(one, two)) == json.dumps(compare_studies(*turned))
 
 
-def test_clips_of_one_study_alone_are_named_and_no_common_clip_is_refused(tmp_path):
+def test_clips_of_one_study_alone_are_named_and_studies_without_a_common_clip_refused(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.1, (0, 1)), of_tracks(tmp_path, "two", 0.2, (1, 2))
-    found = compare_studies(one, two)
-    assert found["notes"] == [
+    assert compare_studies(one, two)["notes"] == [
         "clip-0, tracking: only in the first study, one",
         "clip-2, tracking: only in the second study, two",
     ]
@@ -87,25 +83,20 @@ def test_clips_of_one_study_alone_are_named_and_no_common_clip_is_refused(tmp_pa
 def test_another_truth_or_other_frames_are_not_compared(tmp_path):
     one, two = of_tracks(tmp_path, "one", 0.1, (0, 1)), of_tracks(tmp_path, "two", 0.2, (0, 1))
     clip, found = tracked(tmp_path / "more" / "clip", 0)
-    assert clip.truth is not None
-    assert clip.truth.tracks is not None
-    fewer = replace(
-        clip, truth=replace(clip.truth, tracks=clip.truth.tracks.at(np.arange(1, len(clip.truth.tracks.frame))))
-    )
+    tracks = clip.truth.tracks
+    fewer = replace(clip, truth=replace(clip.truth, tracks=tracks.at(np.arange(1, len(tracks.frame)))))
     other = ScoredCase("tracking", "clip-0", score(fewer, "tracking", found))
-    notes = compare_studies(one, ScoredStudy("two", (other, two.cases[1])))["notes"]
-    assert len(notes) == 1
-    assert "clip-0, tracking: its truth is another" in notes[0]
+    (note,) = compare_studies(one, ScoredStudy("two", (other, two.cases[1])))["notes"]
+    assert "clip-0, tracking: its truth is another" in note
     short, found = tracked(tmp_path / "more" / "short", 0, 20)
     other = ScoredCase("tracking", "clip-0", score(short, "tracking", found))
     with pytest.raises(InputError, match="no clip can be compared; clip-0, tracking: other frames were scored"):
         compare_studies(ScoredStudy("one", one.cases[:1]), ScoredStudy("two", (other,)))
 
 
-def test_less_is_better_where_it_is(tmp_path):
+def test_less_is_better_where_it_is():
     entry = {"change": -0.1, "over_frames": {"p_holm": 0.01, "enough": True}}
-    assert comparison.verdict(entry, "log_average_miss_rate") == "better"
-    assert comparison.verdict(entry, "f") == "worse"
+    assert (verdict(entry, "log_average_miss_rate"), verdict(entry, "f")) == ("better", "worse")
 
 
 def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):
@@ -121,39 +112,6 @@ def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):
     assert list(found["clips"]["clip"]["pixels"]) == ["f"]
 
 
-def run(*words) -> int:
-    return app([*map(str, words)], standalone_mode=False) or 0
-
-
-def test_the_command_shows_tables_or_json(tmp_path, capsys):
-    for name, miss in (("one", 0.05), ("two", 0.6)):
-        (tmp_path / name).mkdir()
-        study = of_tracks(tmp_path, name, miss, range(6))
-        write_scores(tmp_path / name, name, study.cases)
-    assert run("compare", tmp_path / "one", tmp_path / "two") == 0
-    shown = capsys.readouterr().out
-    assert "tracking, 6 clips together" in shown
-    assert "worse on these clips" in shown
-    run("compare", tmp_path / "one", tmp_path / "two", "--json")
-    said = json.loads(capsys.readouterr().out)
-    assert said["tasks"]["tracking"]["pooled"]["tracks"]["mota"]["says"] == "worse on these clips"
-
-
-def test_what_is_no_study_is_one_line_and_exit_2(tmp_path, capsys):
-    (tmp_path / "a").mkdir()
-    for content, words in (
-        (None, "holds no study: no scores.bin"),
-        (b"x" * 100, "is damaged or of another version"),
-    ):
-        if content is not None:
-            (tmp_path / "a" / SCORES).write_bytes(content)
-        assert run("compare", tmp_path / "a", tmp_path / "a") == 2
-        said = capsys.readouterr().err
-        assert said.startswith("dddas: ")
-        assert words in said
-        assert said.count("\n") == 1
-
-
 def test_scores_are_read_back_as_they_were_written(tmp_path):
     study = of_tracks(tmp_path, "one", 0.2, (1, 0))
     write_scores(tmp_path, "one", study.cases)
@@ -163,3 +121,57 @@ def test_scores_are_read_back_as_they_were_written(tmp_path):
     write_scores(tmp_path, "one", again.cases)
     assert (tmp_path / SCORES).read_bytes() == content
     assert np.array_equal(again.cases[1].scored.frames, study.cases[0].scored.frames)
+
+
+def entry(first, second, says, interval=None, p=0.01):
+    change = None if first is None or second is None else second - first
+    over_frames = {"interval": interval, "p": p, "p_holm": 2 * p, "enough": True}
+    return {"first": first, "second": second, "change": change, "over_frames": over_frames, "says": says}
+
+
+def comparison(clips):
+    pooled = {
+        "pixels": {"f": entry(0.5, 0.6, "better on these clips", [0.05, 0.15]), "precision": entry(0.5, None, "x")}
+    }
+    pooled["pixels"]["f"]["over_clips"] = {"interval": [0.01, 0.2], "p": 0.2, "p_holm": 0.4, "enough": True}
+    mine = {"same": ["untouched"], "pooled": pooled, "clips": clips}
+    return {"first": "a <b>", "second": "b", "tasks": {"motion": mine}, "notes": ["lost, motion: only in the first"]}
+
+
+CLIPS = {
+    "up <i>": {"pixels": {"f": entry(0.2, 0.5, "better", [0.1, 0.5])}},
+    "down": {"pixels": {"f": entry(0.9, 0.7, "worse", [-0.3, -0.1])}},
+    "quiet": {"pixels": {"f": entry(0.9, 0.901, "within noise", [-0.1, 0.1], 0.9)}},
+}
+
+
+def words(text):
+    return " ".join(" ".join(Page(text).words).split())
+
+
+def test_the_page_begins_with_what_changed_by_how_much_and_whether_that_is_beyond_noise():
+    text = comparison_report(comparison(CLIPS))
+    shown = words(text)
+    assert "+0.100 F, pixels 0.500 → 0.600: better on these clips" in shown
+    assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 not, 1 the same" in shown
+    assert "only in the first" in shown and "untouched" in shown
+    assert not {"i", "b>"} & set(Page(text).found)
+    # The interval over clips stands before that over frames, and p is the corrected one.
+    assert "0.010 to 0.200" in text and "0.050 to 0.150" not in text
+    values = [value for tag, name, value in Page(text).attributes if (tag, name) == ("td", "data-v")]
+    assert "0.4" in values and "0.2" not in values[:6]
+    # The largest loss stands first in the plot.
+    rows = [text.index(f">{name}</text>") for name in ("down", "quiet", "up &lt;i&gt;")]
+    assert rows == sorted(rows)
+    assert "1 the same" in words(comparison_report(comparison({})))
+
+
+@pytest.mark.browser
+@needs_browser
+def test_in_a_browser_the_page_fits_a_phone_and_its_rows_sort(tmp_path):
+    script = """var table=page.querySelector("table[aria-label='clip by clip']");
+      table.querySelectorAll("thead button")[4].click();
+      var names=Array.from(table.querySelectorAll("tbody th")).map(e=>e.textContent);
+      return [page.documentElement.scrollWidth, names];"""
+    width, rows = evaluate(comparison_report(comparison(CLIPS)), script, tmp_path, 390, dark=True)
+    assert width <= 390 and rows == ["down", "quiet", "up <i>"]

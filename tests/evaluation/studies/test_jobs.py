@@ -1,5 +1,15 @@
-"""What is kept is not computed again; a change computes again what depends on it, and nothing else."""
+"""What is kept is not computed again; workers share jobs, and one that dies costs its clip's time alone."""
 
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import textwrap
+import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,12 +17,23 @@ import pytest
 
 from tests.evaluation.studies import world
 from torchvision_dddas.config import load_config
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.cache import Cache
-from torchvision_dddas.evaluation.studies.jobs import Job, do_job, find_cached, make_keys
+from torchvision_dddas.evaluation.studies.jobs import (
+    CONNECT_S,
+    MAX_DEATHS,
+    Job,
+    Workers,
+    do_job,
+    find_cached,
+    make_keys,
+)
 from torchvision_dddas.evaluation.studies.records import Task
+from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
+from torchvision_dddas.evaluation.studies.summary import summarize
 
 TASKS: tuple[Task, ...] = ("motion", "tracking", "association")
 ALL = ["motion", "motion: score", "tracking", "tracking: score", "association", "association: score"]
@@ -33,7 +54,7 @@ def job_of(place, *overrides, interval=1):
 
 
 def do(place, job, cache=None):
-    return do_job(job, make_keys(job, None), cache or Cache(place / "cache"))
+    return do_job(job, make_keys(job), cache or Cache(place / "cache"))
 
 
 def computed(place, job):
@@ -57,10 +78,14 @@ def test_a_changed_parameter_computes_again_what_depends_on_it_and_nothing_else(
     assert computed(folder, job_of(folder, change)) == again
 
 
-def test_a_changed_interval_leaves_what_moves(folder) -> None:
-    """Motion is scored by the interval's key too, which costs nothing worth saving."""
+def test_a_changed_interval_or_truth_leaves_what_does_not_depend_on_it(folder) -> None:
     stages = computed(folder, job_of(folder, interval=2))
     assert [stage for stage in stages if "score" not in stage] == ["tracking", "association"]
+    job = job_of(folder)
+    tracks = job.clip.truth.tracks
+    fewer = replace(job.clip.truth, tracks=tracks.at(tracks.frame != 2))
+    again = computed(folder, replace(job, clip=replace(job.clip, truth=fewer)))
+    assert again == ["motion: score", "tracking: score", "association", "association: score"]
 
 
 def test_a_clip_is_known_by_its_content_not_by_its_place_or_name(folder, tmp_path) -> None:
@@ -72,26 +97,18 @@ def test_a_clip_is_known_by_its_content_not_by_its_place_or_name(folder, tmp_pat
     assert computed(folder, replace(job_of(folder), clip=clip)) == ALL
 
 
-def test_a_changed_truth_scores_again_and_finds_again_only_what_was_made_of_it(folder) -> None:
-    job = job_of(folder)
-    tracks = job.clip.truth.tracks
-    fewer = replace(job.clip.truth, tracks=tracks.at(tracks.frame != 2))
-    again = computed(folder, replace(job, clip=replace(job.clip, truth=fewer)))
-    assert again == ["motion: score", "tracking: score", "association", "association: score"]
-
-
 def test_other_code_is_another_key(folder, monkeypatch) -> None:
-    job, files = job_of(folder), None
-    before = make_keys(job, files)
+    job = job_of(folder)
+    before = make_keys(job)
     monkeypatch.setattr(jobs, "code_digest", lambda function, engine="": "another")
-    after = make_keys(job, files)
+    after = make_keys(job)
     for task in TASKS:
         assert before.found[task] != after.found[task] and before.scored[task] != after.scored[task]
 
 
 def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
     cache, job = Cache(folder / "cache"), job_of(folder)
-    keys = make_keys(job, None)
+    keys = make_keys(job)
     assert find_cached(job, keys, cache) == do(folder, job)
     cache.path(keys.found["tracking"]).write_bytes(b"damaged")
     assert find_cached(job, keys, cache) is None
@@ -99,24 +116,205 @@ def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
     assert len(cache.notes) == 1 and "computed again" in cache.notes[0]
 
 
-def test_bad_input_of_one_task_leaves_the_others(folder) -> None:
+def test_bad_input_and_faults_are_the_causes_of_the_tasks_that_meet_them(folder, tmp_path, monkeypatch) -> None:
     job = job_of(folder)
     far = job.clip.truth.tracks._replace(frame=job.clip.truth.tracks.frame + 100)
     done = do(folder, replace(job, clip=replace(job.clip, truth=replace(job.clip.truth, tracks=far))))
     assert done[0].cause == "" and "goes on to frame" in done[2].cause
-
-
-def test_a_file_that_is_gone_is_the_cause_of_every_task_that_reads_it(folder, tmp_path) -> None:
     world.followed(tmp_path / "clips", "tracks", 2)
-    job = job_of(tmp_path)
-    job.clip.pictures[3].unlink()
-    assert all("cannot be read" in d.cause for d in do(folder, job))
+    gone = job_of(tmp_path)
+    gone.clip.pictures[3].unlink()
+    assert all("cannot be read" in d.cause for d in do(folder, gone))
 
-
-def test_a_fault_of_the_program_is_a_cause_with_its_trace(folder, tmp_path, monkeypatch) -> None:
     def broken(*given, **more):
         raise KeyError("x")
 
     monkeypatch.setattr(jobs, "find", broken)
-    done = do(tmp_path, job_of(folder))
+    done = do(tmp_path, job)
     assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
+
+
+linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds workers by /proc")
+
+SCHEDULER = """
+    import asyncio
+    from distributed import Scheduler
+    async def main():
+        async with Scheduler(host="127.0.0.1", port=0, dashboard=False, dashboard_address=None) as scheduler:
+            print(scheduler.address, flush=True)
+            await scheduler.finished()
+    asyncio.run(main())
+"""
+
+WORKER = """
+    import asyncio, sys
+    {before}
+    from distributed import Worker
+    async def main():
+        async with Worker(sys.argv[1], nthreads=1, dashboard=False) as worker:
+            print(worker.address, flush=True)
+            await worker.finished()
+    asyncio.run(main())
+"""
+
+OTHER_CODE = "import torchvision_dddas.evaluation.studies.jobs as jobs; jobs.code_identity = lambda backend: 'other'"
+
+
+@contextmanager
+def process(script: str, *words: str, before: str = ""):
+    """A process that prints its address in its first line; it ends with the block."""
+    command = [sys.executable, "-c", textwrap.dedent(script).replace("{before}", before), *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as run:
+        try:
+            assert run.stdout is not None
+            yield run.stdout.readline().strip()
+        finally:
+            run.kill()
+
+
+@pytest.fixture
+def study(tmp_path):
+    return read_spec(world.three(tmp_path / "clips"))
+
+
+@pytest.fixture
+def by_name(study, tmp_path):
+    return {job.clip.name: job for job in plan_study(study, tmp_path).jobs}
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    pytest.importorskip("distributed")
+    with process(SCHEDULER) as address:
+        yield address
+
+
+def die_over_tracks(job, keys, store, code):
+    """In place of `jobs._do_remotely`: the worker is killed, as often as a file says."""
+    left = store.folder / "deaths"
+    if job.clip.name == "tracks" and (deaths := int(left.read_text())):
+        left.write_text(str(deaths - 1))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return jobs._do_remotely(job, keys, store, code)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("deaths", [1, MAX_DEATHS])
+def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(by_name, tmp_path, monkeypatch, deaths) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(jobs, "_do_remotely", die_over_tracks)
+    cache = Cache(tmp_path / "cache")
+    (cache.folder / "deaths").write_text(str(deaths))
+    with Workers(2) as team:
+        done = run_jobs([by_name["tracks"], by_name["table"]], team, cache)
+    assert all(d.cause == "" for d in done[by_name["table"].number])
+    for outcome in done[by_name["tracks"].number]:
+        lost = f"its worker died {MAX_DEATHS} times; is there memory enough for tracks and onboard?"
+        assert outcome.cause == ("" if deaths == 1 else lost)
+
+
+def children(parent: int) -> list[int]:
+    """The worker processes of a process: those that Python's multiprocessing has spawned."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            ppid = int(stat.read_text().rpartition(")")[2].split()[1])
+            command = (stat.parent / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if ppid == parent and b"spawn_main" in command:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def stopped_after(line: str, words: list[str], by: signal.Signals) -> int:
+    """Run a command and stop it once a line of stderr holds some words; its exit code. Its workers end with it."""
+    with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
+        assert run.stderr is not None
+        assert any(line in text for text in run.stderr)
+        ends = [os.pidfd_open(pid) for pid in children(run.pid)]
+        assert ends
+        run.send_signal(by)
+        run.wait(60)
+    for end in ends:
+        assert select.select([end], [], [], 60.0)[0]
+        os.close(end)
+    return run.returncode
+
+
+@pytest.mark.slow
+@linux
+def test_a_study_killed_interrupted_and_resumed_gives_the_same_bytes_as_one_process(tmp_path) -> None:
+    pytest.importorskip("distributed")
+    study, whole, out = world.three(tmp_path / "clips"), tmp_path / "whole", tmp_path / "out"
+    program = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()"]
+
+    def command(out: Path, cache: str, count: int) -> list[str]:
+        words = ("--dataset", study, "--out", out, "--cache", tmp_path / cache, "--jobs", count)
+        return [*program, "evaluate", *map(str, words)]
+
+    subprocess.run([*command(whole, "other", 1), "--quiet"], check=True)
+    words = command(out, "cache", 2)
+    assert stopped_after("1 of 3", words, signal.SIGKILL) == -signal.SIGKILL
+    assert json.loads((out / "run.json").read_text())["state"] == "running"
+    assert not (out / "metrics.json").exists()
+    assert stopped_after("2 of 3", words, signal.SIGINT) == 130
+    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+    last = subprocess.run(words, check=True, capture_output=True, text=True)
+    assert last.stderr.count("kept") > 0
+    assert (out / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
+    assert json.loads((out / "run.json").read_text())["state"] == "complete"
+
+
+@pytest.mark.slow
+def test_a_cluster_finds_what_one_process_finds_and_survives_a_lost_worker(scheduler, study, tmp_path) -> None:
+    alone = run_study(study, tmp_path, cache=tmp_path / "alone")
+    with Workers(scheduler=scheduler) as cluster, process(WORKER, scheduler):
+        with process(WORKER, scheduler):
+            run_study(study, tmp_path, cluster, tmp_path / "there", ["masks"])
+        there = run_study(study, tmp_path, cluster, tmp_path / "there")
+    assert summarize(there) == summarize(alone)
+    assert 0 < there.facts["computed"] < alone.facts["computed"]
+    with Workers(scheduler=scheduler) as cluster:  # all is kept: no worker is needed, and there is none
+        again = run_study(study, tmp_path, cluster, tmp_path / "there")
+    assert again.facts["computed"] == 0 and summarize(again) == summarize(alone)
+
+
+@pytest.mark.slow
+def test_a_worker_with_another_version_of_the_package_is_one_line(scheduler, by_name, tmp_path) -> None:
+    with (
+        process(WORKER, scheduler, before=OTHER_CODE),
+        Workers(scheduler=scheduler) as cluster,
+        pytest.raises(InputError, match="another version of the package") as caught,
+    ):
+        run_jobs([by_name["table"]], cluster, Cache(tmp_path / "cache"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scheduler_without_workers_is_one_line(scheduler, by_name, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(jobs, "NO_WORKER_S", 0.0)
+    with Workers(scheduler=scheduler) as cluster, pytest.raises(InputError, match="has had no worker"):
+        run_jobs([by_name["table"]], cluster, Cache(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:{free}", "nonsense", "foo://127.0.0.1:1", "tcp://", ""])
+def test_a_scheduler_that_cannot_be_reached_is_one_line_within_seconds(address) -> None:
+    pytest.importorskip("distributed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = address.format(free=free.getsockname()[1])
+    start_s = time.monotonic()
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at .*wanted an address as tcp://host") as caught:
+        Workers(scheduler=address).__enter__()
+    assert "\n" not in str(caught.value) and time.monotonic() - start_s < 5 * CONNECT_S
+
+
+def test_one_process_needs_no_dask_and_others_say_what_to_install(by_name, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(jobs, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    for options in ({"jobs": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
+        with pytest.raises(InputError, match=r"pip install 'torchvision-dddas\[distributed\]'"):
+            Workers(**options)
+    frames = []
+    done = run_jobs([by_name["table"]], Workers(), Cache(tmp_path), lambda event: frames.append(event.frames))
+    assert [d.cause for d in done[by_name["table"].number]] == ["", ""] and sum(frames) > 0

@@ -1,69 +1,129 @@
-"""A whole study: what it plans, that it resumes, and what becomes of bad input."""
+"""A whole study: what its file may say, what it plans, that it resumes, and what becomes of bad input."""
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
 from tests.evaluation.studies import world
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
 from torchvision_dddas.evaluation.studies.jobs import Workers
+from torchvision_dddas.evaluation.studies.records import Spec
 from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
 from torchvision_dddas.evaluation.studies.summary import summarize
 
+SET = '[[dataset]]\nkind = "bms"\nfolder = "data"\n'
 
-def test_no_worker_is_started_if_all_is_kept(tmp_path, monkeypatch) -> None:
+
+def spec(tmp_path: Path, content: str) -> Spec:
+    (tmp_path / "study.toml").write_text(content, encoding="utf-8")
+    return read_spec(tmp_path / "study.toml")
+
+
+def test_a_file_says_everything_or_only_its_data_set(tmp_path: Path) -> None:
+    content = f"""
+        name = "all of it"
+        tasks = ["tracking", "motion"]
+        config = "fast"
+        set = ["track.history=4", "motion.blur_px=3"]
+        backend = "onboard"
+        interval = 5
+        {SET}
+        clips = ["cars*", "people1"]
+        rate_hz = 25
+        [[dataset]]
+        kind = "folder"
+        folder = "/elsewhere"
+        still = ["roof"]
+    """
+    sources = (
+        Source("bms", Path("data"), ("cars*", "people1"), {"rate_hz": 25}),
+        Source("folder", Path("/elsewhere"), ("*",), {"still": ["roof"]}),
+    )
+    overrides = ("track.history=4", "motion.blur_px=3")
+    whole = Spec("all of it", sources, ("motion", "tracking"), "fast", overrides, "onboard", 5)
+    assert spec(tmp_path, content) == whole
+    assert spec(tmp_path, SET) == Spec("study", (Source("bms", Path("data")),))
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ("", "names no data set; wanted [[dataset]] with kind and folder, once or more"),
+        ("dataset = 3", "names no data set"),
+        ("[dataset]\nkind = 'bms'\nfolder = 'x'", "names no data set; wanted [[dataset]]"),
+        ("name = 'a", "is not valid TOML"),
+        ("task = ['motion']\n" + SET, "has no key 'task'; wanted name, tasks, config, set, backend, interval, dataset"),
+        ("tasks = ['flying']\n" + SET, "tasks must be some of motion, tracking, association, people"),
+        ("tasks = 'motion'\n" + SET, "tasks must be a list of texts, got 'motion'"),
+        ("set = [1]\n" + SET, "set must be a list of texts, got [1]"),
+        ("backend = 'gpu'\n" + SET, "backend must be one of auto, torch, onboard, got 'gpu'"),
+        ("interval = 0\n" + SET, "interval must be a whole number of frames from 1 to 1000, got 0"),
+        ("interval = true\n" + SET, "1000, got True"),
+        ("interval = 1.5\n" + SET, "1000, got 1.5"),
+        ("name = 3\n" + SET, "name must be a text, got 3"),
+        ("name = '../up'\n" + SET, "name must consist of letters, digits, blanks"),
+        ("[[dataset]]\nfolder = 'x'", "data set 1 has no kind; wanted kind = one of folder, bms"),
+        (SET + "[[dataset]]\nkind = 'bms'", "data set 2 has no folder; wanted kind = one of folder, bms"),
+        (SET + "[[dataset]]\nkind = 'imagenet'\nfolder = 'x'", "data set 2: 'imagenet' is no kind of data set; wanted"),
+        ("[[dataset]]\nkind = 'bms'\nfolder = ''", "data set 1 has no folder"),
+        ("[[dataset]]\nkind = 'bms'\nfolder = 3", "data set 1: folder must be a text, got 3"),
+        (SET + "clips = []", "data set 1: clips is empty; wanted patterns of names"),
+        (SET + "clips = 'cars*'", "data set 1: clips must be a list of texts, got 'cars*'"),
+    ],
+)
+def test_a_bad_file_is_one_line_that_names_it(tmp_path: Path, content: str, line: str) -> None:
+    with pytest.raises(InputError) as caught:
+        spec(tmp_path, content)
+    assert line in str(caught.value) and str(tmp_path / "study.toml") in str(caught.value)
+    with pytest.raises(InputError, match=r"study .*absent\.toml cannot be read: No such file"):
+        read_spec(tmp_path / "absent.toml")
+
+
+@pytest.fixture
+def study(tmp_path):
+    return read_spec(world.three(tmp_path / "clips"))
+
+
+def test_a_repeated_study_starts_no_worker_and_gives_the_same_bytes(study, tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
-    spec = read_spec(world.three(tmp_path / "clips"))
-    first = run_study(spec, tmp_path, cache=tmp_path / "cache")
-    monkeypatch.setattr(jobs, "_start_local", lambda *given: pytest.fail("a worker was started"))
-    with Workers(2) as two:
-        again = run_study(spec, tmp_path, two, cache=tmp_path / "cache")
+    first = run_study(study, tmp_path, cache=tmp_path / "cache")
+    with monkeypatch.context() as alone:
+        alone.setattr(jobs, "_start_local", lambda *given: pytest.fail("a worker was started"))
+        with Workers(2) as two:
+            again = run_study(study, tmp_path, two, cache=tmp_path / "cache")
     assert again.facts["computed"] == 0 < first.facts["computed"]
-    assert json.dumps(summarize(again)) == json.dumps(summarize(first))
-
-
-def test_a_damaged_entry_is_noted_and_computed_again(tmp_path) -> None:
-    spec = read_spec(world.three(tmp_path / "clips"))
-    first = run_study(spec, tmp_path, cache=tmp_path / "cache")
     for path in (tmp_path / "cache").glob("??/*.npz"):
         path.write_bytes(path.read_bytes()[:-3])
-    again = run_study(spec, tmp_path, cache=tmp_path / "cache")
-    assert json.dumps(summarize(again)) == json.dumps(summarize(first))
-    assert again.facts["computed"] == first.facts["computed"] and "damaged" in str(again.facts["notes"])
+    damaged = run_study(study, tmp_path, cache=tmp_path / "cache")
+    assert damaged.facts["computed"] == first.facts["computed"] and "damaged" in str(damaged.facts["notes"])
+    assert json.dumps(summarize(damaged)) == json.dumps(summarize(again)) == json.dumps(summarize(first))
 
 
-def test_a_clip_s_bad_input_is_told_and_the_others_go_on(tmp_path) -> None:
-    study = world.three(tmp_path / "clips")
+def test_bad_input_of_a_clip_is_left_out_and_the_others_go_on(study, tmp_path) -> None:
     (tmp_path / "clips" / "tracks" / "frames" / "000001.png").write_bytes(b"no picture")
-    results = run_study(read_spec(study), tmp_path, cache=tmp_path / "cache")
+    world.filmed(tmp_path / "clips", "bare", masks=False)
+    results = run_study(study, tmp_path, cache=tmp_path / "cache")
     causes = {(case.clip.name, case.task): case.cause for case in results.cases}
     assert causes["masks", "motion"] == causes["table", "tracking"] == ""
-    told = [line for line in results.left_out if "tracks" in line]
-    assert told and all("\n" not in line for line in told)
+    lines = [line for line in results.left_out if "tracks" in line]
+    assert lines and all("\n" not in line for line in lines)
+    assert [line for line in results.left_out if line.startswith("bare: ") and "no truth" in line]
 
 
-def test_clips_are_picked_by_patterns_and_done_the_longest_first(tmp_path) -> None:
-    spec = read_spec(world.three(tmp_path / "clips"))
-    assert [job.clip.name for job in plan_study(spec, tmp_path, ["ta*", "masks"]).jobs] == ["masks", "table"]
+def test_clips_are_picked_by_patterns_and_done_the_longest_first(study, tmp_path) -> None:
+    planned = plan_study(study, tmp_path, ["ta*", "masks"]).jobs
+    assert [job.clip.name for job in planned] == ["masks", "table"]
     with pytest.raises(InputError, match="by study: nobody fits none; there are masks, table, tracks"):
-        plan_study(spec, tmp_path, ["nobody"])
+        plan_study(study, tmp_path, ["nobody"])
     ended: list[str] = []
-    planned = plan_study(spec, tmp_path, ["ta*", "masks"]).jobs
-    run_jobs(
-        planned, Workers(1), Cache(tmp_path / "cache"), lambda e: ended.append(e.job.clip.name) if e.done else None
-    )
+    store = Cache(tmp_path / "cache")
+    run_jobs(planned, Workers(1), store, lambda event: ended.append(event.job.clip.name) if event.done else None)
     assert ended == ["table", "masks"]
-
-
-def test_a_clip_without_truth_is_left_out_by_name(tmp_path) -> None:
-    study = world.three(tmp_path / "clips")
-    world.filmed(tmp_path / "clips", "bare", masks=False)
-    planned = plan_study(read_spec(study), tmp_path)
-    assert "bare" not in [job.clip.name for job in planned.jobs]
-    assert [line for line in planned.left_out if line.startswith("bare: ") and "no truth" in line]
 
 
 def test_results_are_kept_in_the_user_s_cache_folder(monkeypatch, tmp_path) -> None:

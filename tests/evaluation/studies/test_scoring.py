@@ -1,3 +1,5 @@
+"""Scores of a study: those of `dddas evaluate`, ranked boxes, errors in metres."""
+
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +18,7 @@ from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.registry import figures
 from torchvision_dddas.evaluation.metrics.truth import Labels, Positions, TrackTable, Truth
 from torchvision_dddas.evaluation.studies.cache import pack, unpack
-from torchvision_dddas.evaluation.studies.records import Task, round_as_written
+from torchvision_dddas.evaluation.studies.records import round_as_written
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.stages import find
 from torchvision_dddas.geometry import lonlat
@@ -38,30 +40,23 @@ def scored_of(clip, task, found, interval=1):
     return {"frames": len(one.frames), **figures(one.counts)}
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("make", [masked, targeted])
-def test_figures_of_what_moves_are_those_of_evaluate_to_the_last_digit(tmp_path, make, seed):
+@pytest.mark.parametrize(
+    ("make", "task", "seed", "interval"),
+    [
+        *((masked, "motion", 0, 1), (masked, "motion", 1, 1), (targeted, "motion", 0, 1), (targeted, "motion", 2, 1)),
+        *((tracked, "tracking", 0, 1), (tracked, "tracking", 1, 3), (tracked, "tracking", 2, 3)),
+        (targeted, "tracking", 1, 1),
+    ],
+)
+def test_figures_are_those_of_evaluate_to_the_last_digit(tmp_path, make, task, seed, interval):
     clip, found = make(tmp_path / "clip", seed)
-    assert scored_of(clip, "motion", found) == evaluated(clip, as_files(tmp_path / "out", found))
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("interval", [1, 3])
-def test_figures_of_tracks_are_those_of_evaluate_to_the_last_digit(tmp_path, seed, interval):
-    clip, found = tracked(tmp_path / "clip", seed)
-    looked = (found.frame - 1) % interval == 0
-    rows = np.c_[found.frame, found.identity, found.box_px, found.score][looked]
-    found = replace(found_of(rows, 33), looked=np.arange(1, 34, interval))
-    out = as_files(tmp_path / "out", found, interval, identities=True)
-    mine = scored_of(clip, "tracking", found, interval)
+    if interval > 1:
+        rows = np.c_[found.frame, found.identity, found.box_px, found.score][(found.frame - 1) % interval == 0]
+        found = replace(found_of(rows, 33), looked=np.arange(1, 34, interval))
+    out = as_files(tmp_path / "out", found, interval, identities=task == "tracking")
+    mine = scored_of(clip, task, found, interval)
     assert mine == evaluated(clip, out, interval=interval)
-    assert mine["tracks"]["n_fp"] > 0
-
-
-def test_figures_of_one_targets_track_are_those_of_evaluate(tmp_path):
-    clip, found = targeted(tmp_path / "clip", 1)
-    out = as_files(tmp_path / "out", found, identities=True)
-    assert scored_of(clip, "tracking", found) == evaluated(clip, out)
+    assert make is not tracked or mine["tracks"]["n_fp"] > 0
 
 
 def test_what_dddas_detect_writes_of_a_clip_scores_the_same_as_in_a_study(tmp_path):
@@ -69,42 +64,38 @@ def test_what_dddas_detect_writes_of_a_clip_scores_the_same_as_in_a_study(tmp_pa
     words = ["detect", place / "frames", "--out", tmp_path / "out", "--save", "masks", "--backend", "onboard"]
     app([*map(str, words), "--quiet"], standalone_mode=False)
     (clip,) = read(Source("folder", tmp_path, ("plates",)), tmp_path).clips
-    found = find(clip, "motion", Settings(), "onboard", 1, None)
-    mine = scored_of(clip, "motion", found)
+    mine = scored_of(clip, "motion", find(clip, "motion", Settings(), "onboard"))
     assert mine == evaluated(clip, tmp_path / "out")
     assert mine["boxes"]["n_hit"] > 0
 
 
-def test_frames_add_up_to_the_clip(tmp_path):
-    kinds: list[tuple[Any, Task]] = [(masked, "motion"), (targeted, "motion"), (tracked, "tracking")]
-    for make, task in [*kinds, (targeted, "tracking")]:
-        clip, found = make(tmp_path / f"{make.__name__}_{task}", 5)
-        one = score(clip, task, found)
-        for group in one.counts:
-            whole = counts(one, group).clear if group == "tracks" else counts(one, group)
-            for name, of_frames in one.per_frame[group].items():
-                if not name.startswith(("windows_", "ar_")):
-                    assert np.nansum(of_frames) == pytest.approx(getattr(whole, name))
-    clip, found = tracked(tmp_path / "again", 5)
-    tracks = score(clip, "tracking", found)
-    assert np.nansum(tracks.per_frame["tracks"]["ar_3"]) == pytest.approx(counts(tracks, "tracks").links_3.total)
+@pytest.mark.parametrize(
+    ("make", "task"), [(masked, "motion"), (targeted, "motion"), (tracked, "tracking"), (targeted, "tracking")]
+)
+def test_frames_add_up_to_the_clip_and_come_back_from_the_cache(tmp_path, make, task):
+    clip, found = make(tmp_path / "clip", 5)
+    one = unpack(pack(score(clip, task, found)))
+    assert figures(one.counts) == figures(score(clip, task, found).counts)
+    for group in one.counts:
+        whole = counts(one, group).clear if group == "tracks" else counts(one, group)
+        for name, of_frames in one.per_frame[group].items():
+            if not name.startswith(("windows_", "ar_")):
+                assert np.nansum(of_frames) == pytest.approx(getattr(whole, name))
+    if "tracks" in one.counts:
+        assert np.nansum(one.per_frame["tracks"]["ar_3"]) == pytest.approx(counts(one, "tracks").links_3.total)
 
 
-def test_ranked_detections_know_right_false_and_what_does_not_count(tmp_path):
+def test_ranked_detections_are_right_false_or_do_not_count(tmp_path):
     clip, found = tracked(tmp_path / "clip", 2)
-    assert clip.truth is not None
     truth = replace(clip.truth, ignoring="removed")
     one = score(replace(clip, truth=truth), "people", found)
-    rows = one.ranked["boxes"]
-    boxes = counts(one, "boxes")
-    assert len(rows) == np.isin(found.frame, truth.frames).sum()
-    assert np.isnan(rows[:, 1]).any()
+    rows, boxes = one.ranked["boxes"], counts(one, "boxes")
+    assert len(rows) == np.isin(found.frame, truth.frames).sum() and np.isnan(rows[:, 1]).any()
     assert (np.nansum(rows[:, 1]), np.count_nonzero(~np.isnan(rows[:, 1]))) == (boxes.hit, boxes.hit + boxes.false)
 
 
-def test_boxes_where_nobody_labelled_do_not_count(tmp_path):
+def test_boxes_where_the_mask_is_unlabelled_do_not_count(tmp_path):
     clip, found = masked(tmp_path / "clip", 0)
-    assert clip.truth is not None
     labels = truths.read_mask(clip.truth.masks[1])
     labels[:, 40:] = 170
     clip.truth.masks[1].write_bytes(png(labels.astype(np.uint8)))
@@ -117,67 +108,50 @@ def test_boxes_where_nobody_labelled_do_not_count(tmp_path):
 def test_whatever_is_found_in_a_still_clip_is_false(tmp_path):
     rows = np.array([[2, -1, 0, 0, 5, 5, 0.5], [2, -1, 20, 0, 5, 5, 0.5], [4, -1, 0, 0, 5, 5, 0.5]])
     one = score(Clip("still", tmp_path, still=True), "motion", found_of(rows, 8, identities=False))
-    assert figures(one.counts)["still"] == {
-        "false_blobs_per_frame": 3 / 8,
-        "alarmed": 2 / 8,
-        "n_frames": 8,
-        "n_alarmed": 2,
-        "n_blobs": 3,
-    }
+    wanted = {"false_blobs_per_frame": 3 / 8, "alarmed": 2 / 8, "n_frames": 8, "n_alarmed": 2, "n_blobs": 3}
+    assert figures(one.counts)["still"] == wanted
     assert one.per_frame["still"]["blobs"].tolist() == [0, 2, 0, 1, 0, 0, 0, 0]
     empty = score(Clip("still", tmp_path, still=True), "motion", found_of(rows[:0], 8, identities=False))
     assert figures(empty.counts)["still"]["false_blobs_per_frame"] == 0
 
 
-def test_what_cannot_be_scored_says_why_in_a_line(tmp_path):
+def test_results_that_cannot_be_scored_are_one_line(tmp_path):
     clip, found = masked(tmp_path / "clip")
-    with pytest.raises(InputError, match="clip has no truth; nothing can be scored"):
-        score(replace(clip, truth=None), "motion", found)
-    with pytest.raises(InputError, match="no true places"):
-        score(clip, "location", found)
-    with pytest.raises(InputError, match="frame 3 is labelled, but has no result"):
-        score(clip, "motion", replace(found, masks={1: found.masks[1]}))
     wide = {f: png(np.zeros((60, 90), np.uint8)) for f in found.masks}
-    with pytest.raises(InputError, match="the truth is 80×60 pixels"):
-        score(clip, "motion", replace(found, masks=wide))
-    with pytest.raises(InputError, match="labels frame 11"):
-        score(clip, "motion", replace(found, looked=np.arange(1, 6)))
+    refused: list[Any] = [
+        (None, "motion", found, "clip has no truth; nothing can be scored"),
+        (clip.truth, "location", found, "no true places"),
+        (clip.truth, "motion", replace(found, masks={1: found.masks[1]}), "frame 3 is labelled, but has no result"),
+        (clip.truth, "motion", replace(found, masks=wide), "the truth is 80×60 pixels"),
+        (clip.truth, "motion", replace(found, looked=np.arange(1, 6)), "labels frame 11"),
+    ]
+    for truth, task, result, message in refused:
+        with pytest.raises(InputError, match=message):
+            score(replace(clip, truth=truth), task, result)
 
 
 def test_boxes_are_rounded_as_their_text_is():
     rng = np.random.default_rng(0)
     boxes = np.concatenate([rng.uniform(-50, 2000, (500, 4)), rng.integers(-5000, 90000, (500, 4)) / 1000 + 0.005])
-    wanted = [[float(f"{v:.2f}") for v in row] for row in boxes.tolist()]
-    assert np.array_equal(round_as_written(boxes), wanted)
-
-
-def test_scores_come_back_from_the_cache_as_they_were(tmp_path):
-    clip, found = tracked(tmp_path / "clip")
-    one = score(clip, "tracking", found)
-    again = unpack(pack(one))
-    assert figures(again.counts) == figures(one.counts)
-    assert np.array_equal(again.per_frame["tracks"]["tp"], one.per_frame["tracks"]["tp"])
+    assert np.array_equal(round_as_written(boxes), [[float(f"{v:.2f}") for v in row] for row in boxes.tolist()])
 
 
 def located(tmp_path, off=(0.6, 0.8), boxes=True, sigma_m=1.0):
-    """Two people and a vehicle; the people are told `off` metres from where they are, and a third place is nobody's."""
-    frame = np.repeat(np.arange(1, 11), 3)
-    who = np.tile([1, 2, 9], 10)
+    """Two people, found `off` metres from where they are, and a vehicle; a third place belongs to no target."""
+    frame, who = np.repeat(np.arange(1, 11), 3), np.tile([1, 2, 9], 10)
     place = np.stack([10.0 * who + frame, 5.0 * frame], axis=1)
     px = np.stack([20.0 * who, frame, np.full(30, 8.0), np.full(30, 16.0)], axis=1)
     seen = who != 9
-    truth = Truth("boxes", tmp_path, {}, {f: px[(frame == f) & seen] for f in range(1, 11)},
-                  TrackTable(frame[seen], who[seen], px[seen]), positions=Positions(frame, who, place))  # fmt: skip
-    rows = np.c_[frame[seen], who[seen], px[seen], np.ones(20)]
-    told = place[seen] + np.array(off)
-    stray = np.array([[3, 77, 500, 500, 8, 16, 1.0]])
-    found = found_of(np.r_[rows[:4], stray, rows[4:]] if boxes else np.r_[rows, stray], 10)
-    told = np.insert(told, 4, (900.0, 900.0), axis=0) if boxes else np.r_[told, [[900.0, 900.0]]]
-    covariance = np.broadcast_to(np.eye(2) * sigma_m**2, (21, 2, 2))
-    found = replace(found, east_north_m=told, covariance_m2=covariance)
-    if not boxes:
-        found = replace(found, box_px=np.full((21, 4), np.nan))
-    return Clip("ground", tmp_path, truth=truth), found
+    by_frame = {f: px[(frame == f) & seen] for f in range(1, 11)}
+    tracks = TrackTable(frame[seen], who[seen], px[seen])
+    truth = Truth("boxes", tmp_path, {}, by_frame, tracks, positions=Positions(frame, who, place))
+    rows = np.insert(np.c_[frame[seen], who[seen], px[seen], np.ones(20)], 4, [3, 77, 500, 500, 8, 16, 1.0], axis=0)
+    found = replace(
+        found_of(rows, 10),
+        east_north_m=np.insert(place[seen] + np.array(off), 4, (900.0, 900.0), axis=0),
+        covariance_m2=np.broadcast_to(np.eye(2) * sigma_m**2, (21, 2, 2)),
+    )
+    return Clip("ground", tmp_path, truth=truth), found if boxes else replace(found, box_px=np.full((21, 4), np.nan))
 
 
 @pytest.mark.parametrize("boxes", [True, False])
@@ -186,9 +160,7 @@ def test_errors_in_metres_are_those_that_were_made(tmp_path, boxes):
     one = score(clip, "location", found)
     assert one.samples["error_m"] == pytest.approx(np.ones(20))
     assert one.samples["inside"].tolist() == [1] * 20
-    assert counts(one, "location").strays == 1
-    assert counts(one, "location").told == 20
-    assert counts(one, "location").targets == (20 if boxes else 30)  # a picture tells who can be seen
+    assert counts(one, "location") == (20 if boxes else 30, 20, 1)  # a picture tells who can be seen
     assert bool(one.notes) != boxes
     assert np.isnan(one.samples["relative_error_m"]).all()
 
@@ -200,13 +172,11 @@ def test_an_ellipse_that_is_too_small_does_not_hold_the_truth(tmp_path):
 
 def test_the_error_relative_to_the_team_is_what_the_landmarks_do_not_share(tmp_path):
     clip, found = located(tmp_path, off=(3.0, 4.0))
-    assert clip.truth is not None
     known = clip.truth.positions
     fleet = Positions(*(column[known.identity == 9] for column in (known.frame, known.identity, known.east_north_m)))
-    marks = [
-        f"{f},rover,{e + 3.0:.6f},{n + 3.0:.6f}" for f, (e, n) in zip(fleet.frame, fleet.east_north_m, strict=True)
-    ]
-    (tmp_path / "landmarks.csv").write_text("frame,landmark,east_m,north_m\n" + "\n".join(marks) + "\n")
+    places = zip(fleet.frame, fleet.east_north_m, strict=True)
+    marks = "".join(f"{f},rover,{east + 3.0:.6f},{north + 3.0:.6f}\n" for f, (east, north) in places)
+    (tmp_path / "landmarks.csv").write_text(f"frame,landmark,east_m,north_m\n{marks}")
     found = replace(found, more={"relative_m2": np.broadcast_to(np.eye(2), (21, 2, 2))})
     clip = replace(clip, landmarks=tmp_path / "landmarks.csv")
     assert np.isnan(score(clip, "location", found).samples["relative_error_m"]).all()  # nobody knows where it was
@@ -218,19 +188,15 @@ def test_the_error_relative_to_the_team_is_what_the_landmarks_do_not_share(tmp_p
 
 def test_a_place_of_a_target_that_does_not_count_is_neither_right_nor_nobodys(tmp_path):
     clip, found = located(tmp_path)
-    assert clip.truth is not None
-    tracks = clip.truth.tracks
-    mine, other = (tracks.at(tracks.identity == who) for who in (1, 2))
+    mine, other = (clip.truth.tracks.at(clip.truth.tracks.identity == who) for who in (1, 2))
     one = score(replace(clip, truth=replace(clip.truth, tracks=mine, ignored=other)), "location", found)
     assert counts(one, "location") == (10, 10, 1)
 
 
 def test_degrees_are_compared_where_both_sides_count_metres_from_origins_of_their_own(tmp_path):
     clip, found = located(tmp_path)
-    true = clip.truth.positions
-    origin = (-110.9, 32.2)
-    degrees = lonlat(true.east_north_m, origin)
-    told = lonlat(found.east_north_m, origin)
+    true, origin = clip.truth.positions, (-110.9, 32.2)
+    degrees, of_found = (lonlat(place_m, origin) for place_m in (true.east_north_m, found.east_north_m))
     clip = replace(clip, truth=replace(clip.truth, positions=replace(true, lonlat_deg=degrees)))
-    found = replace(found, east_north_m=found.east_north_m + 777, more={"lonlat_deg": told})
+    found = replace(found, east_north_m=found.east_north_m + 777, more={"lonlat_deg": of_found})
     assert score(clip, "location", found).samples["error_m"] == pytest.approx(np.ones(20), abs=1e-3)

@@ -12,6 +12,7 @@ from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.studies import stages
 from torchvision_dddas.evaluation.studies.stages import (
     PARAMETER_GROUPS,
     allowed_tasks,
@@ -19,10 +20,13 @@ from torchvision_dddas.evaluation.studies.stages import (
     narrow_settings,
     open_clip,
     replay_scenes,
+    true_boxes,
     upstream_task,
 )
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.tracking import track_scenes
+
+NOW = load_config()
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +36,7 @@ def clips(tmp_path_factory):
     return {clip.name: clip for clip in read(Source("folder", folder), Path()).clips}
 
 
-def found_in(clip, task, settings=None, interval=1):
-    settings = settings or load_config()
+def find_all(clip, task, settings=NOW, interval=1):
     need = upstream_task(clip, task)
     before = None if need is None else find(clip, need, settings)
     return find(clip, task, settings, interval=interval, before=before)
@@ -45,38 +48,28 @@ def test_a_clip_allows_what_its_pictures_and_truth_tell(clips) -> None:
     assert allowed_tasks(clips["table"]) == ("tracking", "association")
 
 
-def test_motion_is_what_the_loop_finds(clips) -> None:
-    clip, settings = clips["masks"], load_config()
-    scenes = list(detect_motion(open_clip(clip), settings, "onboard"))
-    found = find(clip, "motion", settings)
-    assert found.looked.tolist() == [scene.frame.number for scene in scenes]
-    assert len(found.frame) > 0
+def test_motion_is_what_the_loop_finds_with_masks_of_labelled_frames(clips) -> None:
+    scenes = list(detect_motion(open_clip(clips["masks"]), NOW, "onboard"))
+    found = find(clips["masks"], "motion", NOW)
+    assert found.looked.tolist() == [scene.frame.number for scene in scenes] and len(found.frame) > 0
     for scene in scenes:
         rows = found.frame == scene.frame.number
         assert (found.box_px[rows] == scene.detections.box_px).all()
         assert (found.score[rows] == scene.detections.score).all()
         mask = decode_image(found.masks[scene.frame.number], cv2.IMREAD_UNCHANGED)
         assert mask is not None and np.array_equal(mask > 0, scene.mask > 0)
-
-
-def test_masks_are_kept_of_frames_that_the_truth_labels_alone(clips) -> None:
-    assert (
-        sorted(find(clips["masks"], "motion", load_config()).masks)
-        == truths.load_truth(clips["masks"].place / "masks").frames
-    )
-    assert find(clips["tracks"], "motion", load_config()).masks == {}
+    assert sorted(found.masks) == truths.load_truth(clips["masks"].place / "masks").frames
+    assert find(clips["tracks"], "motion", NOW).masks == {}
 
 
 @pytest.mark.parametrize("interval", [1, 2])
 def test_tracks_of_what_was_kept_are_those_of_a_run_of_the_clip(clips, interval) -> None:
-    clip, settings = clips["tracks"], load_config()
-    source = open_clip(clip)
-    scenes = detect_motion(source, settings, "onboard")
-    wanted = list(track_scenes(scenes, settings, interval, source.size))
-    found = found_in(clip, "tracking", settings, interval)
-    assert found.looked.tolist() == [followed.number for followed in wanted]
-    assert found.identity.tolist() == [i for followed in wanted for i in followed.tracks.identity.tolist()]
-    boxes = np.concatenate([followed.tracks.box_px for followed in wanted])
+    source = open_clip(clips["tracks"])
+    wanted = list(track_scenes(detect_motion(source, NOW, "onboard"), NOW, interval, source.size))
+    found = find_all(clips["tracks"], "tracking", interval=interval)
+    assert found.looked.tolist() == [frame.number for frame in wanted]
+    assert found.identity.tolist() == [i for frame in wanted for i in frame.tracks.identity.tolist()]
+    boxes = np.concatenate([frame.tracks.box_px for frame in wanted])
     assert np.abs(found.box_px - boxes).max(initial=0) <= 0.005
 
 
@@ -84,64 +77,53 @@ def test_a_picture_that_cannot_be_read_stays_out_of_the_tracks_too(clips, tmp_pa
     world.followed(tmp_path / "clips", "tracks", 2)
     (clip,) = read(Source("folder", tmp_path / "clips"), Path()).clips
     clip.pictures[3].write_bytes(b"no picture")
-    settings = load_config()
-    source = open_clip(clip)
-    scenes = list(detect_motion(source, settings, "onboard"))
-    found = find(clip, "motion", settings)
+    scenes = list(detect_motion(open_clip(clip), NOW, "onboard"))
+    found = find(clip, "motion", NOW)
     assert any("could not be decoded" in note for note in found.notes)
     for scene, again in zip(scenes, replay_scenes(clip, found), strict=True):
         assert (scene.frame.image == again.frame.image).all() and scene.frame.number == again.frame.number
         assert np.array_equal(scene.detections.middle_px, again.detections.middle_px, equal_nan=True)
-        reliable = scene.step is not None and scene.step.reliable
-        assert reliable == (again.step is not None)
+        assert (scene.step is not None and scene.step.reliable) == (again.step is not None)
 
 
-def test_tracks_without_pictures_are_of_the_given_detections(clips) -> None:
-    found = found_in(clips["table"], "tracking")
+def test_a_clip_without_pictures_has_tracks_of_its_tables_each_interval_th_frame(clips) -> None:
+    found = find_all(clips["table"], "tracking")
     assert len(found.frame) and set(found.identity.tolist()) != {-1}
-
-
-def test_association_looks_at_each_interval_th_frame_alone(clips) -> None:
-    found = found_in(clips["table"], "association", interval=2)
+    found = find_all(clips["table"], "association", interval=2)
     assert found.looked.tolist() == [1, 3, 5, 7, 9]
     assert set(found.frame.tolist()) <= {1, 3, 5, 7, 9}
 
 
-def test_the_order_of_true_boxes_does_not_tell_who_is_who(clips) -> None:
-    from torchvision_dddas.evaluation.studies.stages import true_boxes
-
-    clip = clips["table"]
-    table = true_boxes(clip, 1)
-    assert sorted(map(tuple, table.box_px.tolist())) == sorted(map(tuple, clip.truth.tracks.box_px.tolist()))
-    assert not (table.box_px == clip.truth.tracks.box_px).all()
+def test_the_order_of_true_boxes_does_not_reveal_their_identities(clips) -> None:
+    table, true_px = true_boxes(clips["table"], 1), clips["table"].truth.tracks.box_px
+    assert sorted(map(tuple, table.box_px.tolist())) == sorted(map(tuple, true_px.tolist()))
+    assert not (table.box_px == true_px).all()
     assert (table.score == 1).all() and table.identity is None
 
 
 class Watched(Settings):
-    """Settings that note which of their groups are looked at."""
+    """Settings that note which of their groups are read."""
 
     def __getattribute__(self, name):
         if name in Settings.model_fields:
-            LOOKED.add(name)
+            READ.add(name)
         return super().__getattribute__(name)
 
 
-LOOKED: set[str] = set()
+READ: set[str] = set()
 
 
 @pytest.mark.parametrize("mode", ["default", "paper"])
 @pytest.mark.parametrize("task", ["motion", "tracking", "association"])
-def test_a_stage_looks_at_no_settings_but_those_in_its_key(clips, monkeypatch, task, mode) -> None:
-    from torchvision_dddas.evaluation.studies import stages
-
+def test_a_stage_reads_no_settings_but_those_in_its_key(clips, monkeypatch, task, mode) -> None:
     clip, settings = clips["tracks"], load_config(None, [f"track.mode={mode}"])
     need = upstream_task(clip, task)
     before = None if need is None else find(clip, need, settings)
     monkeypatch.setattr(stages, "narrow_settings", lambda settings, task: Watched.model_validate(settings.model_dump()))
     find(clip, task, settings, before=before)
-    LOOKED.clear()
+    READ.clear()
     find(clip, task, settings, before=before)
-    assert set(PARAMETER_GROUPS[task]) >= LOOKED
+    assert set(PARAMETER_GROUPS[task]) >= READ
 
 
 def test_a_stage_is_given_the_defaults_of_other_groups() -> None:

@@ -1,17 +1,37 @@
+"""Measures of a study: those of `dddas evaluate`, their intervals, tables and costs; the goals of sweeps."""
+
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.evaluation.studies.scored_clips import as_files, found_of, masked, study_of, tracked
+from tests.evaluation.studies.scored_clips import as_files, found_of, masked, study_of, targeted, tracked
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import evaluate
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.evaluation.studies.runner import frame_rows, metric_rows, write_csv, write_parquet
+from torchvision_dddas.evaluation.metrics.registry import HEADLINES, groups_of_task, is_lower_better, measure_names
+from torchvision_dddas.evaluation.studies.runner import (
+    FRAME_COLUMNS,
+    METRIC_COLUMNS,
+    frame_rows,
+    metric_rows,
+    write_csv,
+    write_parquet,
+)
 from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import measures, over_clips, over_frames, summarize, summarize_costs
+from torchvision_dddas.evaluation.studies.summary import (
+    check_possible,
+    goal_value,
+    measures,
+    over_clips,
+    over_frames,
+    parse_goal,
+    possible_groups,
+    summarize,
+    summarize_costs,
+)
 from torchvision_dddas.io.output.run_record import finite
 
 
@@ -44,103 +64,77 @@ def test_clips_pooled_and_mean_are_those_of_evaluate_to_the_last_digit(tmp_path,
         assert {group: mine[part][group] for group in theirs[part]} == theirs[part]
 
 
-def test_the_summary_does_not_depend_on_the_order_of_the_cases(tmp_path):
-    cases = several(tmp_path, tracked, "tracking", 6)
-    found = [json.dumps(finite(summarize(study_of(*order)))) for order in (cases, cases[::-1], cases[2:] + cases[:2])]
-    assert found[0] == found[1] == found[2]
-
-
-def test_nothing_of_the_machine_is_in_it(tmp_path):
-    cases = several(tmp_path / "here", masked, "motion", 2)
-    clip = cases[0][0]
+def test_the_summary_depends_neither_on_the_order_of_cases_nor_on_the_machine(tmp_path):
+    cases = several(tmp_path / "here", masked, "motion", 3)
     cause = f"{tmp_path}/here/clip-0/masks/000003.png is no picture that can be read; see /etc/fstab: it fails"
-    found = summarize(study_of(*cases, (replace(clip, name="broken"), "motion", None, None, cause)))
-    assert str(tmp_path) not in json.dumps(finite(found))
-    assert found["left_out"] == [
+    cases.append((replace(cases[0][0], name="broken"), "motion", None, None, cause))
+    slow = [(c, t, f and replace(f, seconds={"find": 99.0}, peak_mb=7.0), s, w) for c, t, f, s, w in cases]
+    texts = [json.dumps(finite(summarize(study_of(*order)))) for order in (cases, cases[::-1], slow)]
+    assert texts[0] == texts[1] == texts[2] and str(tmp_path) not in texts[0]
+    assert json.loads(texts[0])["left_out"] == [
         {"clip": "broken", "task": "motion", "cause": "000003.png is no picture that can be read; see fstab: it fails"}
     ]
-    slow = [(c, t, replace(f, seconds={"find": 99.0}, peak_mb=7.0), s, w) for c, t, f, s, w in cases]
-    assert finite(summarize(study_of(*slow))) == finite(summarize(study_of(*cases)))
 
 
-def test_intervals_hold_the_figures_and_speak_of_clips_where_there_are_enough(tmp_path):
+def test_intervals_hold_the_figures_and_are_over_clips_where_there_are_enough(tmp_path):
     cases = several(tmp_path, tracked, "tracking", 6)
     mine = summarize(study_of(*cases))["tasks"]["tracking"]
     assert mine["pooled"]["over"] == {"tracks": "clips"}
     for place in (mine["pooled"], *mine["clips"].values()):
         low, high = place["intervals"]["tracks"]["mota"]
-        assert low <= place["tracks"]["mota"] <= high
-        assert low < high
+        assert low <= place["tracks"]["mota"] <= high and low < high
     assert mine["pooled"]["intervals"]["tracks"]["hota"] is not None
     assert "hota" not in mine["clips"]["clip-0"]["intervals"]["tracks"]  # of whole tracks, not of frames
     few = summarize(study_of(*cases[:3]))["tasks"]["tracking"]["pooled"]
-    assert few["over"] == {"tracks": "frames"}
-    assert few["intervals"]["tracks"]["mota"] is not None
-
-
-def test_too_few_frames_have_no_interval(tmp_path):
-    cases = several(tmp_path, masked, "motion", 1, frames=6)
-    assert set(summarize(study_of(*cases))["tasks"]["motion"]["clips"]["clip-0"]["intervals"]["pixels"].values()) == {
-        None
-    }
+    assert few["over"] == {"tracks": "frames"} and few["intervals"]["tracks"]["mota"] is not None
+    short = several(tmp_path / "short", masked, "motion", 1, frames=6)
+    intervals = summarize(study_of(*short))["tasks"]["motion"]["clips"]["clip-0"]["intervals"]
+    assert set(intervals["pixels"].values()) == {None}
 
 
 def test_the_worst_clip_is_the_lowest_or_where_less_is_better_the_highest(tmp_path):
-    cases = several(tmp_path, masked, "motion", 4)
-    mine = summarize(study_of(*cases))["tasks"]["motion"]
+    mine = summarize(study_of(*several(tmp_path, masked, "motion", 4)))["tasks"]["motion"]
     for group, measure, pick in (("pixels", "f", min), ("ranking", "log_average_miss_rate", max)):
         values = {name: clip[group][measure] for name, clip in mine["clips"].items()}
         worst = mine["worst"][group][measure]
         assert (worst["value"], values[worst["clip"]]) == (pick(values.values()), pick(values.values()))
 
 
-def test_weights_of_one_give_the_figures_themselves(tmp_path):
-    for make, task in ((masked, "motion"), (tracked, "tracking"), (tracked, "people")):
-        scored = [case[3] for case in several(tmp_path / task, make, task, 3)]
-        whole = measures(scored)
-        for estimate in (over_clips(scored), over_frames(scored)):
-            for group, one in estimate.items():
-                found = one.statistic(np.ones(sum(stratum.units for stratum in one.strata)))
-                assert found == pytest.approx({name: whole[group][name] for name in found}, nan_ok=True)
+@pytest.mark.parametrize(("make", "task"), [(masked, "motion"), (tracked, "tracking"), (tracked, "people")])
+def test_weights_of_units_are_how_often_each_counts(tmp_path, make, task):
+    scored = [case[3] for case in several(tmp_path, make, task, 3)]
+    whole, twice = measures(scored), measures([scored[0], scored[0], scored[2]])
+    for estimates in (over_clips(scored), over_frames(scored)):
+        for group, one in estimates.items():
+            found = one.statistic(np.ones(sum(stratum.units for stratum in one.strata)))
+            assert found == pytest.approx({name: whole[group][name] for name in found}, nan_ok=True)
+    for group, one in over_clips(scored).items():
+        found = one.statistic(np.array([2.0, 0.0, 1.0]))
+        assert found == pytest.approx({name: twice[group][name] for name in found}, nan_ok=True)
 
 
-def test_a_clip_that_counts_twice_is_the_clip_twice(tmp_path):
-    scored = [case[3] for case in several(tmp_path, tracked, "tracking", 3)]
-    estimate = over_clips(scored)["tracks"]
-    twice = measures([scored[0], scored[0], scored[2]])["tracks"]
-    found = estimate.statistic(np.array([2.0, 0.0, 1.0]))
-    assert found == pytest.approx({name: twice[name] for name in found})
-
-
-def test_costs_are_told_apart_from_measures(tmp_path):
+def test_costs_add_up(tmp_path):
     clip, found = masked(tmp_path / "a")
     other, more = masked(tmp_path / "b", 1)
     more = replace(more, seconds={"find": 1.5, "read": 1.0}, peak_mb=300.0)
-    told = summarize_costs(study_of((clip, "motion", found, None, ""), (other, "motion", more, None, "")))["motion"]
-    assert told["all"] == {
-        "frames": 24,
-        "seconds": 3.0,
-        "frames_per_s": 8.0,
-        "peak_mb": 300.0,
-        "ms_per_frame": {"find": 2000 / 24, "read": 1000 / 24},
-    }
-    assert told["clips"]["a"]["frames_per_s"] == 24
+    costs = summarize_costs(study_of((clip, "motion", found, None, ""), (other, "motion", more, None, "")))["motion"]
+    by_stage = {"find": 2000 / 24, "read": 1000 / 24}
+    whole = {"frames": 24, "seconds": 3.0, "frames_per_s": 8.0, "peak_mb": 300.0, "ms_per_frame": by_stage}
+    assert costs["all"] == whole
+    assert costs["clips"]["a"]["frames_per_s"] == 24
 
 
-def study(tmp_path: Path):
+def test_tables_have_every_figure_to_the_last_digit(tmp_path):
     cases = several(tmp_path / "truth", masked, "motion", 2)
     empty = found_of(np.zeros((0, 7)), 12, {f: cases[0][2].masks[f] for f in range(1, 13)}, False)
     clip = replace(cases[0][0], name='odd, "name"')
     results = study_of(*cases, (clip, "motion", empty, score(clip, "motion", empty), ""))
-    return results, summarize(results)
-
-
-def test_tables_have_every_figure_to_the_last_digit(tmp_path):
-    _, metrics = study(tmp_path)
+    metrics = summarize(results)
+    rows = [dict(zip(METRIC_COLUMNS, row, strict=True)) for row in metric_rows(metrics)]
     write_csv(tmp_path / "metrics.csv", metrics)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         read = list(csv.DictReader(file))
-    assert len(read) == len(metric_rows(metrics))
+    assert len(read) == len(rows)
     for row in read:
         mine = metrics["tasks"][row["task"]]
         place = mine["clips"][row["clip"]] if row["scope"] == "clip" else mine[row["scope"]]
@@ -149,15 +143,66 @@ def test_tables_have_every_figure_to_the_last_digit(tmp_path):
         span = place.get("intervals", {}).get(row["group"], {}).get(row["measure"])
         assert [row["low"], row["high"]] == (["", ""] if span is None else [repr(end) for end in span])
     assert {row["clip"] for row in read} >= {'odd, "name"', "clip-0", ""}
-
-
-def test_parquet_says_the_same(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
-    results, metrics = study(tmp_path)
     write_parquet(tmp_path, metrics, results)
-    table = parquet.read_table(tmp_path / "metrics.parquet").to_pylist()
-    assert [row["measure"] for row in table] == [row[5] for row in metric_rows(metrics)]
-    np.testing.assert_array_equal([row["value"] for row in table], [row[6] for row in metric_rows(metrics)])
+    np.testing.assert_equal(parquet.read_table(tmp_path / "metrics.parquet").to_pylist(), rows)
     frames = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
-    assert [tuple(row.values()) for row in frames] == list(frame_rows(results))
-    assert sorted(p.name for p in tmp_path.iterdir() if p.suffix) == ["frames.parquet", "metrics.parquet"]
+    assert frames == [dict(zip(FRAME_COLUMNS, row, strict=True)) for row in frame_rows(results)]
+    assert sorted(p.name for p in tmp_path.glob("*.*")) == ["frames.parquet", "metrics.csv", "metrics.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("make", "task"), [(masked, "motion"), (targeted, "motion"), (tracked, "tracking"), (tracked, "association")]
+)
+def test_the_names_of_measures_are_those_that_scored_clips_have(tmp_path, make, task) -> None:
+    clip, found = make(tmp_path / "clip", 0)
+    having = measures([score(clip, task, found)])
+    assert set(having) == set(possible_groups(clip, task)) <= set(groups_of_task(task))
+    for group, figures in having.items():
+        names = {name for name in figures if not name.startswith("n_") or is_lower_better(name)}
+        assert set(measure_names(group)) == names
+
+
+def test_every_measure_can_be_a_goal_and_a_wrong_name_lists_the_right_ones() -> None:
+    for task in HEADLINES:
+        for group in groups_of_task(task):
+            assert parse_goal(f"{task}.{group}.{measure_names(group)[0]}").group == group
+    for text, message in (
+        ("f", "wanted task.group.measure"),
+        ("sight.pixels.f", "no task"),
+        ("motion.voxels.f", "no group"),
+        ("motion.pixels.n_tp", "neither more nor less"),
+        ("motion.pixels.iou", "'iou' is no measure of motion.pixels; wanted accuracy, "),
+        ("location.metres.mean", "'mean' is no measure of location.metres; wanted median_m, "),
+        ("people.ranking.map", "no measure of people.ranking; wanted ap, "),
+        ("tracking.pixels.f", "no group of measures of tracking; wanted tracks, target_track"),
+    ):
+        with pytest.raises(InputError, match=message):
+            parse_goal(text)
+
+
+def test_a_goal_that_the_truth_of_these_clips_does_not_allow_is_refused(tmp_path) -> None:
+    clip, _ = masked(tmp_path / "clip", 0)
+    still = replace(clip, still=True)
+    check_possible(parse_goal("motion.pixels.f"), [clip])
+    check_possible(parse_goal("motion.still.alarmed"), [clip, still])
+    with pytest.raises(InputError, match=r"no clip has truth for motion\.target\.hit; .* motion\.pixels"):
+        check_possible(parse_goal("motion.target.hit"), [clip])
+    with pytest.raises(InputError, match=r"there is truth for motion\.still$"):
+        check_possible(parse_goal("motion.pixels.f"), [still])
+
+
+def test_a_goal_is_pooled_the_mean_or_the_worst_and_fails_with_any_clip(tmp_path) -> None:
+    results = study_of(*several(tmp_path, masked, "motion", 3))
+    mine = summarize(results)["tasks"]["motion"]
+    for name in ("pixels.f", "ranking.log_average_miss_rate"):
+        group, _, measure = name.partition(".")
+        worst = mine["worst"][group][measure]["value"]
+        wanted = (mine["pooled"][group][measure], mine["mean"][group][measure], worst)
+        goals = [parse_goal(f"motion.{name}", by) for by in ("pooled", "mean", "worst")]
+        assert [goal_value(goal, results.cases)[0] for goal in goals] == pytest.approx(wanted)
+    with pytest.raises(InputError, match=r"no clip has motion\.target\.hit; there are pixels\.accuracy, "):
+        goal_value(parse_goal("motion.target.hit"), results.cases)
+    lost = replace(results.cases[0], scored=None, cause="it broke")
+    value, why = goal_value(goals[0], [lost, *results.cases[1:]])
+    assert np.isnan(value) and why == f"{lost.clip.name}: it broke"

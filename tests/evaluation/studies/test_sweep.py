@@ -91,13 +91,10 @@ def test_a_bad_axis_is_refused_in_one_line(parse, text, said) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_grid_of_more_points_than_anyone_waits_for_is_refused() -> None:
+def test_a_grid_has_a_limit_and_one_axis_a_parameter() -> None:
     many = ",".join(str(k) for k in range(50, 250))
     with pytest.raises(InputError, match="got 40000"):
         parse_grid([f"registration.keypoints={many}", f"registration.hypotheses={many}"], NOW)
-
-
-def test_a_parameter_has_one_axis() -> None:
     with pytest.raises(InputError, match="given twice"):
         parse_grid(["refine.on=true", "refine.on=false"], NOW)
 
@@ -112,13 +109,10 @@ def test_a_grid_is_measured_in_order_after_the_settings_as_they_are() -> None:
     assert best(trials, minimize=True) == trials[0]
 
 
-def test_a_point_without_a_value_is_last_and_never_the_best() -> None:
+def test_a_point_without_a_value_is_never_the_best_and_a_grid_of_impossible_points_is_refused() -> None:
     trials = on_grid("difference.threshold=14", "difference.blur_px=7,9")
     assert ranked(trials, minimize=False)[-1].cause == "the clip broke off"
     assert best([Trial(0, {}, math.nan, "why")], minimize=False) is None
-
-
-def test_an_impossible_point_is_recorded_and_a_grid_of_nothing_else_refused() -> None:
     trials = on_grid("interval.minimum_frames=1,7", "interval.maximum_frames=5,9")
     assert [bool(trial.cause) for trial in trials] == [False, False, False, True, False]
     with pytest.raises(InputError, match="no point of the grid is possible"):

@@ -1,0 +1,186 @@
+"""Records on disk, whole or not at all; digests of all that a result depends on."""
+
+import hashlib
+import io
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.studies import cache
+from torchvision_dddas.evaluation.studies.cache import (
+    PACKAGE,
+    Cache,
+    CarriedRecords,
+    DamagedError,
+    code_digest,
+    digest,
+    files_digest,
+    pack,
+    unpack,
+)
+from torchvision_dddas.evaluation.studies.records import Found
+from torchvision_dddas.evaluation.studies.scoring import score
+from torchvision_dddas.evaluation.studies.stages import STAGES
+
+KEY = "ab" + "0" * 62
+RNG = np.random.default_rng(0)
+FOUND = Found(
+    *(np.array([1, 1, 4]), RNG.random((3, 4)), RNG.random(3), np.array([7, -1, 7])),
+    *(np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan), np.array([1, 2, 4])),
+    masks={2: b"\x89PNG", 4: b""},
+    steps={4: np.eye(3) * np.pi},
+    more={"speed_px": RNG.random(3)},
+    seconds={"read": 0.1, "track": 1e-300},
+    notes=("a note – with signs",),
+)
+WHOLE = pack(FOUND)
+
+
+def test_a_result_comes_back_to_the_last_digit() -> None:
+    back = unpack(WHOLE)
+    assert isinstance(back, Found) and pack(back) == WHOLE
+    for name in ("frame", "box_px", "covariance_m2"):
+        before, after = getattr(FOUND, name), getattr(back, name)
+        assert after.dtype == before.dtype and after.tobytes() == before.tobytes()
+    assert back.masks == FOUND.masks and back.seconds == FOUND.seconds and back.notes == FOUND.notes
+    assert (back.steps[4] == FOUND.steps[4]).all()
+
+
+@given(st.integers(0, len(WHOLE) - 1), st.integers(0, 255))
+def test_any_changed_byte_or_lost_end_is_noticed(place: int, change: int) -> None:
+    damaged = bytearray(WHOLE)
+    damaged[place] ^= change
+    with pytest.raises(DamagedError):
+        unpack(bytes(damaged) if change else WHOLE[:place])
+
+
+@pytest.mark.parametrize("name", ["os:system", "torchvision_dddas.cli:main", "Settings"])
+def test_only_records_are_made(name: str) -> None:
+    file = io.BytesIO()
+    np.savez(file, content=np.frombuffer(json.dumps({"of": name, "fields": {"command": "true"}}).encode(), np.uint8))
+    with pytest.raises(DamagedError):
+        unpack(hashlib.sha256(file.getvalue()).digest() + file.getvalue())
+    with pytest.raises(TypeError, match="a set cannot be stored"):
+        pack({"a": {1, 2}})
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        *((1, 1.0), ("1", 1), (("a", "bc"), ("ab", "c")), ((1, (2,)), ((1, 2),)), (None, "None"), (True, 1)),
+        *((np.zeros(2), np.zeros((2, 1))), (np.zeros(2), np.zeros(2, int)), ({"a": 1}, {"a": 2})),
+    ],
+)
+def test_different_values_have_different_digests(one, other) -> None:
+    assert digest(one) == digest(one) != digest(other)
+
+
+def test_an_entry_is_found_again_by_its_key_alone(tmp_path) -> None:
+    Cache(tmp_path).put(KEY, FOUND)
+    again = Cache(tmp_path)
+    assert again.has(KEY) and pack(again.get(KEY)) == WHOLE
+    assert not again.has(KEY[::-1]) and again.get(KEY[::-1]) is None
+    assert [path.name for path in (tmp_path / KEY[:2]).iterdir()] == [f"{KEY}.npz"]
+
+
+@pytest.mark.parametrize("damage", [lambda b: b[:-1], lambda b: b"", lambda b: b[:40] + b"x" + b[41:]])
+@pytest.mark.parametrize("read", [Cache.has, Cache.get])
+def test_a_damaged_entry_is_noted_once_and_removed(tmp_path, damage, read) -> None:
+    entries = Cache(tmp_path)
+    entries.put(KEY, FOUND)
+    entries.path(KEY).write_bytes(damage(entries.path(KEY).read_bytes()))
+    assert not read(entries, KEY) and not read(entries, KEY)
+    (line,) = entries.notes
+    assert "damaged" in line and KEY in line
+
+
+def test_a_cache_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path, monkeypatch) -> None:
+    def full(path: Path, content: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(content[:10])
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="choose another --cache"):
+        Cache(tmp_path / "file" / "cache")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(InputError, match=r"No space left on device.*choose another --cache"):
+        Cache(tmp_path / "cache").put(KEY, FOUND)
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["file"]
+
+
+def test_entries_unused_for_long_are_pruned_and_those_just_read_stay(tmp_path) -> None:
+    entries, other = Cache(tmp_path), "cd" + KEY[2:]
+    for key in (KEY, other):
+        entries.put(key, FOUND)
+        os.utime(entries.path(key), (1e9, 1e9))
+    assert entries.has(KEY)
+    assert entries.prune(30) == (1, len(WHOLE))
+    assert entries.has(KEY) and not entries.has(other)
+
+
+def test_records_that_travel_with_a_job_are_used_and_new_ones_come_back() -> None:
+    there = CarriedRecords({})
+    there.put(KEY, FOUND)
+    back = CarriedRecords(there.made)
+    assert pack(back.get(KEY)) == WHOLE and back.made == {}
+    assert CarriedRecords({KEY: WHOLE[:-1]}).get(KEY) is None
+
+
+def old(path, text: str):
+    path.write_text(text)
+    os.utime(path, (1e9, 1e9))
+    return path
+
+
+def test_files_count_by_their_content_and_order_not_by_name_or_time(tmp_path) -> None:
+    one, same, other = (old(tmp_path / name, text) for name, text in (("a", "one"), ("b", "one"), ("c", "two")))
+    assert files_digest([one]) == files_digest([same]) != files_digest([other])
+    assert files_digest([one, other]) != files_digest([other, one])
+    with pytest.raises(InputError, match=r"gone\.png cannot be read"):
+        files_digest([tmp_path / "gone.png"])
+
+
+def test_a_file_is_read_again_only_after_a_change_and_one_just_written_is_not_remembered(tmp_path, monkeypatch) -> None:
+    path, memory = tmp_path / "a", tmp_path / "memory"
+    path.write_text("one")  # it may be written again within one tick of its time stamp
+    first = files_digest([path], memory)
+    assert not memory.exists()
+    assert files_digest([old(path, "one")], memory) == first
+    with monkeypatch.context() as blind:
+        blind.setattr(cache, "_file_digest", lambda path: pytest.fail("it was read again"))
+        assert files_digest([path], memory) == first
+    time.sleep(0.05)
+    old(path, "two")  # of the same size and with its old time
+    assert files_digest([path], memory) != first
+
+
+@pytest.mark.parametrize(
+    ("path", "changes", "leaves"),
+    [
+        ("detection/detector.py", {"motion", "location"}, {"people", "score"}),
+        ("tracking/__init__.py", {"tracking", "association", "location"}, {"people", "score"}),
+        ("evaluation/metrics/boxes.py", {"score"}, set(STAGES)),
+        ("people/detector.py", {"people"}, {"motion", "tracking", "association", "score"}),
+        ("evaluation/studies/stages.py", set(STAGES), {"score"}),
+        ("graphs/manifest.json", {*STAGES, "score"}, set()),
+        ("cli/evaluate.py", set(), {*STAGES, "score"}),
+        ("evaluation/report/__init__.py", set(), {*STAGES, "score"}),
+    ],
+)
+def test_changed_code_changes_the_digests_of_what_imports_it_and_no_others(monkeypatch, path, changes, leaves) -> None:
+    functions: dict[str, Any] = dict[str, Any](STAGES.items()) | {"score": score}
+    before = {name: code_digest.__wrapped__(function) for name, function in functions.items()}
+    real = cache._file_digest
+    assert (PACKAGE / path).is_file()
+    monkeypatch.setattr(cache, "_file_digest", lambda read: "other" if read == PACKAGE / path else real(read))
+    changed = {name for name, function in functions.items() if code_digest.__wrapped__(function) != before[name]}
+    assert changed >= changes and not changed & leaves
