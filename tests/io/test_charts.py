@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 
 from tests.pages import Page, points_inside
-from torchvision_dddas.io.report import (
+from torchvision_dddas.io.report import Column, format_number, number_cell, table, text_cell
+from torchvision_dddas.io.report.charts import (
+    MOST_POINTS,
     MOST_ROWS,
+    WIDTH,
     Axis,
-    Column,
     Dots,
     Interval,
     Line,
     chart,
-    format_number,
     interval_chart,
-    number_cell,
-    table,
-    text_cell,
 )
-from torchvision_dddas.io.report.charts import MOST_POINTS, WIDTH
 
 NAN = math.nan
 KINDS = {

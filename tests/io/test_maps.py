@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from tests.io.ground import NAMES, ORIGIN, START, positions, tracks
 from torchvision_dddas import geometry
-from torchvision_dddas.io.maps import cot, encode_geojson, geojson, kml, semi_axes
-from torchvision_dddas.io.maps.formats import UNKNOWN, xml_text
-from torchvision_dddas.io.maps.ground_tracks import CHI2_95, cut_line, ellipse_rows, ring_about, ring_m
+from torchvision_dddas.io.maps.formats import UNKNOWN, cot, encode_geojson, geojson, kml, xml_text
+from torchvision_dddas.io.maps.ground_tracks import CHI2_95, cut_line, ellipse_rows, ring_about, ring_m, semi_axes
 from torchvision_dddas.io.output import GroundRecorder
 from torchvision_dddas.types import GroundLocations, Sightings
 

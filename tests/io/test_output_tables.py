@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.output.tables import PEOPLE, TRACKS, people_tables, track_rows, track_tables
-from torchvision_dddas.io.overlay.drawing import Trails
+from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import MOT_TRACKS
 from torchvision_dddas.types import Detections, Frame, People, PeopleFrame, TrackedFrame, Tracks
 

@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.io.overlay import (
-    OverlayPicture,
-    OverlayVideo,
+    CUT,
+    PERSON,
+    SEARCHED,
+    UNLIKELY,
+    UNTRACKED,
     TrackPictures,
     draw_people,
     draw_scene,
     identity_colour,
 )
-from torchvision_dddas.io.overlay.drawing import CUT, PERSON, SEARCHED, UNLIKELY, UNTRACKED
-from torchvision_dddas.io.overlay.video import ThreadedWriter
+from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo, ThreadedWriter
 from torchvision_dddas.types import Detections, Frame, People, PeopleFrame, Scene, TrackedFrame, Tracks
 
 SIZE = (120, 90)

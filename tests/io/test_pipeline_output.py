@@ -12,8 +12,7 @@ import pytest
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.output import PROBLEM, PipelineRecorder, Site
 from torchvision_dddas.io.output.tables import landmark_table
-from torchvision_dddas.io.overlay import RunPictures
-from torchvision_dddas.io.overlay.drawing import LANDMARK
+from torchvision_dddas.io.overlay import LANDMARK, RunPictures
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

@@ -193,7 +193,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(tmp_path, scene
         def refuse(*_):
             raise full
 
-        place = {"table": "tables.mot_rows", "overlay": "overlay.video._H264.write"}[victim]
+        place = {"table": "tables.mot_rows", "overlay": "overlay_video._H264.encode"}[victim]
         monkeypatch.setattr(f"torchvision_dddas.io.{place}", refuse)
     with pytest.raises(InputError, match="No space left on device") as error:
         fill(tmp_path, [scene(1), scene(2)])

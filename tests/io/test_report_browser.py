@@ -9,8 +9,8 @@ from tests.evaluation.report.studied import HOSTILE, study
 from torchvision_dddas.evaluation.report import study_report
 from torchvision_dddas.evaluation.studies.summary import summarize
 from torchvision_dddas.io.output.run_record import finite
-from torchvision_dddas.io.report import Axis, Column, Line, chart, number_cell, table, text_cell
-from torchvision_dddas.io.report.page import environment
+from torchvision_dddas.io.report import Column, environment, number_cell, table, text_cell
+from torchvision_dddas.io.report.charts import Axis, Line, chart
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, needs_browser]
 

@@ -17,7 +17,7 @@ import numpy as np
 from torchvision_dddas.config import format_toml, read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.colours import CalibratedColours, find_overlaps, mask_range, to_hsv
-from torchvision_dddas.io.overlay.drawing import label, line_width, rectangle
+from torchvision_dddas.io.overlay import label, line_width, rectangle
 from torchvision_dddas.types import Colours
 
 HIGHEST = (180, 255, 255)

@@ -16,7 +16,7 @@ from torchvision_dddas.config import Settings, format_toml, with_parameters
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary, write_whole
 from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
-from torchvision_dddas.io.overlay import OverlayVideo
+from torchvision_dddas.io.overlay_video import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.simulation.scenario import Scenario
 from torchvision_dddas.simulation.scenario_file import load_scenario, scenario_settings, scenario_toml

@@ -11,7 +11,8 @@ import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
 from torchvision_dddas.io.images import Masks
-from torchvision_dddas.io.maps import Gathered, GroundTracks, encode_geojson, geojson
+from torchvision_dddas.io.maps.formats import encode_geojson, geojson
+from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks
 from torchvision_dddas.io.output import PipelineRecorder
 from torchvision_dddas.io.output.recorder import uninterrupted
 from torchvision_dddas.io.tables import TextFiles

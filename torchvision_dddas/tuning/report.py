@@ -9,19 +9,8 @@ from markupsafe import Markup
 
 from torchvision_dddas.evaluation.metrics.registry import describe, title_of_group
 from torchvision_dddas.evaluation.studies.comparison import MEANING, comparison_section
-from torchvision_dddas.io.report import (
-    Axis,
-    Cell,
-    Column,
-    Dots,
-    Line,
-    chart,
-    format_number,
-    number_cell,
-    render_page,
-    table,
-    text_cell,
-)
+from torchvision_dddas.io.report import Cell, Column, format_number, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
 
 SIDES = {"tuned": "Clips tuned on", "held_out": "Clips held out"}
 

@@ -18,21 +18,16 @@ from torchvision_dddas.evaluation.studies.summary import sum_costs
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.io.report import (
-    MOST_ROWS,
-    Axis,
     Cell,
     Column,
-    Dots,
-    Interval,
-    chart,
     format_count,
     format_number,
-    interval_chart,
     number_cell,
     render_page,
     table,
     text_cell,
 )
+from torchvision_dddas.io.report.charts import MOST_ROWS, Axis, Dots, Interval, chart, interval_chart
 from torchvision_dddas.io.sources import open_source
 
 MAX_STAGES = 8

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from torchvision_dddas.evaluation.metrics.boxes import precision_recall
 from torchvision_dddas.evaluation.studies.records import Case, Scored
 from torchvision_dddas.evaluation.studies.summary import rank
-from torchvision_dddas.io.report import Axis, Dots, Line, chart
+from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
 
 MOST_CLIPS = 6
 """Clips whose accuracy over the frames is drawn."""

@@ -13,18 +13,8 @@ from torchvision_dddas.evaluation.metrics.bootstrap import FEWEST, Effect, Strat
 from torchvision_dddas.evaluation.metrics.registry import GROUPS, describe, is_lower_better, title_of_group
 from torchvision_dddas.evaluation.studies.records import Scored, ScoredStudy
 from torchvision_dddas.evaluation.studies.summary import Estimate, flat, measures, over_clips, over_frames
-from torchvision_dddas.io.report import (
-    MOST_ROWS,
-    Cell,
-    Column,
-    Interval,
-    format_number,
-    interval_chart,
-    number_cell,
-    render_page,
-    table,
-    text_cell,
-)
+from torchvision_dddas.io.report import Cell, Column, format_number, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
 
 LEVEL = 0.05
 

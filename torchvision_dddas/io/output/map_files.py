@@ -10,19 +10,9 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import remove, write_whole
-from torchvision_dddas.io.maps import (
-    CameraPath,
-    Gathered,
-    GroundTracks,
-    cot,
-    encode_geojson,
-    geojson,
-    iso_utc,
-    kml,
-    map_picture,
-    semi_axes,
-    view_of,
-)
+from torchvision_dddas.io.maps.formats import cot, encode_geojson, geojson, kml
+from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
+from torchvision_dddas.io.maps.map_picture import CameraPath, map_picture, view_of
 from torchvision_dddas.io.output.run_record import RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, RunReport, location_tables
 from torchvision_dddas.io.output.run_story import RunStory

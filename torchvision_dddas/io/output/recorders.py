@@ -21,15 +21,8 @@ from torchvision_dddas.io.output.run_record import (
 )
 from torchvision_dddas.io.output.run_report import REPORT
 from torchvision_dddas.io.output.run_story import RunStory
-from torchvision_dddas.io.overlay import (
-    LIKELY,
-    OverlayPicture,
-    OverlayVideo,
-    RunPictures,
-    TrackPictures,
-    draw_people,
-    draw_scene,
-)
+from torchvision_dddas.io.overlay import LIKELY, RunPictures, TrackPictures, draw_people, draw_scene
+from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
 from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import (
     AerialLocations,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.io.atomic_files import write_whole
-from torchvision_dddas.io.maps import Signs
+from torchvision_dddas.io.maps.map_picture import Signs
 from torchvision_dddas.io.output.run_log import (
     ADJUSTED,
     LANDMARK,

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Entry
-from torchvision_dddas.io.report import Events, Line, Panel, time_chart
+from torchvision_dddas.io.report.charts import Events, Line, Panel, time_chart
 from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult
 
 _KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours

@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.io.maps import round_step
-from torchvision_dddas.io.report.page import format_number
+from torchvision_dddas.io.maps.map_picture import round_step
+from torchvision_dddas.io.report import format_number
 
 WIDTH, HEIGHT = 420, 300
 MOST_POINTS = 400

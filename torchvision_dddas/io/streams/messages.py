@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.io.maps import STALE_S, event, event_uid, iso_utc, semi_axes
+from torchvision_dddas.io.maps.formats import STALE_S, event, event_uid
+from torchvision_dddas.io.maps.ground_tracks import iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
 from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
 from torchvision_dddas.types import FrameResult, TrackedFrame
