@@ -12,12 +12,7 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.control.footprint import CameraMount, ground_in_middle, inside, update_mount
 from torchvision_dddas.control.ground_confirmation import GroundConfirmation
 from torchvision_dddas.control.prediction import Prediction, TargetPredictor
-from torchvision_dddas.control.rules import (
-    AdjustmentLog,
-    every_least,
-    every_wanted,
-    sampled,
-)
+from torchvision_dddas.control.rules import AdjustmentLog, every_least, every_wanted, sampled
 from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
 from torchvision_dddas.control.uav_commands import UavSteering
 from torchvision_dddas.control.ugv_commands import UgvTeam
@@ -121,16 +116,23 @@ def build_mission(source: Instrument, settings: Settings, backend: str, by_landm
     Raises InputError where the reports are not sufficient.
     """
     settings = fit_settings(settings, source)
-    site = _first_site(source)
-    site = replace(site, elevation=_local_elevation(source, site), sun_rad=source.sun_rad)
+    landmarks, telemetry, elevation = source.landmarks(), source.telemetry(), source.elevation
+    if np.isfinite(landmarks.place).all(axis=1).any():
+        site = build_site(landmarks, telemetry)
+    else:  # about the source's own origin while no ground vehicle has reported
+        origin = source.origin_deg
+        site = Site(to_local(landmarks, origin), to_local(telemetry, origin), origin)
+    if site.origin_deg is not None:
+        elevation = shift_origin(elevation, -geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
+    site = replace(site, elevation=elevation, sun_rad=source.sun_rad)
     locator = AerialLocator.from_site(site, source.camera, settings, load_solver(backend), source.rate_hz, True)
     colours = source.colours if by_landmarks and len(source.colours) else None
     watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
-    confirmation = None
+    confirmation, steering = None, None
     if len(source.colours):
         confirmation = GroundConfirmation(settings, load_scorer(settings.people, backend))
-    steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names) if settings.steering.on else None
-    if steering is not None:
+    if settings.steering.on:
+        steering = Steering(settings, source.camera, source.rate_hz, site.landmarks.names)
         source.steer(steering.begin(locator.telemetry_at(0.0)))
     return Mission(source, watch, settings, confirmation, steering)
 
@@ -171,7 +173,11 @@ class Mission:
         locator.set_site(replace(locator.site, landmarks=landmarks, telemetry=telemetry))
         self._monitor.check_reports(self.source.last, landmarks, telemetry)
         if frame.image.any():  # an all-black picture stands for a missing one
-            self._monitor.check_picture(frame, scene.step, self._metres_per_px(frame.time_s))
+            flight, metres_per_px = locator.telemetry_at(frame.time_s), float("nan")
+            if flight is not None:  # on level ground in the middle of the picture
+                down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
+                metres_per_px = float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
+            self._monitor.check_picture(frame, scene.step, metres_per_px)
         if self._confirmation is not None:
             self._confirmation.take(self.source.pictures())
 
@@ -184,67 +190,39 @@ class Mission:
 
         step: how the background moved up to the frame.
         """
-        grounded = result.locations
-        if grounded is None:
+        located = result.locations
+        if located is None:
             return result
-        seconds, locator = dict(grounded.seconds), self.watch.locator
-        confirmed = None
+        seconds, locator, adjustments = dict(located.seconds), self.watch.locator, located.adjustments
+        confirmed, command = None, None
         if self._confirmation is not None:
-            radius = np.nan_to_num(locator.ground_radii(grounded.fix, grounded.box_px[grounded.row]))
-            confirmed = self._confirmation.confirm(grounded, radius)
-            seconds["people"] = self._confirmation.spent_s
-        command = None
-        adjustments = grounded.adjustments
+            start = time.perf_counter()
+            radius = np.nan_to_num(locator.ground_radii(located.fix, located.box_px[located.row]))
+            confirmed = self._confirmation.confirm(located, radius)
+            seconds["people"] = time.perf_counter() - start
         if self._steering is not None:
             start = time.perf_counter()
             now = self.source.last
             now_s = (now - 1) / self.source.rate_hz
             marks, flight = locator.landmarks_at(now), locator.telemetry_at(now_s)
-            local, made = self._steering.update(grounded, confirmed, now_s, marks, flight, step)
-            command = self._in_degrees(local)
+            command, made = self._steering.update(located, confirmed, now_s, marks, flight, step)
+            command = self._in_degrees(command)
             self.source.steer(command)
             adjustments = (*adjustments, *made)
             seconds["steer"] = time.perf_counter() - start
-        grounded = replace(grounded, adjustments=adjustments, seconds=seconds)
-        return replace(result, locations=grounded, confirmed=confirmed, command=command)
-
-    def _metres_per_px(self, time_s: float) -> float:
-        """On level ground in the middle of the picture; NaN without telemetry."""
-        flight = self.watch.locator.telemetry_at(time_s)
-        if flight is None:
-            return float("nan")
-        down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
-        return float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
+        located = replace(located, adjustments=adjustments, seconds=seconds)
+        return replace(result, locations=located, confirmed=confirmed, command=command)
 
     def _in_degrees(self, command: Command) -> Command:
-        if self._origin is None:
-            return command
         origin = self._origin
+        if origin is None:
+            return command
 
-        def lonlat(place: np.ndarray | None) -> np.ndarray | None:
+        def lonlat(place: Any) -> Any:
             return None if place is None else geometry.lonlat(np.asarray(place, float)[None], origin)[0]
 
-        orders = tuple(
-            replace(order, goal=geometry.lonlat(order.goal[None], origin)[0], look_at=lonlat(order.look_at))
-            for order in command.orders
-        )
+        orders = tuple(replace(o, goal=lonlat(o.goal), look_at=lonlat(o.look_at)) for o in command.orders)
         return replace(command, fly_to=lonlat(command.fly_to), look_at=lonlat(command.look_at), orders=orders)
-
-
-def _first_site(source: Instrument) -> Site:
-    """The reports so far, about the first of them; about the source's own origin while no ground vehicle has any."""
-    landmarks, telemetry = source.landmarks(), source.telemetry()
-    if np.isfinite(landmarks.place).all(axis=1).any():
-        return build_site(landmarks, telemetry)
-    origin = source.origin_deg
-    return Site(to_local(landmarks, origin), to_local(telemetry, origin), origin)
-
-
-def _local_elevation(source: Instrument, site: Site) -> Elevation:
-    if site.origin_deg is None:
-        return source.elevation
-    origin_m = geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0]
-    return shift_origin(source.elevation, -origin_m)
 
 
 class Steering:
@@ -254,7 +232,7 @@ class Steering:
         """camera: of the aerial vehicle. vehicles: names of the ground vehicles, as the landmarks have them."""
         self.settings, self.camera, self.rate_hz = settings, camera, rate_hz
         self._predictor, self._log = TargetPredictor(camera), AdjustmentLog()
-        self._uav, self._team = UavSteering(settings), UgvTeam(settings, vehicles)
+        self._uav, self._team = UavSteering(settings, self._log), UgvTeam(settings, vehicles, self._log)
         self._mount: CameraMount | None = None
         self._command, self._steered_s = Command(), -np.inf
         self._every, self._every_changed_s, self._last_frame = 1, -np.inf, 0
@@ -263,14 +241,14 @@ class Steering:
     def begin(self, flight: Flight | None) -> Command:
         """The command before anything is found: process as many frames as show a walker at this altitude."""
         parameters = self.settings.steering
-        if parameters.on and parameters.sampling and flight is not None and flight.altitude_m > 0:
+        if parameters.sampling and flight is not None and flight.altitude_m > 0:
             self._every = int(np.clip(round(self._least_every(flight)), 1, parameters.maximum_every))
         self._command = Command(self._every)
         return self._command
 
     def update(
         self,
-        grounded: AerialLocations,
+        located: AerialLocations,
         confirmed: Confirmation | None,
         now_s: float,
         marks: LandmarkObservations,
@@ -279,35 +257,32 @@ class Steering:
     ) -> tuple[Command, tuple[Adjustment, ...]]:
         """The command after a frame was located, its places in local metres, and what of it is new with its causes.
 
-        confirmed: row = that of grounded.positions. now_s: of the newest frame read; the located one is older. marks,
+        confirmed: row = that of located.positions. now_s: of the newest frame read; the located one is older. marks,
         flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
         while silent. step: how the background moved up to the located frame.
         """
         parameters = self.settings.steering
-        if not parameters.on:
-            return Command(), ()
-        self._log.begin(grounded.frame)
-        now_s = max(now_s, grounded.time_s)
-        prediction = self._predictor.update(grounded, confirmed, now_s)
-        self._mount = update_mount(flight, grounded.fix, self._mount, self.camera)
+        self._log.begin(located.frame)
+        now_s = max(now_s, located.time_s)
+        prediction = self._predictor.update(located, confirmed, now_s)
+        mount = self._mount = update_mount(flight, located.fix, self._mount, self.camera)
         if parameters.sampling:
-            self._choose_frames(grounded, prediction, now_s, flight, step)
+            self._choose_frames(located, prediction, now_s, flight, step)
         if now_s - self._steered_s < _PERIOD_S - 1e-6:
             repeated = tuple(replace(order, picture=False) for order in self._command.orders)
             self._command = replace(self._command, every=self._every, orders=repeated)
             return self._command, self._log.made()
         self._steered_s = now_s
-        team_m = self._team.hear(marks, now_s, self._log)
+        team_m = self._team.hear(marks, now_s)
         if parameters.follow:
-            middle = ground_in_middle(flight, grounded.fix, self._mount) if self._mount is not None else None
-            self._uav.update(prediction, team_m, self._mount, middle, now_s, self._log)
+            middle = ground_in_middle(flight, located.fix, mount) if mount is not None else None
+            self._uav.update(prediction, team_m, mount, middle, now_s)
         look_at, altitude_m = self._uav.look_at, self._uav.altitude_m
-        mount = self._mount
         if mount is not None and altitude_m is not None:
             mount = replace(mount, altitude_m=altitude_m)
         orders: tuple[Order, ...] = ()
         if parameters.look:
-            orders = self._team.orders(prediction, self._uav.followed(prediction), mount, now_s, self._log)
+            orders = self._team.orders(prediction, self._uav.followed(prediction), mount, now_s)
         fly_to = None
         if look_at is not None and mount is not None:
             fly_to = mount.pose(look_at, mount.altitude_m).place_m[:2]
@@ -320,18 +295,18 @@ class Steering:
 
     def _choose_frames(
         self,
-        grounded: AerialLocations,
+        located: AerialLocations,
         prediction: Prediction,
         now_s: float,
         flight: Flight | None,
         step: Registration | None,
     ) -> None:
         """Of how many frames one is processed."""
-        frame, parameters, interval = grounded.frame, self.settings.steering, self.settings.interval
+        frame, parameters, interval = located.frame, self.settings.steering, self.settings.interval
         between, self._last_frame = max(frame - self._last_frame, 1), frame
         lost = np.flatnonzero(prediction.wanted & (prediction.missed == _MISSED))
-        if grounded.fix.pose is not None and len(lost):  # a target that left the picture is not lost
-            lost = lost[inside(prediction.east_north_m[lost], grounded.fix.pose, self.camera) > 0]
+        if located.fix.pose is not None and len(lost):  # a target that left the picture is not lost
+            lost = lost[inside(prediction.east_north_m[lost], located.fix.pose, self.camera) > 0]
         if len(lost):
             self._alert_s, self._alert = now_s + _ALERT_S, f"target {prediction.target[lost[0]]} was lost"
         elif step is not None and (not step.reliable or step.inliers < _WEAK * step.tracked):

@@ -26,12 +26,6 @@ class CameraMount:
         """The sine of how far it looks below the horizon."""
         return float(-self.axes[2, 2])
 
-    @property
-    def ahead(self) -> np.ndarray:
-        """(2,) unit vector over the ground: where the picture's upper edge is."""
-        ahead = -self.axes[:2, 1] if self.down > _DOWN else self.axes[:2, 2]
-        return ahead / np.linalg.norm(ahead)
-
     def pose(self, look_at_m: np.ndarray, altitude_m: float) -> CameraPose:
         """Where it is when it has a place (2,) in the middle of its picture, looking in the same direction."""
         place = np.array([*look_at_m, 0.0]) - self.axes[:, 2] * altitude_m / self.down
@@ -47,7 +41,9 @@ class CameraMount:
 
     def centre(self, points_m: np.ndarray, altitude_m: float) -> tuple[np.ndarray, float]:
         """The place (2,) to look at so that places (N, 2) are as far within the picture as can be, and how far."""
-        ahead = self.ahead
+        # Over the ground to the picture's upper edge.
+        ahead = -self.axes[:2, 1] if self.down > _DOWN else self.axes[:2, 2]
+        ahead = ahead / np.linalg.norm(ahead)
         turn = np.stack([[ahead[1], -ahead[0]], ahead])  # to the right, and ahead
         along = np.asarray(points_m, float) @ turn.T
         low, high = along.min(axis=0), along.max(axis=0)
@@ -88,19 +84,13 @@ def update_mount(flight: Flight | None, fix: Fix, before: CameraMount | None, ca
     if before is None and np.sin(pitch) < _LEVEL:
         return None
     if before is not None or np.sin(pitch) > _DOWN:
-        upper = _upper_edge(flight, fix)
-        if upper is not None:
-            heading = upper
-        pitch = np.pi / 2
+        # Near straight down the heading of the picture's upper edge is not that of where the camera looks.
+        pitch, axes = np.pi / 2, None if fix.pose is None else fix.pose.axes
+        if flight is not None and np.isfinite([flight.heading_rad, flight.pitch_rad, flight.roll_rad]).all():
+            axes = axes_of(flight.heading_rad, flight.pitch_rad, flight.roll_rad)
+        if axes is not None:
+            heading = float(np.arctan2(-axes[0, 1], -axes[1, 1]))
     return CameraMount(altitude, axes_of(heading, pitch, 0.0), camera)
-
-
-def _upper_edge(flight: Flight | None, fix: Fix) -> float | None:
-    """The heading of the picture's upper edge: near straight down it is not that of where the camera looks."""
-    axes = None if fix.pose is None else fix.pose.axes
-    if flight is not None and np.isfinite([flight.heading_rad, flight.pitch_rad, flight.roll_rad]).all():
-        axes = axes_of(flight.heading_rad, flight.pitch_rad, flight.roll_rad)
-    return None if axes is None else float(np.arctan2(-axes[0, 1], -axes[1, 1]))
 
 
 def ground_in_middle(flight: Flight | None, fix: Fix, mount: CameraMount) -> np.ndarray | None:

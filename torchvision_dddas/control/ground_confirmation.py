@@ -1,7 +1,6 @@
 """Pictures from ground vehicles: people found in them confirm which of the aerial camera's targets are human."""
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,83 +14,6 @@ from torchvision_dddas.types import AerialLocations, Camera, Confirmation, Groun
 
 # Nobody runs faster.
 _RUNNING_M_S = 4.0
-
-
-def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
-    """The look without the people at targets faster than people, (N, 2): they stand beside its way."""
-    fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
-    return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
-
-
-class GroundConfirmation:
-    """What is believed of each target, as pictures from the ground come in."""
-
-    def __init__(self, settings: Settings, recognizer: WindowScorer) -> None:
-        self._settings, self._recognizer = settings, recognizer
-        self._beliefs = Beliefs(settings.confirm)
-        self._waiting: list[GroundPicture] = []
-        self.pictures = 0
-        self.spent_s = 0.0
-
-    def take(self, pictures: list[GroundPicture]) -> None:
-        """Pictures of the frames to come, as targets are located some frames later."""
-        self._waiting += pictures
-
-    def confirm(self, grounded: AerialLocations, extent_m: np.ndarray) -> Confirmation:
-        """The confirmation of the targets of a frame, by the pictures taken at it and before.
-
-        extent_m: (P,) radius of each located target: its people mount about its middle.
-        """
-        here = [picture for picture in self._waiting if picture.frame <= grounded.frame]
-        self._waiting = [picture for picture in self._waiting if picture.frame > grounded.frame]
-        start = time.perf_counter()
-        positions = grounded.positions
-        looks = [(p.vehicle, self._look(p, grounded, extent_m)) for p in here if p.frame == grounded.frame]
-        targets = positions.target.tolist()
-        self._beliefs.add(targets, looks)
-        self.pictures += len(looks)
-        self.spent_s = time.perf_counter() - start
-        return summarize(grounded.frame, slice(0, len(targets)), targets, self._beliefs, looks)
-
-    def _look(self, picture: GroundPicture, grounded: AerialLocations, extent_m: np.ndarray) -> GroundObservation:
-        settings, camera, positions = self._settings, picture.camera, grounded.positions
-        place = np.array([camera.place], float)
-        if positions.origin_deg is not None:
-            place = geometry.east_north(place, positions.origin_deg)
-        # What is known from the air tells where to look, and how large people are there.
-        regions = expected_regions(
-            positions.east_north_m,
-            positions.covariance_m2,
-            extent_m,
-            camera,
-            place[0],
-            camera.heading_rad,
-            settings.ground,
-        )
-        (people,) = detect_people([picture.image], self._recognizer, settings.people, [regions])
-        rows = np.zeros(len(people), np.int64)
-        poses = Poses(
-            np.array([camera.place], float)[rows],
-            np.full(len(people), camera.heading_rad),
-            np.full(len(people), camera.pitch_rad),
-        )
-        seen = range_people(people.box_px, people.cut, camera, poses, place[rows], settings.ground)
-        known = seen.by != "bearing"
-        view = field_of_view(camera, place[0], camera.heading_rad, settings.people, settings.ground)
-        # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
-        spread = positions.covariance_m2 + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
-        found = observe_ground(
-            positions.east_north_m,
-            spread,
-            seen.east_north_m[known],
-            seen.covariance_m2[known],
-            people.score[known],
-            [view],
-            settings.confirm,
-        )
-        return drop_fast_targets(found, grounded.velocity_m_s)
-
-
 # Bounds of body heights and of the camera's heading, in standard deviations.
 _SIGMAS = 2.0
 # Targets are within one of where they are said to be: most of it is that of the middle within the outline, and the
@@ -101,6 +23,58 @@ _MARGIN_M = 0.5
 _SLOPE_RAD = math.radians(5)
 # Half the width of a body's box over its height: a region holds whole boxes.
 _HALF_WIDE = 0.17
+
+
+class GroundConfirmation:
+    """What is believed of each target, as pictures from the ground come in."""
+
+    def __init__(self, settings: Settings, scorer: WindowScorer) -> None:
+        self._settings, self._scorer = settings, scorer
+        self._beliefs = Beliefs(settings.confirm)
+        self._waiting: list[GroundPicture] = []
+
+    def take(self, pictures: list[GroundPicture]) -> None:
+        """Pictures of the frames to come, as targets are located some frames later."""
+        self._waiting += pictures
+
+    def confirm(self, located: AerialLocations, extent_m: np.ndarray) -> Confirmation:
+        """The confirmation of the targets of a frame, by the pictures taken at it and before.
+
+        extent_m: (P,) radius of each located target: its people mount about its middle.
+        """
+        looks = [(p.vehicle, self._look(p, located, extent_m)) for p in self._waiting if p.frame == located.frame]
+        self._waiting = [picture for picture in self._waiting if picture.frame > located.frame]
+        targets = located.positions.target.tolist()
+        self._beliefs.add(targets, looks)
+        return summarize(located.frame, slice(0, len(targets)), targets, self._beliefs, looks)
+
+    def _look(self, picture: GroundPicture, located: AerialLocations, extent_m: np.ndarray) -> GroundObservation:
+        settings, camera, positions = self._settings, picture.camera, located.positions
+        target_m, covariance, heading = positions.east_north_m, positions.covariance_m2, camera.heading_rad
+        place = np.array([camera.place], float)
+        if positions.origin_deg is not None:
+            place = geometry.east_north(place, positions.origin_deg)
+        # What is known from the air tells where to look, and how large people are there.
+        regions = expected_regions(target_m, covariance, extent_m, camera, place[0], heading, settings.ground)
+        (people,) = detect_people([picture.image], self._scorer, settings.people, [regions])
+        n = len(people)
+        here = np.repeat(place, n, axis=0)
+        poses = Poses(here, np.full(n, heading), np.full(n, camera.pitch_rad))
+        seen = range_people(people.box_px, people.cut, camera, poses, here, settings.ground)
+        known = seen.by != "bearing"
+        view = field_of_view(camera, place[0], heading, settings.people, settings.ground)
+        # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
+        spread = covariance + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
+        person_m, person_m2 = seen.east_north_m[known], seen.covariance_m2[known]
+        scores = people.score[known]
+        found = observe_ground(target_m, spread, person_m, person_m2, scores, [view], settings.confirm)
+        return drop_fast_targets(found, located.velocity_m_s)
+
+
+def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
+    """The look without the people at targets faster than people, (N, 2): they stand beside its way."""
+    fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
+    return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
 
 
 def expected_regions(
@@ -124,6 +98,7 @@ def expected_regions(
     tall = parameters.body_height_m + _SIGMAS * parameters.body_height_sigma_m * np.array([-1.0, 1.0])
     eye = camera.height_m if math.isfinite(camera.height_m) else float(tall[1])
     nearest_m = focal_v * tall[0] / camera.size_px[1]  # nobody is whole in the picture from nearer
+    horizon = middle_v - focal_v * math.tan(camera.pitch_rad)
     for apart, reach in zip(place_m - camera_m, radius_m + unsure + _MARGIN_M, strict=True):
         away = float(np.hypot(*apart))
         if away < nearest_m:
@@ -139,7 +114,6 @@ def expected_regions(
         near = max((away - reach) * math.cos(max(abs(low), abs(high))), nearest_m)
         if far <= near:
             continue
-        horizon = middle_v - focal_v * math.tan(camera.pitch_rad)
         # A head above the eye's height is highest when near, one below it when far.
         top = horizon - focal_v * (_SLOPE_RAD + max((tall[1] - eye) / near, 0.0))
         bottom = horizon + focal_v * (_SLOPE_RAD + eye / near)

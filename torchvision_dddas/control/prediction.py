@@ -1,6 +1,6 @@
-"""What is known of the targets, predicted for now: what steers must not wait until the frame on its way is settled."""
+"""The targets predicted for now: what steers must not wait until the frame on its way is settled."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,16 +33,16 @@ class Prediction:
     steady: (N,) bool, its velocity is known.
     """
 
-    target: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
-    velocity_m_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
-    radius_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    probability: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    unseen: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-    wanted: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
-    lost_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    missed: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    steady: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    target: np.ndarray
+    east_north_m: np.ndarray
+    velocity_m_s: np.ndarray
+    radius_m: np.ndarray
+    probability: np.ndarray
+    unseen: np.ndarray
+    wanted: np.ndarray
+    lost_s: np.ndarray
+    missed: np.ndarray
+    steady: np.ndarray
 
     def __len__(self) -> int:
         return len(self.target)
@@ -54,8 +54,8 @@ class Prediction:
 
 
 @dataclass
-class _Remembered:
-    """A target as it was last located."""
+class _Target:
+    """A target as it was last located. human: it is or may be."""
 
     place_m: np.ndarray
     velocity_m_s: np.ndarray
@@ -66,32 +66,29 @@ class _Remembered:
     missed: int = 0
     probability: float = 0.5
     unseen: bool = True
-    human: bool = True  # or may be
+    human: bool = True
     fast: bool = False
     steady: bool = False
 
     def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
-        """Take over a new location."""
         predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
         off = place_m - predicted
         self.place_m = predicted + (_BELIEVED * off if np.linalg.norm(off) < _FAR_M else off)
         if np.isfinite(velocity_m_s).all():
-            self.velocity_m_s = self.velocity_m_s + (_BELIEVED if self.steady else 1.0) * (
-                velocity_m_s - self.velocity_m_s
-            )
+            gain = _BELIEVED if self.steady else 1.0
+            self.velocity_m_s = self.velocity_m_s + gain * (velocity_m_s - self.velocity_m_s)
             self.steady = True
         self.radius_m += _BELIEVED * (radius_m - self.radius_m)
         self.seen_s, self.missed, self.sightings = time_s, 0, self.sightings + 1
         self.fast = bool(np.linalg.norm(self.velocity_m_s) > (_WALKING_M_S if self.fast else _RUNNING_M_S))
 
     @property
-    def lasting(self) -> bool:
-        """Whether it was located often and long enough to be established."""
+    def established(self) -> bool:
+        """Whether it was located often and long enough."""
         return self.sightings >= _SIGHTINGS and self.seen_s - self.first_s >= _LASTING_S - 1e-6
 
     @property
     def wanted(self) -> bool:
-        """Whether it is or may be human."""
         return self.human and (not self.fast or (not self.unseen and self.probability >= _SURE))
 
 
@@ -100,72 +97,63 @@ class TargetPredictor:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._known: dict[int, _Remembered] = {}
+        self._known: dict[int, _Target] = {}
 
-    def update(self, grounded: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Prediction:
+    def update(self, located: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Prediction:
         """The targets as expected at now_s, after a frame was located; confirmed: row = that of its positions."""
-        radii = radii_m(grounded, self.camera)
-        targets = grounded.positions.target.tolist()
-        for row, target in enumerate(targets):
-            place, velocity = grounded.positions.east_north_m[row], grounded.velocity_m_s[row]
+        time_s, targets = located.time_s, located.positions.target.tolist()
+        for row, radius in enumerate(self._radii_m(located).tolist()):
+            place = located.positions.east_north_m[row]
             if np.isfinite(place).all():
-                when, radius = grounded.time_s, float(radii[row])
-                known = self._known.setdefault(target, _Remembered(place, np.zeros(2), radius, when, when))
-                known.update(place, velocity, radius, when)
+                known = self._known.setdefault(targets[row], _Target(place, np.zeros(2), radius, time_s, time_s))
+                known.update(place, located.velocity_m_s[row], radius, time_s)
         if confirmed is not None:
             for row, kind, probability in zip(confirmed.row, confirmed.kind, confirmed.probability, strict=True):
                 if 0 <= row < len(targets) and targets[row] in self._known:
-                    _judge(self._known[targets[row]], kind, float(probability))
-        self._forget(set(targets), grounded.time_s)
-        return self._expected(now_s, grounded.time_s)
+                    known = self._known[targets[row]]
+                    known.probability, known.unseen = float(probability), kind == "unseen"
+                    if kind == "not_human" and probability <= _GIVEN_UP:
+                        known.human = False
+                    elif kind != "not_human" or probability >= _TAKEN_UP:
+                        known.human = True
+        self._forget(set(targets), time_s)
+        rows = {target: known for target, known in self._known.items() if known.established}
+
+        def column(name: str, kind: type = float) -> np.ndarray:
+            return np.array([getattr(known, name) for known in rows.values()], kind)
+
+        place, velocity = (column(name).reshape(-1, 2) for name in ("place_m", "velocity_m_s"))
+        ahead_s = np.clip(now_s - column("seen_s"), 0, _HORIZON_S)
+        return Prediction(
+            np.array(list(rows), np.int64),
+            place + velocity * ahead_s[:, None],
+            velocity,
+            column("radius_m"),
+            column("probability"),
+            column("unseen", bool),
+            column("wanted", bool),
+            time_s - column("seen_s"),
+            column("missed", np.int64),
+            column("steady", bool),
+        )
 
     def _forget(self, seen: set[int], time_s: float) -> None:
         here = np.array([known.place_m for target, known in self._known.items() if target in seen]).reshape(-1, 2)
-        for target, known in list(self._known.items()):
-            if target in seen:
-                continue
+        for target in self._known.keys() - seen:
+            known = self._known[target]
             known.missed += 1
             gone_s = time_s - known.seen_s
             place = known.place_m + known.velocity_m_s * min(gone_s, _HORIZON_S)
             renamed = len(here) and np.linalg.norm(here - place, axis=1).min() < _RENAMED_M + known.radius_m
-            if gone_s > _KEPT_S or renamed or (not known.lasting and known.missed > 2):
+            if gone_s > _KEPT_S or renamed or (not known.established and known.missed > 2):
                 del self._known[target]
 
-    def _expected(self, now_s: float, time_s: float) -> Prediction:
-        rows = {target: known for target, known in self._known.items() if known.lasting}
-        if not rows:
-            return Prediction()
-        all_of = list(rows.values())
-        ahead_s = np.clip([now_s - known.seen_s for known in all_of], 0, _HORIZON_S)
-        velocity = np.array([known.velocity_m_s for known in all_of])
-        return Prediction(
-            np.array(list(rows), np.int64),
-            np.array([known.place_m for known in all_of]) + velocity * ahead_s[:, None],
-            velocity,
-            np.array([known.radius_m for known in all_of]),
-            np.array([known.probability for known in all_of]),
-            np.array([known.unseen for known in all_of]),
-            np.array([known.wanted for known in all_of]),
-            np.array([time_s - known.seen_s for known in all_of]),
-            np.array([known.missed for known in all_of], np.int64),
-            np.array([known.steady for known in all_of]),
-        )
-
-
-def _judge(known: _Remembered, kind: str, probability: float) -> None:
-    known.probability, known.unseen = probability, kind == "unseen"
-    if kind == "not_human" and probability <= _GIVEN_UP:
-        known.human = False
-    elif kind != "not_human" or probability >= _TAKEN_UP:
-        known.human = True
-
-
-def radii_m(grounded: AerialLocations, camera: Camera) -> np.ndarray:
-    """(P,) half the mean side of each located target's box, over the ground."""
-    boxes = grounded.box_px[grounded.row] if len(grounded.box_px) else np.zeros((len(grounded.positions), 4))
-    if grounded.fix.pose is None:
-        return np.full(len(boxes), _RADIUS_M)
-    pose, places = grounded.fix.pose, grounded.positions.east_north_m
-    depth = (np.c_[places, np.zeros(len(places))] - pose.place_m) @ pose.axes[:, 2]
-    half_px = boxes[:, 2:].mean(axis=1) / 2
-    return half_px * np.maximum(depth, 1.0) / (pose.focal * float(np.mean(camera.focal_px)))
+    def _radii_m(self, located: AerialLocations) -> np.ndarray:
+        """(P,) half the mean side of each located target's box, over the ground."""
+        pose, places = located.fix.pose, located.positions.east_north_m
+        if pose is None:
+            return np.full(len(places), _RADIUS_M)
+        boxes = located.box_px[located.row] if len(located.box_px) else np.zeros((len(places), 4))
+        depth = (np.c_[places, np.zeros(len(places))] - pose.place_m) @ pose.axes[:, 2]
+        scale = pose.focal * float(np.mean(self.camera.focal_px))
+        return boxes[:, 2:].mean(axis=1) / 2 * np.maximum(depth, 1.0) / scale

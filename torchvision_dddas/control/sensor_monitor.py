@@ -8,14 +8,14 @@ import numpy as np
 from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 
 # A vehicle without reports for this time is silent, if reports came faster before.
-SILENT_S = 2.0
+_SILENT_S = 2.0
 # For rare reports, silence is this many times the usual time between them.
 _SLOWER = 3.0
 # A report further from the last one than the vehicle could have driven, by this much, is a leap.
 _LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
-# A change of the ground's velocity in the picture's middle above this is a jerk, as by a gust.
-_JERK_M_S = 4.0
-_USUAL_S = 2.0
+# A change of the ground's velocity in the picture's middle above this, against the median of the second time, is a
+# jerk, as by a gust.
+_JERK_M_S, _USUAL_S = 4.0, 2.0
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Notice:
 
 
 class SensorMonitor:
-    """Holds what comes in against what came before. Ask it once a scene."""
+    """Compares what comes in with what came before. Ask it once a scene."""
 
     def __init__(self, names: tuple[str, ...], rate_hz: float) -> None:
         """names: of the ground vehicles. rate_hz: frames a second."""
@@ -39,7 +39,6 @@ class SensorMonitor:
         self._jerked_s = -math.inf
         self._silent: dict[str, float] = {}
         self._last: dict[int, tuple[float, np.ndarray]] = {}
-        self._looked: tuple[float, bool] | None = None
         self._notices: list[Notice] = []
 
     def notices(self) -> list[Notice]:
@@ -49,23 +48,20 @@ class SensorMonitor:
 
     def check_reports(self, now: int, landmarks: Landmarks, telemetry: Telemetry) -> None:
         """What all vehicles said until frame `now`; places in local metres."""
+        placed = np.isfinite(landmarks.place).all(axis=1)
         for which, name in enumerate(self._names):
-            rows = np.flatnonzero((landmarks.landmark == which) & ~landmarks.planned & (landmarks.frame <= now))
-            rows = rows[np.isfinite(landmarks.place[rows]).all(axis=1)]
+            own = landmarks.landmark == which
+            rows = np.flatnonzero(own & ~landmarks.planned & (landmarks.frame <= now) & placed)
             when_s = (landmarks.frame[rows] - 1) / self._rate_hz
-            ahead = bool(((landmarks.landmark == which) & landmarks.planned & (landmarks.frame > now)).any())
-            what = "its plan stands in for it" if ahead else "nothing stands in for it"
-            self._heard(now, name, when_s, f"{name} reports no place", what, f"{name} reports its place again")
-            self._leaps(which, now, when_s, landmarks.place[rows], landmarks.sigma_m[rows])
-        said = telemetry.time_s[np.isfinite(telemetry.place).all(axis=1)]
-        self._heard(
-            now,
-            "uav",
-            said,
-            "the UAV says nothing of itself",
-            "landmarks alone tell its place",
-            "the UAV reports again",
-        )
+            ahead = (own & landmarks.planned & (landmarks.frame > now)).any()
+            bridge = "its plan stands in for it" if ahead else "nothing stands in for it"
+            self._check_silence(
+                now, name, when_s, f"{name} reports no place", bridge, f"{name} reports its place again"
+            )
+            self._check_leaps(which, now, when_s, landmarks.place[rows], landmarks.sigma_m[rows])
+        when_s = telemetry.time_s[np.isfinite(telemetry.place).all(axis=1)]
+        silent, bridge = "the UAV says nothing of itself", "landmarks alone tell its place"
+        self._check_silence(now, "uav", when_s, silent, bridge, "the UAV reports again")
 
     def check_picture(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
         """The next picture that was read. step: how the ground moved in it since the one before.
@@ -78,15 +74,14 @@ class SensorMonitor:
             self._repeated += 1
             if self._repeated == 1:
                 self._say(frame.number, "the picture repeats the one before: the camera is frozen")
-            return
-        if self._repeated:
+        elif self._repeated:
             count = f"{self._repeated} picture{'s' if self._repeated > 1 else ''}"
             self._say(frame.number, f"the camera sees again: {count} repeated the one before")
-            self._repeated = 0
-            return  # what moved meanwhile came at once
-        self._moved(frame, step, metres_per_px)
+            self._repeated = 0  # what moved meanwhile came at once
+        elif step is not None and step.reliable and math.isfinite(metres_per_px):
+            self._check_jerk(frame, step, metres_per_px)
 
-    def _heard(self, now: int, who: str, when_s: np.ndarray, silent: str, bridge: str, back: str) -> None:
+    def _check_silence(self, now: int, who: str, when_s: np.ndarray, silent: str, bridge: str, back: str) -> None:
         """Who was silent for long, or is heard again. when_s: times of all its reports."""
         now_s = (now - 1) / self._rate_hz
         last_s = float(when_s[-1]) if len(when_s) else 0.0
@@ -94,30 +89,23 @@ class SensorMonitor:
         if who in self._silent:
             if last_s > self._silent[who]:
                 self._say(now, f"{back}, after {last_s - self._silent.pop(who):.1f} s")
-        elif now_s - last_s > max(SILENT_S, _SLOWER * usual_s):
+        elif now_s - last_s > max(_SILENT_S, _SLOWER * usual_s):
             self._silent[who] = last_s
             self._say(now, f"{silent} for {now_s - last_s:.1f} s: {bridge}")
 
-    def _leaps(self, which: int, now: int, when_s: np.ndarray, place_m: np.ndarray, sigma_m: np.ndarray) -> None:
+    def _check_leaps(self, which: int, now: int, when_s: np.ndarray, place_m: np.ndarray, sigma_m: np.ndarray) -> None:
         """Reports that are further from the one before than the vehicle can have driven."""
-        before = self._last.get(which)
         for time_s, place, sigma in zip(when_s.tolist(), place_m, np.nan_to_num(sigma_m).tolist(), strict=True):
-            if before is not None:
-                if time_s <= before[0]:
-                    continue
-                away = float(np.linalg.norm(place - before[1]))
-                if away > _LEAP_M + _LEAP_SIGMAS * sigma + _FASTEST_M_S * (time_s - before[0]):
-                    self._say(
-                        now, f"{self._names[which]}'s reports leap by {away:.1f} m within {time_s - before[0]:.1f} s"
-                    )
-            before = (time_s, place)
-        if before is not None:
-            self._last[which] = before
+            before_s, before = self._last.get(which, (-math.inf, place))
+            if time_s <= before_s:
+                continue
+            away, lapse_s = float(np.linalg.norm(place - before)), time_s - before_s
+            if away > _LEAP_M + _LEAP_SIGMAS * sigma + _FASTEST_M_S * lapse_s:
+                self._say(now, f"{self._names[which]}'s reports leap by {away:.1f} m within {lapse_s:.1f} s")
+            self._last[which] = time_s, place
 
-    def _moved(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
-        """Jerks: the picture's middle moves in another way than it did for a while."""
-        if step is None or not step.reliable or not math.isfinite(metres_per_px):
-            return
+    def _check_jerk(self, frame: Frame, step: Registration, metres_per_px: float) -> None:
+        """Whether the picture's middle moves in another way than it did for a while."""
         middle = np.array([(frame.image.shape[1] - 1) / 2, (frame.image.shape[0] - 1) / 2, 1.0])
         moved = step.later_from_earlier @ middle
         speed = (moved[:2] / moved[2] - middle[:2]) * metres_per_px * self._rate_hz / (frame.skipped + 1)

@@ -14,7 +14,7 @@ NEEDED = 4
 _LEAST, _AIMED, _EASY = 0.1, 0.2, 0.35
 # The same for landmarks.
 _LANDMARK = 0.08
-# The picture's middle follows the targets once they are further off than this share of its half.
+# The picture's middle is drawn along once the targets are further off than this share of its half.
 _LEASH = 0.12
 # It crosses half the picture in this time at the fastest, or goes this many times as fast as the targets: a picture
 # that sweeps over the ground shows nothing that moves.
@@ -34,15 +34,15 @@ _NOTED = 0.5
 class UavSteering:
     """Commanded view and altitude of the aerial vehicle; None: as by itself."""
 
-    def __init__(self, settings: Settings) -> None:
-        self.settings = settings
+    def __init__(self, settings: Settings, log: AdjustmentLog) -> None:
+        self.settings, self._log = settings, log
         self.look_at: np.ndarray | None = None
         self.altitude_m: float | None = None
         self.home_m = 0.0  # its altitude at the start
         self._home_at: np.ndarray | None = None  # where it looked when it was steered first
         self._now_s = 0.0
         self._moved_s = -np.inf  # when the altitude was changed last
-        self._found_s: float | None = None  # when there was something to follow
+        self._found_s: float | None = None  # when a target was predicted last
         self._group: set[int] = set()
 
     def update(
@@ -52,7 +52,6 @@ class UavSteering:
         mount: CameraMount | None,
         ground_in_middle: np.ndarray | None,
         now_s: float,
-        log: AdjustmentLog,
     ) -> None:
         """Update view and altitude by the predicted targets and the places (V, 2) of the team's vehicles.
 
@@ -70,17 +69,18 @@ class UavSteering:
         if self.look_at is None:
             return
         if not len(rows):
-            self._without(prediction, team_m, altitude, mount, lapse_s, log)
+            self._search(prediction, team_m, altitude, mount, lapse_s)
             return
         self._found_s = now_s
-        rows = self._chosen(prediction, rows, mount)
+        rows = self._choose(prediction, rows, mount)
         points, velocity = prediction.east_north_m[rows], prediction.velocity_m_s[rows]
         # Where they are and where they will be: climbing takes time.
         goal, height, why = self._aim(np.r_[points, points + _AHEAD_S * velocity], team_m, altitude, mount)
-        what = f"{count_of(len(rows), 'target')} about {_place(points.mean(axis=0))}: {why}"
-        self._climb(height, altitude, mount, what, log)
+        east, north = points.mean(axis=0)
+        why = f"{count_of(len(rows), 'target')} about ({east:.0f}, {north:.0f}) m: {why}"
+        self._climb(height, altitude, mount, why)
         speed = float(np.linalg.norm(velocity.mean(axis=0)))
-        self._look(goal, mount.half_m(self.altitude_m or altitude), speed, lapse_s, what, log)
+        self._look(goal, mount.half_m(self.altitude_m or altitude), speed, lapse_s, why)
 
     def followed(self, prediction: Prediction) -> np.ndarray:
         """The targets that are followed: the group in the picture, or all that is wanted."""
@@ -94,12 +94,19 @@ class UavSteering:
         size_m = self.settings.gates.expected_size_m
         return float(max(self.home_m, min(limit, size_m * float(np.mean(mount.camera.focal_px)) / _LEAST_PX)))
 
-    def _chosen(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount) -> np.ndarray:
+    def _choose(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount) -> np.ndarray:
         """All that is wanted, where it can be in one picture; else the group that weighs most, not lightly another."""
-        highest = self.highest_m(mount)
+        highest, places = self.highest_m(mount), prediction.east_north_m
         groups = [rows]
-        if mount.centre(prediction.east_north_m[rows], highest)[1] < _LEAST:
-            groups = [_grown(int(seed), rows, prediction, mount, highest) for seed in rows]
+        if mount.centre(places[rows], highest)[1] < _LEAST:
+            groups = []
+            for seed in rows.tolist():
+                # A target and those nearest to it, as long as all are in one picture.
+                group = [seed]
+                for row in rows[np.argsort(np.linalg.norm(places[rows] - places[seed], axis=1), kind="stable")]:
+                    if row != seed and mount.centre(places[[*group, row]], highest)[1] >= _LEAST:
+                        group.append(int(row))
+                groups.append(np.array(group))
         # People who were recognized count more than what nobody has seen yet, and large crowds more than small ones.
         weights = prediction.probability * np.maximum(prediction.radius_m, 0.5)
         members = [set(prediction.target[group].tolist()) for group in groups]
@@ -116,59 +123,47 @@ class UavSteering:
         self, points: np.ndarray, team_m: np.ndarray, altitude: float, mount: CameraMount
     ) -> tuple[np.ndarray, float, str]:
         """Where to look so that targets and four landmarks are in the picture; the altitude it takes; why."""
-        needed = min(NEEDED, len(team_m))
-        for height in self._ladder(altitude, mount):
+        needed, highest, height = min(NEEDED, len(team_m)), self.highest_m(mount), altitude
+        while True:
             place = _between(points, team_m, needed, height, mount, _LEAST if height == altitude else _AIMED)
-            if place is None:
-                continue
-            if height > altitude:
+            if place is not None and height > altitude:
                 return place, height, f"they and {needed} landmarks do not fit from {altitude:.0f} m"
-            lower = max(height / _STEP, self.home_m)
-            if (
-                lower < 0.99 * height
-                and self.altitude_m is not None
-                and _between(points, team_m, needed, lower, mount, _EASY) is not None
-            ):
-                return place, lower, "fit easily from lower, too"
-            return place, height, f"in the picture with {needed} landmarks" if needed else "in the picture"
+            if place is not None:
+                lower = max(height / _STEP, self.home_m)
+                can = lower < 0.99 * height and self.altitude_m is not None
+                if can and _between(points, team_m, needed, lower, mount, _EASY) is not None:
+                    return place, lower, "fit easily from lower, too"
+                return place, height, f"in the picture with {needed} landmarks" if needed else "in the picture"
+            if height >= highest - 1e-6:
+                break
+            height = min(height * _STEP, highest)
         place = _between(points, team_m, needed, altitude, mount, -np.inf)
         if place is not None:
             return place, altitude, f"waiting for {needed} landmarks"
         return mount.centre(points, altitude)[0], altitude, f"no place shows {needed} landmarks"
 
-    def _ladder(self, altitude: float, mount: CameraMount) -> list[float]:
-        highest, steps = self.highest_m(mount), [altitude]
-        while steps[-1] < highest - 1e-6:
-            steps.append(min(steps[-1] * _STEP, highest))
-        return steps
-
-    def _climb(self, height: float, altitude: float, mount: CameraMount, why: str, log: AdjustmentLog) -> None:
+    def _climb(self, height: float, altitude: float, mount: CameraMount, why: str) -> None:
         if height == altitude or (height < altitude and self._now_s - self._moved_s < _SETTLED_S):
             return
         self.altitude_m, self._moved_s = height, self._now_s
-        log.set("uav.altitude_m", round(height, 1), why, old=round(mount.altitude_m, 1))
+        self._log.set("uav.altitude_m", round(height, 1), why, old=round(mount.altitude_m, 1))
 
-    def _look(self, goal: np.ndarray, half: float, speed: float, lapse_s: float, why: str, log: AdjustmentLog) -> None:
-        """Draw the middle of the picture along."""
+    def _look(self, goal: np.ndarray, half: float, speed: float, lapse_s: float, why: str) -> None:
+        """Draw the middle of the picture along, once the goal is further off than the leash."""
         assert self.look_at is not None
-        before = self.look_at
-        way = leashed(before, goal, _LEASH * half) - before
+        before, apart = self.look_at, goal - self.look_at
+        distance = float(np.linalg.norm(apart))
+        way = np.zeros(2) if distance <= _LEASH * half else goal - apart / distance * (_LEASH * half) - before
         pace = max(half / _CROSSING_S, _FASTER * speed) * lapse_s
         self.look_at = before + way * min(1.0, pace / max(float(np.linalg.norm(way)), 1e-9))
         for axis, name in enumerate(("east", "north")):
             value, old = round(float(self.look_at[axis]), 1), round(float(before[axis]), 1)
-            log.set(f"uav.look_{name}_m", value, why, old=old, least=_NOTED * half)
+            self._log.set(f"uav.look_{name}_m", value, why, old=old, least=_NOTED * half)
 
-    def _without(
-        self,
-        prediction: Prediction,
-        team_m: np.ndarray,
-        altitude: float,
-        mount: CameraMount,
-        lapse_s: float,
-        log: AdjustmentLog,
+    def _search(
+        self, prediction: Prediction, team_m: np.ndarray, altitude: float, mount: CameraMount, lapse_s: float
     ) -> None:
-        """Nothing to follow: wait where it was last, see more from higher, and at last go back to the team."""
+        """Without targets: wait where the last one was, see more from higher, and at last go back to the team."""
         gone_s = np.inf if self._found_s is None else self._now_s - self._found_s
         if self._group & set(prediction.target.tolist()):
             why = f"target {min(self._group)} goes on, but is not human"
@@ -177,21 +172,13 @@ class UavSteering:
         else:
             highest = self.highest_m(mount)
             if gone_s > _WIDEN_S and self._now_s - self._moved_s > _WIDEN_S and altitude < highest - 1e-6:
-                higher = min(altitude * _STEP**2, highest)
-                self._climb(higher, altitude, mount, f"no target for {gone_s:.0f} s", log)
+                self._climb(min(altitude * _STEP**2, highest), altitude, mount, f"no target for {gone_s:.0f} s")
             return
         self._found_s = None
         assert self._home_at is not None
         rest = mount.centre(team_m, self.home_m)[0] if len(team_m) >= NEEDED else self._home_at
-        self._climb(self.home_m, altitude, mount, why, log)
-        self._look(rest, mount.half_m(altitude), 0.0, lapse_s, why, log)
-
-
-def leashed(place: np.ndarray, to: np.ndarray, length: float) -> np.ndarray:
-    """A place that is drawn along by another once that is further off than the length of the leash."""
-    apart = to - place
-    distance = float(np.linalg.norm(apart))
-    return place if distance <= length else to - apart / distance * length
+        self._climb(self.home_m, altitude, mount, why)
+        self._look(rest, mount.half_m(altitude), 0.0, lapse_s, why)
 
 
 def _between(
@@ -211,17 +198,3 @@ def _between(
         if shown >= needed and mount.inside(points, place, altitude).min() >= margin:
             return place
     return None
-
-
-def _grown(seed: int, rows: np.ndarray, prediction: Prediction, mount: CameraMount, altitude: float) -> np.ndarray:
-    """A target and those nearest to it, as long as all are in one picture."""
-    places = prediction.east_north_m
-    group = [seed]
-    for row in rows[np.argsort(np.linalg.norm(places[rows] - places[seed], axis=1), kind="stable")]:
-        if row != seed and mount.centre(places[[*group, row]], altitude)[1] >= _LEAST:
-            group.append(int(row))
-    return np.array(group)
-
-
-def _place(place: np.ndarray) -> str:
-    return f"({place[0]:.0f}, {place[1]:.0f}) m"
