@@ -13,6 +13,20 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Camera, Float, Int, Poses, PoseTable
 
+Box = tuple[int, int, int, int]
+# Masks are searched in blocks of this side, px.
+_BLOCK_PX = 16
+# Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m.
+_DEGREE_M = 111_320.0
+# So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
+_PART = 1 << 14
+
+Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
+"""Longitude and latitude."""
+
+
+# Boxes and masks.
+
 
 def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     """(...) area in both of two boxes (..., 4), broadcast against each other; 0 where they lie apart."""
@@ -22,71 +36,31 @@ def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     return np.maximum(across, 0) * np.maximum(down, 0)
 
 
-_NEAR_PX = 2.0
-"""Boxes that are no further apart than this are beside each other."""
-
-
-def centres_of(boxes: np.ndarray, foreground: np.ndarray | None) -> np.ndarray:
-    """(N, 2) of the blobs' mass where the foreground is given, else of their boxes."""
-    centres = boxes[:, :2] + (boxes[:, 2:] - 1) / 2
-    if foreground is None:
-        return centres
-    middles = middles_of(boxes, foreground)
-    return np.where(np.isfinite(middles), middles, centres)
-
-
-def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
-    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
-
-    core: (H, W) bool, the pixels that count: of what is between the people of a crowd nothing follows. None: all.
-    """
-    middles = np.full((len(boxes), 2), np.nan)
-    for row, box in enumerate(boxes):
-        left, top, right, bottom = _pixels(box, foreground.shape)
-        mine = foreground[top:bottom, left:right] == row + 1
-        v, u = np.nonzero(mine if core is None else mine & core[top:bottom, left:right])
-        if len(u):
-            middles[row] = left + u.mean(), top + v.mean()
-    return middles
-
-
-def covering(
-    box: np.ndarray | None, boxes: np.ndarray, area_px: np.ndarray, foreground: np.ndarray | None
-) -> np.ndarray:
-    """(N,) bool: the blobs, of areas (N,), that cover a good part of a patch's box, or are covered by it."""
-    if box is None or not len(boxes):
-        return np.zeros(len(boxes), bool)
-    if foreground is not None:
-        left, top, right, bottom = _pixels(box, foreground.shape)
-        part = foreground[top:bottom, left:right]
-        count = np.bincount(part.ravel(), minlength=len(boxes) + 1)[1 : len(boxes) + 1]
-        return count > np.minimum(0.3 * part.size, 0.5 * area_px)
-    common = shared_px(box, boxes)
-    return common > 0.5 * np.minimum(box[2:].prod(), boxes[:, 2:].prod(axis=1))
-
-
-def beside(box: np.ndarray | None, boxes: np.ndarray) -> np.ndarray:
-    """(N,) bool: the blobs whose boxes overlap a patch's or nearly do."""
-    if box is None:
-        return np.zeros(len(boxes), bool)
-    return shared_px(box + _NEAR_PX * np.array([-1, -1, 2, 2]), boxes) > 0
-
-
 def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """(P, N) bool: which points lie in which boxes."""
     offset = points[:, None] - boxes[None, :, :2] + 0.5
     return ((offset >= 0) & (offset <= boxes[None, :, 2:])).all(axis=2)
 
 
-def _pixels(box: np.ndarray, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
-    """left, top, right, bottom of a box inside a picture (H, W)."""
+def window_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The rows and columns of a box in a picture (H, W, ...), as far as it is inside."""
     left, top, right, bottom = (round(v) for v in (*box[:2], *(box[:2] + box[2:])))
-    return max(left, 0), max(top, 0), min(right, shape[1]), min(bottom, shape[0])
+    return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
 
 
-Box = tuple[int, int, int, int]
-# Masks are searched in blocks of this side, px.
-_BLOCK_PX = 16
+def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
+
+    core: (H, W) bool, the pixels that count, without what lies between the people of a crowd. None: all.
+    """
+    middles = np.full((len(boxes), 2), np.nan)
+    for row, box in enumerate(boxes):
+        rows, columns = window_of(box, foreground.shape)
+        mine = foreground[rows, columns] == row + 1
+        v, u = np.nonzero(mine if core is None else mine & core[rows, columns])
+        if len(u):
+            middles[row] = columns.start + u.mean(), rows.start + v.mean()
+    return middles
 
 
 def occupied(mask: np.ndarray, apart: int) -> list[Box]:
@@ -102,32 +76,22 @@ def occupied(mask: np.ndarray, apart: int) -> list[Box]:
     reach = -(-apart // (2 * block))
     blocks = cv2.dilate(blocks, np.ones((2 * reach + 1,) * 2, np.uint8))
     count, _, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(blocks, 0, 255, cv2.THRESH_BINARY)[1])
-    boxes = _disjoint([(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()])
+    waiting: list[Box] = [(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()]
+    # Boxes (left, top, right, bottom) that overlap are joined until none do.
+    apart_boxes: list[Box] = []
+    while waiting:
+        box = waiting.pop()
+        over = [b for b in apart_boxes if b[0] < box[2] and box[0] < b[2] and b[1] < box[3] and box[1] < b[3]]
+        if over:
+            apart_boxes = [b for b in apart_boxes if b not in over]
+            left, top, right, bottom = zip(box, *over, strict=True)
+            waiting.append((min(left), min(top), max(right), max(bottom)))
+        else:
+            apart_boxes.append(box)
     return [
         (block * x0, block * y0, min(block * x1, width) - block * x0, min(block * y1, height) - block * y0)
-        for x0, y0, x1, y1 in boxes
+        for x0, y0, x1, y1 in apart_boxes
     ]
-
-
-def _disjoint(boxes: list[Box]) -> list[Box]:
-    """Boxes (left, top, right, bottom) that overlap are joined until none do."""
-    apart: list[Box] = []
-    while boxes:
-        box = boxes.pop()
-        over = [b for b in apart if b[0] < box[2] and box[0] < b[2] and b[1] < box[3] and box[1] < b[3]]
-        if over:
-            apart = [b for b in apart if b not in over]
-            boxes.append(
-                (
-                    min(box[0], *(b[0] for b in over)),
-                    min(box[1], *(b[1] for b in over)),
-                    max(box[2], *(b[2] for b in over)),
-                    max(box[3], *(b[3] for b in over)),
-                )
-            )
-        else:
-            apart.append(box)
-    return apart
 
 
 def connected_parts(mask: np.ndarray, box: Box, min_area_px: float) -> list[tuple[Box, np.ndarray]]:
@@ -137,12 +101,14 @@ def connected_parts(mask: np.ndarray, box: Box, min_area_px: float) -> list[tupl
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
     parts = []
-    for label in range(1, count):
-        left, top, width, height, area = (int(v) for v in stats[label])
+    for label, (left, top, width, height, area) in enumerate(stats[1:count].tolist(), 1):
         if area >= min_area_px:
             part = labels[top : top + height, left : left + width] == label
             parts.append(((box[0] + left, box[1] + top, width, height), part))
     return parts
+
+
+# Plane maps.
 
 
 def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
@@ -178,9 +144,11 @@ def _grid(size: tuple[int, int], samples: int) -> np.ndarray:
 
 def corner_error(a: np.ndarray, b: np.ndarray, size: tuple[int, int]) -> float:
     """How far two homographies differ, at most, at the corners of a (width, height) image, in pixels."""
-    width, height = size
-    corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
+    corners = _grid(size, 2)
     return float(np.linalg.norm(transfer(a, corners) - transfer(b, corners), axis=1).max())
+
+
+# Rotations.
 
 
 def cross(vector: np.ndarray) -> np.ndarray:
@@ -244,6 +212,9 @@ def about_up(rotation: np.ndarray) -> np.ndarray:
     return turned(np.array([0.0, 0.0, angle]))
 
 
+# Matching.
+
+
 def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """Rows, ascending, and the column of each: min(N, M) pairs of the least sum of finite costs."""
     cost = np.asarray(cost, float)
@@ -287,49 +258,38 @@ def namespace(x: Any) -> Any:
     return np if isinstance(x, np.ndarray) else sys.modules["torch"]
 
 
-Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
-"""Longitude and latitude."""
-
-DEGREE_M = 111_320.0
-"""Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m."""
-
-
-# So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
-_PART = 1 << 14
+# Places on the Earth.
 
 
 def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """Metres east and north of an origin, both as (longitude, latitude)."""
     import pymap3d  # here, as most runs have places in metres, or none
 
-    def of_part(lonlat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        east, north, _ = pymap3d.geodetic2enu(lonlat[:, 1], lonlat[:, 0], 0.0, origin_deg[1], origin_deg[0], 0.0)
-        return east, north
+    def convert(longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return pymap3d.geodetic2enu(latitude, longitude, 0.0, origin_deg[1], origin_deg[0], 0.0)[:2]
 
-    return _by_parts(of_part, lonlat_deg)
+    return _by_parts(convert, lonlat_deg)
 
 
 def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
     """(longitude, latitude) of local metres."""
     import pymap3d
 
-    def of_part(metres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        latitude, longitude, _ = pymap3d.enu2geodetic(
-            metres[:, 0], metres[:, 1], 0.0, origin_deg[1], origin_deg[0], 0.0
-        )
-        return longitude, latitude
+    def convert(east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return pymap3d.enu2geodetic(east, north, 0.0, origin_deg[1], origin_deg[0], 0.0)[1::-1]
 
-    return _by_parts(of_part, east_north_m)
+    return _by_parts(convert, east_north_m)
 
 
-def _by_parts(of_part: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], pairs: np.ndarray) -> np.ndarray:
-    """(N, 2) of what a function makes of (n, 2) at a time."""
+def _by_parts(
+    convert: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]], pairs: np.ndarray
+) -> np.ndarray:
     given = np.asarray(pairs, float).reshape(-1, 2)
-    found = np.empty_like(given)
+    converted = np.empty_like(given)
     for begin in range(0, len(given), _PART):
         part = slice(begin, begin + _PART)
-        found[part, 0], found[part, 1] = of_part(given[part])
-    return found
+        converted[part, 0], converted[part, 1] = convert(given[part, 0], given[part, 1])
+    return converted
 
 
 def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
@@ -338,35 +298,33 @@ def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) ->
     0.3 m off in 150 m. Longitudes go on over 180 degrees at -180.
     """
     origin = np.asarray(origin_deg, float)
-    found = origin + np.asarray(east_north_m, float) / _degree_m(origin)
-    beyond = np.abs(found[..., 0]) > 180
-    found[..., 0] = np.where(beyond, (found[..., 0] + 180) % 360 - 180, found[..., 0])
-    return found
+    return _wrap_longitude(origin + np.asarray(east_north_m, float) / _degree_m(origin))
 
 
 def plain_east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
     """Metres east and north, the other way round."""
     origin = np.asarray(origin_deg, float)
-    apart = np.asarray(lonlat_deg, float) - origin
-    far = np.abs(apart[..., 0]) > 180
-    apart[..., 0] = np.where(far, (apart[..., 0] + 180) % 360 - 180, apart[..., 0])
-    return apart * _degree_m(origin)
+    return _wrap_longitude(np.asarray(lonlat_deg, float) - origin) * _degree_m(origin)
 
 
 def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
     """(..., 2) metres a degree of longitude and of latitude."""
     latitude = origin_deg[..., 1]
-    return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)
+    return np.stack([_DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, _DEGREE_M)], axis=-1)
+
+
+def _wrap_longitude(lonlat_deg: np.ndarray) -> np.ndarray:
+    longitude = lonlat_deg[..., 0]
+    longitude = np.where(np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude)
+    return np.stack([longitude, lonlat_deg[..., 1]], axis=-1)
 
 
 def great_circle_m(lonlat_deg: np.ndarray, from_deg: np.ndarray) -> np.ndarray:
     """(N,) great-circle distances on a sphere, good to half a percent: enough to see a mistake."""
     longitude, latitude = np.radians(lonlat_deg).T
     longitude_0, latitude_0 = np.radians(from_deg)
-    half = (
-        np.sin((latitude - latitude_0) / 2) ** 2
-        + np.cos(latitude) * np.cos(latitude_0) * np.sin((longitude - longitude_0) / 2) ** 2
-    )
+    across = np.cos(latitude) * np.cos(latitude_0) * np.sin((longitude - longitude_0) / 2) ** 2
+    half = np.sin((latitude - latitude_0) / 2) ** 2 + across
     return 2 * 6_371_000.0 * np.arcsin(np.sqrt(np.clip(half, 0, 1)))
 
 
@@ -379,41 +337,31 @@ def poses_at(
     Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
     """
     n = len(frame)
+    place, heading, pitch = np.tile(camera.place, (n, 1)).astype(float), camera.heading_rad, camera.pitch_rad
     if table is None:
-        return camera, Poses(
-            np.tile(camera.place, (n, 1)).astype(float),
-            np.full(n, camera.heading_rad),
-            np.full(n, camera.pitch_rad),
-        )
+        return camera, Poses(place, np.full(n, heading), np.full(n, pitch))
     if table.timed and rate_hz is None:
         raise InputError(f"poses {table.path} are by time_s; say with --rate how many frames a second there are")
+    at, values = table.at, table.values
     when = (np.asarray(frame) - 1) / rate_hz if table.timed and rate_hz else np.asarray(frame, float)
-    outside = (when < table.at[0] - 1e-6) | (when > table.at[-1] + 1e-6)
+    outside = (when < at[0] - 1e-6) | (when > at[-1] + 1e-6)
     if outside.any():
         unit = "seconds" if table.timed else "frames"
         first = int(outside.argmax())
         raise InputError(
-            f"poses {table.path} cover {unit} {table.at[0]:g} to {table.at[-1]:g}; {int(outside.sum())} of {n} rows of "
+            f"poses {table.path} cover {unit} {at[0]:g} to {at[-1]:g}; {int(outside.sum())} of {n} rows of "
             f"the table lie outside, the first at frame {frame[first]}. Give poses for all of them"
         )
-    values = table.values
-    for kind, geographic in ((("longitude_deg", "latitude_deg"), True), (("east_m", "north_m"), False)):
-        if kind[0] in values:
-            camera = replace(camera, geographic=geographic)
-            # A longitude goes on over 180 degrees, not back through 0; a place of metres is not turned.
-            samples = [values[key] for key in kind]
-            if geographic:
-                samples[0] = np.unwrap(samples[0], period=360)
-            place = np.stack([np.interp(when, table.at, sample) for sample in samples], axis=1)
-            if geographic:
-                place[:, 0] = (place[:, 0] + 180) % 360 - 180
-            break
-    else:
-        place = np.tile(camera.place, (n, 1)).astype(float)
-    heading = np.full(n, camera.heading_rad)
+    if "longitude_deg" in values:
+        # A longitude goes on over 180 degrees, not back through 0.
+        longitude = np.interp(when, at, np.unwrap(values["longitude_deg"], period=360))
+        place = _wrap_longitude(np.stack([longitude, np.interp(when, at, values["latitude_deg"])], axis=1))
+        camera = replace(camera, geographic=True)
+    elif "east_m" in values:
+        place = np.stack([np.interp(when, at, values[key]) for key in ("east_m", "north_m")], axis=1)
+        camera = replace(camera, geographic=False)
     if "heading_deg" in values:
-        heading = np.interp(when, table.at, np.unwrap(np.radians(values["heading_deg"])))
-    pitch = np.full(n, camera.pitch_rad)
+        heading = np.interp(when, at, np.unwrap(np.radians(values["heading_deg"])))
     if "pitch_deg" in values:
-        pitch = np.interp(when, table.at, np.radians(values["pitch_deg"]))
-    return camera, Poses(place, heading, pitch)
+        pitch = np.interp(when, at, np.radians(values["pitch_deg"]))
+    return camera, Poses(place, np.broadcast_to(heading, n).astype(float), np.broadcast_to(pitch, n).astype(float))

@@ -343,8 +343,6 @@ def test_each_part_can_be_left_as_planned():
         w = world([[0, 5]], [[1.4, 0]], kinds=("unseen",), settings=with_steering(**parameters)).run(8)
         return w.commands[-1], w.made
 
-    command, made = after(on=False)
-    assert command == Command() and made == []
     command, _ = after(sampling=False)
     assert command.every == 1 and command.look_at is not None and command.orders
     command, _ = after(follow=False)

@@ -58,8 +58,20 @@ def blobs(*boxes):
     return Detections(box, np.ones(n), box[:, 2:].prod(axis=1), unknown, unknown)
 
 
-def follower(names="a", **parameters):
-    return LandmarkTracker(len(names), LandmarkParameters(reach_px=30.0, **parameters))
+class follower:
+    """A tracker of one landmark a letter, given blobs that fill their boxes and nothing else that is known."""
+
+    def __init__(self, names="a", **parameters):
+        self.count = len(names)
+        self.tracker = LandmarkTracker(self.count, LandmarkParameters(reach_px=30.0, **parameters))
+
+    def update(self, frame, masks, found, expected_px=None, length_px=None):
+        foreground = np.zeros(SIZE, np.uint16)
+        for row, (x, y, width, height) in enumerate(found.box_px.astype(int), 1):
+            foreground[y : y + height, x : x + width] = row
+        expected = np.full((self.count, 2), np.nan) if expected_px is None else expected_px
+        length = np.full(self.count, np.nan) if length_px is None else length_px
+        return self.tracker.update(frame, masks, found, foreground, None, expected, length)
 
 
 def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target():

@@ -13,13 +13,15 @@ import numpy as np
 from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.geo.colours import Patches, find_patches
 from torchvision_dddas.geo.ranging import touches_border
-from torchvision_dddas.geometry import beside, centres_of, cheapest, covering, inside, transfer
+from torchvision_dddas.geometry import cheapest, inside, middles_of, shared_px, transfer, window_of
 from torchvision_dddas.types import Detections
 
 # A blob this many times larger than usual for its colour holds something beside the landmark.
 _SHARED = 1.8
 # A vehicle's blob is no longer than it, but for its shadow; and its middle no further from the colour than this share.
 _LONGER, _WITHIN = 1.25, 0.6
+# Blobs whose boxes are no further than this from a patch's are beside it.
+_BESIDE_PX = 2.0
 # Frames whose blobs define the usual size, and the fewest that do.
 _MEMORY, _ENOUGH = 25, 3
 # Score of a patch, in logarithms of its area: for motion at it; for its travel over the ground; for being the
@@ -224,56 +226,55 @@ class LandmarkTracker:
         frame: int,
         masks: np.ndarray,
         detections: Detections,
-        now_from_before: np.ndarray | None = None,
-        foreground: np.ndarray | None = None,
-        expected_px: np.ndarray | None = None,
-        length_px: np.ndarray | None = None,
+        foreground: np.ndarray,
+        now_from_before: np.ndarray | None,
+        expected_px: np.ndarray,
+        length_px: np.ndarray,
     ) -> TrackedLandmarks:
         """The landmarks of the next frame.
 
-        masks: (K, H, W) uint8 of the landmarks' colours. now_from_before: (3, 3) how the background moved since the
-        frame before; None: it did not, or nobody knows. foreground: (H, W), i + 1 where detection i is, as in Scene;
-        without it a blob's centre is its box's, which a limb or a shadow shifts more.
-        expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN or
-        None: unknown.
+        masks: (K, H, W) uint8 of the landmarks' colours. foreground: (H, W), i + 1 where detection i is, as in Scene.
+        now_from_before: (3, 3) how the background moved since the frame before; None: it did not, or nobody knows.
+        expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN:
+        unknown.
         """
-        size, shape = (masks.shape[2], masks.shape[1]), (len(masks), len(detections))
+        size = masks.shape[2], masks.shape[1]
         anew = frame >= self._next
         if anew:
             self._next = frame + self._parameters.interval_frames
-        expected = np.full((len(masks), 2), np.nan) if expected_px is None else expected_px
         boxes = detections.box_px
-        blobs = centres_of(boxes, foreground)
+        middle = boxes[:, :2] + (boxes[:, 2:] - 1) / 2
+        blobs = middles_of(boxes, foreground)
+        blobs = np.where(np.isfinite(blobs), blobs, middle)
         blob_area = detections.area_px if len(detections.area_px) else boxes[:, 2:].prod(axis=1)
-        self._find(masks, boxes, now_from_before, expected, anew)
+        self._find(masks, boxes, now_from_before, expected_px, anew)
         shown = [colour.shown for colour in self._colours]
-        chosen = [None if one is None else one.box_px for one in shown]
+        own_px = np.array([np.full(4, np.nan) if one is None else one.box_px for one in shown]).reshape(-1, 4)
         centre = np.array([(np.nan, np.nan) if one is None else one.centre_px for one in shown]).reshape(-1, 2)
         area = np.array([np.nan if one is None else one.area_px for one in shown])
-        near = np.array([beside(box, boxes) for box in chosen], bool).reshape(shape)
+        near = shared_px(own_px[:, None] + _BESIDE_PX * np.array([-1, -1, 2, 2]), boxes) > 0  # False for NaN
         match = self._couple(centre, blobs, near, now_from_before, anew)
         has = match >= 0
-        touching = np.array([covering(box, boxes, blob_area, foreground) for box in chosen], bool).reshape(shape)
+        touching = _covering(own_px, blob_area, foreground)
         # A blob that is not at the colour is a part of the vehicle; its centre is not the vehicle's.
         whole = touching.sum(axis=0) == 1
         touching[has, match[has]] = True
         shared = self._shared(match, touching, area, blob_area)
         clean = whole & ~shared & (touching.sum(axis=0) == 1) & ~touches_border(boxes, size)
         image, by = np.full((len(masks), 2), np.nan), [""] * len(masks)
-        for k, (colour, box) in enumerate(zip(self._colours, chosen, strict=True)):
+        cut = touches_border(own_px, size)
+        for k, colour in enumerate(self._colours):
             is_clean = bool(has[k] and clean[match[k]])
             if is_clean:
                 colour.blob_px = blobs[match[k]]
             if is_clean and self._parameters.centre == "motion":
                 image[k], by[k] = blobs[match[k]], "motion"
-            elif box is not None and not touches_border(box[None], size)[0]:
+            elif shown[k] is not None and not cut[k]:
                 image[k], by[k] = centre[k], "colour"
         # Too large for its colour need not be too large for a vehicle: of most, a part alone is seen to move at first.
-        own = np.zeros(len(boxes), bool)
-        if length_px is not None:
-            at, long = np.where(np.isnan(centre), expected, centre), length_px[:, None]
-            away = np.linalg.norm(at[:, None] - (boxes[:, :2] + (boxes[:, 2:] - 1) / 2), axis=2)  # NaN where unknown
-            own = ((away <= _WITHIN * long) & (boxes[:, 2:].max(axis=1, initial=0) <= _LONGER * long)).any(axis=0)
+        at, long = np.where(np.isnan(centre), expected_px, centre), length_px[:, None]
+        away = np.linalg.norm(at[:, None] - middle, axis=2)  # NaN where unknown
+        own = ((away <= _WITHIN * long) & (boxes[:, 2:].max(axis=1, initial=0) <= _LONGER * long)).any(axis=0)
         return TrackedLandmarks(image, tuple(by), centre, match, touching.any(axis=0) & ~shared | own, shared & ~own)
 
     def _find(
@@ -338,6 +339,16 @@ class LandmarkTracker:
             if match[k] >= 0 and not shared[match[k]] and touching[:, match[k]].sum() == 1 and np.isfinite(ratio[k]):
                 colour.ratios.append(float(ratio[k]))
         return shared
+
+
+def _covering(box_px: np.ndarray, area_px: np.ndarray, foreground: np.ndarray) -> np.ndarray:
+    """(K, N) bool: the blobs, of areas (N,), that cover a good part of boxes (K, 4), or are covered by them."""
+    covers = np.zeros((len(box_px), len(area_px)), bool)
+    for k in np.flatnonzero(np.isfinite(box_px).all(axis=1)) if len(area_px) else ():
+        part = foreground[window_of(box_px[k], foreground.shape)]
+        count = np.bincount(part.ravel(), minlength=len(area_px) + 1)[1 : len(area_px) + 1]
+        covers[k] = count > np.minimum(0.3 * part.size, 0.5 * area_px)
+    return covers
 
 
 def _median_of(values: Sequence[float] | np.ndarray, otherwise: float) -> float:

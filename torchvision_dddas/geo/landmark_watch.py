@@ -125,7 +125,7 @@ class LandmarkWatch:
         expected[colour] = should_px[rows]
         length[colour] = self.locator.settings.landmarks.length_m * px_per_m[rows]
         masks = finder(image, colours.low, colours.high)
-        seen = self._tracker.update(scene.frame.number, masks, scene.detections, step, scene.mask, expected, length)
+        seen = self._tracker.update(scene.frame.number, masks, scene.detections, scene.mask, step, expected, length)
         pixels, by = np.full((len(marks), 2), np.nan), np.full(len(marks), "", "<U6")
         pixels[rows], by[rows] = seen.image_px[colour], np.array(seen.by, "<U6")[colour]
         # Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the
