@@ -17,7 +17,7 @@ Box = tuple[int, int, int, int]
 # Masks are searched in blocks of this side, px.
 _BLOCK_PX = 16
 # Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m.
-_DEGREE_M = 111_320.0
+DEGREE_M = 111_320.0
 # So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
 _PART = 1 << 14
 
@@ -310,7 +310,7 @@ def plain_east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: Degrees) 
 def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
     """(..., 2) metres a degree of longitude and of latitude."""
     latitude = origin_deg[..., 1]
-    return np.stack([_DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, _DEGREE_M)], axis=-1)
+    return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)
 
 
 def _wrap_longitude(lonlat_deg: np.ndarray) -> np.ndarray:
