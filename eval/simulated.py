@@ -33,8 +33,8 @@ from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.geo.projection import shift_origin
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
-from torchvision_dddas.simulation.drawing import view_from_pose
-from torchvision_dddas.simulation.sensor_errors import SIGMAS_95, Receivers
+from torchvision_dddas.simulation.cameras import view_from_pose
+from torchvision_dddas.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.types import Command, Frame, FrameResult, Landmarks, Scene, TrackedFrame, Tracks, Truth
 
 CONFIG = "patrol"

@@ -76,7 +76,7 @@ def test_the_elevation_is_that_of_the_world(made):
     pytest.importorskip("rasterio")
     from torchvision_dddas.io.elevation import read_elevation
     from torchvision_dddas.simulation import open_simulator
-    from torchvision_dddas.simulation.relief import height_at
+    from torchvision_dddas.simulation.world import height_at
 
     folder, _ = made
     scenario = load_scenario(folder / "scenario.toml")

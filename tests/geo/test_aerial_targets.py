@@ -12,7 +12,7 @@ from torchvision_dddas.geo.aerial_targets import BODY_WIDTH_M, TargetSpeeds, rem
 from torchvision_dddas.geo.landmark_watch import group_targets, merge_detections
 from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.geometry import middles_of
-from torchvision_dddas.simulation.drawing import camera_axes, view_from_pose
+from torchvision_dddas.simulation.cameras import camera_axes, view_from_pose
 from torchvision_dddas.types import Camera, CameraPose, Detections, Elevation
 
 STILL = np.zeros((3, 2))

@@ -9,7 +9,7 @@ import pytest
 from torchvision_dddas.simulation import CameraParameters, Scenario, World, WorldParameters, build_world
 from torchvision_dddas.simulation.aerial_camera import AerialCamera
 from torchvision_dddas.simulation.agents import Moment
-from torchvision_dddas.simulation.drawing import camera_axes, view_from_pose
+from torchvision_dddas.simulation.cameras import camera_axes, view_from_pose
 from torchvision_dddas.types import Bodies, CameraPose, Elevation
 
 SIDE_M = 120.0

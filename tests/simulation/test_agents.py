@@ -57,9 +57,15 @@ def busy(**changed: object) -> Scenario:
 def moments(scenario: Scenario, count: int, every: int = 1) -> list[Moment]:
     agents, found = Agents(scenario, world_of(scenario.world.side_m)), []
     for _ in range(count):
-        agents.step(every)
+        for _ in range(every):
+            agents.step()
         found.append(agents.moment())
     return found
+
+
+def run(agents: Agents, frames: int) -> None:
+    for _ in range(frames):
+        agents.step()
 
 
 def same(one: Moment, other: Moment) -> bool:
@@ -106,8 +112,8 @@ def test_nobody_leaves_the_world() -> None:
 def test_nobody_is_run_over() -> None:
     across = (CrowdPlan(people=12, start_m=(0.0, -20.0), heading_deg=0.0), CrowdPlan(people=8, behaviour="stand"))
     agents = Agents(busy(crowd=across, car=(CarPlan(start_m=(-60.0, 0.0), speed_m_s=8.0),)), world_of())
-    for _ in range(100):
-        agents.step(2)
+    for _ in range(200):
+        agents.step()
         bodies = agents.moment().bodies
         car = np.flatnonzero(bodies.kind == "car")[0]
         ahead = np.array([np.sin(bodies.facing_rad[car]), np.cos(bodies.facing_rad[car])])
@@ -242,9 +248,9 @@ def test_orders_in_degrees_reach_the_vehicles_and_hold() -> None:
     agents.step()
     agents.moment()
     agents.steer(Command(orders=(Order("ugv3", goal_deg, 3.0, seen_deg),)))
-    agents.step(50)
+    run(agents, 50)
     agents.steer(Command())
-    agents.step(200)
+    run(agents, 200)
     found = agents.moment()
     row = np.flatnonzero(found.bodies.kind == "ugv")[2]
     assert found.bodies.place_m[row, :2] == pytest.approx(goal, abs=0.5)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.simulation import AircraftParameters, TeamParameters
-from torchvision_dddas.simulation.drawing import view_from_pose
+from torchvision_dddas.simulation.cameras import view_from_pose
 from torchvision_dddas.simulation.ground_vehicles import ACCELERATION_M_S2, TURN_RAD_S, Team, marker_plates
 from torchvision_dddas.simulation.movement import Obstacles, Waypoints
-from torchvision_dddas.simulation.sensor_errors import Receivers
+from torchvision_dddas.simulation.sensors import Receivers
 from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, Swaying
 from torchvision_dddas.types import Camera
 

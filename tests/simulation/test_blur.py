@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation.shutter import motion_blur
+from torchvision_dddas.simulation.cameras import motion_blur
 
 
 def dot() -> np.ndarray:

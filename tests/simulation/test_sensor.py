@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.simulation import CameraParameters
-from torchvision_dddas.simulation.sensor import Sensor
+from torchvision_dddas.simulation.sensors import Sensor
 
 SIZE = (320, 240)
 CLEAR = {"sharpness_px": 0, "shot_noise": 0, "read_noise": 0, "drift": 0, "quality": 100}

@@ -50,7 +50,7 @@ def test_frames_that_are_left_out_change_nothing_in_those_that_are_not():
 
 def test_an_order_moves_the_vehicle_that_it_names():
     simulator, run = plain()
-    first = run[0].moment
+    first = run[0].moments[-1]
     goal = first.reported_lonlat_deg[0] + (0.0, 5e-4)
     far = shots(simulator, {1: Command(orders=(Order("ugv1", goal, 3.0),))})[-1].truth.bodies
     own = np.flatnonzero(far.kind == "ugv")[0]

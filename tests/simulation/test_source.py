@@ -10,7 +10,7 @@ from tests.simulation.small import as_file, small
 from torchvision_dddas import geometry, open_video
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation import SimulatorSource
-from torchvision_dddas.simulation.source import KEPT
+from torchvision_dddas.simulation.simulator import KEPT
 from torchvision_dddas.types import Command, Order
 
 

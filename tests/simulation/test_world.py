@@ -6,7 +6,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.simulation import WorldParameters, build_world
-from torchvision_dddas.simulation.relief import shadow_above_ground, sun_direction
+from torchvision_dddas.simulation.world import shadow_above_ground, sun_direction
 from torchvision_dddas.types import Elevation, Ortho
 
 KNOBS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)

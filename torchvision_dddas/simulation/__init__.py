@@ -1,14 +1,6 @@
 """A simulated team above and on a piece of desert, with known truth: scenarios, the simulator, its recordings."""
 
-from torchvision_dddas.simulation.recording import (
-    RECORDED,
-    RadioReport,
-    RecordedFrame,
-    RecordingOutput,
-    film,
-    film_clip,
-    record_scenario,
-)
+from torchvision_dddas.simulation.recording import RECORDED, film, film_clip, record_scenario
 from torchvision_dddas.simulation.scenario import (
     AircraftParameters,
     CameraParameters,
@@ -21,16 +13,20 @@ from torchvision_dddas.simulation.scenario import (
     Scenario,
     TeamParameters,
     WorldParameters,
-)
-from torchvision_dddas.simulation.scenario_file import (
     check_scenario,
     load_scenario,
     scenario_names,
     scenario_settings,
     scenario_toml,
 )
-from torchvision_dddas.simulation.simulator import Shot, Simulator
-from torchvision_dddas.simulation.source import SimulatorSource, name_scenario_in_errors, open_scenario, open_simulator
+from torchvision_dddas.simulation.simulator import (
+    Shot,
+    Simulator,
+    SimulatorSource,
+    name_scenario_in_errors,
+    open_scenario,
+    open_simulator,
+)
 from torchvision_dddas.simulation.truth import SimulatedRunRecorder, TruthOutput
 from torchvision_dddas.simulation.world import World, build_world
 
@@ -44,9 +40,6 @@ __all__ = [
     "Fault",
     "GpsParameters",
     "Happening",
-    "RadioReport",
-    "RecordedFrame",
-    "RecordingOutput",
     "Scenario",
     "Shot",
     "SimulatedRunRecorder",

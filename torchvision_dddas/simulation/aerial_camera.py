@@ -9,14 +9,30 @@ import numpy as np
 
 from torchvision_dddas.simulation.aerial_ground import PixelPlaces, Terrain
 from torchvision_dddas.simulation.agents import Moment
-from torchvision_dddas.simulation.body_outlines import Outlines, Shapes
+from torchvision_dddas.simulation.body_shapes import Wardrobe, limb_capsules, vehicle_faces
+from torchvision_dddas.simulation.cameras import LEAST_PX, Shutter, motion_blur, streak_kernel
 from torchvision_dddas.simulation.ground_backdrop import HAZE
-from torchvision_dddas.simulation.relief import SHADE_BGR, shadow_above_ground
+from torchvision_dddas.simulation.ground_objects import BITS
 from torchvision_dddas.simulation.scenario import Scenario
-from torchvision_dddas.simulation.sensor import Sensor
-from torchvision_dddas.simulation.shutter import LEAST_PX, Shutter, motion_blur, streak_kernel
-from torchvision_dddas.simulation.world import World
+from torchvision_dddas.simulation.sensors import Sensor
+from torchvision_dddas.simulation.world import SHADE_BGR, World, equal_runs, shadow_above_ground
 from torchvision_dddas.types import Camera
+
+_REACH_M = 5.0  # reach of a body with its shadow
+_TALLEST_M = 2.5
+_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # enlargement of canvases for bodies up to these sizes
+_WIDEST_PX = 400  # canvases of targets whose people are further apart would be large
+_CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
+_HIDDEN_M = 0.35  # an object hides a limb if it is higher by this
+_SIGHTS = 12  # places on the line of sight at which a hill may hide a body
+_SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
+
+_SKYLIGHT = 0.45  # how bright a face is that the sun does not reach
+_PLAIN_PX_M = 12.0  # where a metre is smaller, a limb has one tone
+_THICK_M = 0.055  # limbs thinner than this cast no shadow there
+_THIN_M = 0.04  # limbs thinner than this are left out there, and out of all shadows
+
+Part = tuple[slice, slice]
 
 
 class AerialCamera:
@@ -30,7 +46,7 @@ class AerialCamera:
         self._world, self._exposure_s = world, parameters.exposure_s
         self._shutter = Shutter(self.camera, parameters.readout_s, parameters.vibration_px, scenario.seed)
         self._terrain = Terrain(world, self._shutter)
-        self._painter = Painter(world, self._shutter, parameters.exposure_s, scenario.seed)
+        self._painter = _Painter(world, self._shutter, parameters.exposure_s, scenario.seed)
         self._sensor = Sensor(parameters, size, scenario.seed)
 
     def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -38,66 +54,64 @@ class AerialCamera:
         # Both take about as long, and neither needs the other. A thread for each picture costs little, and none is left
         # behind in a process that forks.
         with ThreadPoolExecutor(1) as other:
-            drawing = other.submit(self._painter.drawn, moment)
-            lie = self._terrain.lie(moment)
-            picture = self._terrain.texture(lie)
+            drawing = other.submit(self._painter.draw, moment)
+            places = self._terrain.places(moment)
+            picture = self._terrain.picture(places)
             drawn = drawing.result()
-        targets, bodies = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
-        self._painter.paint(moment, drawn, picture, targets, bodies, lie.rise_m)
-        if lie.haze is not None:
+        targets, bodies = self._painter.paint(moment, drawn, picture, places.rise_m)
+        if places.haze is not None:
             air = np.empty_like(picture)
             air[:] = HAZE.astype(np.uint8)
-            picture = np.asarray(cv2.blendLinear(picture, air, 1 - lie.haze, lie.haze))
+            picture = np.asarray(cv2.blendLinear(picture, air, 1 - places.haze, places.haze))
         if self._exposure_s > 0:
-            picture = motion_blur(picture, self._ways(moment, lie))
+            picture = motion_blur(picture, self._ways(moment, places))
         return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies
 
-    def _ways(self, moment: Moment, lie: PixelPlaces) -> np.ndarray:
+    def _ways(self, moment: Moment, places: PixelPlaces) -> np.ndarray:
         """(3, 3, 2) pixels that the ground moves in the picture while it is exposed, from corner to corner."""
-        height, width = lie.east_m.shape
-        row, column = np.meshgrid([0, height // 2, height - 1], [0, width // 2, width - 1], indexing="ij")
-        place = np.stack([lie.east_m[row, column], lie.north_m[row, column]], axis=-1).reshape(-1, 2).astype(float)
+        height, width = places.east_m.shape
+        at = np.ix_([0, height // 2, height - 1], [0, width // 2, width - 1])
+        place = np.stack([places.east_m[at], places.north_m[at]], axis=-1).reshape(-1, 2).astype(float)
         ground = np.c_[place, self._world.up_m(place)]
         return self._shutter.ways(moment, ground, self._exposure_s).reshape(3, 3, 2).astype(np.float32)
 
 
-# Paint people and vehicles with their shadows into a picture from the air, and label their pixels.
+class _Outlines(NamedTuple):
+    """Convex outlines in the order to draw them, one row each.
+
+    body: (M,) int, a row of the moment's bodies; those of one body follow each other. points_px: (M, C, 2).
+    colour: (M, 3) BGR. up_m: (M,) above the ground.
+    """
+
+    body: np.ndarray
+    points_px: np.ndarray
+    colour: np.ndarray
+    up_m: np.ndarray
 
 
-_BITS = 4  # of sub-pixel accuracy that OpenCV draws with
-_REACH_M = 5.0  # reach of a body with its shadow
-_TALLEST_M = 2.5
-_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # enlargement of canvases for bodies up to these sizes
-_WIDEST_PX = 400  # canvases of targets whose people are further apart would be large
-_CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
-_HIDDEN_M = 0.35  # an object hides a limb if it is higher by this
-_SIGHTS = 12  # places on the line of sight at which a hill may hide a body
-_SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
-
-
-class Sheet(NamedTuple):
+class _Sheet(NamedTuple):
     """A canvas enlarged `step` times, (h * step, w * step, ...), and the part of the picture that it covers."""
 
     body: int
-    at: tuple[slice, slice]
+    at: Part
     canvas: np.ndarray
     step: int
 
-
-class Drawn(NamedTuple):
-    """Bodies (h, w, 4: BGR and height) and shadows (h, w), and the ways of bodies that move while they are exposed."""
-
-    sheets: list[Sheet]
-    shades: list[Sheet]
-    ways_px: dict[int, np.ndarray]
+    def averaged(self) -> np.ndarray:
+        """The canvas at the picture's own size."""
+        size = self.canvas.shape[1] // self.step, self.canvas.shape[0] // self.step
+        return np.asarray(cv2.resize(self.canvas, size, interpolation=cv2.INTER_AREA))
 
 
-class Painter:
-    """Paints the bodies of a moment."""
+_Drawn = tuple[list[_Sheet], list[_Sheet], dict[int, np.ndarray]]
+
+
+class _Painter:
+    """Paints people and vehicles with their shadows into a picture, and labels their pixels."""
 
     def __init__(self, world: World, shutter: Shutter, exposure_s: float, seed: int) -> None:
         self._world, self._shutter, self._exposure_s = world, shutter, exposure_s
-        self._shapes = Shapes(world, shutter, seed)
+        self._shapes = _Shapes(world, shutter, seed)
         step = max(-(-max(world.surface.shape) // _SHADE_CELLS), 1)
         cells = tuple(-(-n // step) for n in world.surface.shape[::-1])
         surface = cv2.resize(world.surface, cells, interpolation=cv2.INTER_AREA)
@@ -105,67 +119,61 @@ class Painter:
         middles = (np.arange(cells[0]) + 0.5) * self._cell_m - world.side_m / 2
         east, north = np.meshgrid(middles, -middles)
         ground = world.up_m(np.c_[east.ravel(), north.ravel()]).reshape(surface.shape)
-        # How high the shadow of what stands about reaches above each cell.
+        # Height to which the shadow of what stands about reaches above each cell.
         self._shade_m = shadow_above_ground(np.asarray(surface + ground, np.float32), self._cell_m, world.to_sun)
 
-    def drawn(self, moment: Moment) -> Drawn:
-        """All bodies that a moment's picture may show, and their shadows, each on a canvas of its own."""
+    def draw(self, moment: Moment) -> _Drawn:
+        """All bodies that a picture may show, (h, w, 4: BGR and height), and their shadows, (h, w), on canvases.
+
+        Also the ways in pixels, by body, of those that move while they are exposed.
+        """
         bodies, shape = moment.bodies, self._shutter.camera.size_px[::-1]
         rows, scale = self._in_view(moment)
         if not len(rows):
-            return Drawn([], [], {})
-        shaded = self._shaded(moment, rows)
-        solids, shadows = self._shapes.outlines(moment, rows, float(scale.max()), shaded)
+            return [], [], {}
+        shaded = self._shaded(bodies.place_m[rows, :2].astype(np.float32))
+        solids, shade_body, shade_px = self._shapes.outlines(moment, rows, float(scale.max()), shaded)
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
-        shadows = Outlines(*(column[in_sun[shadows.body]] for column in shadows))
-        return Drawn(
-            draw_sheets(solids, shape), draw_shades(shadows, bodies.target, shape), self._own_ways(moment, rows)
-        )
+        kept = in_sun[shade_body]
+        shades = _draw_shades(shade_body[kept], shade_px[kept], bodies.target, shape)
+        step = np.c_[bodies.velocity_m_s[rows], np.zeros(len(rows))] * self._exposure_s / 2
+        places = np.concatenate([bodies.place_m[rows] - step, bodies.place_m[rows] + step])
+        ends, _ = self._shutter.project(moment, places)
+        way = ends[len(rows) :] - ends[: len(rows)]
+        visible = np.hypot(way[:, 0], way[:, 1]) > LEAST_PX
+        return _draw_sheets(solids, shape), shades, dict(zip(rows[visible].tolist(), way[visible], strict=True))
 
     def paint(
-        self,
-        moment: Moment,
-        drawn: Drawn,
-        picture: np.ndarray,
-        targets: np.ndarray,
-        numbers: np.ndarray,
-        rise_m: np.ndarray | None = None,
-    ) -> None:
-        """Paint the drawn bodies into a picture (H, W, 3) uint8, and their numbers into masks (H, W).
+        self, moment: Moment, drawn: _Drawn, picture: np.ndarray, rise_m: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Paint the drawn bodies into a picture (H, W, 3) uint8; returns masks (H, W) of their targets and numbers.
 
         rise_m: (H, W) height above ground of what stands and is seen; it hides what is behind it.
         """
-        bodies = moment.bodies
-        _shade(picture, drawn.shades, rise_m)
-        for body, at, canvas, step in drawn.sheets:
-            hide_behind(canvas, step, rise_m, at)
-            cover = _averaged(_covered(cv2.extractChannel(canvas, 3)), step)
-            paint = np.ascontiguousarray(_averaged(canvas, step)[..., :3])
+        bodies, (sheets, shades, ways_px) = moment.bodies, drawn
+        targets, numbers = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
+        _shade(picture, shades, rise_m)
+        for sheet in sheets:
+            body, at, canvas, step = sheet
+            if rise_m is not None and (rise := rise_m[at]).any():
+                code = np.clip(1 + (rise - _HIDDEN_M) * _CODES, 0, 256).astype(np.uint16)
+                canvas[canvas[..., 3] < np.repeat(np.repeat(code, step, axis=0), step, axis=1)] = 0
+            covered = cv2.threshold(cv2.extractChannel(canvas, 3), 0, 255, cv2.THRESH_BINARY)[1]
+            cover = sheet._replace(canvas=covered).averaged()
+            paint = np.ascontiguousarray(sheet.averaged()[..., :3])
             mine = cover >= 128
             np.copyto(targets[at], bodies.target[body], where=mine, casting="unsafe")
             np.copyto(numbers[at], bodies.number[body], where=mine, casting="unsafe")
-            if body in drawn.ways_px:
-                at, cover, paint = _drawn_out(at, cover, paint, drawn.ways_px[body], targets.shape)
+            if body in ways_px:
+                at, cover, paint = _streak(at, cover, paint, ways_px[body], targets.shape)
             clear = cv2.cvtColor(255 - cover, cv2.COLOR_GRAY2BGR)
             picture[at] = cv2.add(cv2.multiply(picture[at], clear, scale=1 / 255), paint)
-
-    def _own_ways(self, moment: Moment, rows: np.ndarray) -> dict[int, np.ndarray]:
-        """Pixels that bodies move on their own during the exposure, of those that do so visibly."""
-        bodies = moment.bodies
-        step = np.c_[bodies.velocity_m_s[rows], np.zeros(len(rows))] * self._exposure_s / 2
-        ends, _ = self._shutter.project(
-            moment, np.concatenate([bodies.place_m[rows] - step, bodies.place_m[rows] + step])
-        )
-        way = ends[len(rows) :] - ends[: len(rows)]
-        visible = np.hypot(way[:, 0], way[:, 1]) > LEAST_PX
-        return dict(zip(rows[visible].tolist(), way[visible], strict=True))
+        return targets, numbers
 
     def _in_view(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
         """The rows of the bodies that the picture may show, far ones first, and pixels for each metre there."""
         bodies, pose = moment.bodies, moment.pose
-        if not len(bodies):
-            return np.zeros(0, np.int64), np.zeros(0)
         size = np.array(self._shutter.camera.size_px)
         middle_px, depth = self._shutter.project(moment, bodies.place_m)
         scale = self._shutter.camera.focal_px[0] * pose.focal / np.maximum(depth, 1.0)
@@ -179,120 +187,215 @@ class Painter:
         rows = rows[np.argsort(-np.linalg.norm(bodies.place_m[rows] - pose.place_m, axis=1), kind="stable")]
         return rows, scale[rows]
 
-    def _shaded(self, moment: Moment, rows: np.ndarray) -> np.ndarray:
-        """(N,) how much of bodies lies in the shade of what stands about."""
-        place = moment.bodies.place_m[rows, :2].astype(np.float32)
+    def _shaded(self, place: np.ndarray) -> np.ndarray:
+        """(N,) how much of bodies at places (N, 2) float32 lies in the shade of what stands about."""
         half = self._world.side_m / 2
         u, v = (place[:, 0] + half) / self._cell_m - 0.5, (half - place[:, 1]) / self._cell_m - 0.5
-        above = np.zeros(len(rows), np.float32)
-        for at in np.array_split(np.arange(len(rows)), -(-len(rows) // 30_000)):
+        above = np.zeros(len(place), np.float32)
+        for at in np.array_split(np.arange(len(place)), -(-len(place) // 30_000)):
             above[at] = cv2.remap(self._shade_m, u[at], v[at], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[:, 0]
         return np.clip(above / 1.6, 0, 1)
 
 
-def draw_sheets(outlines: Outlines, shape: tuple[int, ...]) -> list[Sheet]:
+def _draw_sheets(outlines: _Outlines, shape: tuple[int, ...]) -> list[_Sheet]:
     """The outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
-    if not len(outlines.body):
-        return []
-    low, high = _boxes(outlines, shape)
-    steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
+    low, high = _boxes(outlines.body, outlines.points_px, shape)
+    steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1, initial=0))]
     code = np.clip(1 + outlines.up_m * _CODES, 1, 255)
     colours = np.c_[np.clip(outlines.colour, 0, 255), code].tolist()
-    return _sheets(outlines, low, high, steps, colours)
+    return _fill(outlines.body, outlines.points_px, low, high, steps, colours)
 
 
-def draw_shades(outlines: Outlines, target: np.ndarray, shape: tuple[int, ...]) -> list[Sheet]:
+def _draw_shades(body: np.ndarray, points_px: np.ndarray, target: np.ndarray, shape: tuple[int, ...]) -> list[_Sheet]:
     """The shadows of all of a target on one canvas; target: (N,) of each body."""
-    if not len(outlines.body):
+    if not len(body):
         return []
-    each = _boxes(outlines, shape)
-    typical = float(np.median((each[1] - each[0]).max(axis=1)))
-    step = _STEPS[int(np.searchsorted(_SIZES_PX, typical))]
-    order = np.argsort(target[outlines.body], kind="stable")
-    joined = outlines._replace(body=target[outlines.body][order], points_px=outlines.points_px[order])
-    low, high = _boxes(joined, shape)
+    each = _boxes(body, points_px, shape)
+    step = _STEPS[int(np.searchsorted(_SIZES_PX, float(np.median((each[1] - each[0]).max(axis=1)))))]
+    order = np.argsort(target[body], kind="stable")
+    joined, joined_px = target[body][order], points_px[order]
+    low, high = _boxes(joined, joined_px, shape)
     if (high - low).max() > _WIDEST_PX:
-        joined, (low, high) = outlines, each
-    return _sheets(joined, low, high, np.full(len(low), step), [255] * len(joined.body))
+        joined, joined_px, (low, high) = body, points_px, each
+    return _fill(joined, joined_px, low, high, np.full(len(low), step), None)
 
 
-def _boxes(outlines: Outlines, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _boxes(body: np.ndarray, points_px: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """(B, 2) column and row of the first pixel of each body, and of the one after its last."""
-    first, limit = np.array([run[0] for run in outlines.runs]), np.array(shape[1::-1])
-    low = np.floor(np.minimum.reduceat(outlines.points_px.min(axis=1), first)).astype(int) - 1
-    high = np.ceil(np.maximum.reduceat(outlines.points_px.max(axis=1), first)).astype(int) + 2
+    first, limit = np.array([begin for begin, _ in equal_runs(body)]), np.array(shape[1::-1])
+    low = np.floor(np.minimum.reduceat(points_px.min(axis=1), first)).astype(int) - 1
+    high = np.ceil(np.maximum.reduceat(points_px.max(axis=1), first)).astype(int) + 2
     return np.maximum(low, 0), np.minimum(high, limit)
 
 
-def _sheets(
-    outlines: Outlines, low: np.ndarray, high: np.ndarray, steps: np.ndarray, colours: Sequence[float | list[float]]
-) -> list[Sheet]:
-    runs = outlines.runs
-    each = np.diff([*(run[0] for run in runs), len(outlines.body)])
+def _fill(
+    body: np.ndarray,
+    points_px: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    steps: np.ndarray,
+    colours: list[list[float]] | None,
+) -> list[_Sheet]:
+    """The outlines of each body on its canvas, with colours of four layers, or 255 on one."""
+    runs = list(equal_runs(body))
+    each = np.diff([*(begin for begin, _ in runs), len(body)])
     start, step_of = low.repeat(each, axis=0)[:, None], steps.repeat(each)[:, None, None]
-    fixed = np.round(((outlines.points_px - start + 0.5) * step_of - 0.5) * 2**_BITS)
+    fixed = np.round(((points_px - start + 0.5) * step_of - 0.5) * 2**BITS)
     corners = list(np.clip(fixed, -(2**26), 2**26).astype(np.int32))
-    found = []
+    sheets = []
     for k in np.flatnonzero((high > low).all(axis=1)).tolist():
         (x, y), (right, foot), step = low[k].tolist(), high[k].tolist(), int(steps[k])
-        first, last = runs[k]
-        layers = () if isinstance(colours[first], int) else (4,)
-        canvas = np.zeros(((foot - y) * step, (right - x) * step, *layers), np.uint8)
-        for row in range(first, last):
-            cv2.fillConvexPoly(canvas, corners[row], colours[row], cv2.LINE_8, _BITS)
-        found.append(Sheet(int(outlines.body[first]), (slice(y, foot), slice(x, right)), canvas, step))
-    return found
+        canvas = np.zeros(((foot - y) * step, (right - x) * step, *(() if colours is None else (4,))), np.uint8)
+        for row in range(*runs[k]):
+            cv2.fillConvexPoly(canvas, corners[row], 255 if colours is None else colours[row], cv2.LINE_8, BITS)
+        sheets.append(_Sheet(int(body[runs[k][0]]), (slice(y, foot), slice(x, right)), canvas, step))
+    return sheets
 
 
-def _shade(picture: np.ndarray, shades: list[Sheet], rise_m: np.ndarray | None) -> None:
+def _shade(picture: np.ndarray, shades: list[_Sheet], rise_m: np.ndarray | None) -> None:
     """Darken a picture where shadows lie; where two lie on each other it is as dark as under one."""
     layer = np.zeros(picture.shape[:2], np.uint8)
-    for _, at, canvas, step in shades:
-        cover = _averaged(canvas, step)
+    for sheet in shades:
+        cover = sheet.averaged()
         if rise_m is not None:
-            cover[rise_m[at] > _HIDDEN_M] = 0
-        layer[at] = cv2.max(np.ascontiguousarray(layer[at]), cover)
+            cover[rise_m[sheet.at] > _HIDDEN_M] = 0
+        layer[sheet.at] = cv2.max(np.ascontiguousarray(layer[sheet.at]), cover)
     share = 1 - np.arange(256)[:, None] / 255 * (1 - SHADE_BGR)
     keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
-    for _, at, _, _ in shades:
+    for sheet in shades:
         # Taken off the layer when done: where boxes overlap nothing is darkened twice.
-        dark = cv2.LUT(cv2.cvtColor(layer[at], cv2.COLOR_GRAY2BGR), keep)
-        picture[at] = cv2.multiply(picture[at], dark, scale=1 / 255)
-        layer[at] = 0
+        dark = cv2.LUT(cv2.cvtColor(layer[sheet.at], cv2.COLOR_GRAY2BGR), keep)
+        picture[sheet.at] = cv2.multiply(picture[sheet.at], dark, scale=1 / 255)
+        layer[sheet.at] = 0
 
 
-def hide_behind(canvas: np.ndarray, step: int, rise_m: np.ndarray | None, at: tuple[slice, slice]) -> None:
-    """Take away from a canvas what is behind something higher on the line of sight."""
-    if rise_m is None:
-        return
-    rise = rise_m[at]
-    if rise.any():
-        code = np.clip(1 + (rise - _HIDDEN_M) * _CODES, 0, 256).astype(np.uint16)
-        code = np.repeat(np.repeat(code, step, axis=0), step, axis=1)
-        canvas[canvas[..., 3] < code] = 0
-
-
-def _drawn_out(
-    at: tuple[slice, slice], cover: np.ndarray, paint: np.ndarray, way_px: np.ndarray, shape: tuple[int, ...]
-) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
-    """What covers a part of a picture, drawn out along a way; the part grows by what the way needs."""
+def _streak(
+    at: Part, cover: np.ndarray, paint: np.ndarray, way_px: np.ndarray, shape: tuple[int, ...]
+) -> tuple[Part, np.ndarray, np.ndarray]:
+    """What covers a part of a picture, blurred along a way; the part grows by what the way needs."""
     kernel = streak_kernel(way_px)
     reach = kernel.shape[0] // 2
-    part = [(min(reach, one.start), min(reach, size - one.stop)) for one, size in zip(at, shape[:2], strict=True)]
+    part = [(min(reach, one.start), min(reach, size - one.stop)) for one, size in zip(at, shape, strict=True)]
     wide = cv2.copyMakeBorder(
         np.dstack([paint, cover]), *part[0], *part[1], borderType=cv2.BORDER_CONSTANT, value=(0, 0, 0, 0)
     )
     wide = cv2.filter2D(wide, -1, kernel, borderType=cv2.BORDER_CONSTANT)
-    grown = [slice(one.start - before, one.stop + after) for one, (before, after) in zip(at, part, strict=True)]
-    return (grown[0], grown[1]), np.ascontiguousarray(wide[..., 3]), np.ascontiguousarray(wide[..., :3])
+    rows, columns = (slice(one.start - before, one.stop + after) for one, (before, after) in zip(at, part, strict=True))
+    return (rows, columns), np.ascontiguousarray(wide[..., 3]), np.ascontiguousarray(wide[..., :3])
 
 
-def _covered(canvas: np.ndarray) -> np.ndarray:
-    """255 where anything is drawn on a canvas (h, w)."""
-    return cv2.threshold(canvas, 0, 255, cv2.THRESH_BINARY)[1]
+class _Shapes:
+    """Gives bodies their shape: limbs or faces, as lit by the sun."""
+
+    def __init__(self, world: World, shutter: Shutter, seed: int) -> None:
+        self._world, self._shutter, self._wardrobe = world, shutter, Wardrobe(seed)
+
+    def outlines(
+        self, moment: Moment, rows: np.ndarray, scale_px_m: float, shaded: np.ndarray
+    ) -> tuple[_Outlines, np.ndarray, np.ndarray]:
+        """The outlines of bodies, in the order of rows (N,), and of their shadows on the ground: body, points_px.
+
+        scale_px_m: pixels for each metre at the nearest. shaded: (N,) how much of each stands in other things' shade.
+        """
+        bodies, is_plain = moment.bodies, scale_px_m < _PLAIN_PX_M
+        rank = np.zeros(len(bodies), np.int64)
+        rank[rows] = np.arange(len(rows))
+        dim = np.ones((len(bodies), 3))
+        dim[rows] = 1 - shaded[:, None] * (1 - SHADE_BGR)
+        is_person = bodies.kind[rows] == "person"
+        limb_body, ends, radius, limb_colour = self._limbs(moment, rows[is_person], _THIN_M if is_plain else 0.0)
+        face_body, corners, face_colour, seen = self._faces(moment, rows[~is_person])
+
+        # One projection for all: limbs' ends, corners, and the shadows of both.
+        solid = np.concatenate([ends.reshape(-1, 3), corners.reshape(-1, 3)])
+        body = np.concatenate([limb_body.repeat(2), face_body.repeat(corners.shape[1])])
+        cast = self._cast(solid, bodies.place_m[body, 2])
+        velocity = np.c_[bodies.velocity_m_s, np.zeros(len(bodies))][body]
+        px, depth = self._shutter.project(moment, np.concatenate([solid, cast]), np.tile(velocity, (2, 1)))
+        px, depth = px.reshape(2, -1, 2), depth.reshape(2, -1)
+        limbs = 2 * len(ends)
+        ends_px = px[:, :limbs].reshape(2, len(ends), 2, 2)
+        focal = self._shutter.camera.focal_px[0] * moment.pose.focal
+        radius_px = radius * focal / depth[:, :limbs].reshape(2, len(ends), 2)
+        corners_px = px[:, limbs:].reshape(2, *corners.shape[:2], 2)
+
+        sun = self._world.to_sun @ moment.pose.axes
+        facing = max(-float(sun[2]), 0.0)
+        dark, bright = 0.5 + 0.2 * facing, 0.9 + 0.2 * facing
+        up = (ends[..., 2] - bodies.place_m[limb_body, 2, None]).mean(axis=1)
+        points = 5 if scale_px_m < 30 else 7
+        whole = limb_capsules(ends_px[0], radius_px[0], points)
+        if is_plain:
+            people = limb_body, whole, limb_colour * (0.45 * dark + 0.55 * bright), up
+        else:
+            part = limb_capsules(ends_px[0] + radius_px[0, ..., None] * sun[:2] * 0.35, radius_px[0] * 0.72, points)
+            both = np.stack([whole, part], axis=1).reshape(2 * len(whole), *whole.shape[1:])
+            tones = np.stack([limb_colour * dark, limb_colour * bright], axis=1).reshape(-1, 3)
+            people = limb_body.repeat(2), both, tones, up.repeat(2)
+        middle_up = corners[..., 2].mean(axis=1) - bodies.place_m[face_body, 2]
+        faces = face_body[seen], corners_px[0][seen], face_colour[seen], middle_up[seen]
+        solids = _Outlines(*_join(rank, people, faces))
+        thick = radius.max(axis=1) > (_THICK_M if is_plain else _THIN_M)
+        limb_shade = limb_body[thick], limb_capsules(ends_px[1][thick], radius_px[1][thick], points)
+        shade_body, shade_px = _join(rank, limb_shade, (face_body, corners_px[1]))
+        return solids._replace(colour=solids.colour * dim[solids.body]), shade_body, shade_px
+
+    def _limbs(
+        self, moment: Moment, rows: np.ndarray, thin_m: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The limbs of people, far ones first: body (M,), ends (M, 2, 3), radii (M, 2), colour (M, 3)."""
+        shape = self._wardrobe.figures(moment.bodies, rows)
+        # What is not worn has no size.
+        person, limb = np.nonzero(np.isfinite(shape.radius_m).all(axis=2) & (shape.radius_m.max(axis=2) > thin_m))
+        depth = (shape.ends_m[person, limb].mean(axis=1) - moment.pose.place_m) @ moment.pose.axes[:, 2]
+        order = np.lexsort((-depth, person))
+        person, limb = person[order], limb[order]
+        return rows[person], shape.ends_m[person, limb], shape.radius_m[person, limb], shape.colour[person, limb]
+
+    def _faces(self, moment: Moment, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The faces of vehicles in the order to draw them.
+
+        body (M,), corners (M, C, 3), colour (M, 3), and which are turned to the camera (M,).
+        """
+        bodies, pose, sun = moment.bodies, moment.pose, self._world.to_sun
+        parts = [(np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 3)), np.zeros(0, bool))]
+        for row in rows:
+            faces = vehicle_faces(str(bodies.kind[row]))
+            corners, normal, colour = faces.placed(bodies, row)
+            light = np.where(faces.lit, _SKYLIGHT + (1.05 - _SKYLIGHT) * np.maximum(normal @ sun, 0) / sun[2], 1)
+            colour, middle = colour * light[:, None], corners.mean(axis=1)
+            order = np.arange(len(corners))
+            if bodies.kind[row] != "car":
+                # Far faces first; the marker lies on top of all.
+                order = np.lexsort(((middle - pose.place_m) @ -pose.axes[:, 2], faces.plate))
+            seen = np.einsum("fk,fk->f", normal, pose.place_m - middle) > 0
+            parts.append((np.full(len(corners), row), corners[order], colour[order], seen[order]))
+        body, corners, colour, seen = _concatenate(parts)
+        return body, corners, colour, seen
+
+    def _cast(self, points_m: np.ndarray, feet_up_m: np.ndarray) -> np.ndarray:
+        """Where the shadows of points (N, 3) fall on the ground, (N, 3)."""
+        sun = self._world.to_sun
+        place, up = points_m[:, :2], feet_up_m
+        for _ in range(2):
+            # Where the ground rises it is met earlier: once more, from the height that was found.
+            place = points_m[:, :2] - (np.maximum(points_m[:, 2] - up, 0) / max(sun[2], 0.1))[:, None] * sun[:2]
+            up = self._world.up_m(place)
+        return np.c_[place, up]
 
 
-def _averaged(canvas: np.ndarray, step: int) -> np.ndarray:
-    """An enlarged canvas at the picture's own size."""
-    size = canvas.shape[1] // step, canvas.shape[0] // step
-    return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA))
+def _join(rank: np.ndarray, *parts: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+    """The columns of all outlines (body, points, ...), the bodies in the order of their rank."""
+    columns = _concatenate(parts)
+    order = np.argsort(rank[columns[0]], kind="stable")
+    return [column[order] for column in columns]
+
+
+def _concatenate(parts: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
+    """The columns of all outlines (body, points, ...); the last corner is repeated where one has fewer than others."""
+    most = max(part[1].shape[1] for part in parts)
+    filled = [
+        (body, np.pad(points, ((0, 0), (0, most - points.shape[1]), (0, 0)), mode="edge"), *others)
+        for body, points, *others in parts
+    ]
+    return [np.concatenate(column) for column in zip(*filled, strict=True)]

@@ -1,19 +1,14 @@
-"""The ground of a world seen from above: where each pixel lies, and its colour."""
+"""The ground of a world seen from above: where each pixel lies, what stands there, and its colour."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.agents import Moment
-from torchvision_dddas.simulation.drawing import halved_levels
-from torchvision_dddas.simulation.shutter import Shutter, meet_ground
-from torchvision_dddas.simulation.world import World
-
-# Relief marching: what stands on the ground leans in the picture, and hides what is behind it.
-
+from torchvision_dddas.simulation.cameras import Shutter, meet_ground
+from torchvision_dddas.simulation.world import GroundTexture, World, halved_levels
 
 _CELL_M = 0.4  # of the maps of what is highest nearby
 _BLOCK_SLICES = 20  # heights at which a block of pixels is tested
@@ -28,6 +23,16 @@ _INSIDE_M = 0.4  # walls take the colour of the roof at this distance from its e
 _SKYLIGHT = 0.42
 _WIDE = 30_000  # OpenCV remaps no picture wider than 32767
 
+_STEP_PX = 8  # distance between rays; what lies between them is interpolated
+_LEVELS = 8
+_SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
+_VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
+_HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
+_GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
+_GRAIN_TILES = 6
+_FLAT_PX, _LOW_M = 0.8, 1.4
+_LEAST_M, _MOST_LEAN = 1.0, 8.0  # least height of the camera; greatest lean
+
 
 class SightLines(NamedTuple):
     """N lines of sight, float32, and where they meet the bare ground. All (N,).
@@ -40,10 +45,6 @@ class SightLines(NamedTuple):
     lean_east: np.ndarray
     lean_north: np.ndarray
     pixel_m: np.ndarray
-
-    def at(self, up_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places east and north where they pass at a height up_m, (N,) or (K, N)."""
-        return self.east_m + self.lean_east * up_m, self.north_m + self.lean_north * up_m
 
     @property
     def lean(self) -> np.ndarray:
@@ -66,11 +67,10 @@ class Hits(NamedTuple):
 
 
 class StandingSurface:
-    """What stands on a world's ground, made ready for lines of sight from above."""
+    """What stands on a world's ground, prepared for lines of sight from above."""
 
     def __init__(self, world: World) -> None:
-        self._side_m, self._to_sun = world.side_m, world.to_sun
-        self._texel_m = world.surface_texel_m
+        self._side_m, self._to_sun, self._texel_m = world.side_m, world.to_sun, world.surface_texel_m
         self._levels = halved_levels(np.ascontiguousarray(world.surface, np.float32), _HEIGHT_LEVELS)
         cells = max(int(np.ceil(world.side_m / _CELL_M)), 1)
         # A reach of one cell from wherever in its own cell a place lies, and a texel for what is interpolated.
@@ -90,21 +90,15 @@ class StandingSurface:
         kinds = level * len(_MARCH_STEPS) + steps
         found = []
         for part in _parts(kinds):
-            kind = int(kinds[part[0]])
-            hit, up = self._march(
-                kind // len(_MARCH_STEPS),
-                _MARCH_STEPS[kind % len(_MARCH_STEPS)],
-                sights.of(part),
-                top_m[part],
-                bottom_m[part],
-            )
+            at, steps_at = divmod(int(kinds[part[0]]), len(_MARCH_STEPS))
+            hit, up = self._march(at, _MARCH_STEPS[steps_at], sights.of(part), top_m[part], bottom_m[part])
             found.append((part[hit], up))
         which, up = (np.concatenate(column) for column in zip(*found, strict=True))
         if not len(which):
             return None
-        east, north = sights.of(which).at(up)
-        light = np.ones(len(which), np.float32)
-        side = np.float32(_INSIDE_M)
+        met = sights.of(which)
+        east, north = met.east_m + met.lean_east * up, met.north_m + met.lean_north * up
+        light, side = np.ones(len(which), np.float32), np.float32(_INSIDE_M)
         beside = [self._up(east + x, north + y) for x, y in ((side, 0), (-side, 0), (0, side), (0, -side))]
         rise_east, rise_north = beside[0] - beside[1], beside[2] - beside[3]
         rise = np.hypot(rise_east, rise_north)
@@ -125,12 +119,10 @@ class StandingSurface:
         top, bottom = (np.zeros(len(reach_m), np.float32) for _ in range(2))
         whole = np.full(len(reach_m), self.tallest_m + _LOWEST_M, np.float32)
         # Most of them have nothing near, which one look-up shows.
-        some, _ = self.narrowed(sights, reach_m, whole, top, 1)
-        part = np.flatnonzero(some)
+        part = np.flatnonzero(self.narrowed(sights, reach_m, whole, top, 1)[0])
         if len(part):
-            top[part], bottom[part] = self.narrowed(
-                sights.of(part), reach_m[part], whole[part], top[part], _BLOCK_SLICES
-            )
+            some = sights.of(part), reach_m[part], whole[part], top[part]
+            top[part], bottom[part] = self.narrowed(*some, _BLOCK_SLICES)
         return top, bottom
 
     def narrowed(
@@ -141,14 +133,15 @@ class StandingSurface:
         The heights are found to one of `slices` steps. Where nothing is in reach, both are 0.
         """
         slice_m = (top_m - bottom_m) / np.float32(slices)
-        ring = rings(reach_m + sights.lean * slice_m / 2)
+        reach = np.maximum(reach_m + sights.lean * slice_m / 2, _CELL_M)
+        ring = np.ceil(np.log2(reach / _CELL_M)).astype(np.int8)  # each is twice as wide as the one before
         top, bottom = (np.zeros(len(ring), np.float32) for _ in range(2))
         below = np.arange(1, slices + 1, dtype=np.float32)[:, None]
         for part in _parts(ring):
             highest = self._nearby(int(ring[part[0]]))
             first, each = top_m[part], slice_m[part]
             edge = first - below * each
-            may = self._looked(highest, sights.of(part), edge + each / 2, cv2.INTER_NEAREST)
+            may = self._sample(highest, sights.of(part), edge + each / 2, cv2.INTER_NEAREST)
             may = may > np.maximum(edge, _LOWEST_M) / np.float32(self._code_m)
             high, low = (np.zeros(len(part), np.float32) for _ in range(2))
             for k in range(slices):
@@ -166,7 +159,7 @@ class StandingSurface:
         up = top_m - np.arange(1, steps + 1, dtype=np.float32)[:, None] * step
         # The last step ends a little above the ground, which everything flat is not.
         up[-1] = np.maximum(up[-1], np.minimum(_LOWEST_M, step / 2))
-        inside = self._looked(texture, sights, up, cv2.INTER_LINEAR) > np.maximum(up, _LOWEST_M)
+        inside = self._sample(texture, sights, up, cv2.INTER_LINEAR) > np.maximum(up, _LOWEST_M)
         highest = np.full(len(step), -1, np.float32)
         for k in range(steps - 1, -1, -1):
             np.copyto(highest, up[k], where=inside[k])
@@ -175,7 +168,7 @@ class StandingSurface:
         high, met = low + step[hit], sights.of(hit)
         for _ in range(_HALVINGS if len(hit) else 0):
             middle = (low + high) / 2
-            within = self._looked(texture, met, middle[None], cv2.INTER_LINEAR)[0] > middle
+            within = self._sample(texture, met, middle[None], cv2.INTER_LINEAR)[0] > middle
             low, high = np.where(within, middle, low), np.where(within, high, middle)
         return hit, low
 
@@ -186,10 +179,10 @@ class StandingSurface:
             part = slice(first, first + _WIDE)
             none = np.zeros_like(east_m[part])
             plumb = SightLines(east_m[part], north_m[part], none, none, none)
-            up[part] = self._looked(self._levels[0], plumb, none[None], cv2.INTER_LINEAR)[0]
+            up[part] = self._sample(self._levels[0], plumb, none[None], cv2.INTER_LINEAR)[0]
         return up
 
-    def _looked(self, texture: np.ndarray, sights: SightLines, up_m: np.ndarray, how: int) -> np.ndarray:
+    def _sample(self, texture: np.ndarray, sights: SightLines, up_m: np.ndarray, how: int) -> np.ndarray:
         """(K, N) values of a texture (H, W) of the whole world where N lines of sight pass at heights up_m (K, N)."""
         half = self._side_m / 2
         across, down = (np.float32(n / self._side_m) for n in texture.shape[1::-1])
@@ -208,37 +201,12 @@ class StandingSurface:
         return self._highest[ring]
 
 
-def rings(reach_m: np.ndarray) -> np.ndarray:
-    """How many rings cover a reach (N,): each is twice as wide as the one before."""
-    return np.ceil(np.log2(np.maximum(reach_m, _CELL_M) / _CELL_M)).astype(np.int8)
-
-
 def _parts(kind: np.ndarray) -> Iterator[np.ndarray]:
     """The rows of each kind (N,), 0 or more, in lists that are not too long."""
     for k in np.flatnonzero(np.bincount(kind)):
         rows = np.flatnonzero(kind == k)
         for first in range(0, len(rows), _WIDE):
             yield rows[first : first + _WIDE]
-
-
-# Rows that are alike, done at once.
-
-
-def equal_runs(values: np.ndarray) -> Iterable[tuple[int, int]]:
-    """The first row of each run of equal values (N,), and the one after its last."""
-    return pairwise([0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)])
-
-
-_STEP_PX = 8  # distance between rays; what lies between them is interpolated
-_LEVELS = 8
-_BETWEEN = 32  # shares in which two levels are mixed
-_SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
-_VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
-_HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
-_GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
-_GRAIN_TILES = 6
-_FLAT_PX, _LOW_M = 0.8, 1.4
-_LEAST_M, _MOST_LEAN = 1.0, 8.0  # least height of the camera; greatest lean
 
 
 class PixelPlaces(NamedTuple):
@@ -257,12 +225,12 @@ class PixelPlaces(NamedTuple):
 
 
 class Terrain:
-    """The ground of a world, made ready for many looks from above."""
+    """The ground of a world, prepared for many pictures from above."""
 
     def __init__(self, world: World, shutter: Shutter) -> None:
         self._world, self._shutter = world, shutter
         self._standing = StandingSurface(world)
-        self._levels = halved_levels(world.albedo, _LEVELS)
+        self._texture = GroundTexture(world, _LEVELS)
         rough = np.random.default_rng(_GRAIN_PX).standard_normal((_GRAIN_PX, _GRAIN_PX), np.float32)
         rough = np.tile(rough, (3, 3))
         rough = (cv2.GaussianBlur(rough, (0, 0), 0.7) - cv2.GaussianBlur(rough, (0, 0), 3))[_GRAIN_PX : 2 * _GRAIN_PX]
@@ -277,7 +245,7 @@ class Terrain:
         row, column = (np.arange(n) // _STEP_PX + 1 for n in (height, width))
         self._block = (row[:, None] * self._cells[0] + column).ravel().astype(np.int32)
 
-    def lie(self, moment: Moment) -> PixelPlaces:
+    def places(self, moment: Moment) -> PixelPlaces:
         """Where the pixels of a moment's picture lie."""
         columns, rows = self._cells
         start, way = self._shutter.rays(moment, self._block_px.reshape(-1, 2))
@@ -285,34 +253,40 @@ class Terrain:
         place = (start + far[:, None] * way)[:, :2].reshape(rows, columns, 2)
         # On a plane the inverse of the distance is linear over the picture, and so is the place over the distance.
         inverse = (1 / np.maximum(far, 1e-3)).reshape(rows, columns)
-        scale = self._enlarged(inverse)
-        east, north = (cv2.divide(self._enlarged(place[..., k] * inverse), scale) for k in range(2))
+        scale = self._enlarge(inverse)
+        east, north = (cv2.divide(self._enlarge(place[..., k] * inverse), scale) for k in range(2))
         along, aside = (np.gradient(place, axis=axis) / _STEP_PX for axis in range(2))
         pixel_m = np.sqrt(np.abs(along[..., 0] * aside[..., 1] - along[..., 1] * aside[..., 0]))
         height = self._shutter.camera.size_px[1]
         each_row = np.interp(np.arange(height), self._block_px[:, 0, 1], np.median(pixel_m, axis=1))
         away = far * np.linalg.norm(way, axis=1)
         haze = np.where(way[:, 2] > -_HORIZON, 1, 1 - np.exp(-away / _VISIBILITY_M)).reshape(rows, columns)
-        lie = PixelPlaces(east, north, each_row, haze=self._enlarged(haze) if haze.max() > _CLEAR else None)
+        places = PixelPlaces(east, north, each_row, haze=self._enlarge(haze) if haze.max() > _CLEAR else None)
         if self._standing.tallest_m <= 0:
-            return lie
-        sights = _lines_of_sight(list(place.reshape(-1, 2).T), list(start.T), up, pixel_m.ravel())
+            return places
+        blocks = _lines_of_sight(list(place.reshape(-1, 2).T), list(start.T), up, pixel_m.ravel())
         longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
-        top, bottom = self._standing.between(sights, 0.75 * _STEP_PX * longest)
+        top, bottom = self._standing.between(blocks, 0.75 * _STEP_PX * longest)
         # Low things that lean by less than a pixel may lie flat.
-        top[(top * sights.lean < _FLAT_PX * sights.pixel_m) & (top < _LOW_M)] = 0
-        return self._risen(lie, moment, sights, up, top, bottom, longest) if top.any() else lie
+        top[(top * blocks.lean < _FLAT_PX * blocks.pixel_m) & (top < _LOW_M)] = 0
+        return self._raise(places, moment, blocks, up, top, bottom, longest) if top.any() else places
 
-    def _risen(
-        self, lie: PixelPlaces, moment: Moment, blocks: SightLines, up: np.ndarray, top: np.ndarray, bottom: np.ndarray,
+    def _raise(
+        self,
+        places: PixelPlaces,
+        moment: Moment,
+        blocks: SightLines,
+        up: np.ndarray,
+        top: np.ndarray,
+        bottom: np.ndarray,
         longest: np.ndarray,
-    ) -> PixelPlaces:  # fmt: skip
-        """Where pixels lie once lines of sight have met what stands, between the heights that blocks say (N,).
+    ) -> PixelPlaces:
+        """Where pixels lie once lines of sight have met what stands, between the top and bottom of blocks (N,).
 
-        longest: (N,) metres that a pixel is long on the ground.
+        up: (N,) height of their ground. longest: (N,) metres that a pixel is long on the ground.
         """
         columns, rows = self._cells
-        height, width = lie.east_m.shape
+        height, width = places.east_m.shape
         hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
         some = cv2.resize(hopeful, None, fx=_STEP_PX // 2, fy=_STEP_PX // 2, interpolation=cv2.INTER_NEAREST)
         # Most pixels of such blocks miss it. Pixels are tested by fours: the first of four with a reach about it.
@@ -321,15 +295,12 @@ class Terrain:
         row, column = 2 * (four // across), 2 * (four % across)
         first = row * width + column
         block = self._block.take(first)
-        lines = SightLines(
-            lie.east_m.take(first), lie.north_m.take(first), blocks.lean_east.take(block),
-            blocks.lean_north.take(block), blocks.pixel_m.take(block),
-        )  # fmt: skip
+        lines = blocks.of(block)._replace(east_m=places.east_m.take(first), north_m=places.north_m.take(first))
         reach = (1.5 * longest).astype(np.float32).take(block)
         top, bottom = self._standing.narrowed(lines, reach, top.take(block), bottom.take(block), _SLICES)
         near = np.flatnonzero(top)
         if not len(near):
-            return lie
+            return places
         # All four of them; at an odd edge some count twice.
         row, column = row.take(near), column.take(near)
         row = np.concatenate([row, row, np.minimum(row + 1, height - 1), np.minimum(row + 1, height - 1)])
@@ -338,71 +309,49 @@ class Terrain:
         top, bottom, block = top.take(near), bottom.take(near), block.take(near)
         lag = self._shutter.lag_s(np.arange(height))[:, None]
         eye = (moment.pose.place_m + lag * moment.velocity_m_s).astype(np.float32).T
-        sights = _lines_of_sight(
-            (lie.east_m.take(which), lie.north_m.take(which)), [axis.take(row) for axis in eye],
-            up.astype(np.float32).take(block), blocks.pixel_m.take(block),
-        )  # fmt: skip
+        ground = places.east_m.take(which), places.north_m.take(which)
+        eyes = [axis.take(row) for axis in eye]
+        sights = _lines_of_sight(ground, eyes, up.astype(np.float32).take(block), blocks.pixel_m.take(block))
         met = self._standing.met(sights, top, bottom)
         if met is None:
-            return lie
+            return places
+        met = met._replace(which=which[met.which])
         rise = np.zeros((height, width), np.float32)
-        for picture, values in ((lie.east_m, met.east_m), (lie.north_m, met.north_m), (rise, met.up_m)):
-            picture.ravel()[which[met.which]] = values
-        return lie._replace(rise_m=rise, met=met._replace(which=which[met.which]))
+        for picture, values in ((places.east_m, met.east_m), (places.north_m, met.north_m), (rise, met.up_m)):
+            picture.ravel()[met.which] = values
+        return places._replace(rise_m=rise, met=met)
 
-    def _enlarged(self, blocks: np.ndarray) -> np.ndarray:
-        """What is known of the middles of blocks, (rows, columns), for all pixels, (H, W) float32."""
+    def _enlarge(self, blocks: np.ndarray) -> np.ndarray:
+        """(H, W) float32, for all pixels, of values at the middles of blocks, (rows, columns)."""
         columns, rows = self._cells
         width, height = self._shutter.camera.size_px
         size = columns * _STEP_PX, rows * _STEP_PX
         full = cv2.resize(np.asarray(blocks, np.float32), size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(full[_STEP_PX : _STEP_PX + height, _STEP_PX : _STEP_PX + width])
 
-    def texture(self, lie: PixelPlaces) -> np.ndarray:
+    def picture(self, places: PixelPlaces) -> np.ndarray:
         """(H, W, 3) uint8: the colours where the pixels lie, averaged over as much ground as a pixel covers."""
-        world = self._world
-        level = np.clip(np.log2(lie.pixel_m / world.texel_m), 0, len(self._levels) - 1)
-        level = np.round(level * _BETWEEN).astype(int)
-        picture = np.empty((*lie.east_m.shape, 3), np.uint8)
-        for first, last in equal_runs(level // _BETWEEN):
-            rows, at = slice(first, last), int(level[first]) // _BETWEEN
-            share = level[rows] % _BETWEEN
-            fine = self._look(at, lie.east_m[rows], lie.north_m[rows])
-            if share.any():
-                coarse = self._look(at + 1, lie.east_m[rows], lie.north_m[rows])
-                for begin, end in equal_runs(share):
-                    part, weight = slice(begin, end), float(share[begin]) / _BETWEEN
-                    cv2.addWeighted(fine[part], 1 - weight, coarse[part], weight, 0, dst=fine[part])
-            picture[rows] = fine
-        if lie.met is not None:
-            dim = lie.met.light != 1
-            flat, which = picture.reshape(-1, 3), lie.met.which[dim]
-            flat[which] = np.clip(flat[which] * lie.met.light[dim, None], 0, 255)
+        picture = self._texture.rows(places.pixel_m, places.east_m, places.north_m)
+        if places.met is not None:
+            dim = places.met.light != 1
+            flat, which = picture.reshape(-1, 3), places.met.which[dim]
+            flat[which] = np.clip(flat[which] * places.met.light[dim, None], 0, 255)
         # Enlarged, a texture is smooth: it gets the grain that it is too coarse to show.
-        wanted = float(np.clip(np.log2(world.texel_m / np.median(lie.pixel_m)), 0, 1))
+        wanted = float(np.clip(np.log2(self._world.texel_m / np.median(places.pixel_m)), 0, 1))
         if wanted > 0.25:
             # OpenCV is slow beyond a texture's edge: the pattern is tiled, and moved by whole tiles.
-            side = _GRAIN_PX * _GRAIN_M
-            corner = (float(np.floor(place[::16, ::16].min() / side)) for place in (lie.east_m, lie.north_m))
-            u, v = (
-                cv2.addWeighted(place, 1 / _GRAIN_M, place, 0, -start * _GRAIN_PX)
-                for place, start in zip((lie.east_m, lie.north_m), corner, strict=True)
-            )
+            at = []
+            for place in (places.east_m, places.north_m):
+                start = float(np.floor(place[::16, ::16].min() / (_GRAIN_PX * _GRAIN_M)))
+                at.append(cv2.addWeighted(place, 1 / _GRAIN_M, place, 0, -start * _GRAIN_PX))
+            u, v = at
             grain = cv2.remap(self._grain, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
             cv2.addWeighted(picture, 1, cv2.cvtColor(grain, cv2.COLOR_GRAY2BGR), wanted, -128 * wanted, dst=picture)
         return picture
 
-    def _look(self, level: int, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
-        texture = self._levels[level]
-        half = self._world.side_m / 2
-        across, down = (n / self._world.side_m for n in texture.shape[1::-1])
-        u = cv2.addWeighted(east_m, across, east_m, 0, half * across - 0.5)
-        v = cv2.addWeighted(north_m, -down, north_m, 0, half * down - 0.5)
-        return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-
 
 def _lines_of_sight(
-    place_m: Sequence[np.ndarray], eye_m: Sequence[np.ndarray | float], up_m: np.ndarray, pixel_m: np.ndarray
+    place_m: Sequence[np.ndarray], eye_m: Sequence[np.ndarray], up_m: np.ndarray, pixel_m: np.ndarray
 ) -> SightLines:
     """The lines of sight to places (east, north; N each) at heights up_m (N,), from eyes (east, north, up)."""
     east, north = (eye - place for eye, place in zip(eye_m, place_m, strict=False))

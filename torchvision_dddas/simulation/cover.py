@@ -1,4 +1,4 @@
-"""What stands on the ground: bushes, trees, buildings; where they are, how high they are, how they look from above."""
+"""What stands on the ground: bushes, trees, buildings; their places and heights, and their look from above."""
 
 from dataclasses import dataclass
 
@@ -49,19 +49,17 @@ def scatter_objects(
     is left out.
     """
     kind = np.repeat(["building", "tree", "bush"], counts[::-1])
-    total = len(kind)
-    half = np.zeros((total, 2))
-    of = {name: kind == name for name in ("building", "tree", "bush")}
-    half[of["building"]] = rng.uniform((3.5, 2.5), (7.5, 4.5), (counts[2], 2))
-    half[of["tree"]] = rng.uniform(1.6, 3.4, (counts[1], 1))
-    half[of["bush"]] = np.clip(rng.lognormal(-0.35, 0.4, (counts[0], 1)), 0.3, 1.8)
-    radius = np.where(of["building"], np.hypot(*half.T), half[:, 0])
-    height = np.where(of["building"], rng.uniform(2.8, 4.5, total), radius * rng.uniform(1.0, 1.5, total))
+    total, half = len(kind), np.zeros((len(kind), 2))
+    is_building = kind == "building"
+    half[is_building] = rng.uniform((3.5, 2.5), (7.5, 4.5), (counts[2], 2))
+    half[kind == "tree"] = rng.uniform(1.6, 3.4, (counts[1], 1))
+    half[kind == "bush"] = np.clip(rng.lognormal(-0.35, 0.4, (counts[0], 1)), 0.3, 1.8)
+    radius = np.where(is_building, np.hypot(*half.T), half[:, 0])
+    height = np.where(is_building, rng.uniform(2.8, 4.5, total), radius * rng.uniform(1.0, 1.5, total))
     heading = rng.uniform(0, np.pi, total)
     tries = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (total, _TRIES, 3))
     places, good = side_m * tries[..., :2], np.empty((total, _TRIES), bool)
-    for plant, ground in ((True, wished), (False, built)):
-        some = of["building"] != plant
+    for some, ground in ((~is_building, wished), (is_building, built)):
         row = np.minimum((0.5 - tries[some, :, 1]) * ground.shape[0], ground.shape[0] - 1).astype(int)
         column = np.minimum((0.5 + tries[some, :, 0]) * ground.shape[1], ground.shape[1] - 1).astype(int)
         good[some] = tries[some, :, 2] <= ground[row, column]
@@ -81,10 +79,10 @@ def scatter_objects(
 
 
 class Crowns:
-    """Shapes of things as seen from above, on any grid."""
+    """Shapes of objects as seen from above, on any grid."""
 
     def __init__(self, things: StandingObjects, side_m: float, seed: int) -> None:
-        self.things, self.side_m, self.seed = things, side_m, seed
+        self._things, self._side_m, self._seed = things, side_m, seed
         rng = np.random.default_rng([seed, 21])
         self._moulds = [_mould(rng) for _ in range(16)]
         self._which = rng.integers(0, (len(self._moulds), 8), (len(things), 2))
@@ -92,33 +90,34 @@ class Crowns:
     def surface(self, cells: int) -> np.ndarray:
         """(cells, cells) float32 metres above the ground, row 0 the north edge."""
         heights = np.zeros((cells, cells), np.float32)
-        for k in range(len(self.things)):
-            shape, row, column = self._shape(k, self.side_m / cells)
+        for k in range(len(self._things)):
+            shape, row, column = self._shape(k, self._side_m / cells)
             part, cut = _overlap(heights, shape.shape[0], row, column)
             np.maximum(part, shape[cut], out=part)
         return heights
 
     def paint(self, image: np.ndarray, first_row: int, texel_m: float, to_sun: np.ndarray) -> None:
         """Draw the crowns and roofs, in the sun, into rows of a picture (3, n, W) float32, from first_row on."""
-        things, rows = self.things, image.shape[1]
-        middle_row = (self.side_m / 2 - things.east_north_m[:, 1]) / texel_m
+        things, rows = self._things, image.shape[1]
+        middle_row = (self._side_m / 2 - things.east_north_m[:, 1]) / texel_m
         reach = things.radius_m / texel_m + 2
         near = np.flatnonzero((middle_row + reach > first_row) & (middle_row - reach < first_row + rows))
         # The highest last: a crown hides the lower ones under it.
-        for k in near[np.argsort(things.height_m[near], kind="stable")]:
-            shape, row, column = self._shape(int(k), texel_m)
+        for k in near[np.argsort(things.height_m[near], kind="stable")].tolist():
+            shape, row, column = self._shape(k, texel_m)
             part, cut = _overlap(image, shape.shape[0], row - first_row, column)
             if part.size:
-                look, seen = self._look(int(k), shape, texel_m, to_sun)
-                part += seen[cut] * (look[:, *cut] - part)
+                colour, seen = self._colour(k, shape, row, column, texel_m, to_sun)
+                part += seen[cut] * (colour[:, *cut] - part)
 
     def _shape(self, k: int, texel_m: float) -> tuple[np.ndarray, int, int]:
-        """(n, n) float32 heights of one thing, and the row and column of its first pixel."""
-        things = self.things
+        """(n, n) float32 heights of one object, and the row and column of its first pixel."""
+        things, half = self._things, self._side_m / 2
+        east, north = things.east_north_m[k]
         reach = int(np.ceil(things.radius_m[k] / texel_m))
-        row, column = self._corner(k, reach, texel_m)
-        size = 2 * reach + 1
-        height = np.float32(things.height_m[k])
+        row = int(np.floor((half - north) / texel_m)) - reach
+        column = int(np.floor((east + half) / texel_m)) - reach
+        size, height = 2 * reach + 1, np.float32(things.height_m[k])
         if things.kind[k] == "building":
             along, aside = self._own_metres(k, row, column, size, texel_m)
             walls = (np.abs(along) < things.half_m[k, 0]) & (np.abs(aside) < things.half_m[k, 1])
@@ -131,20 +130,20 @@ class Crowns:
             shape = cv2.resize(shape, (max(round(wide), 3),) * 2, interpolation=cv2.INTER_AREA)
         # To the very place and size, which are no whole numbers of pixels.
         scale = len(shape) / wide
-        east, north = things.east_north_m[k]
-        middle = np.array([(east + self.side_m / 2) / texel_m - column, (self.side_m / 2 - north) / texel_m - row])
+        middle = np.array([(east + half) / texel_m - column, (half - north) / texel_m - row])
         matrix = np.c_[scale * np.eye(2), scale * (0.5 - middle) + (len(shape) - 1) / 2]
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return cv2.warpAffine(shape, matrix, (size, size), flags=flags) * height, row, column
 
-    def _look(self, k: int, shape: np.ndarray, texel_m: float, to_sun: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colours of a thing in the sun (3, n, n), and how much of each pixel it hides (n, n)."""
-        things, rng = self.things, np.random.default_rng([self.seed, 22, k])
+    def _colour(
+        self, k: int, shape: np.ndarray, row: int, column: int, texel_m: float, to_sun: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Colours of an object in the sun (3, n, n), and how much of each pixel it hides (n, n)."""
+        things, rng = self._things, np.random.default_rng([self._seed, 22, k])
         colour = things.colour[k].astype(np.float32)[:, None, None]
         spread = rng.standard_normal(shape.shape, np.float32)
         if things.kind[k] == "building":
-            reach = shape.shape[0] // 2
-            along, _ = self._own_metres(k, *self._corner(k, reach, texel_m), shape.shape[0], texel_m)
+            along, _ = self._own_metres(k, row, column, shape.shape[0], texel_m)
             ribs = 0.04 * np.sign(np.sin(2 * np.pi * along / 0.9))
             stains = cv2.GaussianBlur(spread, (0, 0), 0.8 / texel_m) * np.float32(0.1 / texel_m)
             return colour * (1 + ribs + 0.025 * spread + stains).astype(np.float32), np.sign(shape)
@@ -157,25 +156,18 @@ class Crowns:
         seen = np.clip(shape / (0.22 * things.height_m[k]) + 0.5 * leaves, 0, 1)
         return colour * light.astype(np.float32), np.where(shape > 0, seen, 0).astype(np.float32)
 
-    def _corner(self, k: int, reach: int, texel_m: float) -> tuple[int, int]:
-        """Row and column of the first pixel of a thing's patch."""
-        east, north = self.things.east_north_m[k]
-        row = int(np.floor((self.side_m / 2 - north) / texel_m)) - reach
-        return row, int(np.floor((east + self.side_m / 2) / texel_m)) - reach
-
     def _own_metres(self, k: int, row: int, column: int, size: int, texel_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Metres along and aside of a thing's heading from its middle, (n, n) each, for the pixels of a patch."""
-        east = (column + np.arange(size) + 0.5) * texel_m - self.side_m / 2 - self.things.east_north_m[k, 0]
-        north = self.side_m / 2 - (row + np.arange(size)[:, None] + 0.5) * texel_m - self.things.east_north_m[k, 1]
-        sine, cosine = np.sin(self.things.heading_rad[k]), np.cos(self.things.heading_rad[k])
+        """Metres along and aside of an object's heading from its middle, (n, n) each, for the pixels of a patch."""
+        east = (column + np.arange(size) + 0.5) * texel_m - self._side_m / 2 - self._things.east_north_m[k, 0]
+        north = self._side_m / 2 - (row + np.arange(size)[:, None] + 0.5) * texel_m - self._things.east_north_m[k, 1]
+        sine, cosine = np.sin(self._things.heading_rad[k]), np.cos(self._things.heading_rad[k])
         return east * sine + north * cosine, east * cosine - north * sine
 
 
 def _overlap(image: np.ndarray, size: int, row: int, column: int) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The part of a picture (..., H, W) that a patch laid at (row, column) covers, and which part of it that is."""
-    height, width = image.shape[-2:]
-    top, left = min(max(row, 0), height), min(max(column, 0), width)
-    bottom, right = max(min(row + size, height), top), max(min(column + size, width), left)
+    """The part of a picture (..., H, W) that a patch at (row, column) covers, and which part of it that is."""
+    top, bottom = np.clip((row, row + size), 0, image.shape[-2]).tolist()
+    left, right = np.clip((column, column + size), 0, image.shape[-1]).tolist()
     cut = slice(top - row, bottom - row), slice(left - column, right - column)
     return image[..., top:bottom, left:right], cut
 

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.aerial_ground import equal_runs
-from torchvision_dddas.simulation.drawing import View, halved_levels
-from torchvision_dddas.simulation.world import World
+from torchvision_dddas.simulation.cameras import View
+from torchvision_dddas.simulation.world import GroundTexture, World, equal_runs
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
 _ZENITH = np.array([196.0, 140, 84], np.float32)
@@ -17,16 +16,9 @@ _FAR_M = 1500.0
 _COLUMN_PX = 16  # columns between rays
 _STEPS = 110  # places on the ground on each ray
 _LEVELS = 7
-_BETWEEN = 32  # shares in which two levels, or ground and air, are mixed
+_SHARES = 32  # in which ground and air are mixed
 _TILE = 512  # side of the pattern of pebbles, in its own texels
 _GRAIN_M = (0.007, 0.031)  # sizes of its texels: the pattern is used twice
-
-
-class BackdropView(NamedTuple):
-    """image: (H, W, 3) uint8 BGR. inverse_m: (H, W) float32, 1 / the way over the ground to each pixel; 0: sky."""
-
-    image: np.ndarray
-    inverse_m: np.ndarray
 
 
 class _Rays(NamedTuple):
@@ -40,51 +32,55 @@ class _Rays(NamedTuple):
     level: np.ndarray
     rise: np.ndarray
 
+    def rows(self, part: slice) -> "_Rays":
+        """Those of some rows."""
+        return _Rays(*(values[part] for values in self))
+
 
 class Backdrop:
-    """The ground of a world, made ready for a look along it."""
+    """The ground of a world, prepared for views along it."""
 
     def __init__(self, world: World, seed: int) -> None:
-        self._world = world
-        self._levels = halved_levels(world.albedo, _LEVELS)
+        self._world, self._texture = world, GroundTexture(world, _LEVELS)
         rng = np.random.default_rng([seed, 60])
         self._pebbles = _pebbles(rng)
-        self._maps: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
+        self._maps: dict[tuple[int, ...], list[np.ndarray]] = {}
         self._ridge = rng.uniform(0.3, 1, 6) / np.arange(1, 7), rng.uniform(0, 2 * np.pi, 6)
 
-    def seen(self, view: View, size: tuple[int, int]) -> BackdropView:
-        """What a view (its picture's width, height) holds of it."""
+    def seen(self, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """The picture (H, W, 3) uint8 BGR, and 1 / the way over the ground to each pixel (H, W) float32; 0: sky."""
         width, height = size
-        columns = np.linspace(0, width - 1, (width - 1) // _COLUMN_PX + 2)
-        rays = _rays(view, columns, height)
-        inverse = self._inverse_distance(view, rays)
-        # Between the columns all goes evenly; cv2.resize would count from the pixels' edges.
-        whole_inverse = self._widened(inverse, width)
-        whole_inverse[whole_inverse < 0.5 / _FAR_M] = 0
-        ground_there = whole_inverse > 0
-        rows = np.flatnonzero(ground_there.any(axis=1))
+        matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # of a pixel (u, v, 1)
+        u = np.linspace(0, width - 1, (width - 1) // _COLUMN_PX + 2).astype(np.float32)
+        v = np.arange(height, dtype=np.float32)[:, None]
+        east, north, up = (matrix[i, 0] * u + (matrix[i, 1] * v + matrix[i, 2]) for i in range(3))
+        level = cv2.magnitude(east, north)
+        rays = _Rays(east, north, level, up / level)
+        # Between the columns everything is linear; cv2.resize would count from the pixels' edges.
+        inverse = self._widen(self._inverse_distance(view, rays), width)
+        inverse[inverse < 0.5 / _FAR_M] = 0
+        is_ground = inverse > 0
+        rows = np.flatnonzero(is_ground.any(axis=1))
         first = int(rows[0]) if len(rows) else height
         image = np.empty((height, width, 3), np.uint8)
         last = min(first + _COLUMN_PX * 4, height)  # the ground's edge need not be level
-        while last < height and not ground_there[last].all():
+        while last < height and not is_ground[last].all():
             last += 1
-        sky = self._sky(_Rays(*(part[:last] for part in rays)), view)
-        image[:last] = self._widened(sky, width)
+        image[:last] = self._widen(self._sky(rays.rows(slice(last)), view), width)
         if first < height:
-            ground = self._ground(view, whole_inverse[first:], _Rays(*(part[first:] for part in rays)))
+            ground = self._ground(view, inverse[first:], rays.rows(slice(first, None)))
             mixed, onto = last - first, image[first:last]
-            onto[:] = np.where(ground_there[first:last, :, None], ground[:mixed], onto)
+            onto[:] = np.where(is_ground[first:last, :, None], ground[:mixed], onto)
             image[last:] = ground[mixed:]
-        return BackdropView(image, whole_inverse)
+        return image, inverse
 
-    def _widened(self, image: np.ndarray, width: int) -> np.ndarray:
-        """(H, width) of an image (H, C) of some columns, evenly between them."""
+    def _widen(self, image: np.ndarray, width: int) -> np.ndarray:
+        """(H, width) of an image (H, C) of some columns, interpolated between them."""
         shape = *image.shape[:2], width
         if shape not in self._maps:
             at = np.linspace(0, shape[1] - 1, width, dtype=np.float32)
             v = np.arange(shape[0], dtype=np.float32)[:, None]
-            u, v = (np.ascontiguousarray(np.broadcast_to(one, (shape[0], width))) for one in (at, v))
-            self._maps[shape] = u, v
+            self._maps[shape] = [np.ascontiguousarray(np.broadcast_to(one, (shape[0], width))) for one in (at, v)]
         u, v = self._maps[shape]
         return cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
 
@@ -106,35 +102,20 @@ class Backdrop:
     def _ground(self, view: View, inverse: np.ndarray, rays: _Rays) -> np.ndarray:
         """(H, W, 3) uint8, the rows on which there is ground. rays: those of some columns."""
         inverse = np.maximum(inverse, np.float32(0.5 / _FAR_M))
-        x, y = (
-            cv2.divide(self._widened(way / rays.level, inverse.shape[1]), inverse) for way in (rays.east, rays.north)
-        )
-        place = view.position_m[:2]
-        focal = float(np.linalg.norm(view.image_from_world[0, :3]))
+        width, place = inverse.shape[1], view.position_m[:2]
+        x, y = (cv2.divide(self._widen(way / rays.level, width), inverse) for way in (rays.east, rays.north))
         eye = max(float(view.position_m[2] - self._world.up_m(place[None])[0]), 0.2)
         # A pixel covers far / focal across and far^2 / (focal eye) along the line of sight; alike all along a row.
         far = 1 / np.median(inverse[:, ::16], axis=1)
-        across, along = far / focal, far**2 / (focal * eye)
-        blur = np.log2(np.maximum(np.sqrt(across * along) / self._world.texel_m, 1))
-        blur = np.round(np.clip(blur, 0, len(self._levels) - 1) * _BETWEEN).astype(int)
-        clear = np.round(np.exp(-far / VISIBILITY_M) * _BETWEEN).astype(int) / _BETWEEN
-        image = np.empty((*x.shape, 3), np.uint8)
-        air = np.broadcast_to(np.round(HAZE).astype(np.uint8), image.shape)
-        for first, last in equal_runs(blur // _BETWEEN):
-            part, k = slice(first, last), int(blur[first]) // _BETWEEN
-            fine = self._texture(k, x[part], y[part], place)
-            share = blur[part] % _BETWEEN
-            if share.any():
-                coarse = self._texture(k + 1, x[part], y[part], place)
-                for begin, end in equal_runs(share):
-                    weight = float(share[begin]) / _BETWEEN
-                    cv2.addWeighted(fine[begin:end], 1 - weight, coarse[begin:end], weight, 0, dst=fine[begin:end])
-            image[part] = fine
+        across, along = far / view.scale_px, far**2 / (view.scale_px * eye)
+        image = self._texture.rows(np.sqrt(across * along), x, y, (float(place[0]), float(place[1])))
         self._strew(image, x, y, place, along)
+        clear = np.round(np.exp(-far / VISIBILITY_M) * _SHARES).astype(int) / _SHARES
         for begin, end in equal_runs(clear):
             if clear[begin] < 1:
-                haze = np.ascontiguousarray(air[begin:end])
-                cv2.addWeighted(image[begin:end], clear[begin], haze, 1 - clear[begin], 0, dst=image[begin:end])
+                part = image[begin:end]
+                air = np.full(part.shape, np.round(HAZE), np.uint8)
+                cv2.addWeighted(part, clear[begin], air, 1 - clear[begin], 0, dst=part)
         return image
 
     def _strew(self, image: np.ndarray, x: np.ndarray, y: np.ndarray, place_m: np.ndarray, along_m: np.ndarray) -> None:
@@ -148,21 +129,12 @@ class Backdrop:
                     texel = cv2.addWeighted(way[near], 1 / grain, way[near], 0, float(np.mod(start / grain, _TILE)))
                     # Beyond 16 bits OpenCV would lose count of the tiles.
                     tiles = np.floor(texel * np.float32(1 / _TILE))
-                    texel -= np.multiply(tiles, np.float32(_TILE), out=tiles)
-                    texels.append(texel)
+                    texels.append(texel - np.multiply(tiles, np.float32(_TILE), out=tiles))
                 u, v = texels
                 pebbles = cv2.remap(self._pebbles, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-                weight = np.repeat(64 * strength[near, None], pebbles.shape[1], axis=1)
-                bright = cv2.multiply(pebbles, weight)
+                bright = cv2.multiply(pebbles, np.repeat(64 * strength[near, None], pebbles.shape[1], axis=1))
                 bright = cv2.cvtColor(cv2.convertScaleAbs(bright, alpha=1, beta=64), cv2.COLOR_GRAY2BGR)
                 cv2.multiply(image[near], bright, dst=image[near], scale=1 / 64)
-
-    def _texture(self, level: int, x: np.ndarray, y: np.ndarray, place_m: np.ndarray) -> np.ndarray:
-        texture, half = self._levels[level], self._world.side_m / 2
-        per_m = texture.shape[1] / self._world.side_m
-        u = cv2.addWeighted(x, per_m, x, 0, (half + float(place_m[0])) * per_m - 0.5)
-        v = cv2.addWeighted(y, -per_m, y, 0, (half - float(place_m[1])) * per_m - 0.5)
-        return cv2.remap(texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
 
     def _sky(self, rays: _Rays, view: View) -> np.ndarray:
         """(H, C, 3) float32."""
@@ -172,22 +144,12 @@ class Backdrop:
         bearing = np.arctan2(rays.east[-1], rays.north[-1])
         waves = share[:, None] * np.sin(np.outer(np.arange(2, 14, 2), bearing) + phase[:, None])
         tall = 0.03 + 0.014 * waves.sum(axis=0)
-        focal = float(np.linalg.norm(view.image_from_world[0, :3]))
-        covered = np.clip((tall - rays.rise) * focal + 0.5, 0, 1)[..., None].astype(np.float32)
+        covered = np.clip((tall - rays.rise) * view.scale_px + 0.5, 0, 1)[..., None].astype(np.float32)
         return sky + (_RIDGE * 0.6 + HAZE * 0.4 - sky) * covered
 
 
-def _rays(view: View, columns: np.ndarray, height: int) -> _Rays:
-    """Those through some columns of a picture."""
-    matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # of a pixel (u, v, 1)
-    u, v = columns.astype(np.float32), np.arange(height, dtype=np.float32)[:, None]
-    east, north, up = (matrix[i, 0] * u + (matrix[i, 1] * v + matrix[i, 2]) for i in range(3))
-    level = cv2.magnitude(east, north)
-    return _Rays(east, north, level, up / level)
-
-
 def _pebbles(rng: np.random.Generator) -> np.ndarray:
-    """(_TILE, _TILE) float32, about 0: grit and small stones, each with its dark side, that go on over the border."""
+    """(_TILE, _TILE) float32, about 0: grit and small stones, each with a dark side, seamless at the border."""
     grit = rng.normal(0, 1, (_TILE, _TILE)).astype(np.float32)
     pattern = np.zeros_like(grit)
     for sigma, share in ((0.7, 0.16), (2.5, 0.6), (9, 1.8)):

@@ -1,33 +1,47 @@
-"""The ground vehicles: how they drive and look, and the colours that they wear."""
+"""The ground vehicles: the team of UGVs with their coloured markers, and cars, which are no landmarks."""
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from copy import copy
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.movement import Obstacles, Waypoints, steer_round_discs
+from torchvision_dddas.simulation.body_shapes import UGV_LENGTH_M, UGV_WIDTH_M
+from torchvision_dddas.simulation.movement import (
+    Obstacles,
+    Waypoints,
+    heading_vector,
+    steer_round_discs,
+    wrap_angle,
+)
 from torchvision_dddas.simulation.scenario import AircraftParameters, CarPlan, TeamParameters
-from torchvision_dddas.simulation.vehicle_shapes import UGV_LENGTH_M, UGV_WIDTH_M
 from torchvision_dddas.types import Colours
 
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
-UGV_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2)  # half the length and half the width
-_APART_M, _ROOM_M = 2.1, 3.0  # how near another's middle they can be, and how far from it they mean to pass
-_KEPT_OFF_M = 6.0  # distance from people at which they pass while nobody steers them
-_LOOK_S = 0.25  # steps in which they think ahead
+UGV_HALF_M, CAR_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2), (2.2, 0.9)  # half the length and half the width
+_APART_M, _ROOM_M = 2.1, 3.0  # least distance of two vehicles, and that at which they mean to pass, middle to middle
+_KEPT_OFF_M = 6.0  # distance at which they pass people while nobody steers them
+_LOOK_S = 0.25  # time step of their plans
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
 _STOP_M = UGV_HALF_M[0] + 1.0  # they stop at this distance before others, middle to middle
-# Patrol "gather": speed factor beyond _NEAR_M from the middle, and the ring on which they stand at last.
+# Patrol "gather": speed factor beyond _NEAR_M from the middle, and radius of the final ring.
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
 # In OpenCV's units; those furthest from sand and scrub come first.
 _HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
 
+RADIUS_M = 6.0  # least turning radius of a car
+_BRAKE_M_S2 = 4.0
+_ASIDE_M_S2 = 2.5  # greatest lateral acceleration: cars slow down in turns
+# They pass those whom they see at a distance of _WIDE_M, and brake for those less than _NARROW_M aside.
+_SEEN_M, _WIDE_M, _NARROW_M, _LONG_M, _CREEP_M_S = 25.0, 2.6, 1.5, 2.8, 0.6
+# No paint and no shirt is as bright as a marker: a team chooses colours that nothing around it has.
+_PAINTS = np.array([[230, 230, 228], [40, 38, 36], [150, 150, 148], [95, 90, 88], [105, 88, 76], [78, 76, 108]], float)
+
 
 def marker_plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
-    """Names, the plates' colours (K, 3) BGR, and the ranges in which a picture shows them; 12 at most.
+    """Names of the UGVs, colours of their markers (K, 3) BGR, and the ranges in which pictures show them; 12 at most.
 
-    The ranges do not overlap: hues are 15 apart, in steps of two degrees, and 7 to either side are theirs.
+    The ranges do not overlap: hues are 15 apart, in steps of two degrees, and have 7 to either side.
     """
     hue = np.array(_HUES[:count], int)
     hsv = np.stack([hue, np.full(count, 235), np.full(count, 225)], axis=1).astype(np.uint8)
@@ -39,7 +53,7 @@ def marker_plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
 
 
 class Team:
-    """All ground vehicles as plain arrays: place (K, 2), course, heading (of the camera), speed (K,)."""
+    """All UGVs as plain arrays: place (K, 2), course, heading (of the camera), speed (K,)."""
 
     def __init__(
         self, parameters: TeamParameters, flight: AircraftParameters, side_m: float, obstacles: Obstacles, seed: int
@@ -47,9 +61,7 @@ class Team:
         count = parameters.ugvs
         self._parameters, self._half, self._obstacles, self._seed = parameters, side_m / 2, obstacles, seed
         rng = np.random.default_rng([seed, 30])
-        self.names = marker_plates(count)[0]
-        turn = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 1)
-        self._spoke = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+        self._spoke = heading_vector(rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / max(count, 1))
         self._middle = np.array(parameters.middle_m, float)
         self._way = Waypoints(np.array([flight.start_m, *flight.way_m], float), flight.speed_m_s)
         self.place = self._inside(obstacles.outside(self._middle + parameters.ring_m * self._spoke, 1.5))
@@ -70,166 +82,131 @@ class Team:
     @property
     def velocity(self) -> np.ndarray:
         """(K, 2)."""
-        return self.speed[:, None] * _ahead(self.course)
+        return self.speed[:, None] * heading_vector(self.course)
 
-    def order(self, row: int, goal_m: np.ndarray, speed_m_s: float, look_at_m: np.ndarray | None) -> None:
-        """Go to a place, in local metres, and look at another."""
-        if np.isfinite(goal_m).all():
-            self._ordered[row] = self._inside(np.asarray(goal_m, float)[None])[0]
+    def order(self, row: int, goal_m: np.ndarray | None, speed_m_s: float, look_at_m: np.ndarray | None) -> None:
+        """Send a vehicle to a place, in local metres (None, NaN: as before), and turn its camera to another."""
+        if goal_m is not None and np.isfinite(goal_m).all():
+            self._ordered[row] = self._inside(goal_m)
             self._ordered_speed[row] = max(speed_m_s, 0.0)
         self._look_at[row] = np.nan if look_at_m is None else look_at_m
 
-    def step(self, time_s: float, seconds: float, lost: Sequence[int], people: np.ndarray) -> None:
+    def step(self, time_s: float, seconds: float, lost: Collection[int], people: np.ndarray) -> None:
         """Advance by `seconds` to time_s; the lost stand still. They stop for people (M, 2)."""
         if not len(self):
             return
         goal, most = self._goals(time_s)
         to = goal - self.place
         distance = np.hypot(*to.T)
-        arrived = self._there(goal, 0.3)
+        arrived = self._is_there(goal, 0.3)
         # As fast as it can still brake.
         wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
         direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
-        direction = self._obstacles.steer(self.place, direction, 1.7)
-        direction = self._round_one_another(self._round_people(direction, people))
-        error = _wrapped(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
-        turn = np.where(arrived, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
+        direction = self._avoid(self._obstacles.steer(self.place, direction, 1.7), people)
+        error = wrap_angle(np.arctan2(direction[:, 0], direction[:, 1]) - self.course)
+        stopped = np.isin(np.arange(len(self)), list(lost))
+        turn = np.where(arrived | stopped, 0.0, np.clip(2.5 * error, -TURN_RAD_S, TURN_RAD_S))
         wanted = np.where(arrived, 0.0, wanted * np.clip(np.cos(error), 0, 1))
-        wanted = np.minimum(wanted, self._clear(people))
-        stopped = np.zeros(len(self), bool)
-        stopped[[k for k in lost if k < len(self)]] = True
-        wanted, turn = np.where(stopped, 0.0, wanted), np.where(stopped, 0.0, turn)
+        wanted = np.minimum(wanted, self._free_speed(people))
         hardest = ACCELERATION_M_S2 * seconds
-        self.speed = np.maximum(self.speed + np.clip(wanted - self.speed, -2 * hardest, hardest), 0.0)
+        speed = np.maximum(self.speed + np.clip(wanted - self.speed, -2 * hardest, hardest), 0.0)
         # A vehicle that is lost stands at once: its place is what the team knew last.
-        self.speed = np.where(stopped, 0.0, self.speed)
-        place = self.place + (seconds * self.speed)[:, None] * _ahead(self.course + turn * seconds / 2)
-        place = self._obstacles.outside(_kept_apart(place), 1.0)
+        self.speed = np.where(stopped, 0.0, speed)
+        place = self.place + (seconds * self.speed)[:, None] * heading_vector(self.course + turn * seconds / 2)
+        place = self._obstacles.outside(_keep_apart(place), 1.0)
         self.place = np.where(stopped[:, None], self.place, self._inside(place))
         self.course = (self.course + turn * seconds) % (2 * np.pi)
-        self._pan(seconds, stopped)
+        to = self._look_at - self.place
+        bearing = np.where(np.isfinite(to[:, 0]), np.arctan2(to[:, 0], to[:, 1]), self.course)
+        panned = np.clip(wrap_angle(bearing - self.heading), -PAN_RAD_S * seconds, PAN_RAD_S * seconds)
+        self.heading = (self.heading + np.where(stopped, 0.0, panned)) % (2 * np.pi)
 
-    def waypoints(self, time_s: float, seconds: int, lost: Sequence[int]) -> np.ndarray:
-        """(1 + seconds, K, 2) where they mean to be now and each second from now, if nobody stops them."""
-        ahead, found = copy(self), [self.place]
+    def waypoints(self, time_s: float, seconds: int, lost: Collection[int]) -> np.ndarray:
+        """(1 + seconds, K, 2) planned places now and each second from now, if nobody stops them."""
+        ahead, places = copy(self), [self.place]
         for step in range(1, round(seconds / _LOOK_S) + 1):
             ahead.step(time_s + step * _LOOK_S, _LOOK_S, lost, np.zeros((0, 2)))
             if step % round(1 / _LOOK_S) == 0:
-                found.append(ahead.place)
-        return np.array(found).reshape(seconds + 1, len(self), 2)
+                places.append(ahead.place)
+        return np.array(places)
 
     def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """(K, 2) goals and (K,) speeds."""
-        parameters, patrol = self._parameters, self._parameters.patrol
+        parameters, patrol, goal = self._parameters, self._parameters.patrol, self._start
         speed = np.full(len(self), parameters.patrol_m_s)
         if patrol == "random":
-            goal = np.array([self._random(k, int(n)) for k, n in enumerate(self._passed)]).reshape(-1, 2)
-            self._passed = self._passed + self._there(goal, 1.0)
+            goal = np.array([self._random_place(k, int(n)) for k, n in enumerate(self._passed)])
+            self._passed = self._passed + self._is_there(goal, 1.0)
         elif patrol == "gather":
             reach = max(_GATHERED_M, len(self) * _ROOM_M / 6)
             goal = self._middle + min(reach, parameters.ring_m) * self._spoke
-            far = np.hypot(*(goal - self.place).T) > _NEAR_M
-            speed = np.where(far, _FAST * speed, speed)
+            speed = np.where(np.hypot(*(goal - self.place).T) > _NEAR_M, _FAST * speed, speed)
         elif patrol == "along":
             middle, going = self._way.at(time_s)
             # Who brakes for a goal that moves stays behind it by as much.
             goal = middle + self._start - self._way.at(0.0)[0] + going * np.linalg.norm(going) / ACCELERATION_M_S2
             speed = np.full(len(self), 1.5 * float(np.linalg.norm(going)) + 0.2)
-        else:
-            goal = self._start.copy()
         sent = np.isfinite(self._ordered[:, 0])
         goal = np.where(sent[:, None], self._ordered, goal)
         return self._inside(goal), np.where(sent, self._ordered_speed, speed)
 
-    def _there(self, goal: np.ndarray, within_m: float) -> np.ndarray:
+    def _is_there(self, goal: np.ndarray, within_m: float) -> np.ndarray:
         """(K,) whether each is at its goal; close behind another that stands there counts."""
         distance = np.hypot(*(goal - self.place).T)
         taken = np.linalg.norm(goal[:, None] - self.place, axis=2) < _ROOM_M
         np.fill_diagonal(taken, False)
         return (distance < within_m) | (taken.any(axis=1) & (distance < 1.5 * _ROOM_M))
 
-    def _random(self, k: int, n: int) -> np.ndarray:
+    def _random_place(self, k: int, n: int) -> np.ndarray:
         """(2,) the n-th place of a vehicle within the ring."""
         if (k, n) not in self._drawn:
             rng = np.random.default_rng([self._seed, 31, k, n])
             reach, turn = self._parameters.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
-            self._drawn[k, n] = self._middle + reach * np.array([np.sin(turn), np.cos(turn)])
+            self._drawn[k, n] = self._middle + reach * heading_vector(turn)
         return self._drawn[k, n]
 
-    def _round_people(self, direction: np.ndarray, people: np.ndarray) -> np.ndarray:
-        """Vehicles without orders keep off people: beside them a vehicle is no landmark, and hides them."""
+    def _avoid(self, direction: np.ndarray, people: np.ndarray) -> np.ndarray:
+        """Directions round people and round one another."""
+        # Vehicles without orders keep off people: beside them a vehicle is no landmark, and hides them.
         free = np.flatnonzero(np.isnan(self._ordered[:, 0]))
-        if not len(free) or not len(people):
-            return direction
-        centre = np.broadcast_to(people, (len(free), *people.shape))
-        radius = np.full((len(free), len(people)), _KEPT_OFF_M)
-        direction = direction.copy()
-        direction[free] = steer_round_discs(self.place[free], direction[free], centre, radius)
-        return direction
-
-    def _round_one_another(self, direction: np.ndarray) -> np.ndarray:
-        if len(self) < 2:
-            return direction
+        if len(free) and len(people):
+            centre = np.broadcast_to(people, (len(free), *people.shape))
+            radius = np.full(centre.shape[:2], _KEPT_OFF_M)
+            direction = direction.copy()
+            direction[free] = steer_round_discs(self.place[free], direction[free], centre, radius)
         radius = np.full((len(self), len(self)), _ROOM_M)
         np.fill_diagonal(radius, -1.0)  # nobody goes round itself
         return steer_round_discs(self.place, direction, np.broadcast_to(self.place, (*radius.shape, 2)), radius)
 
-    def _clear(self, people: np.ndarray) -> np.ndarray:
+    def _free_speed(self, people: np.ndarray) -> np.ndarray:
         """(K,) greatest speeds allowed by people ahead, and by vehicles ahead with a lower row."""
-        count = len(self)
-        others = np.concatenate([people, self.place])
-        ahead = _ahead(self.course)
+        others, ahead = np.concatenate([people, self.place]), heading_vector(self.course)
         to = others[None] - self.place[:, None]
         along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
         aside = np.abs(ahead[:, None, 1] * to[..., 0] - ahead[:, None, 0] * to[..., 1])
         blocks = (along > 0) & (aside < UGV_HALF_M[1] + 0.3)
-        blocks[:, len(people) :] &= np.tri(count, k=-1, dtype=bool)
+        blocks[:, len(people) :] &= np.tri(len(self), k=-1, dtype=bool)
         room = np.where(blocks, along, np.inf).min(axis=1)
         return np.sqrt(2 * ACCELERATION_M_S2 * np.maximum(room - _STOP_M, 0))
-
-    def _pan(self, seconds: float, stopped: np.ndarray) -> None:
-        to = self._look_at - self.place
-        wanted = np.where(np.isfinite(to[:, 0]), np.arctan2(to[:, 0], to[:, 1]), self.course)
-        error = _wrapped(wanted - self.heading)
-        turned = np.clip(error, -PAN_RAD_S * seconds, PAN_RAD_S * seconds)
-        self.heading = (self.heading + np.where(stopped, 0.0, turned)) % (2 * np.pi)
 
     def _inside(self, place: np.ndarray) -> np.ndarray:
         edge = self._half - min(3.0, self._half / 4)
         return place.clip(-edge, edge)
 
 
-def _kept_apart(place: np.ndarray) -> np.ndarray:
-    """(K, 2) places, those that are nearer than two vehicles can be moved half the way apart each."""
+def _keep_apart(place: np.ndarray) -> np.ndarray:
+    """(K, 2) places, those that are nearer than two vehicles can be moved half the distance apart each."""
     away = place[:, None] - place
     distance = np.hypot(away[..., 0], away[..., 1]) + 1e9 * np.eye(len(place))
     short = 0.5 * np.maximum(_APART_M - distance, 0) / np.maximum(distance, 1e-6)
     return place + (short[..., None] * away).sum(axis=1) if short.any() else place
 
 
-def _ahead(course: np.ndarray) -> np.ndarray:
-    return np.stack([np.sin(course), np.cos(course)], axis=1)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-# Vehicles that are no landmarks: they follow their way with a least turning radius and brake for those ahead.
-
-
-CAR_HALF_M = (2.2, 0.9)  # half the length and half the width
-RADIUS_M = 6.0  # the narrowest that they turn
-_ACCELERATION_M_S2, _BRAKE_M_S2 = 1.5, 4.0
-_ASIDE_M_S2 = 2.5  # they slow down in turns so that no more pushes aside
-# They pass those whom they see at a distance of _WIDE_M, and brake for those less than _NARROW_M aside.
-_SEEN_M, _WIDE_M, _NARROW_M, _LONG_M, _CREEP_M_S = 25.0, 2.6, 1.5, 2.8, 0.6
-# No paint and no shirt is as bright as a plate: a team chooses colours that nothing around it has.
-_PAINTS = np.array([[230, 230, 228], [40, 38, 36], [150, 150, 148], [95, 90, 88], [105, 88, 76], [78, 76, 108]], float)
-
-
 class Cars:
-    """All cars as plain arrays: place (N, 2), course (N,) clockwise from north, speed (N,), colour (N, 3)."""
+    """All cars as plain arrays: place (N, 2), course (N,) clockwise from north, speed (N,), colour (N, 3).
+
+    They follow their way with a least turning radius and brake for those ahead.
+    """
 
     def __init__(self, plans: tuple[CarPlan, ...], side_m: float, obstacles: Obstacles, seed: int) -> None:
         rng = np.random.default_rng([seed, 20])
@@ -256,20 +233,19 @@ class Cars:
     @property
     def velocity(self) -> np.ndarray:
         """(N, 2)."""
-        return self.speed[:, None] * np.stack([np.sin(self.course), np.cos(self.course)], axis=1)
+        return self.speed[:, None] * heading_vector(self.course)
 
     def step(self, time_s: float, seconds: float, others: np.ndarray) -> None:
         """Advance by `seconds` to time_s; others: (M, 2) people and vehicles that they avoid."""
         for row in range(len(self)):
             wanted = self._wanted(row)
-            around = np.delete(self.place, row, axis=0)
-            self._drive(row, time_s, seconds, wanted, np.concatenate([others, around]))
+            self._drive(row, time_s, seconds, wanted, np.concatenate([others, np.delete(self.place, row, axis=0)]))
 
     def _wanted(self, row: int) -> np.ndarray:
-        """(2,) the direction in which it wants to go."""
+        """(2,) the direction in which a car wants to go."""
         place, way = self.place[row], self._ways[row]
         if not len(way):
-            ahead = np.array([np.sin(self._straight[row]), np.cos(self._straight[row])])
+            ahead = heading_vector(self._straight[row])
             # At the edge it turns back.
             out = (np.abs(place) > self._half - self._margin - RADIUS_M) & (np.sign(ahead) == np.sign(place))
             if out.any():
@@ -283,30 +259,29 @@ class Cars:
         return way[self._at[row]] - place
 
     def _drive(self, row: int, time_s: float, seconds: float, wanted: np.ndarray, others: np.ndarray) -> None:
-        ahead = np.array([np.sin(self.course[row]), np.cos(self.course[row])])
+        place, course, speed = self.place[row : row + 1], self.course[row], float(self.speed[row])
         distance = float(np.linalg.norm(wanted))
-        direction = wanted / max(distance, 1e-9) * max(float(self.speed[row]), 1.0)
-        direction = self._obstacles.steer(self.place[row : row + 1], direction[None], 1.5)
-        to = others - self.place[row]
+        direction = wanted / max(distance, 1e-9) * max(speed, 1.0)
+        direction = self._obstacles.steer(place, direction[None], 1.5)
+        to = others - place
         near = np.hypot(*to.T) < _SEEN_M
         discs = np.full((1, int(near.sum())), _WIDE_M)
-        direction = steer_round_discs(self.place[row : row + 1], direction, others[None, near], discs)[0]
-        error = (np.arctan2(*direction) - self.course[row] + np.pi) % (2 * np.pi) - np.pi
-        curve = float(np.clip(1.2 * error / max(float(self.speed[row]), 1.0), -1 / RADIUS_M, 1 / RADIUS_M))
+        direction = steer_round_discs(place, direction, others[None, near], discs)[0]
+        error = wrap_angle(np.arctan2(*direction) - course)
+        curve = float(np.clip(1.2 * error / max(speed, 1.0), -1 / RADIUS_M, 1 / RADIUS_M))
         most = float(self._fastest[row]) if time_s >= self._from_s[row] else 0.0
         most = min(most, np.sqrt(_ASIDE_M_S2 / max(abs(curve), 1e-6)))
         if len(self._ways[row]) == 1:
-            most = min(most, np.sqrt(2 * _ACCELERATION_M_S2 * max(distance - 1.0, 0.0)))
+            most = min(most, np.sqrt(2 * ACCELERATION_M_S2 * max(distance - 1.0, 0.0)))
+        ahead = heading_vector(course)
         along, aside = to @ ahead, to @ np.array([ahead[1], -ahead[0]])
         if (blocked := along[(along > 0) & (np.abs(aside) < _NARROW_M)]).size:
             room = float(blocked.min()) - _LONG_M
             braked = np.sqrt(2 * 0.6 * _BRAKE_M_S2 * max(room - 1.0, 0.0))
             # Slowly past who stands, where there is room to turn.
             most = min(most, max(float(braked), _CREEP_M_S if room > 0 else 0.0))
-        change = np.clip(most - self.speed[row], -_BRAKE_M_S2 * seconds, _ACCELERATION_M_S2 * seconds)
-        self.speed[row] += change
+        self.speed[row] += np.clip(most - speed, -_BRAKE_M_S2 * seconds, ACCELERATION_M_S2 * seconds)
         gone = self.speed[row] * seconds
-        middle = self.course[row] + gone * curve / 2
-        self.place[row] += gone * np.array([np.sin(middle), np.cos(middle)])
-        self.course[row] = (self.course[row] + gone * curve) % (2 * np.pi)
-        self.place[row] = np.clip(self.place[row], -self._half + 2, self._half - 2)
+        moved = place[0] + gone * heading_vector(course + gone * curve / 2)
+        self.place[row] = np.clip(moved, -self._half + 2, self._half - 2)
+        self.course[row] = (course + gone * curve) % (2 * np.pi)

@@ -1,4 +1,4 @@
-"""How those who move avoid what stands in the way and one another, and follow their waypoints."""
+"""How moving bodies avoid obstacles and one another, and follow waypoints. Directions are clockwise from north."""
 
 import numpy as np
 
@@ -10,40 +10,45 @@ _NEAREST = 6  # objects with the nearest edges that are considered from a cell
 _TOUCHING = 3  # objects of those that somebody may stand in
 
 
-class Obstacles:
-    """Round things on the ground, found by the cell that one is in. Nobody walks through trees and buildings.
+def heading_vector(heading_rad: np.ndarray | float) -> np.ndarray:
+    """(..., 2) unit vectors, east and north."""
+    return np.stack([np.sin(heading_rad), np.cos(heading_rad)], axis=-1)
 
-    Bushes are gone round where there is room, and trodden down where there is none.
-    """
+
+def wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
+    """The same angle within [-pi, pi)."""
+    return (angle_rad + np.pi) % (2 * np.pi) - np.pi
+
+
+class Obstacles:
+    """Discs on the ground, found by grid cell. Trees and buildings block; bushes are avoided where there is room."""
 
     def __init__(self, things: StandingObjects, side_m: float) -> None:
-        self.place = np.asarray(things.east_north_m, float).reshape(-1, 2)
-        self.radius = np.asarray(things.radius_m, float).reshape(-1)
-        self.hard = np.array([str(kind) != "bush" for kind in things.kind], bool)
+        place, radius = np.asarray(things.east_north_m, float).reshape(-1, 2), np.asarray(things.radius_m, float)
         self._half, self._across = side_m / 2, max(1, int(np.ceil(side_m / _CELL_M)))
-        self._table = self._near_cells()
+        self._table = self._near_cells(place, radius)
         # Row -1 of the table stands for nothing: infinitely far.
-        self._places = np.concatenate([self.place, [[1e9, 1e9]]])
-        self._radii = np.append(self.radius, 0.0)
-        self._hards = np.append(self.hard, False)
+        self._place = np.concatenate([place, [[1e9, 1e9]]])
+        self._radius = np.append(radius, 0.0)
+        self._blocks = np.array([*(str(kind) != "bush" for kind in things.kind), False])
 
-    def _near_cells(self) -> np.ndarray:
-        """(cells, _NEAREST) int64, the things near each cell, -1 for none."""
+    def _near_cells(self, place: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """(cells, _NEAREST) int64, the objects near each cell, -1 for none."""
         table = np.full((self._across**2, _NEAREST), -1, np.int64)
-        if not len(self.place):
+        if not len(place):
             return table
         cells, things, away = [], [], []
-        low = np.floor((self.place - (self.radius + _REACH_M)[:, None] + self._half) / _CELL_M).astype(int)
-        high = np.floor((self.place + (self.radius + _REACH_M)[:, None] + self._half) / _CELL_M).astype(int)
-        for k, (first, last) in enumerate(zip(low.clip(0), high.clip(max=self._across - 1), strict=True)):
+        reach = (radius + _REACH_M)[:, None]
+        low = np.floor((place - reach + self._half) / _CELL_M).astype(int).clip(0)
+        high = np.floor((place + reach + self._half) / _CELL_M).astype(int).clip(max=self._across - 1)
+        for k, (first, last) in enumerate(zip(low, high, strict=True)):
             column, row = np.meshgrid(np.arange(first[0], last[0] + 1), np.arange(first[1], last[1] + 1))
             middle = (np.stack([column, row], -1) + 0.5) * _CELL_M - self._half
-            distance = np.linalg.norm(middle - self.place[k], axis=-1) - self.radius[k]
+            away.append((np.linalg.norm(middle - place[k], axis=-1) - radius[k]).ravel())
             cells.append((row * self._across + column).ravel())
-            away.append(distance.ravel())
-            things.append(np.full(distance.size, k))
-        cell, thing, distance = np.concatenate(cells), np.concatenate(things), np.concatenate(away)
-        order = np.lexsort((distance, cell))
+            things.append(np.full(column.size, k))
+        cell, thing = np.concatenate(cells), np.concatenate(things)
+        order = np.lexsort((np.concatenate(away), cell))
         cell, thing = cell[order], thing[order]
         rank = np.arange(len(cell)) - np.searchsorted(cell, cell)
         kept = rank < _NEAREST
@@ -51,32 +56,30 @@ class Obstacles:
         return table
 
     def _near(self, place: np.ndarray) -> np.ndarray:
-        """(N, _NEAREST) the things near places, -1 for none."""
+        """(N, _NEAREST) the objects near places, -1 for none."""
         index = np.floor((place + self._half) / _CELL_M).astype(int).clip(0, self._across - 1)
         return self._table[index[:, 1] * self._across + index[:, 0]]
 
     def steer(self, place: np.ndarray, velocity: np.ndarray, clear_m: float) -> np.ndarray:
         """(N, 2) velocities, as fast as those wanted, that pass what is ahead at clear_m from its edge."""
-        near = self._near(place) if len(self.place) else np.zeros((len(place), 0), np.int64)
+        near = self._near(place)
         if not (near >= 0).any():
             return velocity
-        return steer_round_discs(place, velocity, self._places[near], self._radii[near] + clear_m)
+        return steer_round_discs(place, velocity, self._place[near], self._radius[near] + clear_m)
 
     def outside(self, place: np.ndarray, clear_m: float = 0.3) -> np.ndarray:
         """(N, 2) the places, moved out of trees and buildings."""
-        if not len(self.place):
-            return place
         near = self._near(place)[:, :_TOUCHING]
-        away = place[:, None] - self._places[near]
-        reach = self._radii[near] + clear_m
-        hit = self._hards[near] & ((away**2).sum(axis=2) < reach**2)
+        away = place[:, None] - self._place[near]
+        reach = self._radius[near] + clear_m
+        hit = self._blocks[near] & ((away**2).sum(axis=2) < reach**2)
         if not hit.any():
             return place
         row, which = np.nonzero(hit)
         away, reach = away[row, which], reach[row, which]
         distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
         moved = place.copy()
-        # Of two that one is in, the one that is listed last decides.
+        # Of two objects at one place, the one listed last decides.
         moved[row] = place[row] + ((reach - distance) / distance)[:, None] * away
         return moved
 
@@ -110,14 +113,13 @@ def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarra
     return turned
 
 
-# Who is near whom, by a grid of cells: the time grows with the number of bodies, not with its square.
-
-
 def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs (P,), (P,) of rows of places (N, 2) that are nearer to one another than reach_m, each once."""
-    none = np.zeros(0, np.int64)
+    """The pairs (P,), (P,) of rows of places (N, 2) that are nearer to one another than reach_m, each once.
+
+    They are found by a grid of cells: the time grows with the number of bodies, not with its square.
+    """
     if len(place) < 2:
-        return none, none
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     cell = np.floor((place - place.min(axis=0)) / reach_m).astype(np.int64) + 1
     across = int(cell[:, 0].max()) + 2
     key = cell[:, 1] * across + cell[:, 0]
@@ -125,33 +127,25 @@ def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarra
     ranked = key[order]
     # Neighbours later in the same row of cells, and in the three cells of the row above, which lie in a row as well.
     rank = np.arange(len(place))
-    spans = [
+    firsts, seconds = [], []
+    for begin, end in (
         (rank + 1, np.searchsorted(ranked, ranked + 1, side="right")),
         (np.searchsorted(ranked, ranked + across - 1), np.searchsorted(ranked, ranked + across + 1, side="right")),
-    ]
-    firsts, seconds = [], []
-    for begin, end in spans:
+    ):
         many = np.maximum(end - begin, 0)
-        total = int(many.sum())
-        first = np.repeat(rank, many)
-        seconds.append(np.arange(total) - np.repeat(np.cumsum(many) - many, many) + np.repeat(begin, many))
-        firsts.append(first)
+        firsts.append(np.repeat(rank, many))
+        seconds.append(np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(begin, many))
     first, second = order[np.concatenate(firsts)], order[np.concatenate(seconds)]
     near = ((place[first] - place[second]) ** 2).sum(axis=1) < reach_m**2
     return first[near], second[near]
-
-
-# Ways through places, there and back again.
 
 
 class Waypoints:
     """A point that goes through places (P, 2) one after the other at a constant speed, and back, without end."""
 
     def __init__(self, places_m: np.ndarray, speed_m_s: float) -> None:
-        self._places = np.asarray(places_m, float).reshape(-1, 2)
-        self._speed = speed_m_s
-        steps = np.linalg.norm(np.diff(self._places, axis=0), axis=1)
-        self._at = np.concatenate([[0.0], np.cumsum(steps)])
+        self._places, self._speed = np.asarray(places_m, float).reshape(-1, 2), speed_m_s
+        self._at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._places, axis=0), axis=1))])
 
     def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Place (2,) and velocity (2,)."""

@@ -1,15 +1,38 @@
-"""What a simulated world holds and what happens in it: every number of a scenario, with its unit and range.
+"""A scenario: what a simulated world holds and what happens in it; read from TOML files, changed, checked, written.
 
-Metres are local: east and north of the world's origin, which is its middle. Speeds, behaviours and heights follow
+Metres are local: east and north of the world's origin, which is its middle. Speeds, behaviours and heights are those of
 appendix A, section V: a border area near Tucson, 1300 m above the sea, crowds at U(1.11, 3.34) m a time unit along east
 and along north, UGVs that are fast at first and slow near the crowd, a UAV 50 to 200 m above ground.
 """
 
-from typing import Annotated, Literal
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import Field
+from pydantic import Field, ValidationError
+from pydantic.fields import FieldInfo
 
-from torchvision_dddas.config import Group, parameter
+from torchvision_dddas.config import (
+    Group,
+    Settings,
+    config_folder,
+    describe_error,
+    format_toml,
+    is_file,
+    nearest,
+    parameter,
+    parse_override,
+    read_toml,
+    with_parameters,
+)
+from torchvision_dddas.errors import InputError
+
+_FEWEST = 4  # landmarks needed to georeference a picture
+_HIGHEST_DEG = 85.0  # near the poles longitudes run together
+_MARGIN_M = 2.0  # least distance of what moves from the edge of the world
+_OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")  # faults of one ground vehicle
+_FILES = ("elevation", "photo")  # parameters of the world that name files
 
 Place = tuple[float, float]
 
@@ -180,3 +203,213 @@ class Scenario(Group):
     happening: tuple[Happening, ...] = ()
     fault: tuple[Fault, ...] = ()
     settings: dict[str, dict[str, object]] = Field(default_factory=dict)
+
+
+def scenario_names() -> list[str]:
+    """The shipped scenarios, by name."""
+    return sorted(path.stem for path in (config_folder() / "scenarios").glob("*.toml"))
+
+
+def scenario_settings(scenario: Scenario) -> dict[str, object]:
+    """The parameters of the system that a scenario sets: `{"group.parameter": value}`."""
+    return {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
+
+
+def scenario_toml(scenario: Scenario) -> str:
+    """The whole scenario as a file that `load_scenario` reads."""
+    content = scenario.model_dump(mode="json")
+    return format_toml({key: value for key, value in content.items() if value not in ([], {})})
+
+
+def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
+    """A shipped scenario by its name, or a TOML file; changed by `group.parameter=value`, `crowd.1.people=20`.
+
+    seed: in place of its own. Files that it names are looked for beside it, then from where the program was started.
+    Raises InputError with one line: no such scenario (with those there are), no TOML, an unknown parameter (with the
+    nearest), a value out of its range, and what `check_scenario` says.
+    """
+    path = Path(name_or_path)
+    if not is_file(path):
+        if path.suffix == ".toml" or len(path.parts) > 1:
+            raise InputError(f"no such scenario file: {path}")
+        path = config_folder() / "scenarios" / f"{name_or_path}.toml"
+        if not str(name_or_path) or not is_file(path):
+            names = ", ".join(scenario_names())
+            raise InputError(f"no scenario is named '{name_or_path}'; there are {names}, or give a TOML file")
+    content = read_toml(path)
+    origin = str(path) if path == Path(name_or_path) else f"scenario {path.stem}"
+    if not content:
+        raise InputError(f"{origin} is empty; wanted tables such as [clip] and [[crowd]], as in the shipped scenarios")
+    for text in overrides:
+        _override(content, *parse_override(text))
+    if seed is not None:
+        content["seed"] = seed
+    try:
+        scenario = Scenario.model_validate(_with_tuples(content))
+        files = {key: path.resolve().parent / getattr(scenario.world, key) for key in _FILES}
+        beside = {key: str(file) for key, file in files.items() if is_file(file)}
+        scenario = scenario.model_copy(update={"world": scenario.world.model_copy(update=beside)})
+        check_scenario(scenario)
+    except RecursionError:
+        raise InputError(f"{origin}: its tables go too deep; wanted such as [clip] and [[crowd]]") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{origin}: {_explain(first['loc'], first['type'], first['msg'], first['input'])}") from None
+    except InputError as error:
+        raise InputError(f"{origin}: {error}") from None
+    return scenario
+
+
+def _override(content: dict[str, Any], name: str, value: object) -> None:
+    """Set a value by its name. Raises InputError where there is no such place."""
+    place: Any = content
+    *parts, last = name.split(".")
+    for k, part in enumerate(parts):
+        if isinstance(place, list):
+            if not part.isdecimal() or len(part) > 6 or not 1 <= int(part) <= len(place):
+                kind, count = parts[k - 1], "is 1" if len(place) == 1 else f"are {len(place)}"
+                raise InputError(f"'{name}' names no {kind}; wanted {kind}.1, {kind}.2, ..., of which there {count}")
+            place = place[int(part) - 1]
+        else:
+            place = place.setdefault(part, {})
+        if not isinstance(place, (dict, list)):
+            raise InputError(f"unknown parameter '{name}'; {_nearest_parameter(name)}")
+    if isinstance(place, list):
+        kind = parts[-1]
+        group = _group(Scenario.model_fields[kind]) if kind in Scenario.model_fields else None
+        example = next(iter(group.model_fields)) if group else "value"
+        raise InputError(f"'{name}' names no parameter; wanted such as {kind}.1.{example}=...")
+    place[last] = value
+
+
+def _with_tuples(value: Any) -> Any:
+    """TOML has lists where scenarios have tuples."""
+    if isinstance(value, dict):
+        return {key: _with_tuples(entry) for key, entry in value.items()}
+    return tuple(_with_tuples(entry) for entry in value) if isinstance(value, list) else value
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Raises InputError with one line for an impossible scenario: places outside the world, no such crowd, ..."""
+    clip, camera, team = scenario.clip, scenario.camera, scenario.team
+    longitude, latitude = scenario.world.origin_deg
+    if abs(longitude) > 180 or abs(latitude) > _HIGHEST_DEG:
+        raise InputError(
+            f"world.origin_deg must be a longitude from -180 to 180 and a latitude from -{_HIGHEST_DEG:g} to "
+            f"{_HIGHEST_DEG:g} degrees, got [{longitude:g}, {latitude:g}]"
+        )
+    _check_places(scenario)
+    _check_events(scenario)
+    if clip.located_by == "landmarks" and team.ugvs < _FEWEST:
+        raise InputError(
+            f"team.ugvs must be {_FEWEST} or more in a clip located by landmarks, got {team.ugvs}; "
+            'add vehicles, or set clip.located_by = "telemetry"'
+        )
+    if camera.exposure_s * clip.rate_hz > 1:
+        raise InputError(
+            f"camera.exposure_s = {camera.exposure_s:g} is longer than from picture to picture; wanted "
+            f"{1 / clip.rate_hz:g} s or less at clip.rate_hz = {clip.rate_hz:g}"
+        )
+    for key in _FILES:
+        if (file := getattr(scenario.world, key)) and not is_file(Path(file)):
+            raise InputError(f"world.{key}: there is no file {file}")
+    with_parameters(Settings(), scenario_settings(scenario), "settings")
+
+
+def _check_places(scenario: Scenario) -> None:
+    """Everything that has a place is inside the world."""
+    team, uav, reach = scenario.team, scenario.uav, scenario.world.side_m / 2 - _MARGIN_M
+    places: list[tuple[str, Place, float]] = []
+    plans: dict[str, Sequence[CrowdPlan | CarPlan]] = {"crowd": scenario.crowd, "car": scenario.car}
+    for kind, entries in plans.items():
+        for k, plan in enumerate(entries, 1):
+            places.append((f"{kind}.{k}.start_m", plan.start_m, getattr(plan, "radius_m", 0.0)))
+            places += [(f"{kind}.{k}.way_m", place, 0.0) for place in plan.way_m]
+    if team.ugvs:
+        places.append(("team.middle_m", team.middle_m, team.ring_m))
+    places += [("uav.start_m", uav.start_m, 0.0), *(("uav.way_m", place, 0.0) for place in uav.way_m)]
+    for name, (east, north), radius in places:
+        if max(abs(east), abs(north)) + radius > reach:
+            about = f" with {radius:g} m about it" if radius else ""
+            raise InputError(
+                f"{name} = [{east:g}, {north:g}]{about} is outside the world; wanted within {reach:g} m of its middle "
+                "east and north, or a larger world.side_m"
+            )
+
+
+def _check_events(scenario: Scenario) -> None:
+    """What happens, happens during the clip, to something that is there."""
+    ugvs, end, count = scenario.team.ugvs, scenario.clip.seconds, len(scenario.crowd)
+
+    def check_time(name: str, time_s: float) -> None:
+        if time_s >= end:
+            raise InputError(f"{name}.time_s = {time_s:g} is after the end; clip.seconds = {end:g}")
+
+    for k, happening in enumerate(scenario.happening, 1):
+        name, crowds = f"happening.{k}", happening.crowds
+        for which in crowds:
+            if which > count:
+                there = f"there {'is' if count == 1 else 'are'} {count or 'none'}"
+                raise InputError(f"{name}.crowds names crowd {which}, of which {there}")
+        if happening.what == "join" and len(set(crowds)) < 2:
+            raise InputError(f"{name}.crowds must name two or more crowds to join, got {list(crowds)}")
+        if len(set(crowds)) < len(crowds):
+            raise InputError(f"{name}.crowds = {list(crowds)} names a crowd twice")
+        for which in crowds:
+            if happening.what == "split" and scenario.crowd[which - 1].people < 2:
+                raise InputError(f"{name}: crowd {which} is one person, and cannot split")
+        check_time(name, happening.time_s)
+    for k, fault in enumerate(scenario.fault, 1):
+        check_time(f"fault.{k}", fault.time_s)
+        if fault.what in _OF_VEHICLES and fault.vehicle > ugvs:
+            raise InputError(f"fault.{k}.vehicle = {fault.vehicle} is not there; team.ugvs = {ugvs} counts them")
+
+
+def _explain(loc: tuple[int | str, ...], kind: str, message: str, value: object) -> str:
+    """One line of what pydantic found first: the parameter by its name, what came, what was wanted."""
+    fields, name, field, is_list = Scenario.model_fields, "", None, False
+    for part in loc:
+        if is_list:
+            name, is_list = f"{name}.{int(part) + 1}", False
+            continue
+        if part not in fields:  # inside a parameter: a place in a list
+            break
+        name = f"{name}.{part}".lstrip(".")
+        field = fields[str(part)]
+        group = _group(field)
+        fields, is_list = (group.model_fields, get_origin(field.annotation) is tuple) if group else ({}, False)
+    if kind == "extra_forbidden":
+        full = ".".join(str(part + 1) if isinstance(part, int) else part for part in loc)
+        return f"unknown parameter '{full}'; {_nearest_parameter(full)}"
+    text = json.dumps(value, default=str)
+    shown = text if len(text) <= 60 else text[:57] + "..."
+    if name == "settings" and len(loc) > 1 and not isinstance(value, dict):
+        name = f"settings.{loc[1]}"
+    if field is None or _group(field) is not None or name.startswith("settings"):
+        wanted = "a list of tables" if is_list or name in ("crowd", "car", "happening", "fault") else "a table"
+        return f"{name} must be {wanted}, got {shown}"
+    if name == "seed":
+        return f"seed must be a whole number from 0 to {2**31 - 1}, got {value!r}"
+    annotation: Any = field.annotation
+    if annotation == Place:
+        return f"{name} must be two numbers, [east, north], got {shown}"
+    if annotation == tuple[Place, ...]:
+        return f"{name} must be a list of places, [[east, north], ...], got {shown}"
+    return describe_error(name, shown if isinstance(value, (tuple, dict)) else value, field)
+
+
+def _nearest_parameter(name: str) -> str:
+    """Names that look like it, or the tables that there are."""
+    known = ["about", "seed"]
+    for key, field in Scenario.model_fields.items():
+        if group := _group(field):
+            inside = f"{key}.1" if get_origin(field.annotation) is tuple else key
+            known += [f"{inside}.{parameter_name}" for parameter_name in group.model_fields]
+    tables = ", ".join(key for key in Scenario.model_fields if key not in ("about", "seed"))
+    return nearest(name, known, f"its tables are {tables}")
+
+
+def _group(field: FieldInfo) -> type[Group] | None:
+    """The group that a field holds, or that the entries of its list are."""
+    kind = get_args(field.annotation)[0] if get_origin(field.annotation) is tuple else field.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, Group) else None

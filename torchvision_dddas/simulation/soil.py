@@ -4,7 +4,7 @@ Colours are BGR as a photo shows them in full sun. Broad patterns lie on a grid 
 and enlarged; what is finer is added band by band, so that a large world needs little memory.
 """
 
-from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +12,9 @@ import numpy as np
 COARSE = 8  # pixels of the texture to a cell of the broad patterns
 
 _TILE = 512  # columns that are coloured at once
+_BLOCK = 64  # rows of noise that share a seed
+_FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
+_SPREAD = 1.35  # makes up for what interpolation between independent numbers takes from their spread, and more
 
 
 def _bgr(*values: float) -> np.ndarray:
@@ -28,30 +31,14 @@ _STONES = ((4.0, 0.05, 30.0), (0.5, 0.1, 40.0), (0.03, 0.22, 28.0))
 _TUFTS = ((2.5, 0.12, 0.9), (0.35, 0.28, 1.0))
 
 
-@dataclass(frozen=True)
-class GroundPatterns:
-    """Broad patterns of the ground, each (h, w) float32 on the coarse grid of cell_m, row 0 the north edge.
+def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+    """Broad patterns of a world's ground, each (h, w) float32 on a coarse grid, row 0 the north edge.
 
     tone: (3, h, w) BGR of the soil. grass: how much of it grows, 0 to 1; green: how much of that is green, not dry.
-    gravel: how rough the soil is, about 1. light: on its slopes, as a share of that on level ground. wash_m, road_m,
-    trail_m: metres from the middle of the nearest creek bed, road, trail, the last two with a sign for the side;
-    wash_half_m: half the creek's width there.
+    gravel: how rough the soil is, about 1. light: as given, on its slopes, as a share of that on level ground. wash,
+    road, trail: metres from the middle of the nearest creek bed, road, trail, the last two with a sign for the side;
+    wash_half: half the creek's width there, metres.
     """
-
-    cell_m: float
-    tone: np.ndarray
-    grass: np.ndarray
-    green: np.ndarray
-    gravel: np.ndarray
-    light: np.ndarray
-    wash_m: np.ndarray
-    wash_half_m: np.ndarray
-    road_m: np.ndarray
-    trail_m: np.ndarray
-
-
-def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> GroundPatterns:
-    """Where soils, creeks, road and trails of a world lie. light: (h, h) on the coarse grid, as in Lie."""
     cells = len(light)
     rng = np.random.default_rng([seed, 11])
     shape, cell = (cells, cells), side_m / cells
@@ -59,7 +46,7 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> GroundPatterns
     east, north = np.meshgrid(middle.astype(np.float32), -middle.astype(np.float32))
 
     def patches(widest_m: float, fall: float = 0.6) -> np.ndarray:
-        return fractal_noise(rng, shape, max(widest_m / cell, 1), 1, fall)
+        return _fractal_noise(rng, shape, max(widest_m / cell, 1), fall)
 
     tone = np.empty((3, *shape), np.float32)
     tone[:] = _TAN[:, None, None]
@@ -82,7 +69,7 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> GroundPatterns
     wash, half = np.full(shape, 1e3, np.float32), np.ones(shape, np.float32)
     for size in (1.0, 0.5, 0.35, 0.3)[: max(1, min(4, round(side_m / 100)))]:
         distance = np.abs(course(9 * size**0.5, 110 * size**0.5) + ripple)
-        width = size * np.clip(2.6 + 0.8 * noise_bumps(rng, shape, max(30 / cell, 1)), 1, 4.5)
+        width = size * np.clip(2.6 + 0.8 * _noise_bumps(rng, shape, max(30 / cell, 1)), 1, 4.5)
         nearer = distance / width < wash / half
         wash, half = np.where(nearer, distance, wash), np.where(nearer, width, half)
     road = course(14, 260)
@@ -93,40 +80,44 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> GroundPatterns
     grass = np.clip(0.45 + 0.3 * patches(35, 0.65) + 0.12 * patches(4), 0, 1)
     green = np.clip(0.45 + 0.35 * patches(20, 0.7) + 0.4 * np.exp(-np.clip(wash - half, 0, None) / 3), 0, 1)
     gravel = np.clip(1 + 0.35 * patches(18, 0.7), 0.3, 2)
-    fields = [np.asarray(field, np.float32) for field in (grass, green, gravel, light, wash, half, road, trail)]
-    return GroundPatterns(cell, tone, *fields)
+    fields = {"grass": grass, "green": green, "gravel": gravel, "light": light}
+    fields |= {"wash": wash, "wash_half": half, "road": road, "trail": trail}
+    return {"tone": tone, **{name: np.asarray(field, np.float32) for name, field in fields.items()}}
 
 
 def soil_rows(
-    ground: GroundPatterns, rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray
+    ground: dict[str, np.ndarray], rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray
 ) -> np.ndarray:
-    """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, in the sun."""
-    columns = ground.grass.shape[1] * COARSE
+    """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, in the sun; ground: of `draw_patterns`."""
+    columns = ground["grass"].shape[1] * COARSE
     # Light and shade of a pixel depend on its neighbours: these extra rows are cut off at the end.
     edge = max(int(np.ceil(0.3 / texel_m)), 1)
     wide = rows[0] - edge, rows[1] + edge
 
     def fine(key: int, width_m: float) -> np.ndarray:
         """Noise with bumps of a width; those within a pixel even out."""
-        noise = noise_band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
+        noise = _noise_band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
         return noise if width_m >= texel_m else noise * np.float32(width_m / texel_m)
 
     def strewn(key: int, each_m2: float, radius_m: float) -> np.ndarray:
         spread = max(0.6 * radius_m / texel_m, 0.4)
         reach = int(3 * spread) + 2
-        drawn = noise_sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
+        drawn = _noise_sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
         full = min(7 * spread**2, (radius_m / texel_m) ** 2 * 6)  # what is smaller than a pixel fills it in part
         return np.minimum(cv2.GaussianBlur(drawn, (0, 0), spread)[reach:-reach] * np.float32(full), 1)
 
     # Where the nearest trail changes, its side may too: no trail is there.
-    trail = np.abs(enlarge_rows(ground.trail_m, wide, COARSE, smooth=True))
-    trail = np.maximum(trail, enlarge_rows(np.abs(ground.trail_m), wide, COARSE) - 0.5 * ground.cell_m)
+    trail = np.abs(enlarge_rows(ground["trail"], wide, COARSE, smooth=True))
+    trail = np.maximum(trail, enlarge_rows(np.abs(ground["trail"]), wide, COARSE) - 0.5 * COARSE * texel_m)
     grain = fine(3, 0.1)
     # A camera near the ground sees what is finer, too.
     for key, width_m in ((5, 0.05), (6, 0.025)):
         if texel_m <= 1.2 * width_m:
             grain += 0.7 * fine(key, width_m)
-    layers = {
+    layers: dict[str, Any] = {
+        name: enlarge_rows(ground[name], wide, COARSE) for name in ("wash_half", "grass", "green", "gravel", "light")
+    }
+    layers |= {
         "broad": fine(4, 1.6),
         "large": fine(0, 0.8),
         "middle": fine(1, 0.4),
@@ -135,14 +126,10 @@ def soil_rows(
         "stones": sum(bright * strewn(k, each_m2, radius_m) for k, (each_m2, radius_m, bright) in enumerate(_STONES)),
         "tufts": sum(dense * strewn(10 + k, each_m2, radius) for k, (each_m2, radius, dense) in enumerate(_TUFTS)),
         "trail": trail,
-        "road": np.abs(enlarge_rows(ground.road_m, wide, COARSE, smooth=True)),
-        "wash": enlarge_rows(ground.wash_m, wide, COARSE, smooth=True),
-        **{
-            name: enlarge_rows(getattr(ground, name), wide, COARSE)
-            for name in ("wash_half_m", "grass", "green", "gravel", "light")
-        },
+        "road": np.abs(enlarge_rows(ground["road"], wide, COARSE, smooth=True)),
+        "wash": enlarge_rows(ground["wash"], wide, COARSE, smooth=True),
     }
-    tone = [enlarge_rows(plane, wide, COARSE) for plane in ground.tone]
+    tone = [enlarge_rows(plane, wide, COARSE) for plane in ground["tone"]]
     image = np.empty((3, rows[1] - rows[0], columns), np.float32)
     # Tiles that fit the processor's cache, most of which hold no creek, road or trail: thrice as fast as whole rows.
     for left in range(0, columns, _TILE):
@@ -165,8 +152,8 @@ def _coloured(
     height = of["gravel"] * (0.012 * large + 0.01 * middle + 0.008 * small + 0.008 * grain)
     stones, bare = np.minimum(of["stones"] * of["gravel"], 50), np.ones_like(large)
     overlays = []
-    if (of["wash"] - of["wash_half_m"]).min() < 3:
-        from_bank = of["wash"] - of["wash_half_m"]
+    from_bank = of["wash"] - of["wash_half"]
+    if from_bank.min() < 3:
         in_wash = np.clip(ragged - from_bank / 0.8, 0, 1)
         dull -= 0.15 * np.exp(-(((from_bank - 0.4) / 0.6) ** 2))
         dull += in_wash * (0.05 * np.sin(2 * of["wash"] + 2 * large))
@@ -213,15 +200,7 @@ def _coloured(
     return planes
 
 
-# Noise of which a landscape is made: smooth bumps of a width, and sums of them.
-
-
-_BLOCK = 64  # rows of noise that share a seed
-_FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
-_SPREAD = 1.35  # makes up for what interpolation between independent numbers takes from their spread, and more
-
-
-def noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
+def _noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
     """(H, W) float32 of mean 0 and standard deviation about 1: smooth noise whose bumps are about width_px wide."""
     if width_px <= 1:
         return rng.standard_normal(shape, np.float32)
@@ -233,18 +212,16 @@ def noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: floa
     return large[first : first + shape[0], first : first + shape[1]] * np.float32(_SPREAD)
 
 
-def fractal_noise(
-    rng: np.random.Generator, shape: tuple[int, int], widest_px: float, narrowest_px: float, fall: float = 0.5
-) -> np.ndarray:
+def _fractal_noise(rng: np.random.Generator, shape: tuple[int, int], widest_px: float, fall: float) -> np.ndarray:
     """(H, W) float32 of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
     total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, widest_px
-    while width >= narrowest_px or power == 0:
-        total += np.float32(height) * noise_bumps(rng, shape, width)
+    while width >= 1:
+        total += np.float32(height) * _noise_bumps(rng, shape, width)
         power, height, width = power + height**2, height * fall, width / 2
     return total / np.float32(np.sqrt(power))
 
 
-def noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
+def _noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
     """Rows [first, last) of an endless (_, columns) noise with spread about 1 whose bumps are width_px wide."""
     first, last = rows[0] // width_px - 2, -(-rows[1] // width_px) + 2
     cells = -(-columns // width_px) + 4
@@ -256,7 +233,7 @@ def noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width
     return large[skip : skip + rows[1] - rows[0], 2 * width_px : 2 * width_px + columns]
 
 
-def noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
+def _noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
     """Rows [first, last) of an endless picture that is 0 but for a share of its pixels, which are in (0.3, 1]."""
     first = rows[0] // _BLOCK
     drawn = np.zeros((((rows[1] - 1) // _BLOCK + 1 - first) * _BLOCK, columns), np.float32)

@@ -1,20 +1,66 @@
-"""A rolling shutter over relief: each row of a picture has the camera's pose at the time at which it is read."""
+"""The cameras' geometry: a pinhole view, and a rolling shutter, whose rows are read one after the other in flight."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.simulation.agents import Moment
-from torchvision_dddas.types import Camera
+from torchvision_dddas.simulation.uav import cross_matrix
+from torchvision_dddas.types import Camera, CameraPose
 
+LEAST_PX = 0.7  # shorter ways during the exposure are lost in the lens's own blur
+_MOST = 40  # pictures that are averaged for one that is blurred
 _LOWEST = 0.004  # least sink of a ray for each metre along the axis: rays above the horizon never meet the ground
 _FURTHEST_M = 20_000.0
 _LANDINGS = 8
 _CLOSE_M = 0.004
 _VIBRATION_HZ = 120.0  # of rotors that turn 60 times a second, two blades each
+
+
+@dataclass(frozen=True)
+class View:
+    """One pinhole view. image_from_world is the (3, 4) projection, position_m the (3,) camera centre."""
+
+    image_from_world: np.ndarray
+    position_m: np.ndarray
+
+    def homogeneous(self, points_m: np.ndarray) -> np.ndarray:
+        """(..., 3) of world points (..., 3): pixels times depth, and depth."""
+        return points_m @ self.image_from_world[:, :3].T + self.image_from_world[:, 3]
+
+    def project(self, points_m: np.ndarray) -> np.ndarray:
+        """Pixels (..., 2) of world points (..., 3)."""
+        seen = self.homogeneous(points_m)
+        return seen[..., :2] / seen[..., 2:]
+
+    @property
+    def scale_px(self) -> float:
+        """Pixels of a length that is as long as its depth, by the first row of the projection."""
+        return float(np.linalg.norm(self.image_from_world[0, :3]))
+
+
+def camera_axes(heading_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
+    """(3, 3), the columns a camera's right, down and forward in east, north, up; the angles as in types.Camera.
+
+    Straight down the heading is that of the picture's upper edge.
+    """
+    level, sunk = np.cos(pitch_rad), np.sin(pitch_rad)
+    ahead = np.array([np.sin(heading_rad) * level, np.cos(heading_rad) * level, -sunk])
+    right = np.array([np.cos(heading_rad), -np.sin(heading_rad), 0.0])
+    down = np.cross(ahead, right)
+    turned = right * np.cos(roll_rad) + down * np.sin(roll_rad), down * np.cos(roll_rad) - right * np.sin(roll_rad)
+    return np.stack([*turned, ahead], axis=1)
+
+
+def view_from_pose(pose: CameraPose, camera: Camera) -> View:
+    """The view of a camera without distortion from a pose in local metres."""
+    focal = np.array(camera.focal_px) * pose.focal
+    inner = np.array([[focal[0], 0, camera.centre_px[0]], [0, focal[1], camera.centre_px[1]], [0, 0, 1.0]])
+    rotation = pose.axes.T
+    return View(inner @ np.c_[rotation, -rotation @ pose.place_m], pose.place_m)
 
 
 class Shutter:
@@ -23,17 +69,16 @@ class Shutter:
     vibration_px: standard deviation along each axis of how far vibration moves a row aside; seed: of its phase.
     """
 
-    def __init__(self, camera: Camera, readout_s: float, vibration_px: float = 0.0, seed: int = 0) -> None:
-        self.camera = camera
-        self.readout_s = readout_s
+    def __init__(self, camera: Camera, readout_s: float, vibration_px: float, seed: int) -> None:
+        self.camera, self._readout_s = camera, readout_s
         self._vibration_px, self._seed = vibration_px, seed
 
     def lag_s(self, v: np.ndarray) -> np.ndarray:
         """When a row is read, after the middle one."""
         last = self.camera.size_px[1] - 1
-        return (np.clip(v, 0, last) / last - 0.5) * self.readout_s
+        return (np.clip(v, 0, last) / last - 0.5) * self._readout_s
 
-    def aside_px(self, number: int, v: np.ndarray) -> np.ndarray | float:
+    def _aside_px(self, number: int, v: np.ndarray) -> np.ndarray | float:
         """(N, 2) how far vibration moves rows (N,) of a picture aside."""
         if not self._vibration_px:
             return 0.0
@@ -42,19 +87,18 @@ class Shutter:
 
     def rays(self, moment: Moment, image_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Starts and directions (N, 3) of the rays through pixels (N, 2), a metre long along the axis."""
-        camera, pose = self.camera, moment.pose
-        focal = np.array(camera.focal_px) * pose.focal
-        steady_px = image_px - self.aside_px(moment.number, image_px[:, 1])
-        flat = (steady_px - np.array(camera.centre_px)) / focal
-        lag = self.lag_s(image_px[:, 1])[:, None]
-        way = rotate_vectors(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
+        pose, row = moment.pose, image_px[:, 1]
+        steady_px = image_px - self._aside_px(moment.number, row)
+        flat = (steady_px - np.array(self.camera.centre_px)) / (np.array(self.camera.focal_px) * pose.focal)
+        lag = self.lag_s(row)[:, None]
+        way = _rotate(np.c_[flat, np.ones(len(flat))] @ pose.axes.T, moment.turn_rad_s, lag)
         return pose.place_m + lag * moment.velocity_m_s, way
 
     def ways(self, moment: Moment, places_m: np.ndarray, exposure_s: float) -> np.ndarray:
         """Pixels (N, 2) that points (N, 3) which stand still move in the picture during an exposure."""
         ends = []
         for lag in (-exposure_s / 2, exposure_s / 2):
-            axes = rotate_vectors(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
+            axes = _rotate(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
             pose = replace(moment.pose, place_m=moment.pose.place_m + lag * moment.velocity_m_s, axes=axes)
             ends.append(self.project(replace(moment, pose=pose), places_m)[0])
         return ends[1] - ends[0]
@@ -63,19 +107,19 @@ class Shutter:
         self, moment: Moment, points_m: np.ndarray, velocity_m_s: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (N, 2) of points (N, 3) that move so, and how far along the axis they are (N,)."""
-        camera, pose = self.camera, moment.pose
-        focal, centre = np.array(camera.focal_px) * pose.focal, np.array(camera.centre_px)
-        # Where it is for the camera at a lag is a polynomial of the lag: its terms are found once.
-        once = cross_matrix(-moment.turn_rad_s)
+        pose, centre = moment.pose, np.array(self.camera.centre_px)
+        focal = np.array(self.camera.focal_px) * pose.focal
+        # The place relative to the camera is a polynomial of the lag: its terms are found once.
+        once = cross_matrix(-moment.turn_rad_s).T
         away, slide = points_m - pose.place_m, np.asarray(velocity_m_s - moment.velocity_m_s)
         terms = [away @ pose.axes]
-        if self.readout_s > 0:
+        if self._readout_s > 0:
             terms += [away @ (once @ pose.axes) + slide @ pose.axes]
             terms += [away @ (once @ once @ pose.axes / 2) + slide @ (once @ pose.axes)]
         seen = terms[0]
         # The row tells the time and the time the row; the shutter is far faster than what moves.
         row = np.zeros(0)
-        for again in range(3 if self.readout_s > 0 else 1):
+        for again in range(3 if self._readout_s > 0 else 1):
             if again:
                 lag = self.lag_s(row)[:, None]
                 seen = terms[0] + lag * (terms[1] + lag * terms[2])
@@ -83,36 +127,30 @@ class Shutter:
             over = 1 / np.where(np.abs(depth) < 1e-6, 1e-6, depth)
             row = seen[:, 1] * over * focal[1] + centre[1]
         column = seen[:, 0] * over * focal[0] + centre[0]
-        return np.stack([column, row], axis=1) + self.aside_px(moment.number, row), depth
+        return np.stack([column, row], axis=1) + self._aside_px(moment.number, row), depth
 
 
 @lru_cache(maxsize=8)
 def _phases(seed: int, number: int) -> np.ndarray:
-    """(2,) of the vibration in a picture's middle row: no frame rate keeps step with it."""
+    """(2,) of the vibration in a picture's middle row: independent of the frame rate."""
     return np.random.default_rng([seed, 79, number]).uniform(0, 2 * np.pi, 2)
 
 
-def rotate_vectors(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
+def _rotate(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
     """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
     if not np.any(lag_s) or not np.any(turn_rad_s):
         return vectors
-    matrix = cross_matrix(turn_rad_s)
+    matrix = cross_matrix(turn_rad_s).T
     once = lag_s * (vectors @ matrix)
     return vectors + once + lag_s / 2 * (once @ matrix)
-
-
-def cross_matrix(turn_rad_s: np.ndarray) -> np.ndarray:
-    """(3, 3) by which row vectors are multiplied for their cross product with a turn."""
-    x, y, z = turn_rad_s
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]).T
 
 
 def meet_ground(
     start_m: np.ndarray, way: np.ndarray, up_m: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far along their way (N,) rays (N, 3) meet the ground, and the height (N,) there; up_m: of places (N, 2).
+    """Distance along rays (N, 3) to the ground (N,), and its height (N,) there; up_m: of places (N, 2).
 
-    Rays that go above the horizon land far off.
+    Rays above the horizon land far off.
     """
     sink = np.maximum(-way[:, 2], _LOWEST)
     up = up_m(start_m[:, :2])
@@ -134,13 +172,6 @@ def meet_ground(
     return far, up
 
 
-# What moves while the shutter is open is drawn out along its way.
-
-
-LEAST_PX = 0.7  # shorter ways are lost in the lens's own blur
-_MOST = 40  # pictures that are averaged for one that is blurred
-
-
 def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     """A picture (H, W, C) uint8 blurred by the way that its parts moved during the exposure.
 
@@ -150,9 +181,8 @@ def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     if longest < LEAST_PX:
         return picture
     if np.ptp(way_px.reshape(-1, 2), axis=0).max() < LEAST_PX:
-        return np.asarray(
-            cv2.filter2D(picture, -1, streak_kernel(way_px.mean(axis=(0, 1))), borderType=cv2.BORDER_REPLICATE)
-        )
+        kernel = streak_kernel(way_px.mean(axis=(0, 1)))
+        return np.asarray(cv2.filter2D(picture, -1, kernel, borderType=cv2.BORDER_REPLICATE))
     height, width = picture.shape[:2]
     rows, columns = way_px.shape[:2]
     # The points are at the corners: pixel 0 is at the first of them and the last pixel at the last.
@@ -162,9 +192,8 @@ def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
     count = min(int(np.ceil(longest)) + 1, _MOST)
     total = np.zeros(picture.shape, np.float32)
     for share in ((np.arange(count, dtype=np.float32) + 0.5) / count - 0.5).astype(np.float32):
-        moved = cv2.remap(picture, u + share * way[0], v + share * way[1], cv2.INTER_LINEAR,
-                          borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
-        cv2.accumulate(moved, total)
+        at = u + share * way[0], v + share * way[1]
+        cv2.accumulate(cv2.remap(picture, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), total)
     return np.round(total / count).astype(np.uint8)
 
 
