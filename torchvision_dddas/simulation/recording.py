@@ -16,14 +16,9 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary, write_whole
 from torchvision_dddas.io.colour_files import format_colours
-<<<<<<< HEAD
-from torchvision_dddas.io.output import RUN_JSON, Part, PartOf, RunRecord, RunRecorder
-from torchvision_dddas.io.overlay_video import OverlayVideo
-=======
 from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.output.recorder import PartOf
 from torchvision_dddas.io.overlay_video import OverlayVideo
->>>>>>> d659976 (Import the part of a field from its module)
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.simulation.agents import Report
 from torchvision_dddas.simulation.scenario import Scenario, load_scenario, scenario_settings, scenario_toml
