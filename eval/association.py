@@ -30,10 +30,15 @@ from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.functional import affinity
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.tracking import CameraMotion, FrameTracker, source_affinity
-from torchvision_dddas.tracking.appearance import rgb_histograms
-from torchvision_dddas.tracking.source_affinity import dispersion, frames_considered, location_weight
-from torchvision_dddas.tracking.source_tracker import assign
+from torchvision_dddas.tracking import CameraMotion, FrameTracker, rgb_histograms
+from torchvision_dddas.tracking.source_tracker import (
+    assign,
+    centres,
+    dispersion,
+    frames_considered,
+    location_weight,
+    normalize_channels,
+)
 from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 SAME_IOU = 0.9
@@ -172,9 +177,7 @@ def read_sequence(place: Path) -> Sequence:
         rows = np.flatnonzero(table.frame == number)
         histogram[rows] = rgb_histograms(image, table.box_px[rows] - (1, 1, 0, 0))
         seen.add(number)
-    return Sequence(
-        table.frame, table.identity, table.box_px, source_affinity.normalize_channels(histogram), frozenset(seen)
-    )
+    return Sequence(table.frame, table.identity, table.box_px, normalize_channels(histogram), frozenset(seen))
 
 
 def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1) -> Windows:
@@ -189,7 +192,7 @@ def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1)
     most = max(len(r) for r in rows.values())
     valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
     sizes, parts = [tuple(len(rows[t]) for t in f) for f in frames], []
-    for feature in (source_affinity.centres(sequence.box_px), sequence.histogram):
+    for feature in (centres(sequence.box_px), sequence.histogram):
         padded = np.zeros((last + 1, most, feature.shape[1]))
         for number, which in rows.items():
             padded[number, : len(which)] = feature[which]
@@ -208,7 +211,7 @@ def measure_dispersions(
     sequence: Sequence, frames: np.ndarray, location_cut: float, histogram_cut: float
 ) -> np.ndarray:
     """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts."""
-    centre, found = source_affinity.centres(sequence.box_px), {}
+    centre, found = centres(sequence.box_px), {}
     for t in np.unique(frames).tolist():
         rows = sequence.rows(t)
         found[t] = dispersion(centre[rows], location_cut), dispersion(sequence.histogram[rows], histogram_cut)

@@ -6,8 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.functional import affinity
-from torchvision_dddas.tracking import source_affinity
+from torchvision_dddas.tracking import source_tracker
 
 Features = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -44,11 +45,10 @@ def test_the_torch_free_twin_agrees(size):
     a, b, c = features(size=size, dtype=torch.float32)
     pairs, triplets = affinity.pairs(a, b, *masks(a, b)), affinity.triplets(a, b, c, *masks(a, b, c))
     for w in range(2):
-        first, second, third = (t[w].double().numpy() for t in (a, b, c))
-        np.testing.assert_allclose(source_affinity.pair_affinity(first, second)[1:, 1:], pairs[w], atol=2e-6)
-        np.testing.assert_allclose(
-            source_affinity.triplet_affinity(first, second, third)[1:, 1:, 1:], triplets[w], atol=2e-6
-        )
+        frames = [t[w].double().numpy() for t in (a, b, c)]
+        of_two, of_three = (source_tracker.affinity(frames[:count], PaperParameters()) for count in (2, 3))
+        np.testing.assert_allclose(of_two[1:, 1:], pairs[w], atol=2e-6)
+        np.testing.assert_allclose(of_three[1:, 1:, 1:], triplets[w], atol=2e-6)
 
 
 def test_padding_changes_no_affinity_and_has_none():
@@ -77,7 +77,7 @@ vectors = st.lists(st.lists(st.floats(0, 1e3), min_size=3, max_size=3), min_size
 @settings(max_examples=60, deadline=None)
 def test_similarity_is_symmetric_between_0_and_1_and_1_with_itself(first, second):
     a, b = np.array(first), np.array(second)
-    found = source_affinity.similarity(a, b)
+    found = source_tracker.similarity(a, b)
     assert ((found >= 0) & (found <= 1)).all()
-    np.testing.assert_allclose(found, source_affinity.similarity(b, a).T)
-    np.testing.assert_allclose(np.diag(source_affinity.similarity(a, a)), (a.sum(axis=1) > 0).astype(float))
+    np.testing.assert_allclose(found, source_tracker.similarity(b, a).T)
+    np.testing.assert_allclose(np.diag(source_tracker.similarity(a, a)), (a.sum(axis=1) > 0).astype(float))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchvision_dddas.functional import color
-from torchvision_dddas.tracking.appearance import rgb_histograms
+from torchvision_dddas.tracking import rgb_histograms
 
 
 def every_colour(step: int = 5) -> np.ndarray:

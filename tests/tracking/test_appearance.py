@@ -12,16 +12,18 @@ from numpy.typing import ArrayLike
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.appearance import (
+from torchvision_dddas.tracking.kalman import SEEN, VX, VY
+from torchvision_dddas.tracking.scores import (
     SIGNATURE,
+    SceneState,
+    SpeedPrior,
     appearance_scores,
+    association_scores,
     blend_histograms,
     is_ambiguous,
     similarity,
     strip_histograms,
 )
-from torchvision_dddas.tracking.kalman import SEEN, VX, VY
-from torchvision_dddas.tracking.scores import SceneState, SpeedPrior, association_scores
 
 RED, GREEN, BLUE = (0, 0, 200), (0, 200, 0), (200, 0, 0)
 GROUND = (110, 120, 115)

@@ -219,7 +219,7 @@ def test_exact_triplets_hold_each_target_once_and_score_the_most(shape, data):
 @given(shapes, st.integers(0, 10_000), st.sampled_from([0.0, 0.01, 0.5]))
 def test_the_best_lies_between_value_and_bound(shape, seed, gap):
     score = tensor_of(seed, shape, -1.0, 1.0)
-    solved = assign_triplets(score, gap=gap, steps=3)
+    solved = assign_triplets(score, gap=gap)
     best = best_triplets(score)
     assert_each_target_once(solved.triplets, shape)
     assert solved.value == pytest.approx(total(score, solved.triplets))

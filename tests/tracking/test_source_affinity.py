@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.config import PaperParameters
-from torchvision_dddas.tracking import source_affinity
+from torchvision_dddas.tracking import source_tracker as source_affinity
 from torchvision_dddas.tracking.dual_ascent import assign_triplets
-from torchvision_dddas.tracking.source_affinity import (
+from torchvision_dddas.tracking.source_tracker import (
     frames_considered,
     gate,
     location_weight,
@@ -30,14 +30,16 @@ def test_normalised_channels_add_up_to_one_and_an_empty_box_stays_empty():
 
 def test_the_dummy_by_words_and_by_formula():
     a, b, c = (np.array([row], float) for row in ([4, 1], [2, 3], [1, 5]))
-    words, formula = source_affinity.triplet_affinity(a, b, c), source_affinity.triplet_affinity(a, b, c, "formula")
+    words, formula = (
+        source_affinity.affinity([a, b, c], PaperParameters.model_validate({"dummy": d})) for d in ("zero", "formula")
+    )
     assert words[1, 1, 1] == formula[1, 1, 1] == pytest.approx(7 / 14)
     assert words.sum() == words[1, 1, 1]
     # A vector of zeros adds nothing above and the other vector below the line: (2 + 1 + 0) / (4 + 3 + 5) and so on.
     assert formula[1, 1, 0] == pytest.approx((2 + 1) / (4 + 3 + 5))
     assert formula[0, 1, 1] == pytest.approx((1 + 3) / (5 + 2 + 5))
     assert formula[1, 0, 1] == formula[0, 0, 0] == formula[0, 0, 1] == formula[0, 1, 0] == 0
-    assert not source_affinity.pair_affinity(a, b)[0].any()
+    assert not source_affinity.affinity([a, b], PaperParameters())[0].any()
 
 
 def padded(real: np.ndarray) -> np.ndarray:

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.config import PaperParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tracking.source_affinity import gate
-from torchvision_dddas.tracking.source_tracker import Features, SourceTracker, assign, associate
+from torchvision_dddas.tracking.source_tracker import Features, SourceTracker, assign, associate, gate
 from torchvision_dddas.types import Detections
 
 SIZE = (20.0, 40.0)

@@ -2,7 +2,7 @@
 
 Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), histograms
 (D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0.
-`tracking.source_affinity` is the twin for one window without torch.
+`tracking.source_tracker` has the twin for one window without torch.
 """
 
 import torch

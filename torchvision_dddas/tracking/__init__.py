@@ -2,6 +2,7 @@
 
 from torchvision_dddas.tracking.camera_motion import CameraMotion
 from torchvision_dddas.tracking.crowd_identity import CrowdIdentities
+from torchvision_dddas.tracking.source_tracker import rgb_histograms
 from torchvision_dddas.tracking.tracker import (
     FrameTracker,
     SceneTracker,
@@ -18,6 +19,7 @@ __all__ = [
     "FrameTracker",
     "SceneTracker",
     "Tracker",
+    "rgb_histograms",
     "track_clip",
     "track_scenes",
     "track_table",

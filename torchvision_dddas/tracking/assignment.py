@@ -49,22 +49,22 @@ def choose_links(
     detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
     leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
-    onward, born, bridging = _without_ties(onward), _without_ties(born), _without_ties(bridging)
-    p, k = np.nonzero((onward > 0) & _is_leading(onward))
-    j, m = np.nonzero((born > 0) & _is_leading(born))
-    i, n = np.nonzero((bridging > 0) & _is_leading(bridging))
-    ends = np.cumsum([len(value), len(p), len(j), len(i)]).tolist()
-    columns, score = np.full((ends[3], 3), -1), np.empty(ends[3])
-    pair, triplet, late, bridge = (slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
-    columns[pair, 0], columns[pair, 1], score[pair] = tracks, now, value
-    columns[triplet, 0], columns[triplet, 1], columns[triplet, 2] = tracks[p], now[p], k
-    score[triplet] = value[p] + _NEXT_WEIGHT * onward[p, k]
-    columns[late, 1], columns[late, 2], score[late] = j, m, _NEXT_WEIGHT * born[j, m]
-    columns[bridge, 0], columns[bridge, 2], score[bridge] = i, n, _NEXT_WEIGHT * bridging[i, n]
+
+    def likely(further: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows, columns and weighted scores of the links to the next frame that are worth a column."""
+        further = _without_ties(further)
+        row, k = np.nonzero((further > 0) & _is_leading(further))
+        return row, k, _NEXT_WEIGHT * further[row, k]
+
+    (p, k, later), (j, m, fresh), (i, n, bridged) = map(likely, (onward, born, bridging))
+    parts = [(tracks, now, -1), (tracks[p], now[p], k), (-1, j, m), (i, -1, n)]
+    columns = np.concatenate([np.stack(np.broadcast_arrays(*part), axis=1) for part in parts])
+    score = np.concatenate([value, value[p] + later, fresh, bridged])
     best, _ = choose_triplets(columns, score, _MOST_BRANCHES)
+    # Each column of a link, alone or with a next detection, stands for that link.
+    links = np.concatenate([np.arange(len(value)), p])
     chosen = np.zeros(len(value), bool)
-    chosen[best[best < ends[0]]] = True
-    chosen[p[best[(best >= ends[0]) & (best < ends[1])] - ends[0]]] = True
+    chosen[links[best[best < len(links)]]] = True
     return chosen
 
 
@@ -91,13 +91,23 @@ def choose_triplets(
     decide, not the order of the columns; of two equal columns the first is chosen.
     Raises InputError if the shapes do not fit, an index is below -1, a column has no node, or a score is NaN or +inf.
     """
-    columns, score = _check(columns, score)
+    columns, score = np.asarray(columns), np.asarray(score, float)
+    if columns.ndim != 2 or columns.shape[1] != 3 or score.shape != columns.shape[:1]:
+        raise InputError(
+            f"triplets need (C, 3) indices and (C,) scores; got {columns.shape} and {score.shape}. "
+            "Give one score a column."
+        )
+    if len(columns) and not np.issubdtype(columns.dtype, np.integer):
+        raise InputError(f"triplets need integer indices; got {columns.dtype}. Convert them, with -1 for none.")
+    if len(columns) and (columns.min() < -1 or columns.max(axis=1).min() < 0):
+        raise InputError("triplets need a node of some layer, -1 for none; got an index below -1 or a column of none.")
+    if np.isnan(score).any() or np.isposinf(score).any():
+        raise InputError("triplets need scores below infinity; got NaN or +inf. Forbid a column with -inf.")
     order = np.lexsort((-score, columns[:, 2], columns[:, 1], columns[:, 0]))
     order = order[score[order] > 0]
     if not len(order):
         return np.zeros(0, np.int64), True
-    kept = columns[order]
-    gain = score[order] / score[order].max()
+    kept, gain = columns[order], score[order] / score[order].max()
     held = [[3 * node + layer for layer, node in enumerate(column) if node >= 0] for column in kept.tolist()]
     gains = gain.tolist()
     chosen, unsolved = np.zeros(len(gain), bool), np.full(len(gain), -1)
@@ -107,28 +117,22 @@ def choose_triplets(
             unsolved[members] = name
         else:
             chosen[[members[place] for place in found]] = True
-    certain, hard = True, unsolved >= 0
-    if hard.any():
-        chosen[hard], certain = _optimize(_incidence(kept[hard]), gain[hard], unsolved[hard], most_branches)
+    certain, hard = True, np.flatnonzero(unsolved >= 0)
+    if len(hard):
+        # Linear first: it is integral in most windows; integer programming only for the groups where it is not.
+        incidence, group = _incidence(kept[hard]), unsolved[hard]
+        solution, certain = _solve(incidence, gain[hard])
+        again = np.isin(group, group[np.abs(solution - solution.round()) > 1e-6])
+        if again.any():
+            options = {} if most_branches is None else {"node_limit": most_branches}
+            solution[again], certain = _solve(incidence[:, again], gain[hard][again], integral=True, **options)
+        chosen[hard] = solution > 0.5
     return np.sort(order[chosen]), certain
 
 
 def relaxed_shares(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
     """(C,) share of each column in the best choice that may take parts of columns: 0 or 1 in most windows."""
     return _solve(_incidence(columns), score)[0] if len(score) else np.zeros(0)
-
-
-def _optimize(
-    incidence: "csc_array", gain: Float[np.ndarray, "C"], group: Int[np.ndarray, "C"], most_branches: int | None
-) -> tuple[Bool[np.ndarray, "C"], bool]:
-    """Linear first: it is integral in most windows; integer programming only for the groups where it is not."""
-    solution, certain = _solve(incidence, gain)
-    broken = np.unique(group[np.abs(solution - solution.round()) > 1e-6])
-    if len(broken):
-        again = np.isin(group, broken)
-        options = {} if most_branches is None else {"node_limit": most_branches}
-        solution[again], certain = _solve(incidence[:, again], gain[again], integral=True, **options)
-    return solution > 0.5, certain
 
 
 def _solve(
@@ -176,7 +180,21 @@ def _search(held: list[list[int]], gain: list[float]) -> list[int] | None:
     """The best choice in one group, as places in its list; None if the search takes too long."""
     if len(held) > _SEARCH_COLUMNS:
         return None
-    price = _prices(held, gain)
+    # Prices that pay for every column: gains shared evenly, then lowered where they exceed.
+    price: dict[int, float] = {}
+    for nodes, worth in zip(held, gain, strict=True):
+        for node in nodes:
+            price[node] = max(price.get(node, 0.0), worth / len(nodes))
+    if len(held) > _EASY_COLUMNS:
+        place = {node: k for k, node in enumerate(price)}
+        at, count = np.array([place[node] for nodes in held for node in nodes]), np.array(list(map(len, held)))
+        start, level = np.cumsum(count) - count, np.array(list(price.values()))
+        for _ in range(_PRICE_ROUNDS):
+            least = level * 3
+            np.minimum.at(least, at, np.repeat(np.add.reduceat(level[at], start) - gain, count))
+            # A column holds up to three nodes: a third each keeps it paid for.
+            level -= np.maximum(least, 0.0) / 3
+        price = dict(zip(price, level.tolist(), strict=True))
     # With one node a layer any two columns share one, unless a column is a single node: the best column wins.
     if len({node % 3 for node in price}) == len(price) and min(map(len, held)) > 1:
         return [gain.index(max(gain))]
@@ -225,27 +243,6 @@ def least_loss(
     return best
 
 
-def _prices(held: list[list[int]], gain: list[float]) -> dict[int, float]:
-    """Prices of the nodes that pay for every column: gains shared evenly, then lowered where they exceed."""
-    price: dict[int, float] = {}
-    for nodes, worth in zip(held, gain, strict=True):
-        share = worth / len(nodes)
-        for node in nodes:
-            if price.get(node, 0.0) < share:
-                price[node] = share
-    if len(held) <= _EASY_COLUMNS:
-        return price
-    place = {node: k for k, node in enumerate(price)}
-    at, count = np.array([place[node] for nodes in held for node in nodes]), np.array([len(nodes) for nodes in held])
-    start, level = np.cumsum(count) - count, np.array(list(price.values()))
-    for _ in range(_PRICE_ROUNDS):
-        least = level * 3
-        np.minimum.at(least, at, np.repeat(np.add.reduceat(level[at], start) - gain, count))
-        # A column holds up to three nodes: a third each keeps it paid for.
-        level -= np.maximum(least, 0.0) / 3
-    return dict(zip(price, level.tolist(), strict=True))
-
-
 def _incidence(columns: Int[np.ndarray, "C 3"]) -> "csc_array":
     """(nodes, C) which nodes of all layers each column holds."""
     from scipy.sparse import csc_array
@@ -255,21 +252,3 @@ def _incidence(columns: Int[np.ndarray, "C 3"]) -> "csc_array":
     known, nodes = np.unique(names, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(there.sum(axis=1))])
     return csc_array((np.ones(len(nodes)), nodes, start), shape=(len(known), len(columns)))
-
-
-def _check(
-    columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]
-) -> tuple[Int[np.ndarray, "C 3"], Float[np.ndarray, "C"]]:
-    columns, score = np.asarray(columns), np.asarray(score, float)
-    if columns.ndim != 2 or columns.shape[1] != 3 or score.shape != columns.shape[:1]:
-        raise InputError(
-            f"triplets need (C, 3) indices and (C,) scores; got {columns.shape} and {score.shape}. "
-            "Give one score a column."
-        )
-    if len(columns) and not np.issubdtype(columns.dtype, np.integer):
-        raise InputError(f"triplets need integer indices; got {columns.dtype}. Convert them, with -1 for none.")
-    if len(columns) and (columns.min() < -1 or columns.max(axis=1).min() < 0):
-        raise InputError("triplets need a node of some layer, -1 for none; got an index below -1 or a column of none.")
-    if np.isnan(score).any() or np.isposinf(score).any():
-        raise InputError("triplets need scores below infinity; got NaN or +inf. Forbid a column with -inf.")
-    return columns.astype(np.int64), score

@@ -5,7 +5,6 @@ camera are recognized on a tiny picture, and the others are registered on a redu
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -62,12 +61,13 @@ class CameraMotion:
         """
         picture = _Picture(image, self.engine)
         self._age += 1
+        is_old = self._age >= _ANCHOR_FRAMES
         if self._anchor is None or self._last is None:
-            self._anchor, self._last, self._age = picture, picture, 0
+            self._begin(picture)
             return None, ""
-        if _is_still(self._anchor, picture):
-            if self._age >= _ANCHOR_FRAMES:
-                self._anchor, self._age = picture, 0
+        if picture.is_still(self._anchor):
+            if is_old:
+                self._begin(picture)
             self._last, self._lost = picture, None
             return None, ""
         # The picture before may be the lost one, such as a flash. The tracker knows of no motion since `_last`, so that
@@ -76,45 +76,41 @@ class CameraMotion:
         for other in earlier:
             (found,) = self.engine.register([(other.view, picture.view)])
             if found.reliable:
-                self._anchor, self._last, self._lost, self._age = picture, picture, None, 0
-                full_from_small = picture.full_from_small
+                self._begin(picture)
+                # From the view's pixels to the picture's. Both count from the middle of their first pixel.
+                x, y = np.array(picture.grey.shape[::-1]) / picture.view.size
+                full_from_small = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
                 motion = full_from_small @ found.later_from_earlier @ np.linalg.inv(full_from_small)
                 return motion / motion[2, 2], ""
-        if self._age >= _ANCHOR_FRAMES:
-            self._anchor, self._last, self._lost, self._age = picture, picture, None, 0
-        else:
-            self._lost = picture
+        self._lost = picture
+        if is_old:
+            self._begin(picture)
         return None, found.cause
 
+    def _begin(self, picture: "_Picture") -> None:
+        """Compare the next pictures with this one."""
+        self._anchor, self._last, self._lost, self._age = picture, picture, None, 0
 
-@dataclass
+
 class _Picture:
     """A picture and what is computed from it when first needed."""
 
-    image: np.ndarray
-    engine: Registrar
+    def __init__(self, image: np.ndarray, engine: Registrar) -> None:
+        self.grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
+        self.engine = engine
+        self.reduction = int(np.clip(max(self.grey.shape) // _TINY_PX, 1, _LARGEST_REDUCTION))
 
-    @cached_property
-    def grey(self) -> np.ndarray:
-        return cv2.cvtColor(self.image, cv2.COLOR_BGR2GRAY) if self.image.ndim == 3 else self.image
+    def _reduce(self, times: int) -> np.ndarray:
+        size = max(1, self.grey.shape[1] // times), max(1, self.grey.shape[0] // times)
+        return self.grey if times == 1 else cv2.resize(self.grey, size, interpolation=cv2.INTER_AREA)
 
     @cached_property
     def view(self) -> Any:
-        return self.engine.prepare(_reduce(self.grey, max(1, min(self.grey.shape) // _REGISTERED_PX)))
-
-    @cached_property
-    def full_from_small(self) -> np.ndarray:
-        """From the view's pixels to the picture's. Both count from the middle of their first pixel."""
-        x, y = np.array([self.grey.shape[1], self.grey.shape[0]]) / self.view.size
-        return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
-
-    @cached_property
-    def reduction(self) -> int:
-        return int(np.clip(max(self.grey.shape) // _TINY_PX, 1, _LARGEST_REDUCTION))
+        return self.engine.prepare(self._reduce(max(1, min(self.grey.shape) // _REGISTERED_PX)))
 
     @cached_property
     def tiny(self) -> np.ndarray:
-        return _reduce(self.grey, self.reduction)
+        return self._reduce(self.reduction)
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -122,24 +118,18 @@ class _Picture:
         found = cv2.goodFeaturesToTrack(self.tiny, _POINTS, 0.01, max(4, min(self.tiny.shape) // 12))
         return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
-
-def _reduce(grey: np.ndarray, times: int) -> np.ndarray:
-    size = max(1, grey.shape[1] // times), max(1, grey.shape[0] // times)
-    return grey if times == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-
-
-def _is_still(anchor: _Picture, picture: _Picture) -> bool:
-    """Whether three quarters of the picture have not moved; a moving target may cover the fourth."""
-    start = anchor.points
-    if len(start) < _LEAST_POINTS * _LEAST_QUARTERS:
-        return False
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
-    search = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 1, "criteria": criteria}
-    end, found, _ = cv2.calcOpticalFlowPyrLK(anchor.tiny, picture.tiny, start, None, **search)  # type: ignore[call-overload]
-    tracked = found.ravel() == 1
-    moved = (end - start)[tracked] * picture.reduction
-    height, width = picture.tiny.shape
-    right, low = (start[tracked] > (width / 2, height / 2)).T
-    quarters = [moved[(right == r) & (low == d)] for r in (False, True) for d in (False, True)]
-    medians = [np.median(motion, axis=0) for motion in quarters if len(motion) >= _LEAST_POINTS]
-    return sum(float(np.linalg.norm(median)) < _STILL_PX for median in medians) >= _LEAST_QUARTERS
+    def is_still(self, anchor: "_Picture") -> bool:
+        """Whether three quarters of the picture have not moved; a moving target may cover the fourth."""
+        start = anchor.points
+        if len(start) < _LEAST_POINTS * _LEAST_QUARTERS:
+            return False
+        criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.01)
+        search = {"winSize": (_WINDOW_PX, _WINDOW_PX), "maxLevel": 1, "criteria": criteria}
+        end, found, _ = cv2.calcOpticalFlowPyrLK(anchor.tiny, self.tiny, start, None, **search)  # type: ignore[call-overload]
+        tracked = found.ravel() == 1
+        moved = (end - start)[tracked] * self.reduction
+        height, width = self.tiny.shape
+        right, low = (start[tracked] > (width / 2, height / 2)).T
+        quarters = [moved[(right == r) & (low == d)] for r in (False, True) for d in (False, True)]
+        medians = [np.median(motion, axis=0) for motion in quarters if len(motion) >= _LEAST_POINTS]
+        return sum(float(np.linalg.norm(median)) < _STILL_PX for median in medians) >= _LEAST_QUARTERS

@@ -6,6 +6,7 @@ move with it until there are as many blobs again.
 """
 
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 
@@ -57,7 +58,7 @@ class CrowdIdentities:
         self._crowds: list[_Crowd] = []
         self._identities: dict[int, int] = {}  # by identity in the picture
         self._parts_since: dict[int, float] = {}  # when a possible part of a crowd was first seen, by track
-        self._count = 0
+        self._new_identities = count(1)
         self._time_s = 0.0
 
     def rename(
@@ -79,9 +80,7 @@ class CrowdIdentities:
                 taken.add(known)
         rows = np.flatnonzero(identity > 0)
         rows = rows[np.argsort(identity[rows], kind="stable")]
-        return replace(
-            tracks, identity=identity[rows], box_px=tracks.box_px[rows], score=tracks.score[rows], row=tracks.row[rows]
-        )
+        return replace(tracks, identity=identity)[rows]
 
     def update(
         self,
@@ -113,20 +112,16 @@ class CrowdIdentities:
             elif self._is_part(int(track[k]), place_m[k], radius):
                 identity[k] = _PART
             else:
-                identity[k] = self._new_identity()
-                place, still = place_m[k].copy(), np.zeros(2)
-                self._crowds.append(_Crowd(int(identity[k]), place, still, radius, int(track[k]), time_s, time_s))
+                identity[k] = next(self._new_identities)
+                begun = _Crowd(int(identity[k]), place_m[k].copy(), np.zeros(2), radius, int(track[k]), time_s, time_s)
+                self._crowds.append(begun)
         for k in np.flatnonzero(identity == 0).tolist():
             earlier = self._identities.get(int(track[k]), 0)
-            identity[k] = earlier if earlier and earlier not in identity else self._new_identity()
+            identity[k] = earlier if earlier and earlier not in identity else next(self._new_identities)
         identity = np.maximum(identity, 0)
         self._identities.update(zip(track.tolist(), identity.tolist(), strict=True))
         self._crowds = [crowd for crowd in self._crowds if time_s - crowd.last_s <= _KEPT_S]
         return identity
-
-    def _new_identity(self) -> int:
-        self._count += 1
-        return self._count
 
     def _is_part(self, track: int, place_m: np.ndarray, radius_m: float) -> bool:
         """Whether a new blob may be people who have fallen behind a crowd."""

@@ -29,10 +29,11 @@ from torchvision_dddas.types import Bool, Float, Int
 Gain = Float[np.ndarray, "N1 M1 L1"]
 Triplets = Int[np.ndarray, "C 3"]
 # Of each layer. The dummy, index 0, costs nothing.
-Prices = tuple[Float[np.ndarray, "N1"], Float[np.ndarray, "M1"], Float[np.ndarray, "L1"]]
+Prices = Sequence[np.ndarray]
 
 _OTHERS = ((1, 2), (0, 2), (0, 1))  # the other two layers of each
 _TURNS = 3  # how often prices are lowered and a choice is rounded before the exact solver is asked
+_STEPS = 20  # subgradient steps of the first turn; the next turns have twice and three times as many
 # Roundings in each turn after the first: with one, 9 of 20 simulated windows of 30 targets end above a gap of 0.5 %,
 # with twenty one does.
 _DRAWS = 20
@@ -46,6 +47,7 @@ _STEP, _SHRINK, _PATIENCE, _MOMENTUM = 0.4, 0.7, 4, 0.4
 # Triplets a target that are rounded: whole ones, and pairs with each other layer, apart because equal dummies would
 # crowd out the whole ones.
 _PER_TARGET = np.array([4, 2, 2])
+_LOWERINGS = 4  # two-frame assignments that lower the first prices
 
 
 @dataclass(frozen=True)
@@ -64,35 +66,15 @@ class Solution:
     exact: bool
 
 
-def assign_triplets(score: Gain, gap: float = 0.005, steps: int = 20, most_exact: int | None = 4000) -> Solution:
+def assign_triplets(score: Gain, gap: float = 0.005, most_exact: int | None = 4000) -> Solution:
     """The triplets with the largest sum of scores, to within `gap` of it, every real target in exactly one.
 
     score: (N + 1, M + 1, L + 1); index 0 of each axis is the dummy, used any number of times; (0, 0, 0) is never used
-    and its score not read. Scores may be zero or negative. gap: the gap to stop at. steps: subgradient steps of the
-    first turn; the next turns have twice and three times as many. most_exact: the exact solver is asked only if at most
-    so many triplets can be in a better solution, and branches at most a tenth as often; otherwise the gap stays wider
-    than asked for. With gap = 0 and most_exact = None the solution is exact, however long it takes.
+    and its score not read. Scores may be zero or negative. gap: the gap to stop at. most_exact: the exact solver is
+    asked only if at most so many triplets can be in a better solution, and branches at most a tenth as often; otherwise
+    the gap stays wider than asked for. With gap = 0 and most_exact = None the solution is exact, however long it takes.
     Raises InputError if the score is no 3-D tensor with a dummy on each axis, or not finite.
     """
-    tensor = _check_scores(score)
-    gain = _gain_over_alone(tensor)
-    alone = float(tensor[1:, 0, 0].sum() + tensor[0, 1:, 0].sum() + tensor[0, 0, 1:].sum())
-    scale = float(gain.max())
-    if scale <= 0:
-        return _solution(tensor, np.zeros((0, 3), np.int64), alone, exact=False)
-    gain /= scale
-    chosen, prices = _relax(gain, gap, alone / scale, steps)
-    if not _is_near(gain, chosen, prices, gap, alone / scale):
-        nodes = _nodes(gain, _cheap(gain, prices, _bound(prices) - _gained(gain, chosen) + _SAME))
-        if most_exact is None or len(nodes) <= most_exact:
-            better, certain = _solve_exactly(nodes, gain, prices, _gained(gain, chosen), most_exact)
-            chosen = max(chosen, better, key=lambda choice: _gained(gain, choice))
-            if certain:
-                return _solution(tensor, chosen, -np.inf, exact=True)
-    return _solution(tensor, chosen, alone + scale * _bound(prices), exact=False)
-
-
-def _check_scores(score: Gain) -> Gain:
     tensor = np.asarray(score, float)
     if tensor.ndim != 3 or 0 in tensor.shape:
         raise InputError(
@@ -103,81 +85,108 @@ def _check_scores(score: Gain) -> Gain:
     finite[0, 0, 0] = True
     if not finite.all():
         raise InputError("triplets need finite scores; got NaN or infinity. Give an impossible triplet a low score.")
-    return tensor
-
-
-def _gain_over_alone(tensor: Gain) -> Gain:
-    """What each triplet scores above its targets alone: 0 for those, and for (0, 0, 0)."""
-    first, second, third = (alone.copy() for alone in (tensor[:, 0, 0], tensor[0, :, 0], tensor[0, 0, :]))
+    # What each triplet scores above its targets alone: 0 for those, and for (0, 0, 0).
+    first, second, third = (single.copy() for single in (tensor[:, 0, 0], tensor[0, :, 0], tensor[0, 0, :]))
     first[0] = second[0] = third[0] = 0.0
     gain = tensor - (second[:, None] + third)
     gain -= first[:, None, None]
     gain[0, 0, 0] = 0.0
-    return gain
-
-
-def _solution(tensor: Gain, chosen: Triplets, bound: float, exact: bool) -> Solution:
-    """The chosen triplets with all other targets alone. A bound below the value is rounding, or absent."""
-    rows = [chosen]
-    for axis, size in enumerate(tensor.shape):
-        rest = np.setdiff1d(np.arange(1, size), chosen[:, axis])
-        alone = np.zeros((len(rest), 3), np.int64)
-        alone[:, axis] = rest
-        rows.append(alone)
-    triplets = np.concatenate(rows).astype(np.int64)
+    alone = float(tensor[1:, 0, 0].sum() + tensor[0, 1:, 0].sum() + tensor[0, 0, 1:].sum())
+    chosen, bound, exact, scale = np.zeros((0, 3), np.int64), alone, False, float(gain.max())
+    if scale > 0:
+        gain /= scale
+        relaxed = _Relaxation(gain, gap, alone / scale)
+        chosen, bound = relaxed.chosen, alone + scale * _bound(relaxed.prices)
+        if not relaxed.is_near():
+            nodes = relaxed.candidates()
+            if most_exact is None or len(nodes) <= most_exact:
+                better, exact = _solve_exactly(nodes, gain, relaxed.prices, _gained(gain, chosen), most_exact)
+                chosen = max(chosen, better, key=lambda choice: _gained(gain, choice))
+    triplets = add_lone_targets(chosen, tensor.shape).astype(np.int64)
     triplets = triplets[np.lexsort(triplets.T[::-1])]
     value = float(tensor[tuple(triplets.T)].sum())
-    bound = max(bound, value)
+    bound = value if exact else max(bound, value)  # a bound below the value is rounding
     return Solution(triplets, value, bound, (bound - value) / max(abs(bound), 1e-9), exact)
+
+
+def add_lone_targets(chosen: Int[np.ndarray, "C K"], sizes: Sequence[int]) -> Int[np.ndarray, "Z K"]:
+    """The rows, and one more for each target that none of them holds, with dummies. sizes: of each axis, and dummy."""
+    rows = [chosen]
+    for axis, size in enumerate(sizes):
+        rest = np.setdiff1d(np.arange(1, size), chosen[:, axis])
+        alone = np.zeros((len(rest), len(sizes)), np.int64)
+        alone[:, axis] = rest
+        rows.append(alone)
+    return np.concatenate(rows)
 
 
 def _gained(gain: Gain, chosen: Triplets) -> float:
     return float(gain[tuple(chosen.T)].sum())
 
 
-def _bound(prices: Sequence[np.ndarray]) -> float:
+def _bound(prices: Prices) -> float:
     return float(sum(price.sum() for price in prices))
 
 
-def _is_near(gain: Gain, chosen: Triplets, prices: Prices, gap: float, alone: float) -> bool:
-    bound = _bound(prices)
-    return bound - _gained(gain, chosen) <= max(gap * abs(bound + alone), _SAME)
-
-
-def _nodes(gain: Gain, index: Int[np.ndarray, "C"]) -> Triplets:
-    """Of flat indices, those with a gain, as triplets."""
-    return np.stack(np.unravel_index(index[gain.ravel()[index] > 0], gain.shape), axis=1)
-
-
 def _cheap(gain: Gain, prices: Prices, most: float) -> Int[np.ndarray, "C"]:
-    """Flat indices, ascending, of the triplets that lose no more than `most`."""
+    """Flat indices, ascending, of the triplets that lose no more than `most` and gain something."""
     across = prices[1][:, None] + prices[2]
     spare, index = np.empty_like(across), []
     for i, block in enumerate(gain):
         lost = np.subtract(across, block, out=spare).ravel()
         index.append(np.flatnonzero(lost <= most - prices[0][i]) + i * spare.size)
-    return np.concatenate(index)
+    found = np.concatenate(index)
+    return found[gain.ravel()[found] > 0]
 
 
-def _relax(gain: Gain, gap: float, alone: float, steps: int) -> tuple[Triplets, Prices]:
-    """A choice of triplets, and prices, near enough to each other if a few turns suffice."""
-    lowest = here = low_prices(gain)
-    _, pairs = settle(best_over(gain, here[0], 0), here, 0)
-    chosen = _improve(gain, _reassign(gain, pairs, 0))
-    for turn in range(1, _TURNS + 1):
-        if _is_near(gain, chosen, lowest, gap, alone):
-            break
-        shortlist = _Shortlist(_some_cheap(gain, here), gain)
-        first, share = shortlist.descend(here[0], _gained(gain, chosen), steps * turn)
-        here, _ = settle(best_over(gain, first, 0), (first, here[1], here[2]), 0)
-        lowest = min(lowest, here, key=_bound)
-        if _is_near(gain, chosen, lowest, gap, alone):
-            break
-        for other in _round(gain, shortlist.nodes, share, here, _DRAWS if turn > 1 else 1):
-            chosen = max(chosen, _improve(gain, other), key=lambda choice: _gained(gain, choice))
-            if _is_near(gain, chosen, lowest, gap, alone):
+class _Relaxation:
+    """A choice of triplets, and prices, near enough to each other if a few turns suffice.
+
+    gain: in units of the largest. gap: wanted. alone: what all targets score alone, in these units.
+    """
+
+    def __init__(self, gain: Gain, gap: float, alone: float) -> None:
+        self.gain, self.gap, self.alone = gain, gap, alone
+        here = _low_prices(gain)
+        self.prices = here  # of the lowest bound
+        self.chosen = _improve(gain, _reassign(gain, _settle(gain, here, 0)[1], 0))
+        for turn in range(1, _TURNS + 1):
+            if self.is_near():
                 break
-    return chosen, lowest
+            shortlist = _Shortlist(self._some_cheap(here), gain)
+            first, share = shortlist.descend(here[0], _gained(gain, self.chosen), _STEPS * turn)
+            here, _ = _settle(gain, (first, *here[1:]), 0)
+            self.prices = min(self.prices, here, key=_bound)
+            if self.is_near():
+                break
+            for other in _round(gain, shortlist.nodes, share, here, _DRAWS if turn > 1 else 1):
+                self.chosen = max(self.chosen, _improve(gain, other), key=lambda choice: _gained(gain, choice))
+                if self.is_near():
+                    break
+
+    def is_near(self) -> bool:
+        """Whether the gap is as small as wanted."""
+        bound = _bound(self.prices)
+        return bound - _gained(self.gain, self.chosen) <= max(self.gap * abs(bound + self.alone), _SAME)
+
+    def candidates(self) -> Triplets:
+        """The triplets that can be in a better choice."""
+        index = _cheap(self.gain, self.prices, _bound(self.prices) - _gained(self.gain, self.chosen) + _SAME)
+        return np.stack(np.unravel_index(index, self.gain.shape), axis=1)
+
+    def _some_cheap(self, prices: Prices) -> Int[np.ndarray, "C"]:
+        """Flat indices of the triplets that lose least, at most about twice as many as wanted."""
+        gain = self.gain
+        wanted, limit = _SHORTLIST * (sum(gain.shape) - 3), np.inf
+        random = np.random.default_rng(0)  # a fixed seed: the same scores give the same triplets in every run
+        if gain.size > wanted:
+            sample = random.integers(0, gain.size, 4000)
+            i, j, k = np.unravel_index(sample, gain.shape)
+            loss = prices[0][i] + prices[1][j] + prices[2][k] - gain.ravel()[sample]
+            limit = max(float(np.quantile(loss, wanted / gain.size)), _SAME)
+        index = _cheap(gain, prices, limit)
+        # Dummies that all score the same leave very many ties.
+        return index if len(index) <= 2 * wanted else np.sort(random.permutation(index)[: 2 * wanted])
 
 
 def _solve_exactly(
@@ -188,10 +197,7 @@ def _solve_exactly(
     named = nodes + np.cumsum([0, *gain.shape[:2]])
     # Targets that none of the triplets holds stay alone, and lose their prices in any case.
     spare = float(price.sum() - price[np.unique(named[nodes > 0])].sum())
-    held = [
-        [name for name, node in zip(*row, strict=True) if node]
-        for row in zip(named.tolist(), nodes.tolist(), strict=True)
-    ]
+    held = [row[real].tolist() for row, real in zip(named, nodes > 0, strict=True)]
     limit = price.sum() - value - spare + _SAME
     found = least_loss(held, worth.tolist(), price.tolist(), _SEARCH_STEPS, limit)
     if found is not None:
@@ -200,78 +206,52 @@ def _solve_exactly(
     return nodes[kept], certain
 
 
-def _some_cheap(gain: Gain, prices: Prices) -> Int[np.ndarray, "C"]:
-    """Flat indices of the triplets that lose least, at most about twice as many as wanted, and gain something."""
-    wanted, limit = _SHORTLIST * (sum(gain.shape) - 3), np.inf
-    random = np.random.default_rng(0)  # a fixed seed: the same scores give the same triplets in every run
-    if gain.size > wanted:
-        sample = random.integers(0, gain.size, 4000)
-        i, j, k = np.unravel_index(sample, gain.shape)
-        loss = prices[0][i] + prices[1][j] + prices[2][k] - gain.ravel()[sample]
-        limit = max(float(np.quantile(loss, wanted / gain.size)), _SAME)
-    index = _cheap(gain, prices, limit)
-    index = index[gain.ravel()[index] > 0]
-    # Dummies that all score the same leave very many ties.
-    return index if len(index) <= 2 * wanted else np.sort(random.permutation(index)[: 2 * wanted])
+# -- prices ------------------------------------------------------------------------------------------------------------
 
 
-def low_prices(gain: Gain, rounds: int = 4) -> Prices:
+def _low_prices(gain: Gain) -> Prices:
     """Prices that pay for every triplet, not far above the lowest sum there is.
 
     Even shares of the gains pay for every triplet. From them, and from nine tenths of them, two layers at a time get
     the least prices that the third's allow. Where all triplets are alike the shares are the best start, elsewhere the
     lower one: the better end is returned.
     """
-    shares = _shared_prices(gain)
-    ends = [shares]
-    for start in (1.0, 0.9):
-        prices = (shares[0] * start, shares[1] * start, shares[2] * start)
-        for step in range(rounds):
-            prices, _ = settle(best_over(gain, prices[step % 3], step % 3), prices, step % 3)
-        ends.append(prices)
-    return min(ends, key=_bound)
-
-
-def _shared_prices(gain: Gain) -> Prices:
-    """For each target the largest even share of the gain of one of its triplets."""
+    # For each target the largest even share of the gain of one of its triplets.
     real = gain[1:, 1:, 1:]
-    over_first = real.max(axis=0, initial=0.0)
-    triple = (
-        real.max(axis=(1, 2), initial=0.0),
-        over_first.max(axis=1, initial=0.0),
-        over_first.max(axis=0, initial=0.0),
-    )
-    prices = []
+    over_first, over_last = real.max(axis=0, initial=0.0), real.max(axis=(1, 2), initial=0.0)
+    triple = over_last, over_first.max(axis=1, initial=0.0), over_first.max(axis=0, initial=0.0)
+    shares = []
     for layer, (a, b) in enumerate(_OTHERS):
         # The pairs of this layer and another: the third index is the dummy's.
         faces = [np.moveaxis(gain.take(0, axis=third), layer - (third < layer), 0)[1:] for third in (a, b)]
         pair = np.maximum(*(face.max(axis=1, initial=0.0) for face in faces))
-        prices.append(np.concatenate([[0.0], np.maximum(triple[layer] / 3, pair / 2)]))
-    return prices[0], prices[1], prices[2]
+        shares.append(np.concatenate([[0.0], np.maximum(triple[layer] / 3, pair / 2)]))
+    ends: list[Prices] = [shares]
+    for start in (1.0, 0.9):
+        prices: Prices = [share * start for share in shares]
+        for step in range(_LOWERINGS):
+            prices, _ = _settle(gain, prices, step % 3)
+        ends.append(prices)
+    return min(ends, key=_bound)
 
 
-def best_over(gain: Gain, price: Float[np.ndarray, "P"], layer: int) -> Float[np.ndarray, "A B"]:
-    """For each pair of the other two layers the most that it gains with one target of `layer`, less its price."""
-    spare = np.empty(gain.shape[1:])
+def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndarray, "P 2"]]:
+    """The least prices of the other two layers that go with those of `layer`, and the pairs that are worth them.
+
+    The prices are the mean of the assignment's two extreme dual solutions: extremes leave no room for the next layer.
+    """
+    # For each pair of the other two layers the most that it gains with one target of `layer`, less its price.
+    spare, price = np.empty(gain.shape[1:]), prices[layer]
     if layer == 0:
         best = gain[0].copy()
         for block, cost in zip(gain[1:], price[1:], strict=True):
             np.maximum(best, np.subtract(block, cost, out=spare), out=best)
-        return best
-    best = np.empty((len(gain), gain.shape[3 - layer]))
-    across = price[:, None] if layer == 1 else price
-    # Block by block: a block fits the cache, the tensor does not.
-    for block, row in zip(gain, best, strict=True):
-        np.subtract(block, across, out=spare).max(axis=layer - 1, out=row)
-    return best
-
-
-def settle(best: Float[np.ndarray, "A B"], prices: Prices, layer: int) -> tuple[Prices, Int[np.ndarray, "P 2"]]:
-    """The least prices of the other two layers that go with those of `layer`, and the pairs that are worth them.
-
-    best: of `best_over` for the layer and its prices. The prices are the mean of the assignment's two extreme dual
-    solutions: extremes leave no room for the next layer.
-    """
+    else:
+        best = np.empty((len(gain), gain.shape[3 - layer]))
+        across = price[:, None] if layer == 1 else price
+        # Block by block: a block fits the cache, the tensor does not.
+        for block, row in zip(gain, best, strict=True):
+            np.subtract(block, across, out=spare).max(axis=layer - 1, out=row)
     first, second, excess, row, column = _match(best)
     worth = excess[row, column]
     low, high = _least_potential(excess, row, column), _least_potential(excess.T, column, row)
@@ -280,10 +260,10 @@ def settle(best: Float[np.ndarray, "A B"], prices: Prices, layer: int) -> tuple[
     second[column] += worth / 2
     second[column] += (low[column] - high[row]) / 2
     settled = list(prices)
-    for other, price in zip(_OTHERS[layer], (first, second), strict=True):
-        settled[other] = np.concatenate([[0.0], price])
+    for other, low_price in zip(_OTHERS[layer], (first, second), strict=True):
+        settled[other] = np.concatenate([[0.0], low_price])
     used = worth > 0
-    return (settled[0], settled[1], settled[2]), np.stack([row[used] + 1, column[used] + 1], axis=1)
+    return settled, np.stack([row[used] + 1, column[used] + 1], axis=1)
 
 
 def _match(best: Float[np.ndarray, "A B"]) -> tuple[np.ndarray, ...]:
@@ -298,9 +278,7 @@ def _match(best: Float[np.ndarray, "A B"]) -> tuple[np.ndarray, ...]:
 def _least_potential(excess: np.ndarray, row: np.ndarray, column: np.ndarray) -> Float[np.ndarray, "B"]:
     """The least dual prices of the columns of an optimal assignment of non-negative scores (Bellman-Ford)."""
     above = excess[row] - excess[row, column][:, None]
-    unmatched = np.ones(len(excess), bool)
-    unmatched[row] = False
-    potential = least = excess[unmatched].max(axis=0, initial=0.0)
+    potential = least = np.delete(excess, row, axis=0).max(axis=0, initial=0.0)
     for _ in range(len(row) + 1):
         raised = np.maximum((above + potential[column][:, None]).max(axis=0, initial=0.0), least)
         if (raised <= potential + 1e-12).all():
@@ -339,13 +317,8 @@ class _Shortlist:
         self.best.ravel()[self.cell] = most
         second, third, excess, row, column = _match(self.best)
         worth = excess[row, column]
-        row, column = row[worth > 0] + 1, column[worth > 0] + 1
-        alone_second, alone_third = np.ones(self.shape[0], bool), np.ones(self.shape[1], bool)
-        alone_second[row] = alone_third[column] = False
-        alone_second[0] = alone_third[0] = False
-        width = self.shape[1]
-        pairs = [row * width + column, np.flatnonzero(alone_second) * width, np.flatnonzero(alone_third)]
-        pair = np.concatenate(pairs)
+        pairs = add_lone_targets(np.stack([row, column], axis=1)[worth > 0] + 1, self.shape)
+        pair = pairs[:, 0] * self.shape[1] + pairs[:, 1]
         place = self.place[pair[self.best.ravel()[pair] > 0]]
         # The first of the triplets that reach their pair's best.
         top = np.flatnonzero(left == np.repeat(most, self.count))
@@ -386,6 +359,9 @@ class _Shortlist:
         return best, share / max(answers, 1)
 
 
+# -- choices -----------------------------------------------------------------------------------------------------------
+
+
 def _round(
     gain: Gain, nodes: Triplets, share: Float[np.ndarray, "C"], prices: Prices, draws: int
 ) -> Iterator[Triplets]:
@@ -397,13 +373,8 @@ def _round(
     agreed = nodes[share > 1 - 1e-9]
     uses = np.bincount(agreed[:, 0], minlength=gain.shape[0])
     agreed = agreed[(agreed[:, 0] == 0) | (uses[agreed[:, 0]] == 1)]
-    free = np.ones(len(nodes), bool)
-    for layer, size in enumerate(gain.shape):
-        held = np.zeros(size, bool)
-        held[agreed[:, layer]] = True
-        held[0] = False
-        free &= ~held[nodes[:, layer]]
-    nodes = nodes[free]
+    taken = ((nodes[:, layer] > 0) & np.isin(nodes[:, layer], agreed[:, layer]) for layer in range(3))
+    nodes = nodes[~np.logical_or.reduce(list(taken))]
     loss = prices[0][nodes[:, 0]] + prices[1][nodes[:, 1]] + prices[2][nodes[:, 2]] - gain[tuple(nodes.T)]
     # Ties in random order: the first of each target would all want the same partners.
     nodes = nodes[np.argsort(loss + _SAME * np.random.default_rng(0).random(len(loss)))]
@@ -413,54 +384,14 @@ def _round(
     for draw in range(draws):
         # The first draw as the programme says, the others shaken: a triplet of which it takes half may go either way.
         order = np.argsort(-(parts + random.random(len(parts)) if draw else parts), kind="stable")
-        yield np.concatenate([agreed, nodes[_first_that_fit(nodes, order[parts[order] > 1e-6])]])
-
-
-def _improve(gain: Gain, chosen: Triplets) -> Triplets:
-    """A choice that reassigning one layer's targets to what is left of the triplets does not improve."""
-    value, idle, layer = _gained(gain, chosen), 0, 0
-    while idle < 3:
-        other = _reassign(gain, chosen[:, _OTHERS[layer]], layer)
-        if _gained(gain, other) > value + _SAME:
-            chosen, value, idle = other, _gained(gain, other), 0
-        else:
-            idle += 1
-        layer = (layer + 1) % 3
-    return chosen
-
-
-def _reassign(gain: Gain, pairs: Int[np.ndarray, "P 2"], layer: int) -> Triplets:
-    """The best choice of triplets that holds these pairs of the other two layers, or their targets alone."""
-    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
-
-    pairs = pairs[(pairs > 0).all(axis=1)]
-    rows = [pairs]
-    for side, other in enumerate(_OTHERS[layer]):
-        rest = np.setdiff1d(np.arange(1, gain.shape[other]), pairs[:, side])
-        single = np.zeros((len(rest), 2), np.int64)
-        single[:, side] = rest
-        rows.append(single)
-    group = np.insert(np.concatenate(rows), layer, 0, axis=1)
-    where = list(group.T)
-    where[layer] = np.arange(gain.shape[layer])[:, None]
-    worth = gain[tuple(where)]
-    without = np.maximum(worth[0], 0.0)
-    target, place = linear_sum_assignment(np.maximum(worth[1:] - without, 0.0), maximize=True)
-    better = worth[1 + target, place] > without[place]
-    group[place[better], layer] = target[better] + 1
-    return group[gain[tuple(group.T)] > 0]
-
-
-def _first_that_fit(nodes: Triplets, order: Int[np.ndarray, "D"]) -> list[int]:
-    """The triplets, in this order, that share no target with one before."""
-    used: set[tuple[int, int]] = set()
-    taken = []
-    for column, row in zip(order.tolist(), nodes[order].tolist(), strict=True):
-        held = {(layer, node) for layer, node in enumerate(row) if node}
-        if not held & used:
-            taken.append(column)
-            used |= held
-    return taken
+        used: set[tuple[int, int]] = set()
+        fitting = []
+        for column in order[parts[order] > 1e-6].tolist():
+            held = {(layer, node) for layer, node in enumerate(nodes[column].tolist()) if node}
+            if not held & used:
+                fitting.append(column)
+                used |= held
+        yield np.concatenate([agreed, nodes[fitting]])
 
 
 def _first_of_each_kind(nodes: Triplets) -> Bool[np.ndarray, "C"]:
@@ -474,3 +405,31 @@ def _first_of_each_kind(nodes: Triplets) -> Bool[np.ndarray, "C"]:
         rank = np.arange(len(nodes)) - np.repeat(start, np.diff(start, append=len(nodes)))
         wanted[order[(rank < _PER_TARGET[kind[order]]) & present[order, layer]]] = True
     return wanted
+
+
+def _improve(gain: Gain, chosen: Triplets) -> Triplets:
+    """A choice that reassigning one layer's targets to what is left of the triplets does not improve."""
+    value, idle, layer = _gained(gain, chosen), 0, 0
+    while idle < 3:
+        other = _reassign(gain, chosen[:, _OTHERS[layer]], layer)
+        idle += 1
+        if _gained(gain, other) > value + _SAME:
+            chosen, value, idle = other, _gained(gain, other), 0
+        layer = (layer + 1) % 3
+    return chosen
+
+
+def _reassign(gain: Gain, pairs: Int[np.ndarray, "P 2"], layer: int) -> Triplets:
+    """The best choice of triplets that holds these pairs of the other two layers, or their targets alone."""
+    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+
+    pairs = add_lone_targets(pairs[(pairs > 0).all(axis=1)], [gain.shape[other] for other in _OTHERS[layer]])
+    group = np.insert(pairs, layer, 0, axis=1)
+    where = list(group.T)
+    where[layer] = np.arange(gain.shape[layer])[:, None]
+    worth = gain[tuple(where)]
+    without = np.maximum(worth[0], 0.0)
+    target, place = linear_sum_assignment(np.maximum(worth[1:] - without, 0.0), maximize=True)
+    better = worth[1 + target, place] > without[place]
+    group[place[better], layer] = target[better] + 1
+    return group[gain[tuple(group.T)] > 0]

@@ -8,29 +8,27 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.appearance import (
-    appearance_scores,
-    blend_histograms,
-    is_ambiguous,
-    similarity,
-    visible_shares,
-)
 from torchvision_dddas.tracking.assignment import choose_links, plausible_links
 from torchvision_dddas.tracking.kalman import SEEN, transform_boxes
 from torchvision_dddas.tracking.scores import (
     SceneState,
     SpeedPrior,
+    appearance_scores,
     association_scores,
     birth_rate,
+    blend_histograms,
+    is_ambiguous,
     is_near_border,
     is_remembered,
+    similarity,
+    visible_shares,
 )
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
-from torchvision_dddas.types import Detections, Tracks
+from torchvision_dddas.types import Detections, Table, Tracks
 
 
 @dataclass(frozen=True)
-class TrackStates:
+class TrackStates(Table):
     """The tracks that are remembered, one row a track.
 
     state: (N, kalman.COLUMNS) as last seen. signature: (N, D) histograms, zeros where unknown; D is 0 until one is
@@ -47,26 +45,12 @@ class TrackStates:
     def __len__(self) -> int:
         return len(self.number)
 
-    def concat(self, other: "TrackStates") -> "TrackStates":
-        """The tracks of both, those of the other last."""
-        if not len(other):
-            return self
-        width = max(self.signature.shape[1], other.signature.shape[1])
-        return TrackStates(
-            np.concatenate([self.state, other.state]),
-            np.concatenate([_widen(self.signature, width), _widen(other.signature, width)]),
-            np.concatenate([self.at_border, other.at_border]),
-            np.concatenate([self.number, other.number]),
-            np.concatenate([self.hits, other.hits]),
-        )
 
-    def __getitem__(self, keep: np.ndarray) -> "TrackStates":
-        """The tracks of a mask (N,)."""
-        if keep.all():
-            return self
-        return TrackStates(
-            self.state[keep], self.signature[keep], self.at_border[keep], self.number[keep], self.hits[keep]
-        )
+def _join(first: TrackStates, *others: TrackStates) -> TrackStates:
+    """All tracks in one table."""
+    tables = [first, *(tracks for tracks in others if len(tracks))]
+    width = max(tracks.signature.shape[1] for tracks in tables)
+    return TrackStates.concat([replace(tracks, signature=_widen(tracks.signature, width)) for tracks in tables])
 
 
 def _widen(signature: np.ndarray, width: int) -> np.ndarray:
@@ -78,8 +62,8 @@ def _widen(signature: np.ndarray, width: int) -> np.ndarray:
 class _Sample:
     """A frame and those of its detections that count. row: of the frame's detections. step: motion from the one before.
 
-    appearance: gives the (M, D) histograms. signature: these, (M, 0) until needed. visible: share of each box.
-    interval: frames from the sampled frame before.
+    appearance: gives the (M, D) histograms. interval: frames from the sampled frame before. signature: the histograms,
+    (M, 0) until needed. visible: share of each box.
     """
 
     frame: int
@@ -88,19 +72,16 @@ class _Sample:
     row: np.ndarray
     step: np.ndarray | None
     appearance: Callable[[], np.ndarray] | None
-    signature: np.ndarray
-    visible: np.ndarray
-    interval: int = 1
+    interval: int
+
+    def __post_init__(self) -> None:
+        self.signature, self.visible = np.zeros((len(self.row), 0), np.float32), np.ones(len(self.row))
 
     def examine(self) -> None:
         """Compute the histograms, once."""
         if self.appearance is not None and len(self.row):
             self.signature, self.visible = self.appearance()[self.row], visible_shares(self.box_px)
         self.appearance = None
-
-    def boxes_before(self) -> np.ndarray:
-        """The boxes in the coordinates of the sampled frame before."""
-        return self.box_px if self.step is None else transform_boxes(self.box_px, np.linalg.inv(self.step))
 
 
 class ScoreTracker:
@@ -137,10 +118,9 @@ class ScoreTracker:
         """
         row = np.flatnonzero(detections.score >= self.parameters.min_score)
         wanted = None if self.parameters.appearance == "never" else appearance
-        unknown = np.zeros((len(row), 0), np.float32), np.ones(len(row))
-        interval = self.interval if interval is None else interval
         box, score = detections.box_px[row], detections.score[row]
-        sample = _Sample(frame, box, score, row, now_from_before, wanted, *unknown, interval)
+        usual = self.interval if interval is None else interval
+        sample = _Sample(frame, box, score, row, now_from_before, wanted, usual)
         if self.parameters.appearance == "always":
             sample.examine()
         if not self.parameters.look_ahead:
@@ -160,29 +140,37 @@ class ScoreTracker:
 
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
         """Link a frame's detections to the tracks, in view of the next frame where there is one."""
+        box, parameters = now.box_px, self.parameters
         if now.step is not None:
             self.tracks = replace(self.tracks, state=kalman.transform(self.tracks.state, now.step))
         if self._before is not None:
             before = self._before.box_px if now.step is None else transform_boxes(self._before.box_px, now.step)
-            self.speed_prior.add(before, now.box_px, now.frame - self._before.frame)
+            self.speed_prior.add(before, box, now.frame - self._before.frame)
         self.seen += len(now.score)
         self.doubtful += int((now.score < 1).sum())
-        score = self._scores(self.tracks, now, now.box_px)
+        score = self._scores(self.tracks, now, box)
         unexamined = [near for near in (now, ahead) if near is not None and near.appearance is not None]
         if unexamined and is_ambiguous(score, self.tracks.signature):
             for near in unexamined:
                 near.examine()
-            score = self._scores(self.tracks, now, now.box_px)
+            score = self._scores(self.tracks, now, box)
         tracks, detections = plausible_links(score)
-        born = self._begin(now)
-        continued = self._update(now, tracks, detections, born.at_border)
+        at_border = is_near_border(box, self.size)
+        # Tracks that would begin with each detection, without numbers yet, and those that would go on by each link.
+        state = kalman.start(box, now.frame, parameters.scatter, self.speed_prior.speed, parameters.size_scatter)
+        count = len(box)
+        born = TrackStates(state, now.signature, at_border, np.full(count, -1), np.ones(count, np.int64))
+        continued = self._update(now, tracks, detections, at_border[detections])
         if ahead is not None and len(ahead.row):
-            onward = self._scores(continued.concat(born).concat(self.tracks), ahead, ahead.boxes_before())
+            there = ahead.box_px
+            if ahead.step is not None:  # in the coordinates of this frame
+                there = transform_boxes(there, np.linalg.inv(ahead.step))
+            onward = self._scores(_join(continued, born, self.tracks), ahead, there)
             parts = np.split(onward, [len(continued), len(continued) + len(born)])
             chosen = choose_links(score[tracks, detections], tracks, detections, *parts)
         else:
             best = best_pairs(score)
-            chosen = np.isin(tracks * len(now.row) + detections, best[:, 0] * len(now.row) + best[:, 1])
+            chosen = np.isin(tracks * count + detections, best[:, 0] * count + best[:, 1])
         self._commit(now, tracks[chosen], detections[chosen], continued[chosen], born)
         self._before = now
 
@@ -200,46 +188,30 @@ class ScoreTracker:
         return score
 
     def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, at_border: np.ndarray) -> TrackStates:
-        """The tracks (K,) after a detection (K,) each. at_border: (M,) which of the frame's detections are."""
+        """The tracks (K,) after a detection (K,) each, which may be at the border."""
         old, box, parameters = self.tracks, now.box_px[detections], self.parameters
         later = kalman.predict(old.state[tracks], now.frame, self._scene(now).agility(parameters))
+        state = kalman.update(later, box, now.frame, parameters.scatter, parameters.size_scatter)
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], now.signature.shape[1])
         signature, seen = _widen(old.signature, width)[tracks], _widen(now.signature, width)[detections]
-        return TrackStates(
-            kalman.update(later, box, now.frame, parameters.scatter, parameters.size_scatter),
-            blend_histograms(signature, seen, now.visible[detections], hits) if width else signature,
-            at_border[detections],
-            old.number[tracks],
-            hits,
-        )
-
-    def _begin(self, now: _Sample) -> TrackStates:
-        """Tracks that would begin with each detection (M,) of a frame, without numbers yet."""
-        box, count, parameters = now.box_px, len(now.row), self.parameters
-        return TrackStates(
-            kalman.start(box, now.frame, parameters.scatter, self.speed_prior.speed, parameters.size_scatter),
-            now.signature,
-            is_near_border(box, self.size),
-            np.full(count, -1),
-            np.ones(count, np.int64),
-        )
+        if width:
+            signature = blend_histograms(signature, seen, now.visible[detections], hits)
+        return TrackStates(state, signature, at_border, old.number[tracks], hits)
 
     def _commit(
         self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, continued: TrackStates, born: TrackStates
     ) -> None:
         """Give these tracks (K,), now `continued`, these detections (K,); begin new tracks; drop old ones."""
-        unmatched = np.ones(len(now.row), bool)
-        unmatched[detections] = False
-        is_birth = unmatched & (now.score >= self.parameters.birth_score)
-        new = np.flatnonzero(is_birth)
-        begun = replace(born[is_birth], number=self.begun + np.arange(len(new)))
+        new = np.flatnonzero(now.score >= self.parameters.birth_score)
+        new = new[~np.isin(new, detections)]
+        begun = replace(born[new], number=self.begun + np.arange(len(new)))
         self.begun += len(begun)
         if self._before is not None:
             self.births += int((~begun.at_border).sum())
         unseen = np.ones(len(self.tracks), bool)
         unseen[tracks] = False
-        self.tracks = self.tracks[unseen].concat(continued).concat(begun)
+        self.tracks = _join(self.tracks[unseen], continued, begun)
         number, at = np.concatenate([continued.number, begun.number]), np.concatenate([detections, new])
         self.smoother.add(now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step)
         keep = is_remembered(self.tracks.state, now.frame, now.interval, self.size, self.parameters)

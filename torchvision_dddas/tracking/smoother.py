@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 
@@ -83,6 +83,15 @@ class FixedLagSmoother:
             past.append(observation)
             pending.tracks[number] = observation
 
+    def _fill(self, number: int, before: _Observation, after: _Observation) -> None:
+        """Boxes of a track in the frames between two observations."""
+        for gap in self.pending:
+            if before.index < gap.index < after.index:
+                part = (gap.frame - before.frame) / (after.frame - before.frame)
+                start, end = self._box_at(before, gap.index), self._box_at(after, gap.index)
+                score = before.score + part * (after.score - before.score)
+                gap.tracks[number] = _Observation(gap.frame, gap.index, start + part * (end - start), score, -1)
+
     def forget(self, numbers: np.ndarray) -> None:
         """Drop tracks that have ended, as soon as no pending frame can hold them."""
         for number in numbers.tolist():
@@ -98,68 +107,50 @@ class FixedLagSmoother:
         done = []
         while self.pending and (everything or len(self.pending) > self.delay):
             pending = self.pending.popleft()
-            confirmed = [(number, seen) for number, seen in pending.tracks.items() if number in self.confirmed]
-            for number, _ in confirmed:
+            confirmed = {number: seen for number, seen in pending.tracks.items() if number in self.confirmed}
+            for number in confirmed:
                 if number not in self.identities:
                     self.identity_count += 1
                     self.identities[number] = self.identity_count
             done.append(
                 Tracks(
                     pending.frame,
-                    np.array([self.identities[number] for number, _ in confirmed], np.int64),
-                    np.array([self._box(number, seen) for number, seen in confirmed], float).reshape(-1, 4),
-                    np.array([seen.score for _, seen in confirmed], float),
-                    np.array([seen.row for _, seen in confirmed], np.int64),
+                    np.array([self.identities[number] for number in confirmed], np.int64),
+                    np.array([self._smoothed(*item) for item in confirmed.items()], float).reshape(-1, 4),
+                    np.array([seen.score for seen in confirmed.values()], float),
+                    np.array([seen.row for seen in confirmed.values()], np.int64),
                 )
             )
-            self._tidy()
+            # Drop what no pending frame can need.
+            while self.forgotten and self.forgotten[0][0] < self.count - len(self.pending):
+                _, number = self.forgotten.popleft()
+                self.identities.pop(number, None)
+                self.confirmed.discard(number)
+            oldest = self.count - len(self.steps)
+            for number in [n for n, past in self.observations.items() if past[-1].index <= oldest]:
+                del self.observations[number]
         return done
 
-    def _fill(self, number: int, before: _Observation, after: _Observation) -> None:
-        for pending in self.pending:
-            if before.index < pending.index < after.index:
-                part = (pending.frame - before.frame) / (after.frame - before.frame)
-                start = _transform(before.box_px, self._step(before.index, pending.index))
-                end = _transform(after.box_px, self._step(after.index, pending.index))
-                score = before.score + part * (after.score - before.score)
-                pending.tracks[number] = _Observation(
-                    pending.frame, pending.index, start + part * (end - start), score, -1
-                )
-
-    def _box(self, number: int, seen: _Observation) -> np.ndarray:
+    def _smoothed(self, number: int, seen: _Observation) -> np.ndarray:
         if not self.smooth or seen.score >= 1:
             return seen.box_px
         near = [s for s in self.observations.get(number, ()) if s.index > self.count - len(self.steps)]
         if len(near) < 2:
             return seen.box_px
-        boxes = np.array([s.box_px for s in near])
-        if self.has_moved:
-            boxes = np.array([_transform(s.box_px, self._step(s.index, seen.index)) for s in near])
+        boxes = np.array([self._box_at(s, seen.index) for s in near])
         return smooth_box(boxes, np.array([s.frame / self.interval for s in near]), seen.frame / self.interval)
 
-    def _step(self, there: int, here: int) -> np.ndarray | None:
-        """How pixels moved from one sampled frame to another; None if the camera stood still between them."""
-        if not self.has_moved:
-            return None
-        low, high = sorted((there, here))
+    def _box_at(self, seen: _Observation, here: int) -> np.ndarray:
+        """An observed box in the coordinates of another sampled frame."""
+        low, high = sorted((seen.index, here))
         oldest = self.count - len(self.steps)
-        steps = [s for index in range(low + 1, high + 1) if (s := self.steps[index - oldest]) is not None]
+        between = range(low + 1, high + 1) if self.has_moved else ()
+        steps = [step for index in between if (step := self.steps[index - oldest]) is not None]
         if not steps:
-            return None
-        high_from_low = steps[0]
-        for step in steps[1:]:
-            high_from_low = step @ high_from_low
-        return high_from_low if there < here else np.linalg.inv(high_from_low)
-
-    def _tidy(self) -> None:
-        """Drop what no pending frame can need."""
-        while self.forgotten and self.forgotten[0][0] < self.count - len(self.pending):
-            _, number = self.forgotten.popleft()
-            self.identities.pop(number, None)
-            self.confirmed.discard(number)
-        oldest = self.count - len(self.steps)
-        for number in [n for n, past in self.observations.items() if past[-1].index <= oldest]:
-            del self.observations[number]
+            return seen.box_px
+        high_from_low = reduce(lambda before, step: step @ before, steps)
+        here_from_there = high_from_low if seen.index < here else np.linalg.inv(high_from_low)
+        return transform_boxes(seen.box_px[None], here_from_there)[0]
 
 
 def smooth_box(box_px: np.ndarray, times: np.ndarray, at: float) -> np.ndarray:
@@ -183,7 +174,3 @@ def _weights(since: tuple[float, ...]) -> np.ndarray:
     once = (weight @ time)[:, None]
     twice = (weight @ time**2)[:, None] + 1e-3 * _WIDTHS**2
     return (twice - once * time) * weight / (total * twice - once**2)
-
-
-def _transform(box_px: np.ndarray, here_from_there: np.ndarray | None) -> np.ndarray:
-    return box_px if here_from_there is None else transform_boxes(box_px[None], here_from_there)[0]

@@ -1,31 +1,59 @@
-"""The source's tracker: association of absolute positions and RGB histograms (appendix C).
+"""The source's tracker: association of absolute positions and RGB histograms, without torch (appendix C).
 
 With every sampled frame, the last K frames are assigned anew; a target takes the identity of the older target that the
 newest link of that window names. What fails in it is kept: see the tests, and `score_tracker` for the improved one.
+
+Features are non-negative vectors, one row a target. Affinities have a dummy target at index 0 of each axis; axes and
+windows go from the newest frame to the oldest. `functional.affinity` holds the affinities for batches of tensors.
 """
 
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal
 
+import cv2
 import numpy as np
 
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
-from torchvision_dddas.tracking.dual_ascent import assign_triplets
-from torchvision_dddas.tracking.source_affinity import (
-    centres,
-    dispersion,
-    frames_considered,
-    gate,
-    location_weight,
-    normalize_channels,
-    pair_affinity,
-    pair_gain_over_alone,
-    triplet_affinity,
-)
+from torchvision_dddas.tracking.dual_ascent import add_lone_targets, assign_triplets
 from torchvision_dddas.types import Detections, Float, Int, Tracks
+
+# -- features ----------------------------------------------------------------------------------------------------------
+
+
+def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """(N, 768) float32 counts of pixels: 256 levels of red, of green, of blue. Source: appendix C, eq. 3.
+
+    image: (H, W, 3) uint8 BGR, or (H, W) grey, counted three times. box_px: (N, 4) x, y, width, height; edges are
+    rounded to whole pixels and clipped to the image. A box without a pixel inside has zeros.
+    """
+    bgr = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    boxes = np.array(box_px, float).reshape(-1, 4)
+    boxes[~np.isfinite(boxes).all(axis=1)] = 0.0
+    limit = np.array(bgr.shape[1::-1])
+    low = np.clip(np.rint(boxes[:, :2]), 0, limit).astype(int)
+    high = np.clip(np.rint(boxes[:, :2] + boxes[:, 2:]), 0, limit).astype(int)
+    counts = np.zeros((len(boxes), 3, 256), np.float32)
+    for row, (left, top), (right, bottom) in zip(counts, low, high, strict=True):
+        if right > left and bottom > top:
+            for place, channel in enumerate((2, 1, 0)):
+                row[place] = cv2.calcHist([bgr[top:bottom, left:right]], [channel], None, [256], [0, 256])[:, 0]
+    return counts.reshape(len(boxes), 768)
+
+
+def normalize_channels(histogram: Float[np.ndarray, "N 768"]) -> Float[np.ndarray, "N 768"]:
+    """Each channel's 256 bins divided by their sum; zeros stay zeros."""
+    channels = np.asarray(histogram, float).reshape(len(histogram), 3, 256)
+    total = channels.sum(axis=-1, keepdims=True)
+    return (channels / np.where(total > 0, total, 1.0)).reshape(len(histogram), 768)
+
+
+def centres(box_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
+    """The boxes' centres (u, v) in pixels from the picture's corner, clipped to 0."""
+    return np.maximum(box_px[:, :2] + box_px[:, 2:] / 2, 0.0)
 
 
 class Features:
@@ -52,18 +80,155 @@ class Features:
             if self._histograms.shape != (len(self), 768):
                 raise InputError(
                     f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
-                    f"got {self._histograms.shape}. Compute them with tracking.appearance.rgb_histograms."
+                    f"got {self._histograms.shape}. Compute them with tracking.rgb_histograms."
                 )
         assert self._histograms is not None
         return normalize_channels(self._histograms) if normalization == "channel" else self._histograms
+
+
+# -- affinities --------------------------------------------------------------------------------------------------------
+
+
+def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.ndarray:
+    """Affinity of the targets of two or three frames by one feature, with a dummy first on each axis.
+
+    Two frames, eq. 1: similarities (N + 1, M + 1). Three, eq. 4 and 5: numerators of (a, b) and (b, c) added, and
+    denominators, (N + 1, M + 1, L + 1). An entry with a dummy is 0, as the source says in words; with `paper.dummy` =
+    formula it is as eq. 4 and 5 give it for a dummy of zeros, up to one half for (i, j, 0) and (0, j, k).
+    """
+    if len(features) == 2:
+        return np.pad(similarity(*features), ((1, 0), (1, 0)))
+    by_formula = parameters.dummy == "formula"
+    a, b, c = (np.pad(rows, ((1, 0), (0, 0))) if by_formula else rows for rows in features)
+    (ab_smaller, ab_larger), (bc_smaller, bc_larger) = _overlap(a, b), _overlap(b, c)
+    share = _share(ab_smaller[:, :, None] + bc_smaller[None], ab_larger[:, :, None] + bc_larger[None])
+    return share if by_formula else np.pad(share, ((1, 0), (1, 0), (1, 0)))
+
+
+def similarity(a: Float[np.ndarray, "N D"], b: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N M"]:
+    """Generalized Jaccard similarity Σ min / Σ max in [0, 1], 0 for two vectors of zeros."""
+    return _share(*_overlap(a, b))
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Σ min and Σ max of each pair: min + max = a + b and max - min = |a - b|."""
+    if not len(a) or not len(b):
+        return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
+    from scipy.spatial.distance import cdist  # here, as only the source's association needs it
+
+    total = a.sum(axis=1)[:, None] + b.sum(axis=1)[None]
+    apart = cdist(a, b, "cityblock")
+    return np.maximum(total - apart, 0.0) / 2, (total + apart) / 2
+
+
+def _share(smaller: np.ndarray, larger: np.ndarray) -> np.ndarray:
+    return np.divide(smaller, larger, out=np.zeros_like(larger), where=larger > 0)
+
+
+def gate(
+    score: Float[np.ndarray, "..."], threshold: float, reading: Literal["one_dummy", "every_dummy", "off"]
+) -> Float[np.ndarray, "..."]:
+    """A copy in which an entry with a dummy is 1 - threshold where all real alternatives are below that (III-E).
+
+    score: two or three axes, index 0 of each the dummy. reading: one_dummy raises entries with exactly one dummy;
+    every_dummy is the text to the letter, so that entries with two dummies are raised too and the best assignment
+    leaves every target alone; off raises none. The entry of dummies alone is never raised.
+    """
+    score = np.array(score, float)
+    is_raised = (best_alternatives(score, reading) < 1 - threshold).astype(float)
+    return blend_gate(score, is_raised, threshold)
+
+
+def best_alternatives(score: Float[np.ndarray, "..."], reading: str) -> Float[np.ndarray, "..."]:
+    """For each entry the best real alternative, which must be below 1 - threshold to raise it; inf where never.
+
+    Of an entry with two dummies the smaller of both indices' alternatives counts. score, reading: as for `gate`.
+    """
+    best = np.full(score.shape, np.inf)
+    if reading == "off":
+        return best
+    dummies = sum((index == 0).astype(int) for index in np.indices(score.shape, sparse=True))
+    allowed = dummies == 1 if reading == "one_dummy" else dummies < score.ndim
+    for axis in range(score.ndim):
+        first = np.index_exp[:] * axis + (0,)
+        real = score.take(np.arange(1, score.shape[axis]), axis).max(axis=axis, initial=-np.inf)
+        best[first] = np.where(allowed[first], np.minimum(best[first], real), best[first])
+    return best
+
+
+def blend_gate(score: Any, raised: Any, threshold: Any) -> Any:
+    """Entries raised to 1 - threshold by a share: not where it is 0, wholly where it is 1. Arrays or tensors."""
+    return raised * (1 - threshold) + (1 - raised) * score
+
+
+# -- which feature counts ----------------------------------------------------------------------------------------------
+
+
+def dispersion(feature: Float[np.ndarray, "N D"], cut: float) -> float:
+    """How far apart a frame's targets are in a feature (III-D): the normalized entropy of their clusters.
+
+    Clusters are of average linkage, the tree cut at a dissimilarity (eq. 10 and G).
+    """
+    if len(feature) < 2:
+        return 1.0
+    from scipy.cluster.hierarchy import fcluster  # here, as only the source's association needs it
+
+    return normalized_entropy(fcluster(_tree(feature), cut, "distance"))
+
+
+def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
+    """Ndm of eq. 9: 1 when every target is a cluster of its own, 0 when all are one; 1 for one target or none."""
+    if len(cluster) < 2:
+        return 1.0
+    share = np.unique(cluster, return_counts=True)[1] / len(cluster)
+    return float(np.abs((share * np.log2(share)).sum()) / np.log2(len(cluster)))
+
+
+def joined_at(feature: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N N"]:
+    """The least cut at which each two targets are in one of the clusters of `dispersion`."""
+    if len(feature) < 2:
+        return np.zeros((len(feature), len(feature)))
+    from scipy.cluster.hierarchy import cophenet
+    from scipy.spatial.distance import squareform
+
+    return np.asarray(squareform(cophenet(_tree(feature))))
+
+
+def _tree(feature: Float[np.ndarray, "N D"]) -> np.ndarray:
+    from scipy.cluster.hierarchy import linkage
+    from scipy.spatial.distance import squareform
+
+    dissimilarity = 1 - similarity(feature, feature)
+    np.fill_diagonal(dissimilarity, 0.0)
+    return np.asarray(linkage(squareform(dissimilarity, checks=False), "average"))
+
+
+def frames_considered(counts: Sequence[int], parameters: PaperParameters) -> int:
+    """Of how many frames of a window, from the newest on, the smallest dispersion counts, by `dispersion_of`."""
+    of_all = {"smallest": True, "newest": False, "smallest_if_counts_differ": len(set(counts)) > 1}
+    return len(counts) if of_all[parameters.dispersion_of] else 1
+
+
+def location_weight(location: float, appearance: Callable[[], float], lowest: float) -> tuple[float, float | None]:
+    """The weight of location, and the dispersion of appearance where it had to be computed.
+
+    1 while locations tell the targets apart; else 0 if appearance does; else one half. The second feedback rule.
+    """
+    if location > lowest:
+        return 1.0, None
+    found = appearance()
+    return (0.0 if found > lowest else 0.5), found
+
+
+# -- association -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Association:
     """How a window was assigned.
 
-    rows: (Z, K) indices from 1, newest frame first, 0 for the dummy. weight: of the location. appearance_dispersion:
-    None where it was not needed.
+    rows: (Z, K) indices from 1, 0 for the dummy. weight: of the location. appearance_dispersion: None where it was not
+    needed.
     """
 
     rows: Int[np.ndarray, "Z K"]
@@ -73,26 +238,24 @@ class Association:
 
 
 def associate(window: Sequence[Features], parameters: PaperParameters) -> Association:
-    """Assign the targets of two or three frames, newest first: weigh, gate, solve."""
-    counts = [len(frame) for frame in window]
-    considered = window[: frames_considered(counts, parameters)]
+    """Assign the targets of two or three frames: weigh, gate, solve."""
+    considered = window[: frames_considered([len(frame) for frame in window], parameters)]
     location = min(dispersion(frame.centre_px, parameters.location_cut) for frame in considered)
 
     def appearance() -> float:
         histograms = [frame.histogram(parameters.histogram) for frame in considered]
         return min(dispersion(histogram, parameters.appearance_cut) for histogram in histograms)
 
-    appearance_dispersion: float | None = None
+    weight, appearance_dispersion = parameters.weight, None
     if not all(frame.has_picture or not len(frame) for frame in window):
         weight = 1.0
-    elif parameters.rule == "fixed":
-        weight = parameters.weight
-    else:
+    elif parameters.rule != "fixed":
         weight, appearance_dispersion = location_weight(location, appearance, parameters.lowest_dispersion)
-    by_location = affinity([frame.centre_px for frame in window], parameters) if weight > 0 else None
-    by_appearance = (
-        affinity([frame.histogram(parameters.histogram) for frame in window], parameters) if weight < 1 else None
-    )
+    by_location = by_appearance = None
+    if weight > 0:
+        by_location = affinity([frame.centre_px for frame in window], parameters)
+    if weight < 1:
+        by_appearance = affinity([frame.histogram(parameters.histogram) for frame in window], parameters)
     return Association(assign(by_location, by_appearance, weight, parameters), weight, location, appearance_dispersion)
 
 
@@ -115,29 +278,16 @@ def assign(
     if not by_feature:
         score = gate(score, parameters.threshold, parameters.gate)
     if score.ndim == 2:
-        return _best_pairs(score)
+        pairs = add_lone_targets(best_pairs(pair_gain_over_alone(score)) + 1, score.shape)
+        return pairs[np.lexsort(pairs.T[::-1])]
     if max(score.shape) - 1 <= parameters.exact_targets:
         return assign_triplets(score, gap=0.0, most_exact=None).triplets
     return assign_triplets(score, parameters.gap).triplets
 
 
-def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.ndarray:
-    """Affinity of the targets of two or three frames by one feature, newest first, with a dummy first on each axis."""
-    if len(features) == 2:
-        return pair_affinity(features[0], features[1])
-    return triplet_affinity(features[0], features[1], features[2], parameters.dummy)
-
-
-def _best_pairs(score: Float[np.ndarray, "N1 M1"]) -> Int[np.ndarray, "Z 2"]:
-    """The best assignment of two frames, every real target in exactly one row."""
-    matched = best_pairs(pair_gain_over_alone(score)) + 1
-    rows = [matched]
-    for axis, size in enumerate(score.shape):
-        alone = np.zeros((size - 1 - len(matched), 2), np.int64)
-        alone[:, axis] = np.setdiff1d(np.arange(1, size), matched[:, axis])
-        rows.append(alone)
-    pairs = np.concatenate(rows)
-    return pairs[np.lexsort(pairs.T[::-1])]
+def pair_gain_over_alone(score: Any) -> Any:
+    """What each pair scores above both left with the dummy: (..., N + 1, M + 1) -> (..., N, M), arrays or tensors."""
+    return score[..., 1:, 1:] - score[..., 1:, :1] - score[..., :1, 1:]
 
 
 class SourceTracker:
@@ -147,9 +297,8 @@ class SourceTracker:
         """interval, size: not used; positions are compared in pixels of the picture."""
         self.parameters = settings.paper
         self.window: deque[Features] = deque(maxlen=self.parameters.window)  # newest first
-        self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window)
+        self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window - 1)  # of its frames but the newest
         self.next_identity = 1
-        self.association: Association | None = None  # of the newest window
 
     def feed(
         self,
@@ -167,10 +316,14 @@ class SourceTracker:
         self.window.appendleft(Features(detections.box_px, appearance))
         identity = np.zeros(len(detections), np.int64)
         if len(self.window) > 1:
-            self.association = associate(list(self.window), self.parameters)
-            identity = inherit_identities(
-                self.association.rows, len(detections), list(self.identities)[: len(self.window) - 1]
-            )
+            rows = associate(list(self.window), self.parameters).rows
+            # The newest link counts: i to j, or i to k where j is the dummy, unless another target has that identity by
+            # its own link to j.
+            for older, known in enumerate(self.identities, 1):
+                direct = (rows[:, 0] > 0) & (rows[:, older] > 0) & (rows[:, 1:older] == 0).all(axis=1)
+                taken = known[rows[direct, older] - 1]
+                free = ~np.isin(taken, identity)
+                identity[rows[direct, 0][free] - 1] = taken[free]
         new = np.flatnonzero(identity == 0)
         identity[new] = self.next_identity + np.arange(len(new))
         self.next_identity += len(new)
@@ -180,20 +333,3 @@ class SourceTracker:
     def end(self) -> list[Tracks]:
         """Nothing: no frame waits."""
         return []
-
-
-def inherit_identities(
-    rows: Int[np.ndarray, "Z K"], count: int, identities: Sequence[Int[np.ndarray, "N"]]
-) -> Int[np.ndarray, "N"]:
-    """The identities of the newest frame's targets by the window's links, 0 for a new target.
-
-    identities: of the older frames, newest first. The newest link counts: i to j, or i to k where j is the dummy,
-    unless another target has that identity by its own link to j.
-    """
-    identity = np.zeros(count, np.int64)
-    for older, known in enumerate(identities, 1):
-        direct = (rows[:, 0] > 0) & (rows[:, older] > 0) & (rows[:, 1:older] == 0).all(axis=1)
-        taken = known[rows[direct, older] - 1]
-        free = ~np.isin(taken, identity)
-        identity[rows[direct, 0][free] - 1] = taken[free]
-    return identity

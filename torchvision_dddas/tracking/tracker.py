@@ -10,10 +10,10 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
-from torchvision_dddas.tracking.appearance import rgb_histograms, strip_histograms
 from torchvision_dddas.tracking.camera_motion import CameraMotion, Registrar
 from torchvision_dddas.tracking.score_tracker import ScoreTracker
-from torchvision_dddas.tracking.source_tracker import SourceTracker
+from torchvision_dddas.tracking.scores import strip_histograms
+from torchvision_dddas.tracking.source_tracker import SourceTracker, rgb_histograms
 from torchvision_dddas.types import (
     Adjustment,
     Detections,
@@ -80,7 +80,10 @@ class Tracker:
         above the last one's.
         """
         detections = _check_detections(detections)
-        camera_motion = _check_motion(camera_motion)
+        if camera_motion is not None:
+            camera_motion = np.asarray(camera_motion, float)
+            if camera_motion.shape != (3, 3) or not np.isfinite(camera_motion).all():
+                raise InputError(f"camera_motion must be a finite (3, 3) homography; got shape {camera_motion.shape}")
         if image is not None and (
             image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,))
         ):
@@ -91,7 +94,14 @@ class Tracker:
             raise InputError(f"frame {number} follows frame {self._frame}; give the frames in order, each once")
         self._frame = number
         if self._tracker is None:
-            self._tracker = self._start(detections)
+            settings, track = self.settings, self.settings.track
+            if self._motion is None:
+                self._motion = detections.kind == MOTION
+            if self._motion:  # blobs come in parts, with shadows, and joined
+                own = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter, "births": track.own_births}
+                settings = settings.model_copy(update={"track": track.model_copy(update=own)})
+            tracker = SourceTracker if track.mode == "paper" else ScoreTracker
+            self._tracker = tracker(settings, self.interval, self.size)
         self._scores.append(detections.score)
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))
@@ -101,16 +111,6 @@ class Tracker:
     def flush(self) -> list[Tracks]:
         """The frames that are not settled yet, at the end of a run."""
         return self._with_given_scores(self._tracker.end()) if self._tracker is not None else []
-
-    def _start(self, detections: Detections) -> "ScoreTracker | SourceTracker":
-        if self._motion is None:
-            self._motion = detections.kind == MOTION
-        settings, track = self.settings, self.settings.track
-        if self._motion:  # blobs come in parts, with shadows, and joined
-            blobs = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter, "births": track.own_births}
-            settings = settings.model_copy(update={"track": track.model_copy(update=blobs)})
-        tracker = SourceTracker if track.mode == "paper" else ScoreTracker
-        return tracker(settings, self.interval, self.size)
 
     def _histograms(self, image: np.ndarray, box_px: np.ndarray) -> Callable[[], np.ndarray]:
         histograms = rgb_histograms if self.settings.track.mode == "paper" else strip_histograms
@@ -135,7 +135,7 @@ class Tracker:
 
 def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]") -> Detections:
     if isinstance(given, Detections):
-        box, score, record = given.box_px, given.score, given
+        box, score = given.box_px, given.score
     else:
         has_scores = isinstance(given, tuple) and len(given) == 2
         try:
@@ -144,10 +144,6 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
         except (TypeError, ValueError):
             raise InputError("detections must be a Detections record, (N, 4) boxes, or (boxes, scores)") from None
         box = box.reshape(0, 4) if box.size == 0 else box
-        if box.ndim != 2 or box.shape[1] != 4:
-            raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
-        unknown = np.full(len(box), np.nan)
-        record = Detections(box, score, box[:, 2] * box[:, 3], unknown, unknown, kind="given")
     if box.ndim != 2 or box.shape[1] != 4:
         raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
     if score.shape != (len(box),):
@@ -158,16 +154,10 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
         row = int((box[:, 2:] <= 0).any(axis=1).argmax())
         width, height = box[row, 2:]
         raise InputError(f"width and height must be above 0 px, got {width:g} x {height:g} in box {row}")
-    return record
-
-
-def _check_motion(camera_motion: np.ndarray | None) -> np.ndarray | None:
-    if camera_motion is None:
-        return None
-    motion = np.asarray(camera_motion, float)
-    if motion.shape != (3, 3) or not np.isfinite(motion).all():
-        raise InputError(f"camera_motion must be a finite (3, 3) homography; got shape {motion.shape}")
-    return motion
+    if isinstance(given, Detections):
+        return given
+    unknown = np.full(len(box), np.nan)
+    return Detections(box, score, box[:, 2] * box[:, 3], unknown, unknown, kind="given")
 
 
 class FrameTracker:
@@ -235,18 +225,11 @@ class SceneTracker:
         number = scene.frame.number
         if not is_sampled(number, self._interval):
             return
-        found = TrackedFrame(
-            number,
-            scene.frame,
-            scene.detections,
-            Tracks(number),
-            chain(self._steps) if self._steps else None,
-            cause=scene.cause,
-            adjustments=self._adjustments,
-            seconds=self._seconds,
-        )
+        given = TrackedFrame(number, scene.frame, scene.detections, Tracks(number), cause=scene.cause)
+        motion = chain(self._steps) if self._steps else None
+        given = replace(given, now_from_before=motion, adjustments=self._adjustments, seconds=self._seconds)
         self._steps, self._adjustments, self._seconds = [], (), {}
-        yield from self._tracker.update(found)
+        yield from self._tracker.update(given)
 
     def flush(self) -> Iterator[TrackedFrame]:
         """The frames that were still waiting."""
@@ -263,6 +246,30 @@ def track_scenes(
     yield from tracker.flush()
 
 
+class _TableTracker(FrameTracker):
+    """Tracks the rows of a table."""
+
+    def __init__(
+        self, table: DetectionTable, settings: Settings, interval: int, size: tuple[float, float] | None
+    ) -> None:
+        super().__init__(settings, interval, size, motion=table.own, certain=table.certain)
+        self.table = table
+
+    def add(
+        self,
+        numbers: Iterable[int],
+        frame: Frame | None = None,
+        motion: np.ndarray | None = None,
+        cause: str = "",
+        seconds: dict[str, float] | None = None,
+    ) -> Iterator[TrackedFrame]:
+        """Add the rows of these frames."""
+        for number in numbers:
+            lines = self.table.line[self.table.rows(number)]
+            rows, tracks = self.table.at(number), Tracks(number)
+            yield from self.update(TrackedFrame(number, frame, rows, tracks, motion, lines, cause, (), seconds or {}))
+
+
 def track_clip(
     source: Source, table: DetectionTable, engine: Registrar, settings: Settings, interval: int
 ) -> Iterator[TrackedFrame]:
@@ -271,20 +278,18 @@ def track_clip(
     The camera's motion is estimated from one picture to the next that can be read. Frames that cannot be read, or lie
     after the clip's end, are tracked without picture.
     """
-    tracker, camera, number = _table_tracker(table, settings, interval, source.size), CameraMotion(engine), 1
+    tracker, camera, number = _TableTracker(table, settings, interval, source.size), CameraMotion(engine), 1
     unread = "the frame could not be read"
     start = time.perf_counter()
     for frame in source.every(interval):
         read = time.perf_counter()
-        for missing in range(number, frame.number, interval):
-            yield from tracker.update(_frame_of(table, missing, cause=unread))
+        yield from tracker.add(range(number, frame.number, interval), cause=unread)
         number = frame.number + interval
         motion, cause = camera.update(frame.image)
         seconds = {"read": read - start, "register": time.perf_counter() - read}
-        yield from tracker.update(_frame_of(table, frame.number, frame, motion, cause, seconds))
+        yield from tracker.add([frame.number], frame, motion, cause, seconds)
         start = time.perf_counter()
-    for missing in range(number, max(source.last, table.last) + 1, interval):
-        yield from tracker.update(_frame_of(table, missing, cause=unread))
+    yield from tracker.add(range(number, max(source.last, table.last) + 1, interval), cause=unread)
     yield from tracker.flush()
 
 
@@ -292,43 +297,16 @@ def track_table(table: DetectionTable, settings: Settings, interval: int) -> Ite
     """Identities of a table alone, from its first to its last row: no camera motion, no appearance.
 
     Frames without rows are empty. Of a long stretch of these, those between the frame when all tracks are forgotten and
-    the one before the next row are left out.
-    """
-    tracker = _table_tracker(table, settings, interval, table.extent)
-    forgotten = settings.track.memory_frames + (settings.track.hits + 3) * interval
-    for number in _table_frames(table, interval, forgotten):
-        yield from tracker.update(_frame_of(table, number))
-    yield from tracker.flush()
-
-
-def _table_frames(table: DetectionTable, interval: int, forgotten: int) -> Iterator[int]:
-    """Each sampled frame, but of a stretch without rows only the first `forgotten` frames and the last one.
-
-    One stray row must not cost a million empty frames.
+    the one before the next row are left out: one stray row must not cost a million empty frames.
     """
     if not len(table):
         return
+    tracker = _TableTracker(table, settings, interval, table.extent)
+    forgotten = settings.track.memory_frames + (settings.track.hits + 3) * interval
     start, last = table.first + -(table.first - 1) % interval, table.last - (table.last - 1) % interval
     for row in np.union1d(table.frame[is_sampled(table.frame, interval)], [last]).tolist():
         quiet = range(start, min(row, start + forgotten), interval)
-        yield from quiet
-        yield from range(max(start + len(quiet) * interval, row - interval), row + 1, interval)
+        yield from tracker.add(quiet)
+        yield from tracker.add(range(max(start + len(quiet) * interval, row - interval), row + 1, interval))
         start = row + interval
-
-
-def _table_tracker(
-    table: DetectionTable, settings: Settings, interval: int, size: tuple[float, float] | None
-) -> FrameTracker:
-    return FrameTracker(settings, interval, size, motion=table.own, certain=table.certain)
-
-
-def _frame_of(
-    table: DetectionTable,
-    number: int,
-    frame: Frame | None = None,
-    motion: np.ndarray | None = None,
-    cause: str = "",
-    seconds: dict[str, float] | None = None,
-) -> TrackedFrame:
-    lines = table.line[table.rows(number)]
-    return TrackedFrame(number, frame, table.at(number), Tracks(number), motion, lines, cause, seconds=seconds or {})
+    yield from tracker.flush()

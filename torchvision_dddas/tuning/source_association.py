@@ -15,16 +15,16 @@ from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.functional.soft import step
-from torchvision_dddas.tracking.appearance import rgb_histograms
-from torchvision_dddas.tracking.source_affinity import (
+from torchvision_dddas.tracking.source_tracker import (
+    Features,
+    affinity,
     best_alternatives,
     blend_gate,
-    dissimilarity,
     frames_considered,
     joined_at,
     pair_gain_over_alone,
+    rgb_histograms,
 )
-from torchvision_dddas.tracking.source_tracker import Features, affinity
 from torchvision_dddas.tuning.examples import boxed_frames, check_identities, stack_padded
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import with_tensors
@@ -118,8 +118,8 @@ class Windows:
     """W windows of two frames: targets of the newer one (N) as rows, of the older one (M) as columns; float64 and bool.
 
     similarity, alternative: of both features, with a dummy first on both axes, as `source_tracker.affinity` and
-    `source_affinity.best_alternatives` return them. now, before: whether a target is there. true: the true links.
-    joined_at: of each two of P targets of the newer and of the older frame, as `source_affinity.joined_at` returns it;
+    `source_tracker.best_alternatives` return them. now, before: whether a target is there. true: the true links.
+    joined_at: of each two of P targets of the newer and of the older frame, as `source_tracker.joined_at` returns it;
     there: whether a target is there. speaks: frames that count in the dispersion. pictured: appearance is known.
     """
 
@@ -160,7 +160,7 @@ def build_window(
     for frame, count in enumerate(counts):
         there[frame, :count] = True
         for place, pair in enumerate(values):
-            joined[place, frame, :count, :count] = joined_at(dissimilarity(pair[frame]))
+            joined[place, frame, :count, :count] = joined_at(pair[frame])
     return {
         "similarity": similarity,
         "alternative": np.stack([best_alternatives(score, parameters.gate) for score in similarity]),

@@ -18,22 +18,20 @@ from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import CameraMotion, kalman
-from torchvision_dddas.tracking.appearance import (
-    appearance_scores,
-    blend_histograms,
-    similarity,
-    strip_histograms,
-    visible_shares,
-)
 from torchvision_dddas.tracking.kalman import transform_boxes
 from torchvision_dddas.tracking.scores import (
     SceneState,
     SpeedPrior,
+    appearance_scores,
     association_scores,
     birth_rate,
+    blend_histograms,
     blend_speed,
     is_near_border,
     is_remembered,
+    similarity,
+    strip_histograms,
+    visible_shares,
 )
 from torchvision_dddas.tracking.smoother import FILLED
 from torchvision_dddas.tuning.examples import OwnedBoxes, boxed_frames, check_identities, match_owners, stack_padded
