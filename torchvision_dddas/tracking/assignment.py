@@ -57,7 +57,7 @@ def choose_links(
         return row, k, _NEXT_WEIGHT * further[row, k]
 
     (p, k, later), (j, m, fresh), (i, n, bridged) = map(likely, (onward, born, bridging))
-    parts = [(tracks, now, -1), (tracks[p], now[p], k), (-1, j, m), (i, -1, n)]
+    parts: list[Any] = [(tracks, now, -1), (tracks[p], now[p], k), (-1, j, m), (i, -1, n)]
     columns = np.concatenate([np.stack(np.broadcast_arrays(*part), axis=1) for part in parts])
     score = np.concatenate([value, value[p] + later, fresh, bridged])
     best, _ = choose_triplets(columns, score, _MOST_BRANCHES)

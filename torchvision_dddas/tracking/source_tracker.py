@@ -147,10 +147,12 @@ def best_alternatives(score: Float[np.ndarray, "..."], reading: str) -> Float[np
     best = np.full(score.shape, np.inf)
     if reading == "off":
         return best
-    dummies = sum((index == 0).astype(int) for index in np.indices(score.shape, sparse=True))
+    firsts = [np.index_exp[:] * axis + (0,) for axis in range(score.ndim)]
+    dummies = np.zeros(score.shape, np.int64)
+    for first in firsts:
+        dummies[first] += 1
     allowed = dummies == 1 if reading == "one_dummy" else dummies < score.ndim
-    for axis in range(score.ndim):
-        first = np.index_exp[:] * axis + (0,)
+    for axis, first in enumerate(firsts):
         real = score.take(np.arange(1, score.shape[axis]), axis).max(axis=axis, initial=-np.inf)
         best[first] = np.where(allowed[first], np.minimum(best[first], real), best[first])
     return best
