@@ -6,7 +6,7 @@ import pytest
 
 from torchvision_dddas.config import MorphologyParameters
 from torchvision_dddas.detection.blobs import find_blobs, find_weak_blobs, group_fragments
-from torchvision_dddas.detection.outlines import remove_shadow, smooth_along_edges
+from torchvision_dddas.detection.observation import remove_shadow, smooth_along_edges
 
 SIZE = (101, 67)
 

@@ -6,8 +6,7 @@ import pytest
 from tests.people.test_detector import SIZE, Brightest, Clip
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.detector import UNREAD
-from torchvision_dddas.people.live_tracker import PersonTracker
+from torchvision_dddas.people.detector import UNREAD, PersonTracker
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Detections, Registration, Scene
 

@@ -1,6 +1,12 @@
 """People in pictures from the ground, by HOG and a linear SVM; `PersonDetector` is the public class."""
 
-from torchvision_dddas.people.detector import PersonDetector, WindowScorer, detect_in_clip, detect_people, load_scorer
-from torchvision_dddas.people.live_tracker import PersonTracker
+from torchvision_dddas.people.detector import (
+    PersonDetector,
+    PersonTracker,
+    WindowScorer,
+    detect_in_clip,
+    detect_people,
+    load_scorer,
+)
 
 __all__ = ["PersonDetector", "PersonTracker", "WindowScorer", "detect_in_clip", "detect_people", "load_scorer"]

@@ -26,6 +26,17 @@ _PARAMETERS = {
     "clip": "people.clip",
     "gamma": "people.gamma",
 }
+_HOG_KEYS = {
+    "window": "winSize",
+    "cell": "cellSize",
+    "block": "blockSize",
+    "stride": "blockStride",
+    "bins": "nbins",
+    "signed": "signedGradient",
+    "clip": "L2HysThreshold",
+    "gamma": "gammaCorrection",
+}
+"""Of a HOGDescriptor that OpenCV saved."""
 _DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
 
 
@@ -50,8 +61,12 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
         numbers, stated = reader(path)
     except OSError as error:
         raise InputError(f"classifier {path} cannot be read: {error.strerror or error}") from None
-    if wanted is not None:
-        _check_layout(stated, wanted, path)
+    for name, parameter in _PARAMETERS.items():
+        if wanted is not None and name in stated and name in wanted and not _is_same(stated[name], wanted[name]):
+            raise InputError(
+                f"classifier {path} was trained with a {name} of {_format(stated[name], wanted[name])}, the "
+                f"settings say {_format(wanted[name], wanted[name])}; change {parameter}"
+            )
     return _svm(numbers, features, path)
 
 
@@ -77,15 +92,6 @@ def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
         first = int(np.argmin(np.isfinite(numbers)))
         raise InputError(f"classifier {path}: number {first + 1} is {numbers[first]:g}; wanted finite numbers")
     return LinearSvm(numbers[:features], float(numbers[features:].sum()), str(path))
-
-
-def _check_layout(stated: Layout, wanted: Layout, path: Path) -> None:
-    for name, parameter in _PARAMETERS.items():
-        if name in stated and name in wanted and not _is_same(stated[name], wanted[name]):
-            raise InputError(
-                f"classifier {path} was trained with a {name} of {_format(stated[name], wanted[name])}, the "
-                f"settings say {_format(wanted[name], wanted[name])}; change {parameter}"
-            )
 
 
 def _is_same(one: object, other: object) -> bool:
@@ -147,12 +153,15 @@ def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         top = storage.getFirstTopLevelNode()
         # An SVM's node is the top one; a HOGDescriptor saved by hand may lie anywhere at the top.
-        inside = set() if top.empty() else set(top.keys()) if top.isMap() else set()
+        inside = set(top.keys()) if not top.empty() and top.isMap() else set()
     except (UnicodeDecodeError, cv2.error, SystemError):
         raise InputError(f"classifier {path} is not a file that OpenCV saved (YAML, XML or JSON)") from None
     try:
         if "SVMDetector" in inside:
-            return _read_hog(top)
+            values = {name: _numbers(top.getNode(key)).tolist() for name, key in _HOG_KEYS.items() if key in inside}
+            # Cells, blocks and strides are squares in a layout.
+            stated = {name: v if name == "window" or len(set(v)) > 1 else v[0] for name, v in values.items()}
+            return _numbers(top.getNode("SVMDetector")), stated
         if "support_vectors" in inside:
             return _read_support_vectors(top, path), {}
     except InputError:
@@ -164,23 +173,6 @@ def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
     )
 
 
-def _read_hog(node: "cv2.FileNode") -> tuple[np.ndarray, Layout]:
-    stated: dict[str, object] = {}
-    for name, key in (("window", "winSize"), ("cell", "cellSize"), ("block", "blockSize"), ("stride", "blockStride")):
-        if not (entry := node.getNode(key)).empty():
-            pair = _numbers(entry)
-            stated[name] = tuple(pair) if name == "window" or len(set(pair)) > 1 else pair[0]
-    for name, key in (
-        ("bins", "nbins"),
-        ("signed", "signedGradient"),
-        ("clip", "L2HysThreshold"),
-        ("gamma", "gammaCorrection"),
-    ):
-        if not (entry := node.getNode(key)).empty():
-            stated[name] = entry.real()
-    return _numbers(node.getNode("SVMDetector")), stated
-
-
 def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
     """Weights and bias of a saved cv2.ml.SVM.
 
@@ -190,13 +182,9 @@ def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
     kind, kernel = node.getNode("svmType").string(), node.getNode("kernel").getNode("type").string()
     if kernel != "LINEAR":
         raise InputError(f"classifier {path} has the kernel {kernel or 'of no name'}; wanted a linear SVM")
-    vectors = node.getNode("support_vectors")
-    functions = node.getNode("decision_functions")
-    if kind in ("C_SVC", "NU_SVC"):
-        sign = -1.0
-    elif kind in ("EPS_SVR", "NU_SVR"):
-        sign = 1.0
-    else:
+    vectors, functions = node.getNode("support_vectors"), node.getNode("decision_functions")
+    sign = {"C_SVC": -1.0, "NU_SVC": -1.0, "EPS_SVR": 1.0, "NU_SVR": 1.0}.get(kind)
+    if sign is None:
         raise InputError(
             f"classifier {path} is an SVM of type {kind or 'unknown'}; wanted C_SVC, NU_SVC or a regression"
         )
@@ -206,21 +194,17 @@ def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
     function = functions.at(0)
     if lacking := [name for name in ("alpha", "rho") if function.getNode(name).empty()]:
         raise InputError(f"classifier {path} lacks {lacking[0]}, a part of its decision function; save it again")
-    alpha = _numbers(function.getNode("alpha"))
-    index = function.getNode("index")
+    alpha, index = _numbers(function.getNode("alpha")), function.getNode("index")
     place = np.arange(len(rows)) if index.empty() else _numbers(index)
     if not ((place >= 0) & (place < len(rows))).all():
         raise InputError(f"classifier {path} names support vectors that it does not hold; save it again")
-    used = rows[place.astype(int)]
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused with its place
-        return sign * np.append(alpha @ used, -function.getNode("rho").real())
+        return sign * np.append(alpha @ rows[place.astype(int)], -function.getNode("rho").real())
 
 
 def _numbers(node: "cv2.FileNode") -> np.ndarray:
-    """A sequence of numbers."""
-    if node.isSeq():
-        return np.array([node.at(i).real() for i in range(node.size())])
-    return np.array([node.real()])
+    """A number, or a sequence of them."""
+    return np.array([node.at(i).real() for i in range(node.size())] if node.isSeq() else [node.real()])
 
 
 _READERS = dict.fromkeys((".npy", ".npz"), _read_numpy)

@@ -7,6 +7,7 @@ extent and can be hidden, and detection and false-alarm rates weigh the evidence
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -44,14 +45,13 @@ def field_of_view(
 ) -> View:
     """The view of a camera that stands at a place, by the body heights in pixels that the people settings can find."""
     height_m, (width_px, height_px) = ground.body_height_m, camera.size_px
-    least_px = smallest_body_px(people)
     aside_px = min(camera.centre_px[0] + 0.5, width_px - 0.5 - camera.centre_px[0])
     return View(
         np.asarray(east_north_m, float),
         heading_rad,
         math.atan(max(aside_px, 0.0) / camera.focal_px[0]),
         camera.focal_px[1] * height_m / height_px,
-        camera.focal_px[1] * height_m / least_px,
+        camera.focal_px[1] * height_m / smallest_body_px(people),
         camera.position_sigma_m,
         camera.heading_sigma_rad,
     )
@@ -91,7 +91,12 @@ def observe_ground(
     improbable people, or those of another blob, is in doubt. views: of the cameras that found these people.
     """
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
-    blob_m2, person_m2 = (_known(covariance, parameters) for covariance in (blob_m2, person_m2))
+    unknown_m2 = parameters.unknown_sigma_m**2 * np.eye(2)
+    covariances = (np.asarray(covariance, float).reshape(-1, 2, 2) for covariance in (blob_m2, person_m2))
+    blob_m2, person_m2 = (
+        np.where(np.isfinite(covariance).all(axis=(1, 2), keepdims=True), covariance, unknown_m2)
+        for covariance in covariances
+    )
     apart = person_m[None] - blob_m[:, None]
     # A micrometre at least: where nothing is unsure, no distance could be told in standard deviations.
     both = blob_m2[:, None] + person_m2[None] + max(parameters.spread_m, 1e-6) ** 2 * np.eye(2)
@@ -100,7 +105,7 @@ def observe_ground(
     people, best = _assigned(sigmas, inside, score, parameters)
     clear = np.zeros(len(blob_m), bool)
     for view in views:
-        clear |= _well_within(blob_m, blob_m2, view, parameters) & ~_hidden(blob_m, person_m, view, parameters)
+        clear |= _is_clear(blob_m, blob_m2, person_m, view, parameters)
     nearest_m = np.linalg.norm(apart, axis=-1).min(axis=1, initial=np.inf)
     nearest_sigmas = sigmas.min(axis=1, initial=np.inf)
     return GroundObservation((people > 0) | (clear & ~inside.any(axis=1)), people, nearest_m, nearest_sigmas, best)
@@ -184,13 +189,6 @@ def _log_odds(probability: float) -> float:
     return math.log(probability / (1 - probability))
 
 
-def _known(covariance_m2: np.ndarray, parameters: ConfirmParameters) -> np.ndarray:
-    """(N, 2, 2), with the stated standard deviation where nothing is known."""
-    covariance_m2 = np.asarray(covariance_m2, float).reshape(-1, 2, 2)
-    unknown = ~np.isfinite(covariance_m2).all(axis=(1, 2), keepdims=True)
-    return np.where(unknown, parameters.unknown_sigma_m**2 * np.eye(2), covariance_m2)
-
-
 def _assigned(
     distance: Float[np.ndarray, "N M"],
     inside: Bool[np.ndarray, "N M"],
@@ -198,11 +196,10 @@ def _assigned(
     parameters: ConfirmParameters,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Each person to the nearest blob whose gate they are in: (N,) probable people, (N,) the highest score of any."""
-    blobs = len(distance)
-    people, best = np.zeros(blobs, np.int64), np.zeros(blobs)
-    if not inside.any():
-        return people, best
+    people, best = np.zeros(len(distance), np.int64), np.zeros(len(distance))
     ours = inside.any(axis=0)
+    if not ours.any():
+        return people, best
     nearest = np.where(inside, distance, np.inf).argmin(axis=0)[ours]
     known = np.nan_to_num(np.asarray(score, float)[ours], nan=1.0)
     np.add.at(people, nearest[known >= parameters.least_score], 1)
@@ -210,10 +207,14 @@ def _assigned(
     return people, best
 
 
-def _well_within(
-    blob_m: np.ndarray, blob_m2: np.ndarray, view: View, parameters: ConfirmParameters
+def _is_clear(
+    blob_m: np.ndarray, blob_m2: np.ndarray, person_m: np.ndarray, view: View, parameters: ConfirmParameters
 ) -> Bool[np.ndarray, "N"]:
-    """Whether a blob is `inside_sigmas` of its own and of the camera's standard deviations within a view."""
+    """Whether a view shows a blob: it is `inside_sigmas` of the standard deviations within, and nothing hides it.
+
+    The deviations are the blob's and the camera's. Another blob or a person hides a blob if it stands before it, nearer
+    the camera by a body's width at least.
+    """
     apart = blob_m - view.east_north_m
     distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
     along = apart / distance[:, None]
@@ -225,26 +226,13 @@ def _well_within(
     bearing = np.arctan2(along[:, 0], along[:, 1]) - view.heading_rad
     off = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
     angle = np.hypot(np.arctan2(lateral, distance), view.heading_sigma_rad)
-    k = parameters.inside_sigmas
-    return (
-        (off + k * angle <= view.half_rad)
-        & (distance - k * radial >= view.near_m)
-        & (distance + k * radial <= view.far_m)
-    )
-
-
-def _hidden(
-    blob_m: np.ndarray, person_m: np.ndarray, view: View, parameters: ConfirmParameters
-) -> Bool[np.ndarray, "N"]:
-    """Whether another blob or a person stands before a blob, nearer the camera by a body's width at least."""
-    apart = blob_m - view.east_north_m
-    distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
-    along = apart / distance[:, None]
+    k, width_m = parameters.inside_sigmas, parameters.body_width_m
+    is_within = (distance - k * radial >= view.near_m) & (distance + k * radial <= view.far_m)
     others = np.concatenate([blob_m, person_m]) - view.east_north_m
     ahead = along @ others.T
     aside = np.abs(along[:, :1] * others[:, 1] - along[:, 1:] * others[:, 0])
-    before = (ahead > 0) & (ahead < distance[:, None] - parameters.body_width_m) & (aside < parameters.body_width_m)
-    return before.any(axis=1)
+    hiding = (ahead > 0) & (ahead < distance[:, None] - width_m) & (aside < width_m)
+    return is_within & (off + k * angle <= view.half_rad) & ~hiding.any(axis=1)
 
 
 @dataclass(frozen=True)
@@ -272,26 +260,25 @@ def confirm_positions(
     degrees, these count. Raises InputError for places of different kinds, and poses that do not cover the frames.
     """
     origin = _origin(blobs, vehicles)
-    blob_m, *persons_m = (_metres(table, origin) for table in (blobs, *(v.people for v in vehicles)))
+    blob_m, *persons_m = (
+        table.east_north_m if origin is None or table.lonlat_deg is None else east_north(table.lonlat_deg, origin)
+        for table in (blobs, *(vehicle.people for vehicle in vehicles))
+    )
     frames = np.unique(blobs.frame)
     frames = frames[(frames - 1) % interval == 0]
-    views = [_views(vehicle, frames, origin, settings, rate_hz) for vehicle in vehicles]
+    views: list[dict[int, list[View]]] = [defaultdict(list) for _ in vehicles]  # by frame
+    for vehicle, seen in zip(vehicles, views, strict=True):
+        for camera, table in zip(vehicle.cameras, vehicle.poses, strict=True):
+            stood, poses = poses_at(camera, table, frames, rate_hz)
+            place_m = poses.place if origin is None else east_north(poses.place, origin)
+            for frame, place, heading in zip(frames.tolist(), place_m, poses.heading_rad.tolist(), strict=True):
+                seen[frame].append(field_of_view(stood, place, heading, settings.people, settings.ground))
 
     def observations(frame: int, rows: slice) -> Iterator[tuple[str, GroundObservation]]:
         for vehicle, person_m, seen in zip(vehicles, persons_m, views, strict=True):
-            there = _rows(vehicle.people.frame, frame)
-            yield (
-                vehicle.name,
-                observe_ground(
-                    blob_m[rows],
-                    blobs.covariance_m2[rows],
-                    person_m[there],
-                    vehicle.people.covariance_m2[there],
-                    vehicle.people.score[there],
-                    seen[frame],
-                    settings.confirm,
-                ),
-            )
+            people, there = vehicle.people, _rows(vehicle.people.frame, frame)
+            blob, person = (blob_m[rows], blobs.covariance_m2[rows]), (person_m[there], people.covariance_m2[there])
+            yield vehicle.name, observe_ground(*blob, *person, people.score[there], seen[frame], settings.confirm)
 
     identity = blobs.target if lasting else np.full(len(blobs), -1)
     return _frames(blobs.frame, identity, observations, settings, interval)
@@ -303,9 +290,8 @@ def confirm_pictures(
     """Blobs and people of the same pictures, as `dddas people` found them at frames 1, 1 + interval, ..."""
     parameters = settings.people
     least_px = smallest_body_px(parameters)
-    aspect = (
-        parameters.width_share * parameters.window_width_px / (parameters.height_share * parameters.window_height_px)
-    )
+    body_height_px = parameters.height_share * parameters.window_height_px
+    aspect = parameters.width_share * parameters.window_width_px / body_height_px
 
     def observations(frame: int, rows: slice) -> Iterator[tuple[str, GroundObservation]]:
         for name, table in zip(names, people, strict=True):
@@ -402,26 +388,3 @@ def _origin(blobs: Positions, vehicles: Sequence[Vehicle]) -> tuple[float, float
     assert blobs.lonlat_deg is not None
     longitude, latitude = blobs.lonlat_deg[0].tolist()
     return longitude, latitude
-
-
-def _metres(table: Positions, origin: tuple[float, float] | None) -> np.ndarray:
-    if origin is None or table.lonlat_deg is None:
-        return table.east_north_m
-    return east_north(table.lonlat_deg, origin)
-
-
-def _views(
-    vehicle: Vehicle,
-    frames: np.ndarray,
-    origin: tuple[float, float] | None,
-    settings: Settings,
-    rate_hz: float | None,
-) -> dict[int, list[View]]:
-    """Frame -> the views of a vehicle's cameras."""
-    views: dict[int, list[View]] = {frame: [] for frame in frames.tolist()}
-    for camera, table in zip(vehicle.cameras, vehicle.poses, strict=True):
-        stood, poses = poses_at(camera, table, frames, rate_hz)
-        place_m = poses.place if origin is None else east_north(poses.place, origin)
-        for frame, place, heading in zip(frames.tolist(), place_m, poses.heading_rad.tolist(), strict=True):
-            views[frame].append(field_of_view(stood, place, heading, settings.people, settings.ground))
-    return views

@@ -1,4 +1,4 @@
-"""People in pictures and clips by HOG and a linear SVM: parts of the pyramid, scores, windows, people."""
+"""People in pictures, clips and live scenes by HOG and a linear SVM: parts of the pyramid, scores, windows, people."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,13 +9,27 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import chain
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.classifiers import load_classifier
 from torchvision_dddas.people.search_regions import Regions, Search, SearchPlan
 from torchvision_dddas.people.suppression import people_from_windows
 from torchvision_dddas.runtime import wants_torch
-from torchvision_dddas.types import DetectionTable, Frame, LinearSvm, Part, People, PeopleFrame
+from torchvision_dddas.types import (
+    Detections,
+    DetectionTable,
+    Frame,
+    LinearSvm,
+    Part,
+    People,
+    PeopleFrame,
+    Scene,
+    TrackedFrame,
+    Tracks,
+    is_sampled,
+)
 
+KIND = "person"
 UNREAD = "the frame could not be read"
 """Cause of a frame without picture."""
 
@@ -75,6 +89,50 @@ def load_scorer(parameters: PeopleParameters, backend: str = "auto", svm: Linear
     return TorchScorer(parameters, svm)
 
 
+def detect_people(
+    images: Sequence[np.ndarray],
+    scorer: WindowScorer,
+    parameters: PeopleParameters,
+    regions: Sequence[Regions] | None = None,
+) -> list[People]:
+    """The people of pictures, searched everywhere or in regions of each. Raises InputError as `detect_in_clip`."""
+    images = [check_image(image, f"picture {i}") for i, image in enumerate(images, start=1)]
+    parts = []
+    for i, image in enumerate(images):
+        size = image.shape[1], image.shape[0]
+        try:
+            whole = pyramid.everywhere(size, parameters)
+        except InputError as error:
+            raise InputError(f"picture {i + 1}: {error}") from None
+        parts.append(whole if regions is None else pyramid.within(*regions[i], size, parameters))
+    return _score_people(images, parts, scorer, parameters)
+
+
+def _score_people(
+    images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]], scorer: WindowScorer, parameters: PeopleParameters
+) -> list[People]:
+    found = []
+    for image, wanted, maps in zip(images, parts, scorer.scores(images, parts), strict=True):
+        size = image.shape[1], image.shape[0]
+        found.append(people_from_windows(*pyramid.windows(wanted, maps, size, parameters), size, parameters))
+    return found
+
+
+def check_image(image: np.ndarray, name: str) -> np.ndarray:
+    """A picture as the backends take it: (H, W) or (H, W, 3) uint8. Raises InputError for anything else."""
+    if image is None:  # what OpenCV gives for a file that it cannot read
+        raise InputError(f"{name} is None; could its file be read? Wanted an array of height x width pixels")
+    image = np.asarray(image)
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or 0 in image.shape:
+        shape = " x ".join(map(str, image.shape))
+        what = f"an array of {shape}" if image.ndim else f"a single {image.dtype.type.__name__}"
+        raise InputError(f"{name} is {what}; wanted height x width, or these x 1 or 3 channels (BGR)")
+    if image.dtype != np.uint8:
+        nan = ", NaN among them" if image.dtype.kind == "f" and bool(np.isnan(image).any()) else ""
+        raise InputError(f"{name} holds {image.dtype} pixels{nan}; wanted 8 bits (uint8), 0 to 255")
+    return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+
+
 def detect_in_clip(
     source: Iterable[Frame],
     scorer: WindowScorer,
@@ -84,109 +142,121 @@ def detect_in_clip(
 ) -> Iterator[PeopleFrame]:
     """The people of every frame number of the clip, in order. Frames that could not be read are black, with a cause.
 
-    moving: boxes around which to search, by frame; see `search_regions.Search`. batch:
-    frames given to the backend at once, which does not change the result. None: 8 for torch, else 1; with
-    `people.search = regions` each frame waits for what was found in the one before.
+    moving: boxes around which to search, by frame; see `search_regions.Search`. batch: frames given to the backend at
+    once, which does not change the result. None: 8 for torch, else 1; with `people.search = regions` each frame waits
+    for what was found in the one before.
     Raises InputError: a picture that is not 8 bits grey or BGR, or smaller than the window.
     """
     parameters = settings.people
     search = Search(parameters, None if moving is None else lambda number: moving.at(number).box_px)
     some = 1 if search.steered else batch or (8 if scorer.name == "torch" else 1)
+    rate_hz = float(getattr(source, "rate_hz", 10.0))
     waiting: list[tuple[Frame, SearchPlan, dict[str, float]]] = []
-    number, rate_hz, shape = 1, float(getattr(source, "rate_hz", 10.0)), (1, 1)
+
+    def search_waiting() -> Iterator[PeopleFrame]:
+        """Search the waiting frames together, and empty the list."""
+        if not waiting:
+            return
+        start = time.perf_counter()
+        parts = [plan.parts for _, plan, _ in waiting]
+        maps = scorer.scores([frame.image for frame, _, _ in waiting], parts)
+        spent = (time.perf_counter() - start) / len(waiting)
+        for (frame, plan, seconds), scored in zip(waiting, maps, strict=True):
+            start, size = time.perf_counter(), (frame.image.shape[1], frame.image.shape[0])
+            people = people_from_windows(*pyramid.windows(plan.parts, scored, size, parameters), size, parameters)
+            search.update(frame.number, people, plan)
+            seconds = seconds | {"score": spent, "people": time.perf_counter() - start}
+            yield PeopleFrame(frame, people, plan.regions_px, plan.share, "", plan.adjustments, seconds)
+        waiting.clear()
+
+    def unread(numbers: range, shape: tuple[int, ...]) -> Iterator[PeopleFrame]:
+        for number in numbers:
+            frame = Frame(number, (number - 1) / rate_hz, np.zeros(shape, np.uint8))
+            yield PeopleFrame(frame, People(), np.zeros((0, 4)), 0.0, UNREAD)
+
+    number, shape = 1, (1, 1)
     start = time.perf_counter()
     for frame in source:
         read = time.perf_counter()
         image = check_image(frame.image, f"frame {frame.number}")
-        frame = replace(frame, image=image)
         if frame.number > number:
-            yield from _search_waiting(waiting, scorer, parameters, search)
-            yield from (_unread(missing, rate_hz, image.shape) for missing in range(number, frame.number))
+            yield from search_waiting()
+            yield from unread(range(number, frame.number), image.shape)
         number, shape = frame.number + 1, image.shape
         planned = time.perf_counter()
         plan = search.plan(frame.number, (image.shape[1], image.shape[0]))
-        waiting.append((frame, plan, {"read": read - start, "plan": time.perf_counter() - planned}))
+        seconds = {"read": read - start, "plan": time.perf_counter() - planned}
+        waiting.append((replace(frame, image=image), plan, seconds))
         if len(waiting) >= some:
-            yield from _search_waiting(waiting, scorer, parameters, search)
+            yield from search_waiting()
         start = time.perf_counter()
-    yield from _search_waiting(waiting, scorer, parameters, search)
-    yield from (_unread(missing, rate_hz, shape) for missing in range(number, getattr(source, "last", 0) + 1))
+    yield from search_waiting()
+    yield from unread(range(number, getattr(source, "last", 0) + 1), shape)
 
 
-def detect_people(
-    images: Sequence[np.ndarray],
-    scorer: WindowScorer,
-    parameters: PeopleParameters,
-    regions: Sequence[Regions] | None = None,
-) -> list[People]:
-    """The people of pictures, searched everywhere or in regions of each. Raises InputError as `detect_in_clip`."""
-    images = [check_image(image, f"picture {i}") for i, image in enumerate(images, start=1)]
-    parts = [_whole_pyramid(image, f"picture {i}", parameters) for i, image in enumerate(images, start=1)]
-    if regions is not None:
-        sizes = [(image.shape[1], image.shape[0]) for image in images]
-        parts = [pyramid.within(*some, size, parameters) for some, size in zip(regions, sizes, strict=True)]
-    return [
-        _people(maps, wanted, image, parameters)
-        for maps, wanted, image in zip(scorer.scores(images, parts), parts, images, strict=True)
-    ]
+class FrameTracker(Protocol):
+    """What gives frames their tracks, such as `tracking.FrameTracker`."""
+
+    def update(self, given: TrackedFrame) -> Iterable[TrackedFrame]:
+        """Add a frame; returns the frames that are settled by it."""
+        ...
+
+    def flush(self) -> Iterable[TrackedFrame]:
+        """The frames that were still waiting."""
+        ...
 
 
-def check_image(image: np.ndarray, name: str) -> np.ndarray:
-    """A picture as the backends take it: (H, W) or (H, W, 3) uint8. Raises InputError for anything else."""
-    if image is None:  # what OpenCV gives for a file that it cannot read
-        raise InputError(f"{name} is None; could its file be read? Wanted an array of height x width pixels")
-    image = np.asarray(image)
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or 0 in image.shape:
-        what = (
-            "an array of " + " x ".join(map(str, image.shape))
-            if image.ndim
-            else f"a single {image.dtype.type.__name__}"
-        )
-        raise InputError(f"{name} is {what}; wanted height x width, or these x 1 or 3 channels (BGR)")
-    if image.dtype != np.uint8:
-        nan = image.dtype.kind == "f" and bool(np.isnan(image).any())
-        raise InputError(
-            f"{name} holds {image.dtype} pixels{', NaN among them' if nan else ''}; wanted 8 bits (uint8), 0 to 255"
-        )
-    return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+class PersonTracker:
+    """Detects people around what moves in the scenes of a run, and tracks them by the run's own registrations.
 
+    Give it the scenes in order. A scene whose picture could not be read has no people. Identities are from 1, apart
+    from those of what moves.
+    """
 
-def _whole_pyramid(image: np.ndarray, name: str, parameters: PeopleParameters) -> list[Part]:
-    """All parts of a picture. Raises InputError, which names it, where no window fits."""
-    try:
-        return pyramid.everywhere((image.shape[1], image.shape[0]), parameters)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+    def __init__(
+        self, scorer: WindowScorer, settings: Settings, interval: int, size: tuple[int, int], tracker: FrameTracker
+    ) -> None:
+        """size: (width, height) of the pictures. Raises InputError where they are smaller than the window."""
+        self._scorer, self._interval, self._size, self._tracker = scorer, interval, size, tracker
+        self._box_px = np.zeros((0, 4))
+        self._search = Search(settings.people, lambda number: self._box_px)
+        self._steps: list[np.ndarray] = []
+        self._settled: dict[int, TrackedFrame] = {}
+        pyramid.everywhere(size, settings.people)
 
+    def retune(self, settings: Settings) -> None:
+        """Search as these settings say from now on."""
+        self._search.retune(settings.people)
 
-def _search_waiting(
-    waiting: list[tuple[Frame, SearchPlan, dict[str, float]]],
-    scorer: WindowScorer,
-    parameters: PeopleParameters,
-    search: Search,
-) -> Iterator[PeopleFrame]:
-    """Search the waiting frames together, and empty the list."""
-    if not waiting:
-        return
-    start = time.perf_counter()
-    maps = scorer.scores([frame.image for frame, _, _ in waiting], [plan.parts for _, plan, _ in waiting])
-    spent = (time.perf_counter() - start) / len(waiting)
-    for (frame, plan, seconds), scored in zip(waiting, maps, strict=True):
-        start = time.perf_counter()
-        people = _people(scored, plan.parts, frame.image, parameters)
-        search.update(frame.number, people, plan)
-        seconds = seconds | {"score": spent, "people": time.perf_counter() - start}
-        yield PeopleFrame(frame, people, plan.regions_px, plan.share, "", plan.adjustments, seconds)
-    waiting.clear()
+    def update(self, scene: Scene) -> None:
+        """Add the next scene."""
+        if scene.step is not None and scene.step.reliable:
+            self._steps.append(scene.step.later_from_earlier)
+        number, image = scene.frame.number, scene.frame.image
+        if not is_sampled(number, self._interval):
+            return
+        motion, self._steps = chain(self._steps) if self._steps else None, []
+        given = TrackedFrame(number, scene.frame, Detections(kind=KIND), Tracks(number), motion, cause=scene.cause)
+        if image.shape[1::-1] == self._size and scene.cause != UNREAD:
+            start = time.perf_counter()
+            self._box_px = scene.detections.box_px
+            plan = self._search.plan(number, self._size)
+            image = check_image(image, f"frame {number}")
+            (people,) = _score_people([image], [plan.parts], self._scorer, self._search.parameters)
+            self._search.update(number, people, plan)
+            unknown = np.full(len(people), np.nan)
+            area_px = people.box_px[:, 2:].prod(axis=1)
+            found = Detections(people.box_px, people.score, area_px, unknown, unknown, KIND)
+            seconds = {"people": time.perf_counter() - start}
+            given = replace(given, detections=found, adjustments=plan.adjustments, seconds=seconds)
+        self._settled |= {settled.number: settled for settled in self._tracker.update(given)}
 
+    def people_of(self, number: int, ended: bool) -> TrackedFrame | None:
+        """The people of a frame, once; None while they are not settled. Those of earlier frames are forgotten.
 
-def _people(
-    maps: Sequence[np.ndarray], parts: Sequence[Part], image: np.ndarray, parameters: PeopleParameters
-) -> People:
-    size = image.shape[1], image.shape[0]
-    return people_from_windows(*pyramid.windows(parts, maps, size, parameters), size, parameters)
-
-
-def _unread(number: int, rate_hz: float, shape: tuple[int, ...]) -> PeopleFrame:
-    frame = Frame(number, (number - 1) / rate_hz, np.zeros(shape, np.uint8))
-    return PeopleFrame(frame, People(), np.zeros((0, 4)), 0.0, UNREAD)
+        ended: whether no scene follows.
+        """
+        if ended and number not in self._settled:
+            self._settled |= {settled.number: settled for settled in self._tracker.flush()}
+        self._settled = {other: settled for other, settled in self._settled.items() if other >= number}
+        return self._settled.pop(number, None)

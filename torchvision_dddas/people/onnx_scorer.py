@@ -19,6 +19,7 @@ import numpy as np
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.people.pyramid import count_windows, split_evenly
 from torchvision_dddas.runtime import SHIPPED, manifest, verified
 from torchvision_dddas.runtime import opened as open_graph
 from torchvision_dddas.types import LinearSvm, Part
@@ -55,7 +56,9 @@ class OnnxScorer:
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
         """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
-        return open_people_graph(self.graphs, GRAPHS[0]), open_people_graph(self.graphs, GRAPHS[1])
+        # A memory pattern is a plan for every size of a level, which is no quicker and takes 9 MB.
+        histograms, scores = (open_graph(self.graphs, name, enable_mem_pattern=False) for name in GRAPHS)
+        return histograms, scores
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
@@ -89,15 +92,14 @@ class OnnxScorer:
 
     def _score_part(self, level: np.ndarray, part: Part) -> np.ndarray:
         """A part's scores, every window stride. level: uint8 (H, W) or (H, W, 4) BGRA."""
-        parameters, stride = self.parameters, self.parameters.window_stride_px
-        width = max(0, (part.width - parameters.window_width_px) // stride + 1)
-        height = max(0, (part.height - parameters.window_height_px) // stride + 1)
+        stride, block_stride = self.parameters.window_stride_px, self.parameters.block_stride_px
+        width, height = count_windows(part, self.parameters)
         scores = np.empty((height, width), np.float32)
         if not scores.size:
             return scores
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
-        common = math.gcd(stride, parameters.block_stride_px)
-        phases, every = parameters.block_stride_px // common, stride // common
+        common = math.gcd(stride, block_stride)
+        phases, every = block_stride // common, stride // common
         for row in range(min(phases, height)):
             for column in range(min(phases, width)):
                 x, y = column * stride, row * stride
@@ -121,7 +123,9 @@ class OnnxScorer:
 
     def _compute_histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
         """(F, ny, nx), tile by tile."""
-        gradient = self._gradient
+        if not hasattr(self.local, "gradient"):  # one a thread
+            self.local.gradient = Gradient(self.parameters.gamma, self.parameters.signed)
+        gradient: Gradient = self.local.gradient
         block, stride = self.parameters.block_px, self.parameters.block_stride_px
         down, across = ((length - block) // stride + 1 for length in (part.height, part.width))
         channels = 1 if level.ndim == 2 else 3
@@ -145,22 +149,14 @@ class OnnxScorer:
                     )
         return found
 
-    @property
-    def _gradient(self) -> "Gradient":
-        """This thread's."""
-        if not hasattr(self.local, "gradient"):
-            self.local.gradient = Gradient(self.parameters.gamma, self.parameters.signed)
-        held: Gradient = self.local.gradient
-        return held
-
 
 def find_graphs(parameters: PeopleParameters) -> Path:
     """The folder of the graphs. Raises InputError where they are not those of the manifest, or of another layout."""
     folder = SHIPPED if parameters.graphs == "shipped" else Path(parameters.graphs)
     wanted = {name: int(getattr(parameters, name)) for name in BAKED}
     settings = " ".join(f"--set people.{name}={value}" for name, value in wanted.items())
-    make = f"make such graphs with `dddas export --graph people --out FOLDER {settings}`"
-    make = f"{make}, and give people.graphs=FOLDER; or take --backend torch"
+    make = f"make such graphs with `dddas export --graph people --out FOLDER {settings}`, and give "
+    make += "people.graphs=FOLDER; or take --backend torch"
     try:
         held = manifest(folder)["graphs"]
     except InputError as error:
@@ -174,12 +170,6 @@ def find_graphs(parameters: PeopleParameters) -> Path:
     for name in GRAPHS:
         verified(folder, name)
     return folder
-
-
-def open_people_graph(folder: Path, name: str) -> Any:
-    """An ONNX Runtime session of a graph."""
-    # A memory pattern is a plan for every size of a level, which is no quicker and takes 9 MB.
-    return open_graph(folder, name, enable_mem_pattern=False)
 
 
 def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
@@ -227,7 +217,15 @@ class Gradient:
     def __init__(self, gamma: bool, signed: bool) -> None:
         """gamma: of square roots of the levels. signed: directions of a whole turn; false: folded into half of it."""
         self.gamma, self.signed = gamma, signed
-        self.scratch = Scratch()
+        self.held: dict[str, np.ndarray] = {}
+
+    def scratch(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+        """A contiguous array by its name: what it was given last, until it is asked for again."""
+        size = math.prod(shape)
+        held = self.held.get(name)
+        if held is None or held.size < size or held.dtype != dtype:
+            held = self.held[name] = np.empty(size, dtype)
+        return held[:size].reshape(shape)
 
     def __call__(self, planes: np.ndarray) -> np.ndarray:
         """(2, H, W) float32 of planes uint8 (C, H + 2, W + 2): magnitude, and magnitude x direction in radians.
@@ -269,24 +267,3 @@ class Gradient:
             half_turn = cv2.threshold(moment, math.pi, math.pi, cv2.THRESH_BINARY, dst=best_dx)[1]
             cv2.subtract(moment, half_turn, dst=moment)
         cv2.multiply(moment, magnitude, dst=moment)
-
-
-class Scratch:
-    """Arrays by name; each is what it was given last, until it is asked for again. One object a thread."""
-
-    def __init__(self) -> None:
-        self.held: dict[str, np.ndarray] = {}
-
-    def __call__(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-        """A contiguous array of any content."""
-        size = math.prod(shape)
-        held = self.held.get(name)
-        if held is None or held.size < size or held.dtype != dtype:
-            held = self.held[name] = np.empty(size, dtype)
-        return held[:size].reshape(shape)
-
-
-def split_evenly(length: int, most: int) -> list[tuple[int, int]]:
-    """(begin, end) of the fewest stretches, of about equal length, that make up the whole."""
-    count = -(-length // most)
-    return [(length * i // count, length * (i + 1) // count) for i in range(count)]

@@ -7,6 +7,7 @@ around what is expected, have the scores of a search everywhere.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from torchvision_dddas.types import Float, Part
 
 # To make a pixel of a level takes so much of the time that it takes to search one (5 ms and 140 ms for 1634 x 919).
 _RESIZED = 0.04
-_FEWEST_ALONG = 16
+_FEWEST_ALONG = 16  # windows in a row of a part; a row of fewer would be mostly border of what lies beside
+
+# Counts windows of a level: (first column, first row, last column, last row).
+_Span = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -77,31 +81,47 @@ def everywhere(size: tuple[int, int], parameters: PeopleParameters) -> list[Part
     ]
 
 
+def count_windows(part: Part, parameters: PeopleParameters) -> tuple[int, int]:
+    """How many windows a part holds, across and down."""
+    stride = parameters.window_stride_px
+    across = max((part.width - parameters.window_width_px) // stride + 1, 0)
+    return across, max((part.height - parameters.window_height_px) // stride + 1, 0)
+
+
+def cost(parts: Sequence[Part], parameters: PeopleParameters) -> int:
+    """How many windows the parts hold."""
+    return sum(math.prod(count_windows(part, parameters)) for part in parts)
+
+
+def pixels(parts: Sequence[Part]) -> float:
+    """What the parts cost to search: their pixels, and a share of each level's that any of them is on."""
+    made = sum(width * height for width, height in {part.level for part in parts})
+    return sum(part.width * part.height for part in parts) + _RESIZED * made
+
+
 def tiles(parts: Sequence[Part], most_px: float, parameters: PeopleParameters) -> list[Part]:
     """The parts, cut where they have more pixels than this, but into no less than some windows along each side."""
-    stride, cut = parameters.window_stride_px, []
+    stride, width, height = parameters.window_stride_px, parameters.window_width_px, parameters.window_height_px
+
+    def along(room_px: float, window_px: int, most: int) -> int:
+        """How many windows in a row fit."""
+        return min(max(int((room_px - window_px) // stride) + 1, _FEWEST_ALONG), most)
+
+    cut = []
     for part in parts:
-        across, down = _windows(part, parameters)
-        high = _along(most_px / part.width, parameters.window_height_px, down, stride)
-        wide = _along(
-            most_px / (parameters.window_height_px + (high - 1) * stride), parameters.window_width_px, across, stride
-        )
-        for top, bottom in _cut(down, high):
-            for left, right in _cut(across, wide):
-                x, y = part.x + left * stride, part.y + top * stride
-                width = (right - left - 1) * stride + parameters.window_width_px
-                height = (bottom - top - 1) * stride + parameters.window_height_px
-                cut.append(Part(part.level, x, y, width, height))
+        across, down = count_windows(part, parameters)
+        high = along(most_px / part.width, height, down)
+        wide = along(most_px / (height + (high - 1) * stride), width, across)
+        for top, bottom in split_evenly(down, high):
+            for left, right in split_evenly(across, wide):
+                size = (right - left - 1) * stride + width, (bottom - top - 1) * stride + height
+                cut.append(Part(part.level, part.x + left * stride, part.y + top * stride, *size))
     return cut
 
 
-def _along(room_px: float, window_px: int, all_of_them: int, stride: int) -> int:
-    """How many windows in a row fit, all of them at most; a row of fewer would be mostly border of what lies beside."""
-    return min(max(int((room_px - window_px) // stride) + 1, _FEWEST_ALONG), all_of_them)
-
-
-def _cut(length: int, most: int) -> list[tuple[int, int]]:
-    count = math.ceil(length / most)
+def split_evenly(length: int, most: int) -> list[tuple[int, int]]:
+    """(begin, end) of the fewest stretches, of about equal length, that make up the whole."""
+    count = -(-length // most)
     return [(length * i // count, length * (i + 1) // count) for i in range(count)]
 
 
@@ -121,65 +141,29 @@ def within(
     slack = parameters.scale_step**0.5
     least = np.where(np.isnan(heights_px[:, 0]), 0.0, heights_px[:, 0]) / slack
     largest = np.where(np.isnan(heights_px[:, 1]), regions_px[:, 3], heights_px[:, 1]) * slack
+    stride, pad = parameters.window_stride_px, _padding(parameters)
+    width, height = parameters.window_width_px, parameters.window_height_px
+
+    def sides(span: _Span) -> tuple[int, int]:
+        """Width and height in px that the windows of a span cover."""
+        return (span[2] - span[0]) * stride + width, (span[3] - span[1]) * stride + height
+
     parts: list[Part] = []
     for level in levels(size, parameters):
-        body = parameters.height_share * parameters.window_height_px * level.scale
+        body = parameters.height_share * height * level.scale
         wanted = regions_px[(least <= body) & (body <= largest)]
-        spans = [span for region in wanted if (span := _span(region, level, parameters)) is not None]
-        parts += [_part(span, level, parameters) for span in _merged(spans, parameters)]
+        spans = sorted({span for region in wanted if (span := _span(region, level, parameters)) is not None})
+        join = True
+        while join:  # as long as one around two costs no more than the two
+            join = False
+            for one, other in combinations(spans, 2):
+                both = min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
+                if math.prod(sides(both)) <= math.prod(sides(one)) + math.prod(sides(other)):
+                    spans = sorted({*(span for span in spans if span not in (one, other)), both})
+                    join = True
+                    break
+        parts += [Part(level.size, span[0] * stride - pad, span[1] * stride - pad, *sides(span)) for span in spans]
     return parts
-
-
-def windows(
-    parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters
-) -> tuple[np.ndarray, np.ndarray]:
-    """The windows that score the threshold or more, each once: x, y, width, height in the picture (N, 4), scores (N,).
-
-    maps: (ny, nx) scores of each part. With OpenCV's grouping the windows are rounded to whole pixels, as there.
-    """
-    scale_of = {level.size: level.scale for level in levels(size, parameters)}
-    width, height, stride = parameters.window_width_px, parameters.window_height_px, parameters.window_stride_px
-    boxes, scores, seen = [], [], []
-    for part, scored in zip(parts, maps, strict=True):
-        row, column = np.nonzero(scored >= parameters.threshold)
-        x, y = part.x + column * stride, part.y + row * stride
-        if parameters.suppression == "opencv":
-            scale = scale_of[part.level]
-            box = np.stack([x, y, np.full_like(x, width), np.full_like(y, height)], axis=1) * scale
-            box = np.rint(box)
-        else:  # the level's pixels are not exactly `scale` of the picture's, as its size was rounded
-            across, down = size[0] / part.level[0], size[1] / part.level[1]
-            box = np.stack([x * across, y * down, np.full(len(x), width * across), np.full(len(y), height * down)], 1)
-        boxes.append(box)
-        scores.append(scored[row, column].astype(np.float64))
-        seen.append(np.stack([np.full_like(x, part.level[0]), np.full_like(x, part.level[1]), x, y], axis=1))
-    if not boxes:
-        return np.zeros((0, 4)), np.zeros(0)
-    _, first = np.unique(np.concatenate(seen), axis=0, return_index=True)
-    first.sort()
-    return np.concatenate(boxes)[first].astype(np.float64), np.concatenate(scores)[first]
-
-
-def cost(parts: Sequence[Part], parameters: PeopleParameters) -> int:
-    """How many windows the parts hold."""
-    return sum(across * down for across, down in (_windows(part, parameters) for part in parts))
-
-
-def pixels(parts: Sequence[Part]) -> float:
-    """What the parts cost to search: their pixels, and a share of each level's that any of them is on."""
-    made = sum(width * height for width, height in {part.level for part in parts})
-    return sum(part.width * part.height for part in parts) + _RESIZED * made
-
-
-def _windows(part: Part, parameters: PeopleParameters) -> tuple[int, int]:
-    """How many windows a part holds, across and down."""
-    stride = parameters.window_stride_px
-    across = max((part.width - parameters.window_width_px) // stride + 1, 0)
-    return across, max((part.height - parameters.window_height_px) // stride + 1, 0)
-
-
-# Spans count windows of a level: (first column, first row, last column, last row).
-_Span = tuple[int, int, int, int]
 
 
 def _span(region: np.ndarray, level: Level, parameters: PeopleParameters) -> _Span | None:
@@ -196,43 +180,31 @@ def _span(region: np.ndarray, level: Level, parameters: PeopleParameters) -> _Sp
     end = np.ceil((high + pad) / stride).astype(int)
     if (end < 0).any() or (begin > last).any():
         return None
-    begin, end = np.maximum(begin, 0), np.minimum(end, last)
-    return int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
+    (left, top), (right, bottom) = np.maximum(begin, 0).tolist(), np.minimum(end, last).tolist()
+    return left, top, right, bottom
 
 
-def _area(span: _Span, parameters: PeopleParameters) -> int:
-    """Pixels that the windows of a span cover: what it costs."""
-    stride = parameters.window_stride_px
-    return ((span[2] - span[0]) * stride + parameters.window_width_px) * (
-        (span[3] - span[1]) * stride + parameters.window_height_px
-    )
+def windows(
+    parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters
+) -> tuple[np.ndarray, np.ndarray]:
+    """The windows that score the threshold or more, each once: x, y, width, height in the picture (N, 4), scores (N,).
 
-
-def _merged(spans: list[_Span], parameters: PeopleParameters) -> list[_Span]:
-    """Spans joined as long as one around two costs no more than the two."""
-    spans = sorted(set(spans))
-    joined = True
-    while joined:
-        joined = False
-        for i, one in enumerate(spans):
-            for j in range(i + 1, len(spans)):
-                other = spans[j]
-                both = min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
-                if _area(both, parameters) <= _area(one, parameters) + _area(other, parameters):
-                    spans = sorted({*spans[:i], *spans[i + 1 : j], *spans[j + 1 :], both})
-                    joined = True
-                    break
-            if joined:
-                break
-    return spans
-
-
-def _part(span: _Span, level: Level, parameters: PeopleParameters) -> Part:
-    stride, pad = parameters.window_stride_px, _padding(parameters)
-    return Part(
-        level.size,
-        span[0] * stride - pad,
-        span[1] * stride - pad,
-        (span[2] - span[0]) * stride + parameters.window_width_px,
-        (span[3] - span[1]) * stride + parameters.window_height_px,
-    )
+    maps: (ny, nx) scores of each part. With OpenCV's grouping the windows are rounded to whole pixels, as there.
+    """
+    scale_of = {level.size: level.scale for level in levels(size, parameters)}
+    stride, window = parameters.window_stride_px, np.array([parameters.window_width_px, parameters.window_height_px])
+    boxes, scores, seen = [np.zeros((0, 4))], [np.zeros(0)], [np.zeros((0, 4), int)]
+    for part, scored in zip(parts, maps, strict=True):
+        row, column = np.nonzero(scored >= parameters.threshold)
+        place = np.stack([part.x + column * stride, part.y + row * stride], axis=1)
+        box = np.concatenate([place, np.broadcast_to(window, place.shape)], axis=1)
+        if parameters.suppression == "opencv":
+            boxes.append(np.rint(box * scale_of[part.level]))
+        else:  # the level's pixels are not exactly `scale` of the picture's, as its size was rounded
+            across, down = size[0] / part.level[0], size[1] / part.level[1]
+            boxes.append(box * (across, down, across, down))
+        scores.append(scored[row, column].astype(np.float64))
+        seen.append(np.concatenate([np.broadcast_to(part.level, place.shape), place], axis=1))
+    _, first = np.unique(np.concatenate(seen), axis=0, return_index=True)
+    first.sort()
+    return np.concatenate(boxes)[first], np.concatenate(scores)[first]

@@ -47,16 +47,9 @@ class SearchPlan:
     adjustments: tuple[Adjustment, ...] = ()
 
 
-def around_blobs(box_px: Float[np.ndarray, "N 4"]) -> Regions:
-    """Around moving blobs: bodies from half to 2.5 times as high."""
-    box_px = np.asarray(box_px, float).reshape(-1, 4)
-    return grown(box_px, _BESIDE, _ABOVE, _BELOW), box_px[:, 3:] * _BLOB_HEIGHTS
-
-
-def grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: float) -> Float[np.ndarray, "N 4"]:
+def _grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: float) -> Float[np.ndarray, "N 4"]:
     """Boxes with margins, in their heights."""
-    more = np.array([-beside, -above, 2 * beside, above + below])
-    return box_px + box_px[:, 3:] * more
+    return box_px + box_px[:, 3:] * np.array([-beside, -above, 2 * beside, above + below])
 
 
 class ExpectedPeople:
@@ -85,12 +78,8 @@ class ExpectedPeople:
 
     def regions(self, frame: int) -> Regions:
         """Around them."""
-        box_px, parameters = self.box_px(frame), self.parameters
-        margin = parameters.region_margin
-        return grown(box_px, margin, margin, margin), box_px[:, 3:] * (
-            1 / parameters.region_scales,
-            parameters.region_scales,
-        )
+        box_px, scales = self.box_px(frame), self.parameters.region_scales
+        return _grown(box_px, *[self.parameters.region_margin] * 3), box_px[:, 3:] * (1 / scales, scales)
 
     def update(self, frame: int, people: People) -> int:
         """Correct by the people found; returns how many of those expected are among them."""
@@ -121,29 +110,18 @@ def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tupl
 
     SciPy would find the pairs that are nearest in all, and take 40 MB to be imported.
     """
-    if not len(expected_px) or not len(found_px):
-        return np.zeros(0, int), np.zeros(0, int)
     apart = expected_px[:, None, :2] + expected_px[:, None, 2:] / 2 - found_px[:, :2] - found_px[:, 2:] / 2
     height = expected_px[:, None, 3]
     far = np.linalg.norm(apart, axis=2) / height
     ratio = np.abs(np.log(found_px[:, 3] / height))
     away = np.where((far > _NEAR_HEIGHTS) | (ratio > np.log(scales) + 0.05), np.inf, far + ratio)
-    rows, columns = [], []
-    while np.isfinite(nearest := away.min()):
+    pairs = []
+    while np.isfinite(nearest := away.min(initial=np.inf)):
         row, column = np.argwhere(away == nearest)[0]
-        rows.append(row)
-        columns.append(column)
+        pairs.append((row, column))
         away[row], away[:, column] = np.inf, np.inf
-    return np.array(rows, int), np.array(columns, int)
-
-
-def _covered_share(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
-    """(N,) share of each box that the others cover, those that overlap counted twice."""
-    return shared_px(box_px[:, None], other_px).sum(axis=1) / box_px[:, 2:].prod(axis=1)
-
-
-def _both(some: Regions, others: Regions) -> Regions:
-    return np.concatenate([some[0], others[0]]), np.concatenate([some[1], others[1]])
+    rows, columns = np.array(pairs, int).reshape(-1, 2).T
+    return rows, columns
 
 
 class Search:
@@ -169,62 +147,6 @@ class Search:
     def retune(self, parameters: PeopleParameters) -> None:
         """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
         self.parameters = self.expected.parameters = parameters
-        self.bound = parameters.look_share < 1
-
-    def plan(self, frame: int, size: tuple[int, int]) -> SearchPlan:
-        """Where to search a frame of (width, height)."""
-        everywhere = pyramid.everywhere(size, self.parameters)
-        if not self.steered and self.blobs is None:
-            return SearchPlan(everywhere, None, 1.0)
-        all_windows = pyramid.cost(everywhere, self.parameters)
-        if self.steered and not self.bound:
-            if not self.plans or frame - self.expected.frame > self.parameters.rescan_frames:
-                return SearchPlan(everywhere, None, 1.0)
-            if self.lost:
-                return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
-        known, moving = self._regions(frame)
-        if self.steered and self.bound:
-            return self._bounded(frame, known, moving, everywhere, size)
-        region_px, heights_px = _both(known, moving)
-        parts = pyramid.within(region_px, heights_px, size, self.parameters)
-        around = pyramid.cost(parts, self.parameters) / all_windows
-        if not self.steered:
-            return SearchPlan(parts, region_px, around)
-        if around > _DEAR:
-            return self._whole(frame, everywhere, f"{len(region_px)} regions would take {around:.0%} of the windows")
-        due = self._due(everywhere, self.parameters.rescan_frames)
-        levels = {part.level for part in due}
-        parts = due + [part for part in parts if part.level not in levels]
-        share = pyramid.cost(parts, self.parameters) / all_windows
-        return SearchPlan(parts, region_px, share, self._report(frame, around))
-
-    def _bounded(
-        self, frame: int, known: Regions, moving: Regions, everywhere: list[Part], size: tuple[int, int]
-    ) -> SearchPlan:
-        """A look that costs `people.look_share` of one at all: what is due, around those expected, around movers."""
-        whole = pyramid.pixels(everywhere)
-        most = self.parameters.look_share * whole
-        tiles = pyramid.tiles(everywhere, most / 2, self.parameters)
-        # Half of what a look may take is for the rest of the picture.
-        parts = self._due(tiles, max(self.parameters.rescan_frames, math.ceil(pyramid.pixels(tiles) / (most / 2))))
-        around = 0.0
-        for regions in (known, moving):
-            wanted = pyramid.within(*regions, size, self.parameters)
-            around += pyramid.pixels(wanted)
-            parts += self._thinned(wanted, most - pyramid.pixels(parts))
-        region_px, _ = _both(known, moving)
-        share = pyramid.cost(parts, self.parameters) / pyramid.cost(everywhere, self.parameters)
-        return SearchPlan(parts, region_px, share, self._report(frame, min(around / whole, self.parameters.look_share)))
-
-    def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
-        """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.
-
-        A body scores at several levels that lie together.
-        """
-        levels = sorted({part.level for part in parts})
-        every = min(math.ceil(pyramid.pixels(parts) / max(most_px, 1)), len(levels))
-        due = set(levels[self.plans % every :: every]) if every else set()
-        return [part for part in parts if part.level in due]
 
     def update(self, frame: int, people: People, plan: SearchPlan) -> None:
         """Add what was found by a plan."""
@@ -236,22 +158,76 @@ class Search:
         self.lost = self.there if self.there > 1 and not again and plan.regions_px is not None else 0
         self.there = len(people)
 
-    def _due(self, parts: list[Part], rounds: int) -> list[Part]:
-        """Those whose turn it is: each comes once in so many looks, far from those before."""
-        step = min((k for k in range(1, rounds + 1) if math.gcd(k, rounds) == 1), key=lambda k: abs(k - _TURN * rounds))
-        return parts[self.plans * step % rounds :: rounds]
+    def plan(self, frame: int, size: tuple[int, int]) -> SearchPlan:
+        """Where to search a frame of (width, height)."""
+        parameters = self.parameters
+        everywhere = pyramid.everywhere(size, parameters)
+        is_bound = parameters.look_share < 1
+        if not self.steered and self.blobs is None:
+            return SearchPlan(everywhere, None, 1.0)
+        if self.steered and not is_bound:
+            if not self.plans or frame - self.expected.frame > parameters.rescan_frames:
+                return SearchPlan(everywhere, None, 1.0)
+            if self.lost:
+                return self._whole(frame, everywhere, f"none of {_persons(self.lost)} expected was found")
+        regions = self._regions(frame)
+        region_px, heights_px = (np.concatenate(parts) for parts in zip(*regions, strict=True))
+        all_windows = pyramid.cost(everywhere, parameters)
+        if self.steered and is_bound:
+            # A look that costs `people.look_share` of one at all: what is due, around those expected, around movers.
+            # Half of what it may take is for the rest of the picture.
+            whole = pyramid.pixels(everywhere)
+            most = parameters.look_share * whole
+            tiles = pyramid.tiles(everywhere, most / 2, parameters)
+            parts = self._due(tiles, max(parameters.rescan_frames, math.ceil(pyramid.pixels(tiles) / (most / 2))))
+            costs = 0.0
+            for each in regions:
+                wanted = pyramid.within(*each, size, parameters)
+                costs += pyramid.pixels(wanted)
+                parts += self._thinned(wanted, most - pyramid.pixels(parts))
+            around = min(costs / whole, parameters.look_share)
+        else:
+            parts = pyramid.within(region_px, heights_px, size, parameters)
+            around = pyramid.cost(parts, parameters) / all_windows
+            if not self.steered:
+                return SearchPlan(parts, region_px, around)
+            if around > _DEAR:
+                why = f"{len(region_px)} regions would take {around:.0%} of the windows"
+                return self._whole(frame, everywhere, why)
+            due = self._due(everywhere, parameters.rescan_frames)
+            levels = {part.level for part in due}
+            parts = due + [part for part in parts if part.level not in levels]
+        share = pyramid.cost(parts, parameters) / all_windows
+        return SearchPlan(parts, region_px, share, self._report(frame, around))
 
     def _regions(self, frame: int) -> tuple[Regions, Regions]:
-        """Around those expected, and around what moves."""
+        """Around those expected, and around what moves: bodies from half to 2.5 times as high as a blob."""
         known = moving = np.zeros((0, 4)), np.zeros((0, 2))
         if self.steered:
             known = self.expected.regions(frame)
         if self.blobs is not None:
-            box_px = self.blobs(frame)
+            box_px = np.asarray(self.blobs(frame), float).reshape(-1, 4)
             if self.steered:
-                box_px = box_px[_covered_share(box_px, self.expected.box_px(frame)) < _EXPLAINED]
-            moving = around_blobs(box_px)
+                # Of each blob the share that those expected cover, those that overlap counted twice.
+                covered = shared_px(box_px[:, None], self.expected.box_px(frame)).sum(axis=1)
+                box_px = box_px[covered / box_px[:, 2:].prod(axis=1) < _EXPLAINED]
+            moving = _grown(box_px, _BESIDE, _ABOVE, _BELOW), box_px[:, 3:] * _BLOB_HEIGHTS
         return known, moving
+
+    def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
+        """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.
+
+        A body scores at several levels that lie together.
+        """
+        levels = sorted({part.level for part in parts})
+        every = min(math.ceil(pyramid.pixels(parts) / max(most_px, 1)), len(levels))
+        due = set(levels[self.plans % every :: every]) if every else set()
+        return [part for part in parts if part.level in due]
+
+    def _due(self, parts: list[Part], rounds: int) -> list[Part]:
+        """Those whose turn it is: each comes once in so many looks, far from those before."""
+        step = min((k for k in range(1, rounds + 1) if math.gcd(k, rounds) == 1), key=lambda k: abs(k - _TURN * rounds))
+        return parts[self.plans * step % rounds :: rounds]
 
     def _whole(self, frame: int, everywhere: list[Part], why: str) -> SearchPlan:
         """A look at all, which the record explains."""

@@ -58,9 +58,8 @@ def body_sides(
 
 def probability(margin: Float[np.ndarray, " N"], parameters: PeopleParameters) -> Float[np.ndarray, " N"]:
     """Probability that a window of this score shows a person (Platt scaling)."""
-    return 1 / (
-        1 + np.exp(-np.clip(log_odds(margin, parameters.probability_slope, parameters.probability_even), -50, 50))
-    )
+    odds = log_odds(margin, parameters.probability_slope, parameters.probability_even)
+    return 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
 
 
 def log_odds(margin: Column, slope: Share, even: Share) -> Column:
@@ -175,7 +174,7 @@ def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
         size = np.minimum(box[here, None, 2:], box[None, others, 2:])
         reach = distance * (size[..., 0] + size[..., 1]) * 0.5
         near = np.ones(reach.shape, bool)
-        for edge in (low[:, 0], low[:, 1], high[:, 0], high[:, 1]):
+        for edge in (*low.T, *high.T):
             near &= np.abs(edge[here, None] - edge[None, others]) <= reach
         i, j = np.nonzero(near)
         one.append(order[i + start])
@@ -184,6 +183,4 @@ def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
     table = coo_array((np.ones(len(i), bool), (i, j)), shape=(len(box), len(box)))
     label = connected_components(table, directed=False)[1]
     _, first, of_label = np.unique(label, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[of_label]
+    return np.argsort(np.argsort(first))[of_label]

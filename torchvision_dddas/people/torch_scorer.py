@@ -3,6 +3,8 @@
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import hog
 from torchvision_dddas.functional.filters import reflect_index
 from torchvision_dddas.functional.warp import resize
+from torchvision_dddas.people.pyramid import count_windows
 from torchvision_dddas.types import LinearSvm, Part
 
 # So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
@@ -43,23 +46,27 @@ class TorchScorer:
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
         """The score map of each part of each picture. Pictures of one size that want the same part share a batch."""
-        maps = [[np.zeros(self._windows(part)[::-1], np.float32) for part in wanted] for wanted in parts]
+        maps = [
+            [np.zeros(count_windows(part, self.parameters)[::-1], np.float32) for part in wanted] for wanted in parts
+        ]
         places: dict[tuple[tuple[int, ...], Part], list[tuple[int, int]]] = defaultdict(list)
         for picture, wanted in enumerate(parts):
             for index, part in enumerate(wanted):
-                if min(self._windows(part)):
+                if maps[picture][index].size:
                     places[images[picture].shape, part].append((picture, index))
-        # A picture goes to the device once, for all its parts.
-        held: dict[int, Tensor] = {}
+
+        @cache  # a picture goes to the device once, for all its parts
+        def levels(picture: int) -> Tensor:
+            # A copy: torch warns of memory that must not be written to.
+            channels = torch.tensor(np.ascontiguousarray(np.atleast_3d(images[picture])))
+            return channels.to(self.device).permute(2, 0, 1).float().contiguous()
+
         for (_, part), where in places.items():
             some = max(1, _PIXELS.get(self.device.type, 1 << 22) // (part.width * part.height))
             for begin in range(0, len(where), some):
                 chunk = where[begin : begin + some]
-                for picture, _ in chunk:
-                    if picture not in held:
-                        held[picture] = self._tensor(images[picture])
                 with torch.inference_mode():
-                    found = self.score(torch.stack([held[picture] for picture, _ in chunk]), part)
+                    found = self.score(torch.stack([levels(picture) for picture, _ in chunk]), part)
                 for (picture, index), scored in zip(chunk, found.cpu().numpy(), strict=True):
                     maps[picture][index] = scored
         return maps
@@ -67,23 +74,27 @@ class TorchScorer:
     def score(self, levels: Tensor, part: Part) -> Tensor:
         """(B, ny, nx) scores of one part of pictures of one size, with gradients to their levels and to the weights.
 
-        levels: (B, C, H, W) floats 0 .. 255, BGR.
+        levels: (B, C, H, W) floats 0 .. 255, BGR. Blocks are computed at the common divisor of the strides of windows
+        and blocks, and windows that share blocks are scored together: one phase of the block stride after the other.
         """
         width, height = part.level
         rows = reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
         columns = reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
         bordered = resize(levels, (height, width), rows, columns)
-        return strided_scores(bordered, self.weights, self.bias, self.layout, self.parameters.window_stride_px)
-
-    def _windows(self, part: Part) -> tuple[int, int]:
-        """Windows of a part, (across, down)."""
-        stride, (width, height) = self.parameters.window_stride_px, self.layout.window
-        return max(0, (part.width - width) // stride + 1), max(0, (part.height - height) // stride + 1)
-
-    def _tensor(self, image: np.ndarray) -> Tensor:
-        # A copy: torch warns of memory that must not be written to.
-        channels = torch.tensor(np.ascontiguousarray(np.atleast_3d(image)))
-        return channels.to(self.device).permute(2, 0, 1).float().contiguous()
+        stride = self.parameters.window_stride_px
+        step = math.gcd(stride, self.layout.stride)
+        hop, skip = self.layout.stride // step, stride // step
+        found = hog.blocks(bordered, replace(self.layout, stride=step))
+        if hop == 1:
+            return hog.scores(found, self.weights, self.bias)[:, ::skip, ::skip]
+        window_width, window_height = self.layout.window
+        ny, nx = (part.height - window_height) // step + 1, (part.width - window_width) // step + 1
+        dense = bordered.new_empty(len(bordered), ny, nx)
+        for down in range(min(hop, ny)):
+            for across in range(min(hop, nx)):
+                phase = hog.scores(found[..., down::hop, across::hop], self.weights, self.bias)
+                dense[:, down::hop, across::hop] = phase
+        return dense[:, ::skip, ::skip]
 
 
 def layout(parameters: PeopleParameters) -> hog.Layout:
@@ -98,27 +109,3 @@ def layout(parameters: PeopleParameters) -> hog.Layout:
         parameters.clip,
         parameters.gamma,
     )
-
-
-def strided_scores(bordered: Tensor, weights: Tensor, bias: Tensor, layout: hog.Layout, stride: int) -> Tensor:
-    """(B, ny, nx) scores of windows every `stride` pixels, which need not be a multiple of the block stride.
-
-    bordered: as in `hog.gradient`. Blocks are then computed at the common divisor of both strides, and the windows that
-    share blocks are scored together: one phase of the block stride after the other.
-    """
-    step = math.gcd(stride, layout.stride)
-    hop, skip = layout.stride // step, stride // step
-    finer = hog.Layout(
-        layout.window, layout.cell, layout.block, step, layout.bins, layout.signed, layout.clip, layout.gamma
-    )
-    found = hog.blocks(bordered, finer)
-    if hop == 1:
-        return hog.scores(found, weights, bias)[:, ::skip, ::skip]
-    height, width = bordered.shape[-2] - 2, bordered.shape[-1] - 2
-    ny, nx = ((have - need) // step + 1 for have, need in zip((height, width), layout.window[::-1], strict=True))
-    dense = bordered.new_empty(len(bordered), ny, nx)
-    for down in range(min(hop, ny)):
-        for across in range(min(hop, nx)):
-            phase = hog.scores(found[..., down::hop, across::hop], weights, bias)
-            dense[:, down::hop, across::hop] = phase
-    return dense[:, ::skip, ::skip]
