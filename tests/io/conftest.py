@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Adjustment, Detections, Frame, Scene
 
 
@@ -34,3 +36,30 @@ def scene():
 @pytest.fixture
 def adjustment():
     return Adjustment(2, "interval_frames", 1.0, 2.0, "background flow 0.4 px a frame")
+
+
+@pytest.fixture
+def fly(tmp_path):
+    """Telemetry from the content of a file."""
+
+    def read(content, name="telemetry.csv", **options):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_telemetry(path, **options)
+
+    return read
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """The one line in which a reader refuses a file."""
+
+    def words(read, content, name="table.csv"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(InputError) as caught:
+            read(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+        return str(caught.value)
+
+    return words

@@ -12,10 +12,8 @@ KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
 
 def spread(value: float, low: float, high: float, size: int, signed: bool = False) -> bytes:
     """A number over a range as an integer of so many bytes; signed ones over +-high, as ST 0601 has them."""
-    bits = 8 * size
-    number = (
-        round(value / high * (2 ** (bits - 1) - 1)) if signed else round((value - low) / (high - low) * (2**bits - 1))
-    )
+    most = 2 ** (8 * size - signed) - 1
+    number = round(value / high * most) if signed else round((value - low) / (high - low) * most)
     return number.to_bytes(size, "big", signed=signed)
 
 
@@ -29,26 +27,22 @@ def local_set(tags: dict[int, bytes], long_length: bool = False) -> bytes:
     return packet + total.to_bytes(2, "big")
 
 
-def _stamp(pts: int) -> bytes:
-    parts = (pts >> 30 & 7, pts >> 22 & 0xFF, pts >> 15 & 0x7F, pts >> 7 & 0xFF, pts & 0x7F)
-    return bytes([0x21 | parts[0] << 1, parts[1], parts[2] << 1 | 1, parts[3], parts[4] << 1 | 1])
-
-
 def _pes(stream: int, payload: bytes, pts: int | None) -> bytes:
-    head = bytes([0x80, 0x80, 5]) + _stamp(pts) if pts is not None else bytes([0x80, 0x00, 0])
+    head = bytes([0x80, 0x00, 0])
+    if pts is not None:
+        a, b, c, d, e = pts >> 30 & 7, pts >> 22 & 0xFF, pts >> 15 & 0x7F, pts >> 7 & 0xFF, pts & 0x7F
+        head = bytes([0x80, 0x80, 5, 0x21 | a << 1, b, c << 1 | 1, d, e << 1 | 1])
     return b"\0\0\1" + bytes([stream]) + (len(head) + len(payload)).to_bytes(2, "big") + head + payload
 
 
 def _packets(pid: int, content: bytes) -> Iterable[bytes]:
-    first = True
-    while content or first:
-        part, content = content[:184], content[184:]
+    for place in range(0, len(content), 184):
+        part = content[place : place + 184]
         filling = 184 - len(part)
-        head = bytes([0x47, (0x40 if first else 0) | pid >> 8, pid & 0xFF, 0x30 if filling else 0x10])
+        head = bytes([0x47, (0x40 if place == 0 else 0) | pid >> 8, pid & 0xFF, 0x30 if filling else 0x10])
         if filling:
             head += bytes([filling - 1]) + (b"\0" + b"\xff" * (filling - 2) if filling > 1 else b"")
         yield head + part
-        first = False
 
 
 def transport_stream(
@@ -84,17 +78,9 @@ def tlog(messages: Iterable[tuple[float, str, dict]], system: int = 1, version: 
 
 
 def global_position(time_boot_ms: int, lon: float, lat: float, above_m: float = 50.0, v_m_s: float = 5.0) -> dict:
-    return {
-        "time_boot_ms": time_boot_ms,
-        "lat": round(lat * 1e7),
-        "lon": round(lon * 1e7),
-        "alt": round((above_m + 100) * 1000),
-        "relative_alt": round(above_m * 1000),
-        "vx": round(v_m_s * 100),
-        "vy": 0,
-        "vz": 0,
-        "hdg": 9000,
-    }
+    heights = {"alt": round((above_m + 100) * 1000), "relative_alt": round(above_m * 1000)}
+    place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7)}
+    return {"time_boot_ms": time_boot_ms, **place, **heights, "vx": round(v_m_s * 100), "vy": 0, "vz": 0, "hdg": 9000}
 
 
 # -- PX4 ---------------------------------------------------------------------------------------------------------------
@@ -116,9 +102,8 @@ def ulog(topics: dict[str, tuple[Sequence[str], Sequence[Sequence[float]]]]) -> 
     for number, (fields, rows) in enumerate(topics.values()):
         pattern = "<HQ"
         for field in fields:
-            kind = field.split()[0]
-            count = int(kind[kind.index("[") + 1 : -1]) if "[" in kind else 1
-            pattern += f"{count}{_LETTERS[kind.split('[')[0]]}"
+            kind, _, count = field.split()[0].rstrip("]").partition("[")
+            pattern += f"{count or 1}{_LETTERS[kind]}"
         for row in rows:
             content += message(b"D", struct.pack(pattern, number, *row))
     return content

@@ -1,13 +1,11 @@
 """MISB ST 0601 in transport streams: packets, times, and where a camera looks that turns in a vehicle that turns."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.io.flights import local_set, spread, transport_stream
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.attitude import angles, axes, axes_of_quaternion
@@ -31,12 +29,6 @@ def attitude(heading: float, pitch: float, roll: float, azimuth: float, elevatio
 def packet(i: int, **further: bytes) -> bytes:
     more = {int(tag[1:]): value for tag, value in further.items()}
     return local_set({2: (START_US + i * 40_000).to_bytes(8, "big"), **PLACE, **more})
-
-
-def written(folder: Path, content: bytes, name: str = "video.ts") -> Path:
-    path = folder / name
-    path.write_bytes(content)
-    return path
 
 
 def test_values_are_those_of_the_examples_in_the_standard() -> None:
@@ -73,33 +65,33 @@ def test_packets_behind_a_damaged_one_are_still_found() -> None:
 
 
 @pytest.mark.parametrize(("kind", "before"), [(0x06, b""), (0x15, b""), (0x06, b"time")])
-def test_times_are_those_of_the_stream_since_the_picture_shown_first(tmp_path: Path, kind: int, before: bytes) -> None:
+def test_times_are_those_of_the_stream_since_the_picture_shown_first(fly, kind: int, before: bytes) -> None:
     first = 2**33 - 90_000  # the stamps wrap within the clip
     video = [(first + 3600 * shown) % 2**33 for shown in (2, 0, 1, 5, 3, 4, *range(6, 50))]
     metadata = [((first + 3600 * i + 900) % 2**33, packet(i)) for i in range(50)]
-    found = read_telemetry(written(tmp_path, transport_stream(video, metadata, kind, before)), clock_offset_s=0.5)
+    found = fly(transport_stream(video, metadata, kind, before), "a.ts", clock_offset_s=0.5)
     np.testing.assert_allclose(found.time_s, 0.5 + 0.01 + 0.04 * np.arange(50), atol=1e-9)
     assert found.start_utc_s == pytest.approx(START_US / 1e6 - 0.01 - 0.5)
     np.testing.assert_allclose(found.place, [[-86.6891, 34.7211]] * 50, atol=1e-7)
     np.testing.assert_allclose(found.above_sea_m, 3048, atol=0.2)
 
 
-def test_where_the_stream_tells_no_times_the_packets_own_stamps_do(tmp_path: Path) -> None:
+def test_where_the_stream_tells_no_times_the_packets_own_stamps_do(fly) -> None:
     video = [90_000 + 3600 * i for i in range(20)]
-    found = read_telemetry(written(tmp_path, transport_stream(video, [(None, packet(i)) for i in range(20)])))
+    found = fly(transport_stream(video, [(None, packet(i)) for i in range(20)]), "a.ts")
     np.testing.assert_allclose(found.time_s, 0.04 * np.arange(20), atol=1e-6)
-    alone = read_telemetry(written(tmp_path, b"".join(packet(i) for i in range(20)), "flight.klv"))
+    alone = fly(b"".join(packet(i) for i in range(20)), "a.klv")
     np.testing.assert_allclose(alone.time_s, 0.04 * np.arange(20), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_camera_looks_where_mount_and_vehicle_together_turn_it(tmp_path: Path, seed: int) -> None:
+def test_the_camera_looks_where_mount_and_vehicle_together_turn_it(fly, seed: int) -> None:
     rng = np.random.default_rng(seed)
     platform = rng.uniform([0, -19, -49], [360, 19, 49])
     sensor = rng.uniform([0, -80, 0], [360, 10, 360])
     tags = {f"t{tag}": value for tag, value in attitude(*platform, *sensor).items()}
     content = transport_stream([0, 3600], [(3600 * i, packet(i, **tags)) for i in range(2)])
-    found = read_telemetry(written(tmp_path, content))
+    found = fly(content, "a.ts")
 
     def about(axis: int, degrees: float) -> np.ndarray:
         turn = np.eye(3)
@@ -129,46 +121,46 @@ def test_angles_and_axes_are_each_others_inverse_and_straight_down_the_upper_edg
     assert np.isnan(axes_of_quaternion(np.zeros((1, 4)))).any()
 
 
-def test_the_altitude_is_that_above_the_ground_in_the_picture_or_as_told(tmp_path: Path) -> None:
+def test_the_altitude_is_that_above_the_ground_in_the_picture_or_as_told(fly) -> None:
     ground = {"t25": spread(201, -900, 19000, 2)}
     content = transport_stream([0], [(3600 * i, packet(i, **ground)) for i in range(3)])
-    found = read_telemetry(written(tmp_path, content))
+    found = fly(content, "a.ts")
     np.testing.assert_allclose(found.altitude_m, 3048 - 201, atol=0.4)
     assert any("picture's middle" in note for note in found.notes)
     told = ground | {"t113": ((2150 + 900) * 2**7).to_bytes(3, "big")}
-    found = read_telemetry(written(tmp_path, transport_stream([0], [(3600 * i, packet(i, **told)) for i in range(3)])))
+    found = fly(transport_stream([0], [(3600 * i, packet(i, **told)) for i in range(3)]), "a.ts")
     np.testing.assert_allclose(found.altitude_m, 2150, atol=0.01)
 
 
-def test_what_is_told_in_some_packets_alone_goes_on_between_them(tmp_path: Path) -> None:
+def test_what_is_told_in_some_packets_alone_goes_on_between_them(fly) -> None:
     view = {"t16": spread(13, 0, 180, 2)}
     metadata = [(3600 * i, packet(i, **(view if i % 10 == 0 else {}))) for i in range(41)]
-    found = read_telemetry(written(tmp_path, transport_stream([0], metadata)))
+    found = fly(transport_stream([0], metadata), "a.ts")
     flight = found.at(0.7)
     assert flight is not None and math.degrees(flight.hfov_rad) == pytest.approx(13, abs=0.01)
 
 
-def test_a_stream_that_is_cut_is_read_as_far_as_it_is_whole_and_says_so(tmp_path: Path) -> None:
-    content = transport_stream([3600 * i for i in range(30)], [(3600 * i, packet(i)) for i in range(30)])
-    found = read_telemetry(written(tmp_path, content[: len(content) // 2 + 77]))
-    assert 10 < len(found) < 20
-    assert any(f"at byte {len(content) // 2 + 77}" in note for note in found.notes)
+@pytest.mark.parametrize(
+    ("damage", "least", "words"),
+    [(lambda c: c[: len(c) // 2 + 77], 11, "cut off"), (lambda c: c[:9000] + b"rubbish" + c[9000:], 28, "out of step")],
+)
+def test_a_damaged_stream_is_read_around_the_damage(fly, damage, least, words):
+    flown = fly(
+        damage(transport_stream([3600 * i for i in range(30)], [(3600 * i, packet(i)) for i in range(30)])), "a.ts"
+    )
+    assert least <= len(flown) <= 30 and any(words in note for note in flown.notes)
 
 
-def test_a_stream_out_of_step_is_read_around_the_damage(tmp_path: Path) -> None:
-    content = transport_stream([3600 * i for i in range(30)], [(3600 * i, packet(i)) for i in range(30)])
-    found = read_telemetry(written(tmp_path, content[:9000] + b"rubbish" + content[9000:]))
-    assert len(found) >= 28 and any("out of step" in note for note in found.notes)
-
-
-def test_a_stream_without_metadata_or_with_none_whole_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="carries no KLV metadata; its streams are of the types 0x1b, 0x03"):
-        read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, b"sound")] * 9, kind=0x03)))
-    with pytest.raises(InputError, match="no MISB ST 0601 packet"):
-        read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, b"other keys")] * 9)))
-    wrong = packet(0)[:-1] + b"\0"
-    with pytest.raises(InputError, match="none of 9 MISB ST 0601 packets is whole"):
-        read_telemetry(written(tmp_path, transport_stream([0, 3600], [(0, wrong)] * 9)))
+@pytest.mark.parametrize(
+    ("payload", "kind", "words"),
+    [
+        (b"sound", 0x03, "carries no KLV metadata; its streams are of the types 0x1b, 0x03"),
+        (b"other keys", 0x06, "no MISB ST 0601 packet"),
+        (packet(0)[:-1] + b"\0", 0x06, "none of 9 MISB ST 0601 packets is whole"),
+    ],
+)
+def test_a_stream_without_whole_metadata_is_refused(refused, payload, kind, words):
+    assert words in refused(read_telemetry, transport_stream([0, 3600], [(0, payload)] * 9, kind), "a.ts")
 
 
 def test_a_camera_is_turned_as_the_projection_has_it_in_other_axes_of_the_same_world():
