@@ -148,15 +148,15 @@ def test_a_single_damaged_time_does_not_spoil_a_mavlink_log(fly):
 
 # -- PX4 ---------------------------------------------------------------------------------------------------------------
 
-GLOBAL = (("double lat", "double lon", "float alt"), [(i * 100_000, 63.4 + i * 1e-6, 10.4, 60 + i) for i in range(50)])
-LOCAL = (
+GLOBAL: tuple = (("double lat", "double lon", "float alt"), [(i * 100_000, 63.4 + i * 1e-6, 10.4, 60 + i) for i in range(50)])
+LOCAL: tuple = (
     (*(f"float {name}" for name in ("x", "y", "z", "vx", "vy")), "double ref_lat", "double ref_lon", "float ref_alt"),
     [(i * 50_000, 10.0, 20.0, -30 - i, 3, 4, 63.4, 10.4, 60) for i in range(100)],
 )
 
 
 def test_the_places_heights_and_speeds_of_a_px4_log(fly):
-    topics = {
+    topics: dict = {
         "vehicle_global_position": GLOBAL,
         "vehicle_local_position": LOCAL,
         "vehicle_attitude": (("float[4] q",), [(i * 5000 + 1000, *quaternion(80, 5, -5)) for i in range(900)]),
