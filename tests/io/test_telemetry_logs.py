@@ -148,7 +148,10 @@ def test_a_single_damaged_time_does_not_spoil_a_mavlink_log(fly):
 
 # -- PX4 ---------------------------------------------------------------------------------------------------------------
 
-GLOBAL: tuple = (("double lat", "double lon", "float alt"), [(i * 100_000, 63.4 + i * 1e-6, 10.4, 60 + i) for i in range(50)])
+GLOBAL: tuple = (
+    ("double lat", "double lon", "float alt"),
+    [(i * 100_000, 63.4 + i * 1e-6, 10.4, 60 + i) for i in range(50)],
+)
 LOCAL: tuple = (
     (*(f"float {name}" for name in ("x", "y", "z", "vx", "vy")), "double ref_lat", "double ref_lon", "float ref_alt"),
     [(i * 50_000, 10.0, 20.0, -30 - i, 3, 4, 63.4, 10.4, 60) for i in range(100)],
