@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -41,30 +41,26 @@ def intervals(
 ) -> dict[str, Interval | None]:
     """An interval for each measure; None where there are fewer than FEWEST blocks or too few samples gave a figure.
 
-    Percentiles of the resampled figures, widened for few blocks as a t distribution is against the normal one. Source:
-    Hesterberg, 2015, "expanded percentile interval".
+    Source: Hesterberg, 2015, "expanded percentile interval".
     """
     whole = statistic(np.ones(sum(stratum.units for stratum in strata)))
     if parts(strata) < FEWEST:
         return dict.fromkeys(whole)
-    drawn = samples(statistic, strata, seed, resamples)
+    drawn = _by_name(statistic(weight) for weight in weights(strata, seed, resamples))
     return {
-        name: percentiles(values, parts(strata)) if math.isfinite(whole[name]) else None
-        for name, values in drawn.items()
+        name: percentiles(drawn[name], parts(strata)) if math.isfinite(value) else None for name, value in whole.items()
     }
+
+
+def _by_name(samples: Iterable[Mapping[str, float]]) -> dict[str, np.ndarray]:
+    """(R,) each measure in each sample."""
+    found = list(samples)
+    return {name: np.array([sample[name] for sample in found]) for name in found[0]}
 
 
 def parts(strata: Sequence[Stratum]) -> float:
     """How many blocks there are, what may be taken as independent."""
     return sum(stratum.units / stratum.block for stratum in strata)
-
-
-def samples(
-    statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES
-) -> dict[str, np.ndarray]:
-    """(R,) each measure in each sample."""
-    found = [statistic(weight) for weight in weights(strata, seed, resamples)]
-    return {name: np.array([one[name] for one in found]) for name in found[0]}
 
 
 def weights(strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES) -> Iterator[np.ndarray]:
@@ -82,19 +78,15 @@ def weights(strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES) ->
         yield np.concatenate(drawn).astype(float)
 
 
-def percentiles(values: np.ndarray, count: float, level: float = LEVEL) -> Interval | None:
-    """The interval that samples of so many independent blocks tell; None if a tenth of them are no number."""
+def percentiles(values: np.ndarray, count: float) -> Interval | None:
+    """The interval by samples of so many independent blocks; None if a tenth of them are no number."""
     known = values[np.isfinite(values)]
     if len(known) < 0.9 * len(values) or not len(known):
         return None
-    tail = expanded(count, level)
+    # Expanded: widened for few blocks as a t distribution is against the normal one.
+    tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - LEVEL) / 2)))
     low, high = np.quantile(known, [tail, 1 - tail])
     return Interval(float(low), float(high))
-
-
-def expanded(count: float, level: float = LEVEL) -> float:
-    """The share of samples beyond either end, for so many independent blocks."""
-    return float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - level) / 2)))
 
 
 def block_length(series: np.ndarray) -> int:
@@ -136,7 +128,7 @@ def _asked(column: np.ndarray) -> float:
 
 
 def seed_of(*parts: str | np.ndarray) -> int:
-    """A seed that is told by the content alone, so that the same counts give the same interval wherever they stand."""
+    """A seed by the content alone, so that the same counts give the same interval wherever they stand."""
     digest = hashlib.sha256()
     for part in parts:
         content = part.encode() if isinstance(part, str) else np.ascontiguousarray(part, float).tobytes()
@@ -174,48 +166,45 @@ def effects(
     units = sum(stratum.units for stratum in strata)
     ones, none = np.ones(units), np.zeros(units)
 
-    def apart(first: np.ndarray, second: np.ndarray) -> dict[str, float]:
-        before, after = statistic(first), statistic(second)
+    def difference(weight: np.ndarray, other: np.ndarray) -> dict[str, float]:
+        before, after = (statistic(np.concatenate(pair)) for pair in ((weight, other), (other, weight)))
         return {name: after[name] - before[name] for name in before}
 
-    whole = apart(np.concatenate([ones, none]), np.concatenate([none, ones]))
-    drawn: dict[str, list[float]] = {name: [] for name in whole}
+    whole, drawn = difference(ones, none), None
     if parts(strata) >= FEWEST:
-        for weight in weights(strata, seed, resamples):
-            one = apart(np.concatenate([weight, none]), np.concatenate([none, weight]))
-            for name, value in one.items():
-                drawn[name].append(value)
-    exchanged: dict[str, list[float]] = {name: [] for name in whole}
-    for swap in exchanges(strata, seed, most):
-        one = apart(np.concatenate([1 - swap, swap]), np.concatenate([swap, 1 - swap]))
-        for name, value in one.items():
-            exchanged[name].append(value)
-    every = _all(strata, most)
+        drawn = _by_name(difference(weight, none) for weight in weights(strata, seed, resamples))
+    # Blocks, none much shorter than the others: every way to exchange their two results, or random ones of many.
+    sizes: list[int] = []
+    for stratum in strata:
+        count = max(1, stratum.units // stratum.block)
+        sizes += [len(part) for part in np.array_split(np.arange(stratum.units), count)]
+    every = 2 ** min(len(sizes), 60) <= most
+    rng = np.random.Generator(np.random.PCG64(seed))
+    sides: Iterable[Sequence[int]] = (
+        product((0, 1), repeat=len(sizes)) if every else (rng.integers(0, 2, len(sizes)).tolist() for _ in range(most))
+    )
+    swaps = (np.repeat(np.array(side, float), sizes) for side in sides)
+    exchanged = _by_name(difference(1 - swap, swap) for swap in swaps)
     # Exchanging everything only turns the sign of the difference.
-    least = 2 ** (1 - _blocks(strata)) if every else 1 / (most + 1)
+    least = 2 ** (1 - len(sizes)) if every else 1 / (most + 1)
     return {
         name: Effect(
             value,
-            percentiles(np.array(drawn[name]), parts(strata)) if drawn[name] else None,
-            _p(value, np.array(exchanged[name]), every),
+            None if drawn is None else percentiles(drawn[name], parts(strata)),
+            _p(value, exchanged[name], every),
             least,
         )
         for name, value in whole.items()
     }
 
 
-def exchanges(strata: Sequence[Stratum], seed: int, most: int = EXCHANGES) -> Iterator[np.ndarray]:
-    """(U,) 1.0 for units whose two results are exchanged, block by block: every way, or random ones of many."""
-    count = _blocks(strata)
-    rng = np.random.Generator(np.random.PCG64(seed))
-    sides: Iterator[Sequence[int]] = (
-        product((0, 1), repeat=count)
-        if _all(strata, most)
-        else (rng.integers(0, 2, count).tolist() for _ in range(most))
-    )
-    sizes = [size for stratum in strata for size in _sizes(stratum)]
-    for side in sides:
-        yield np.repeat(np.array(side, float), sizes)
+def _p(value: float, exchanged: np.ndarray, every: bool) -> float:
+    known = exchanged[np.isfinite(exchanged)]
+    if not math.isfinite(value) or len(known) < 0.9 * len(exchanged) or not len(known):
+        return math.nan
+    as_large = int((np.abs(known) >= abs(value) * (1 - _ROUNDING) - _ROUNDING * 1e-3).sum())
+    # What was seen is one of the ways itself; random ones may have missed it.
+    return as_large / len(known) if every else (as_large + 1) / (len(known) + 1)
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
@@ -229,26 +218,3 @@ def holm(p: Mapping[str, float]) -> dict[str, float]:
         least = max(least, min(1.0, (len(known) - rank) * value))
         adjusted[name] = least
     return adjusted
-
-
-def _all(strata: Sequence[Stratum], most: int) -> bool:
-    return 2 ** min(_blocks(strata), 60) <= most
-
-
-def _blocks(strata: Sequence[Stratum]) -> int:
-    return sum(len(_sizes(stratum)) for stratum in strata)
-
-
-def _sizes(stratum: Stratum) -> list[int]:
-    """Units of each block, none much shorter than the others."""
-    count = max(1, stratum.units // stratum.block)
-    return [len(part) for part in np.array_split(np.arange(stratum.units), count)]
-
-
-def _p(value: float, exchanged: np.ndarray, every: bool) -> float:
-    known = exchanged[np.isfinite(exchanged)]
-    if not math.isfinite(value) or len(known) < 0.9 * len(exchanged) or not len(known):
-        return math.nan
-    as_large = int((np.abs(known) >= abs(value) * (1 - _ROUNDING) - _ROUNDING * 1e-3).sum())
-    # What was seen is one of the ways itself; random ones may have missed it.
-    return as_large / len(known) if every else (as_large + 1) / (len(known) + 1)

@@ -1,5 +1,6 @@
 """Measures of boxes: precision, recall and F1; average precision and miss rate of ranked detections."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -157,15 +158,30 @@ class Ranking:
         return Curve(self.score, right, np.cumsum(of_each)[self.ends] - right)
 
     def measures(self, weight: np.ndarray | None = None) -> dict[str, float]:
-        """AP, log-average miss rate, and the miss rate at 0.1 and at 1 false positives an image."""
+        """AP, log-average miss rate, and the miss rate at 0.1 and at 1 false positives an image.
+
+        AP: the area under the precision-recall curve, in which the precision at a recall is the best one at that recall
+        or above; 0 if nothing right is found. Miss rate: the share of true boxes missed with at most so many false
+        positives; its geometric mean is over RATES. NaN without a true box. Source: PASCAL VOC from 2010 on; Dollár et
+        al., 2012.
+        """
         once = np.ones(len(self.true)) if weight is None else weight
         true, images = float(once @ self.true), float(once @ self.images)
         curve = self.curve(weight)
+        area = math.nan
+        if true:
+            precision, recall = precision_recall(curve, true)
+            best = np.maximum.accumulate(np.nan_to_num(precision)[::-1])[::-1]
+            area = float(np.diff(recall, prepend=0.0) @ best)
+        misses = np.full(len(RATES) + 2, np.nan)
+        if true and images:
+            found = [curve.right[curve.false <= rate * images].max(initial=0.0) for rate in (*RATES, 0.1, 1.0)]
+            misses = 1.0 - np.array(found) / true
         return {
-            "ap": average_precision(curve, true),
-            "log_average_miss_rate": log_average_miss_rate(curve, true, images),
-            "miss_rate_at_0.1": miss_rate(curve, true, images, 0.1),
-            "miss_rate_at_1": miss_rate(curve, true, images, 1.0),
+            "ap": area,
+            "log_average_miss_rate": float(np.exp(np.mean(np.log(np.maximum(misses[:-2], LEAST_MISS))))),
+            "miss_rate_at_0.1": float(misses[-2]),
+            "miss_rate_at_1": float(misses[-1]),
         }
 
 
@@ -189,29 +205,3 @@ def precision_recall(curve: Curve, true: float) -> tuple[np.ndarray, np.ndarray]
     found = curve.right + curve.false
     precision = np.divide(curve.right, found, out=np.full_like(found, np.nan), where=found > 0)
     return precision, curve.right / true if true else np.full_like(found, np.nan)
-
-
-def average_precision(curve: Curve, true: float) -> float:
-    """The area under the precision-recall curve, made to fall; NaN without a true box, 0 if nothing right is found.
-
-    The precision at a recall is the best one at that recall or above. Source: PASCAL VOC from 2010 on.
-    """
-    if not true:
-        return float("nan")
-    precision, recall = precision_recall(curve, true)
-    best = np.maximum.accumulate(np.nan_to_num(precision)[::-1])[::-1]
-    return float(np.diff(recall, prepend=0.0) @ best)
-
-
-def miss_rate(curve: Curve, true: float, images: float, false: float) -> float:
-    """Share of true boxes missed with at most so many false positives an image; NaN without true boxes or images."""
-    if not true or not images:
-        return float("nan")
-    within = curve.false <= false * images
-    return 1.0 - ratio(float(curve.right[within].max(initial=0.0)), true)
-
-
-def log_average_miss_rate(curve: Curve, true: float, images: float) -> float:
-    """The geometric mean of the miss rate over RATES. Source: Dollar et al., 2012."""
-    misses = np.array([miss_rate(curve, true, images, rate) for rate in RATES])
-    return float(np.exp(np.mean(np.log(np.maximum(misses, LEAST_MISS)))))

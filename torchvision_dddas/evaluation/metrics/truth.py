@@ -180,7 +180,17 @@ def _load_boxes(path: Path) -> Truth:
     if not lines:
         raise InputError(f"{path} is empty: wanted one box a line")
     if len(lines[0]) == 4:
-        return _one_target(path, lines)
+        try:
+            boxes_px = np.array([[float(v) for v in row] for row in lines])
+        except ValueError as error:
+            raise InputError(f"{path} is no table of boxes: {error}") from error
+        if (is_far := (np.abs(boxes_px) > FARTHEST).any(axis=1)).any():
+            far = ",".join(lines[int(is_far.argmax())])
+            raise InputError(f"{path}: a box is {far}; wanted numbers from {-FARTHEST:g} to {FARTHEST:g}")
+        there = np.flatnonzero(~np.isnan(boxes_px).any(axis=1))
+        tracks = TrackTable(there + 1, np.ones(len(there), np.int64), boxes_px[there])
+        by_frame = {frame: row[None] for frame, row in enumerate(boxes_px, 1)}
+        return Truth("one target", path, {}, by_frame, tracks, None, len(boxes_px))
     if len(lines[0]) < 6:
         raise InputError(
             f"{path} has {len(lines[0])} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
@@ -198,18 +208,6 @@ def _load_boxes(path: Path) -> Truth:
     ini = next((p for p in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini") if p.is_file()), None)
     length = read_seqinfo(ini).length if ini is not None else 0
     return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
-
-
-def _one_target(path: Path, lines: list[list[str]]) -> Truth:
-    try:
-        table = np.array([[float(v) for v in row] for row in lines])
-    except ValueError as error:
-        raise InputError(f"{path} is no table of boxes: {error}") from error
-    if far := [row for row, far in zip(lines, (np.abs(table) > FARTHEST).any(axis=1), strict=True) if far]:
-        raise InputError(f"{path}: a box is {','.join(far[0])}; wanted numbers from {-FARTHEST:g} to {FARTHEST:g}")
-    there = np.flatnonzero(~np.isnan(table).any(axis=1))
-    tracks = TrackTable(there + 1, np.ones(len(there), np.int64), table[there])
-    return Truth("one target", path, {}, {i + 1: row[None] for i, row in enumerate(table)}, tracks, None, len(table))
 
 
 FARTHEST = 1e9
@@ -237,14 +235,32 @@ def read_rows(path: Path, what: str) -> MotRows:
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole
     or below 1, an identity that is not whole, a size that is not positive.
     """
-    rows = [
-        [*_row(split_cells(line), f"{what} {path}, line {number}"), number]
-        for number, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1)
-        if line.strip()
-    ]
-    values = np.array(rows, float).reshape(-1, 8)
-    table = TrackTable.of(values[:, 0], values[:, 1], values[:, 2:6])
-    return MotRows(table, values[:, 6], values[:, 7].astype(np.int64))
+    rows = []
+    for number, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1):
+        if not line.strip():
+            continue
+        where, cells = f"{what} {path}, line {number}", split_cells(line)
+        if len(cells) < 6:
+            count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
+            raise InputError(f"{where}: {count}; wanted frame,id,x,y,w,h[,score]")
+        values = []
+        for cell, column in zip(cells, _COLUMNS, strict=False):
+            value, is_whole = to_number(cell), column in ("frame", "id")
+            if not math.isfinite(value):
+                raise InputError(f"{where}: {column} is '{cell}'; wanted a finite number")
+            if is_whole and (value != int(value) or abs(value) > 2**53):
+                raise InputError(f"{where}: {column} is '{cell}'; wanted a whole number")
+            if not is_whole and abs(value) > FARTHEST:
+                raise InputError(f"{where}: {column} is '{cell}'; wanted {-FARTHEST:g} to {FARTHEST:g}")
+            values.append(value)
+        if values[0] < 1:
+            raise InputError(f"{where}: frame is '{cells[0]}'; frames count from 1")
+        if min(values[4:6]) <= 0:
+            raise InputError(f"{where}: the box is {cells[4]}×{cells[5]} pixels; wanted more than 0")
+        rows.append([*[*values, 1.0][:7], number])
+    table = np.array(rows, float).reshape(-1, 8)
+    boxes = TrackTable.of(table[:, 0], table[:, 1], table[:, 2:6])
+    return MotRows(boxes, table[:, 6], table[:, 7].astype(np.int64))
 
 
 def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
@@ -286,27 +302,6 @@ def to_number(cell: str) -> float:
         return float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
     except ValueError:
         return math.nan
-
-
-def _row(cells: list[str], where: str) -> list[float]:
-    if len(cells) < 6:
-        count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
-        raise InputError(f"{where}: {count}; wanted frame,id,x,y,w,h[,score]")
-    values = []
-    for cell, column in zip(cells, _COLUMNS, strict=False):
-        value = to_number(cell)
-        if not math.isfinite(value):
-            raise InputError(f"{where}: {column} is '{cell}'; wanted a finite number")
-        if column in ("frame", "id") and (value != int(value) or abs(value) > 2**53):
-            raise InputError(f"{where}: {column} is '{cell}'; wanted a whole number")
-        if column not in ("frame", "id") and abs(value) > FARTHEST:
-            raise InputError(f"{where}: {column} is '{cell}'; wanted {-FARTHEST:g} to {FARTHEST:g}")
-        values.append(value)
-    if values[0] < 1:
-        raise InputError(f"{where}: frame is '{cells[0]}'; frames count from 1")
-    if min(values[4:6]) <= 0:
-        raise InputError(f"{where}: the box is {cells[4]}×{cells[5]} pixels; wanted more than 0")
-    return [*values, 1.0][:7]
 
 
 MOST_FRAMES = 10_000_000
