@@ -32,17 +32,17 @@ def image(grey=False, size=SIZE):
 
 def scene_of(boxes=((5, 20, 20, 30),), grey=False, size=SIZE, cause=""):
     boxes = np.array(boxes, float).reshape(-1, 4)
-    unknown = np.full(len(boxes), np.nan)
-    found = Detections(boxes, np.ones(len(boxes)), unknown, unknown, unknown)
+    heading = np.full(len(boxes), 0.5)
+    found = Detections(boxes, np.ones(len(boxes)), heading, heading, heading)
     mask = np.zeros(size[::-1], np.uint16)
     return Scene(Frame(1, 0.1, image(grey, size)), mask, found, 1, reliable=not cause, cause=cause)
 
 
-def tracked(boxes=((5, 20, 20, 30),), identities=(1,), grey=False, number=1, read=True, row=None, cause="", size=SIZE):
+def tracked(boxes=((5, 20, 20, 30),), identities=(1,), grey=False, number=1, read=True, cause="", size=SIZE):
     boxes = np.array(boxes, float).reshape(-1, 4)
     given = Detections(boxes, np.ones(len(boxes)), np.zeros(0), np.zeros(0), np.zeros(0))
-    shown = np.arange(len(identities)) if row is None else np.array(row)
-    tracks = Tracks(number, np.array(identities, int), boxes[: len(shown)], np.ones(len(shown)), shown)
+    n = len(identities)
+    tracks = Tracks(number, np.array(identities, int), boxes[:n], np.ones(n), np.arange(n))
     frame = Frame(number, 0.1 * number, image(grey, size)) if read else None
     return TrackedFrame(number, frame, given, tracks, cause=cause)
 
@@ -55,17 +55,11 @@ def people(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause="
     return PeopleFrame(Frame(3, 0.2, image(grey, size)), found, regions, 0.25, cause)
 
 
-def draw_tracked(item):
-    height, width = item.frame.image.shape[:2]
-    return TrackPictures((width, height))(item)
-
-
 DRAWERS: dict[str, Any] = {
     "scene": (scene_of, draw_scene),
-    "tracks": (tracked, draw_tracked),
+    "tracks": (tracked, lambda item: TrackPictures(item.frame.image.shape[1::-1])(item)),
     "people": (people, draw_people),
 }
-BOXES = [(-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (-1e9, -1e9, 3e9, 3e9), (3, 3, 1e-3, 1e-3)]
 
 
 def shows(picture, colour):
@@ -82,12 +76,12 @@ def test_a_picture_is_drawn_on_a_copy_in_colour(kind, grey):
     assert (item.frame.image == 90).all()
 
 
-@pytest.mark.parametrize("box", BOXES)
 @pytest.mark.parametrize("kind", DRAWERS)
-def test_boxes_anywhere_and_of_any_size_can_be_drawn(kind, box):
+def test_boxes_anywhere_and_of_any_size_can_be_drawn(kind):
     make, draw = DRAWERS[kind]
-    item = make([box], grey=True)
-    assert draw(item).shape == (*item.frame.image.shape[:2], 3)
+    for box in ((-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (-1e9, -1e9, 3e9, 3e9), (3, 3, 1e-3, 1e-3)):
+        item = make([box], grey=True)
+        assert draw(item).shape == (*item.frame.image.shape[:2], 3)
 
 
 @pytest.mark.parametrize("kind", DRAWERS)
@@ -99,56 +93,38 @@ def test_a_cause_is_a_caption_that_fits_pictures_of_any_size(kind):
     assert (sound != doubtful).any()
 
 
-def test_each_identity_has_its_colour_in_every_frame():
+def test_each_identity_has_its_colour_in_every_frame_and_a_trail():
     pictures = TrackPictures(SIZE)
     for number in (1, 2):
         drawn = pictures(tracked([[5, 20, 20, 30], [60, 20, 20, 30]], [3, 11], number=number))
         assert [shows(drawn, identity_colour(identity)) for identity in (3, 11, 4)] == [True, True, False]
         assert (drawn[20:50, 5] == identity_colour(3)).all()
-
-
-def test_the_first_hundred_colours_are_different_and_bright():
+    drawn = pictures(tracked([[95, 20, 20, 30]], [3], number=3))
+    assert np.abs(drawn[35, 55].astype(int) - identity_colour(3)).max() < 40  # the line is smoothed
     colours = np.array([identity_colour(i) for i in range(1, 101)])
-    assert len(np.unique(colours, axis=0)) > 90
-    assert colours.max(axis=1).min() >= 190
-
-
-def test_the_trail_of_an_identity_is_drawn():
-    pictures = TrackPictures(SIZE)
-    pictures(tracked([[5, 5, 10, 10]], [2]))
-    drawn = pictures(tracked([[65, 5, 10, 10]], [2], number=2))
-    assert np.abs(drawn[10, 40].astype(int) - identity_colour(2)).max() < 40  # the line is smoothed
+    assert len(np.unique(colours, axis=0)) > 90 and colours.max(axis=1).min() >= 190
 
 
 def test_detections_without_identity_and_frames_without_picture_are_drawn():
-    drawn = TrackPictures(SIZE)(tracked(identities=[], row=[], read=False, cause="the frame could not be read"))
-    assert drawn.shape == (90, 120, 3)
-    assert (drawn[20, 5:25] == UNTRACKED).all()
+    drawn = TrackPictures(SIZE)(tracked(identities=[], read=False, cause="the frame could not be read"))
+    assert drawn.shape == (90, 120, 3) and (drawn[20, 5:25] == UNTRACKED).all()
 
 
-def test_a_person_has_a_box_and_a_point_at_the_feet_and_one_cut_by_the_border_another_colour():
+def test_people_have_boxes_and_feet_those_cut_another_colour_and_unlikely_ones_are_grey_below():
     drawn = draw_people(people())
-    assert (drawn[70:150, 60] == PERSON).all() and (drawn[60, 60:100] == PERSON).any()
-    assert (drawn[160, 80] == PERSON).all() and not shows(drawn, CUT)
+    assert (drawn[70:150, 60] == PERSON).all() and (drawn[160, 80] == PERSON).all() and not shows(drawn, CUT)
     both = draw_people(people([(60, 60, 40, 100), (-20, 60, 60, 140)], cut=(1,)))
     assert shows(both, PERSON) and shows(both, CUT)
-
-
-def test_an_unlikely_person_is_grey_without_a_number_and_below_the_others():
-    alone = draw_people(people(score=0.4))
+    alone = draw_people(people(score=0.4, cut=(0,)))
     assert (alone[70:150, 60] == UNLIKELY).all() and not shows(alone, PERSON) and not shows(alone, CUT)
-    assert not shows(draw_people(people(cut=(0,), score=0.4)), CUT)
     both = draw_people(people([(60, 60, 40, 100), (60, 60, 40, 100)], score=(0.6, 0.4)))
     assert (both[70:150, 60] == PERSON).all()
 
 
 def test_of_labels_that_overlap_the_best_is_on_top():
     pair = [(60, 60, 40, 100), (70, 60, 40, 100)]
-    best_first, best_last = (
-        draw_people(people(pair, score=(0.99, 0.6))),
-        draw_people(people(pair[::-1], score=(0.6, 0.99))),
-    )
-    np.testing.assert_array_equal(best_first, best_last)
+    best_first = draw_people(people(pair, score=(0.99, 0.6)))
+    np.testing.assert_array_equal(best_first, draw_people(people(pair[::-1], score=(0.6, 0.99))))
     alone = draw_people(people(pair[:1], score=0.99))
     np.testing.assert_array_equal(best_first[40:58, 62:85], alone[40:58, 62:85])
 
@@ -157,21 +133,16 @@ def test_searched_regions_are_drawn_and_the_caption_says_how_much_was_searched()
     drawn = draw_people(people(regions=np.array([[40, 30, 100, 150.0]])))
     assert (drawn[100, 40] == SEARCHED).all()
     nowhere = draw_people(people(regions=np.zeros((0, 4))))
-    assert not shows(nowhere, SEARCHED)
-    assert (nowhere[-40:] != draw_people(people())[-40:]).any()
+    assert not shows(nowhere, SEARCHED) and (nowhere[-40:] != draw_people(people())[-40:]).any()
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Files.
 
-
-ENGINES = [
-    "mp4v",
-    pytest.param("h264", marks=pytest.mark.skipif(not importlib.util.find_spec("av"), reason="needs av")),
-]
+NEEDS_AV = pytest.mark.skipif(not importlib.util.find_spec("av"), reason="needs av")
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["mp4v", pytest.param("h264", marks=NEEDS_AV)])
 @pytest.mark.parametrize(("size", "grey"), [((64, 48), False), ((65, 49), True)])
 def test_a_video_has_every_frame_and_even_sizes(tmp_path, scene, monkeypatch, engine, size, grey):
     if engine == "mp4v":
@@ -201,23 +172,23 @@ def test_a_video_that_cannot_be_opened_again_is_none(tmp_path, scene, monkeypatc
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "make", [lambda folder: OverlayVideo(folder, 10, draw_people), lambda folder: OverlayPicture(folder, draw_people)]
-)
-def test_an_overlay_is_written_whole_or_not_at_all(tmp_path, make):
-    kept, dropped, empty = (make(tmp_path / name) for name in ("kept", "dropped", "empty"))
-    for name in ("kept", "dropped", "empty"):
-        (tmp_path / name).mkdir()
-    for overlay in (kept, dropped):
-        overlay.write(people())
-    assert not [path for path in (tmp_path / "kept").iterdir() if not path.name.startswith(".")]
-    kept.close(complete=True)
-    dropped.discard()
-    empty.close(complete=True)
-    counts = [len(list((tmp_path / name).iterdir())) for name in ("kept", "dropped", "empty")]
-    assert counts == [1, 0, 0]
-    read = cv2.imread(str(tmp_path / "kept/overlay.png"))
-    assert read is None or np.array_equal(read, draw_people(people()))
+@pytest.mark.parametrize("is_video", [True, False])
+def test_an_overlay_is_written_whole_or_not_at_all(tmp_path, is_video):
+    folders = {name: tmp_path / name for name in ("kept", "dropped", "empty")}
+    overlays: dict[str, Any] = {}
+    for name, folder in folders.items():
+        folder.mkdir()
+        overlays[name] = OverlayVideo(folder, 10, draw_people) if is_video else OverlayPicture(folder, draw_people)
+    for name in ("kept", "dropped"):
+        overlays[name].write(people())
+    assert not list(folders["kept"].glob("overlay*"))
+    overlays["kept"].close(complete=True)
+    overlays["dropped"].discard()
+    overlays["empty"].close(complete=True)
+    assert [len(list(folder.iterdir())) for folder in folders.values()] == [1, 0, 0]
+    if not is_video:
+        read = cv2.imread(str(folders["kept"] / "overlay.png"))
+        assert read is not None and np.array_equal(read, draw_people(people()))
 
 
 class Writer(ThreadedWriter):
@@ -253,12 +224,12 @@ def test_every_picture_is_written_in_order_once_the_writer_is_closed():
 
 def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
     first, last = Writer(bad=(0,)), Writer(bad=(1,))
-    for writer in (first, last):
-        writer.may.set()
+    first.may.set()
     with pytest.raises(OSError, match="full"):
         list(map(first.write, [level(0)] * 100))
-    for value in (0, 1):
-        last.write(level(value))
+    last.write(level(0))
+    last.write(level(1))
+    last.may.set()
     with pytest.raises(OSError, match="full"):
         last.close()
     assert last.closed
