@@ -116,7 +116,7 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
         calls.append(settings.difference.threshold)
         return settings.difference.threshold
 
-    monkeypatch.setattr(time_cost, "_timer", lambda *_: timed)
+    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: timed)
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
     assert asked(clips, *words).exit_code == 0
     count = len(calls)
@@ -128,7 +128,7 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
 
 
 def test_another_weight_of_the_cost_is_not_taken_for_the_one_before(clips, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: settings.difference.threshold)
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     assert asked(clips, *words, "--cost", "0.5").exit_code == 0
     result = asked(clips, *words, "--cost", "2", "--resume", "--quiet")
@@ -241,9 +241,9 @@ def test_an_unfinished_descent_that_was_set_aside_can_be_gone_on_with_at_its_own
             return super().loss(parameters, batch, softness)
 
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
-    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: settings.difference.threshold)
     assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
-    monkeypatch.setattr(time_cost, "_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
+    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
     assert asked(clips, *words).exit_code == 0
     for name in ("checkpoint", "cost"):
         end = "pt" if name == "checkpoint" else "json"

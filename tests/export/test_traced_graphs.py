@@ -19,9 +19,8 @@ import torch
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import traced_graphs as traced
-from torchvision_dddas.export.graph_files import ExportedGraph, refuse_failed
-from torchvision_dddas.export.tracing import OPSET, open_session
-from torchvision_dddas.functional import homography
+from torchvision_dddas.export.graph_files import OPSET, ExportedGraph, open_session, refuse_failed
+from torchvision_dddas.functional import plane_maps
 from torchvision_dddas.runtime import SHIPPED
 
 SIZE, STEP_SIZE = (96, 80), (128, 96)
@@ -96,7 +95,7 @@ def test_only_standard_operations_are_used_and_inputs_have_names_of_our_own(made
     assert {node.domain for node in model.graph.node} == {""} and not model.functions
     given = traced.example_pictures("warp_difference", load_config("fast"), SIZE, 0)
     assert [value.name for value in model.graph.input] == list(given)
-    assert tuple(value.name for value in model.graph.output) == traced.OUTPUTS["warp_difference"]
+    assert tuple(value.name for value in model.graph.output) == traced.SEGMENTATION["warp_difference"][1]
 
 
 def test_the_file_is_the_same_each_time_and_holds_nothing_of_the_machine(made, fast):
@@ -195,5 +194,5 @@ def test_the_horizon_of_the_homography_graph_is_that_of_torch(planes, tilt: floa
     image = corners / (1 + corners @ (tilt, 0))[..., None]
     given = {"ground": corners, "image": image, "weight": np.ones((1, 4))}
     _, valid = open_session(planes["homography.onnx"].content).run(None, given)
-    torch_valid = homography.fit(*(torch.from_numpy(array) for array in given.values()))[1]
+    torch_valid = plane_maps.fit_homography(*(torch.from_numpy(array) for array in given.values()))[1]
     assert valid.item() == torch_valid.item() == is_seen

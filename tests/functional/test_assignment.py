@@ -7,12 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.functional.assignment import dispersion, log_partition, shares
+from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.geometry import best_pairs
 
 
 def scores(*shape: int, spread: float = 3.0, seed: int = 0) -> Tensor:
     return spread * torch.randn(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def shares(score: Tensor, softness: float) -> Tensor:
+    score = score.detach().requires_grad_()
+    return torch.autograd.grad(log_partition(score, softness).sum(), score)[0]
 
 
 def counted(score: Tensor, softness: float) -> Tensor:

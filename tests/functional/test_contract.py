@@ -9,18 +9,16 @@ import pytest
 import torch
 
 from torchvision_dddas.functional import (
-    affine,
     affinity,
     assignment,
     color,
-    consensus,
     difference,
     filters,
     flow,
     hog,
-    homography,
     keypoints,
     morphology,
+    plane_maps,
     soft,
     warp,
 )
@@ -43,28 +41,27 @@ RANGES = P[0, :5].repeat(1, 2)[:, :3]
 BOXES = torch.tensor([[3.0, 2, 10, 12], [8, 5, 20, 9]]).expand(BATCH, 2, 4)
 LAYOUT = hog.Layout((16, 24), 4, 8, 4)
 CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
-    affine.fit: (P, Q, ONES),
-    affine.three_point: (P[:, :3], Q[:, :3]),
-    affine.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2], [3, 4, 5]]]).expand(BATCH, -1, -1)),
+    plane_maps.fit_affine: (P, Q, ONES),
+    plane_maps.three_point: (P[:, :3], Q[:, :3]),
     affinity.pairs: (P, Q[:, :4], ONES.bool(), ONES[:, :4].bool()),
     affinity.triplets: (P, Q[:, :4], P[:, :3], ONES.bool(), ONES[:, :4].bool(), ONES[:, :3].bool()),
     color.bgr_to_hsv: (HSV / 30,),
     color.within_ranges: (HSV, RANGES, RANGES),
     color.rgb_histogram: (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool), 1.0),
     assignment.log_partition: (P[:, :4, :], 1.0),
-    consensus.transfer: (EYES, P),
-    consensus.transfer_error: (EYES, P, Q),
+    plane_maps.transfer: (EYES, P),
+    plane_maps.transfer_error: (EYES, P, Q),
     difference.exposure: (GREY, GREY * 0.9 + 0.01, MASK),
     difference.gradient: ((GREY * 255).round(),),
     filters.gaussian: (COLOUR, 5),
     filters.box_sum: (GREY, 5),
     flow.track: (P, [GREY], [GREY.roll(1, -1)]),
     flow.forward_backward: (P, [GREY], [GREY.roll(1, -1)]),
-    homography.fit: (P, Q, ONES),
-    homography.fit_raw: (P, Q),
-    homography.four_point: (P[:, :4], Q[:, :4]),
-    homography.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
-    homography.solve_linear: (EYES, P[:, :3]),
+    plane_maps.fit_homography: (P, Q, ONES),
+    plane_maps.fit_raw: (P, Q),
+    plane_maps.four_point: (P[:, :4], Q[:, :4]),
+    plane_maps.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
+    plane_maps.solve_linear: (EYES, P[:, :3]),
     keypoints.grid_features: (GREY, 16),
     keypoints.min_eigenvalue: (GREY,),
     morphology.dilate: (MASK, 3),
@@ -142,6 +139,7 @@ def quad(*points: tuple[float, float]) -> torch.Tensor:
 
 FIVE, THERE = 500 * double(1, 5, 2), 500 * double(1, 5, 2) + 3 * double(1, 5, 2, seed=1)
 SIX, SEEN = 500 * double(1, 6, 2), 480 * double(1, 6, 2) + 9 * double(1, 6, 2, seed=1)
+WEIGHTS = torch.linspace(0.5, 1, 6).double()[None]
 KNOWN = [torch.ones(2, count, dtype=torch.bool) for count in (4, 3, 5)]
 KNOWN[2][1, 4] = False
 LABELS = torch.tensor([[[[0, 1, 1, 0], [0, 1, 0, 2], [0, 0, 0, 2]]]])
@@ -150,7 +148,10 @@ BOX, THERE_ARE = torch.tensor([[[0.0, 1, 3, 3], [2, 0, 9, 2]]]).double(), torch.
 LOW, HIGH = torch.tensor([[10.0, 80, 60], [170, 100, 0]]).double(), torch.tensor([[25.0, 255, 255], [8, 255, 255]])
 # Smooth functions of the tensors at which their gradient is compared with finite differences.
 GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] = {
-    "affine.fit": (lambda p, q: affine.fit(p, q, torch.linspace(0.5, 1, 5).double()[None])[0], (FIVE, THERE)),
+    "plane_maps.fit_affine": (
+        lambda p, q: plane_maps.fit_affine(p, q, torch.linspace(0.5, 1, 5).double()[None])[0],
+        (FIVE, THERE),
+    ),
     "affinity.pairs": (lambda a, b: affinity.pairs(a, b, *KNOWN[:2]), (double(2, 4, 3), double(2, 3, 3, seed=1))),
     "affinity.triplets": (
         lambda a, b, c: affinity.triplets(a, b, c, *KNOWN),
@@ -173,18 +174,21 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         (double(1, 1, 4, 5), double(1, 1, 4, 5, seed=1)),
     ),
     "filters.gaussian": (lambda x: filters.gaussian(x, 3), (double(1, 1, 5, 6),)),
-    "homography.solve_linear": (
-        lambda a, b: homography.solve_linear(a, b)[0],
+    "plane_maps.solve_linear": (
+        lambda a, b: plane_maps.solve_linear(a, b)[0],
         (double(2, 4, 4) - 0.5, double(2, 4, 2, seed=1)),
     ),
-    "homography.four_point": (
-        lambda p, q: homography.four_point(p, q)[0],
+    "plane_maps.four_point": (
+        lambda p, q: plane_maps.four_point(p, q)[0],
         (quad((0, 0), (90, 10), (100, 80), (5, 70)), quad((3, 1), (95, 15), (99, 90), (1, 72))),
     ),
-    "homography.fit": (lambda *x: homography.fit(*x)[0], (SIX, SEEN, torch.linspace(0.5, 1, 6).double()[None])),
+    "plane_maps.fit_homography": (
+        lambda *x: plane_maps.fit_homography(*x)[0],
+        (SIX, SEEN, torch.linspace(0.5, 1, 6).double()[None]),
+    ),
     **{
-        f"homography.fit_raw {count}": (
-            lambda p, q: homography.fit_raw(p, q)[0],
+        f"plane_maps.fit_raw {count}": (
+            lambda p, q: plane_maps.fit_raw(p, q)[0],
             (SIX[:, :count] / 300, SEEN[:, :count] / 300),
         )
         for count in (4, 6)

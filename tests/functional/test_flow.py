@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.functional import consensus, flow
+from torchvision_dddas.functional import flow, plane_maps
 
 MOTION = np.array([[1.01, 0.02, 4.0], [-0.015, 0.99, -3.0], [1e-5, -2e-5, 1.0]])
 
@@ -51,7 +51,7 @@ def test_agrees_with_opencv_to_a_hundredth_of_a_pixel(scene, tensor, levels, win
 
 def test_with_a_prediction_one_level_and_a_small_table_do(scene, tensor):
     first, second, corners, points = scene
-    truth = consensus.transfer(torch.from_numpy(MOTION).float()[None], points)
+    truth = plane_maps.transfer(torch.from_numpy(MOTION).float()[None], points)
     guess = truth + 0.4 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
     found, ok = flow.track(
         points, *pyramids(tensor, first, second, 1), guess=guess, window_px=15, iterations=5, reach_px=2
@@ -86,7 +86,7 @@ def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tens
     first, second, _, points = scene
     covered = second.copy()
     covered[60:140, 80:180] = texture(9, 80, 100)
-    truth = consensus.transfer(torch.from_numpy(MOTION).float()[None], points)
+    truth = plane_maps.transfer(torch.from_numpy(MOTION).float()[None], points)
     inside = ((truth > torch.tensor([90.0, 70.0])) & (truth < torch.tensor([170.0, 130.0]))).all(-1)
     away = ((truth < torch.tensor([60.0, 40.0])) | (truth > torch.tensor([200.0, 160.0]))).any(-1)
     away &= ((truth > 10) & (truth < torch.tensor([250.0, 190.0]))).all(-1)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import affine, consensus, homography
-from torchvision_dddas.functional.consensus import fit_to_inliers, inlier_weights
+from torchvision_dddas.functional import plane_maps
+from torchvision_dddas.functional.plane_maps import MODELS, fit_homography, ransac
 
 PROJECTIVE = torch.tensor(
     [
@@ -18,29 +18,24 @@ PROJECTIVE = torch.tensor(
     ]
 )
 AFFINE = PROJECTIVE * torch.tensor([[1.0], [1], [0]]) + torch.diag(torch.tensor([0.0, 0, 1]))
-# Each with a true map of two clips, the number of points of a sample and the solver of one.
-MODELS = {"homography": (homography, PROJECTIVE, 4), "affine": (affine, AFFINE, 3)}
+TRUE = {"homography": PROJECTIVE, "affine": AFFINE}  # maps of two clips
 CORNERS = torch.tensor([[0.0, 0.0], [639.0, 0.0], [0.0, 479.0], [639.0, 479.0]])
 
 
 @pytest.fixture(params=MODELS)
 def model(request):
-    return MODELS[request.param]
-
-
-def minimal(module):
-    return module.four_point if module is homography else module.three_point
+    return MODELS[request.param], TRUE[request.param], MODELS[request.param].size
 
 
 def corner_error(found: torch.Tensor, wanted: torch.Tensor) -> float:
-    return consensus.transfer_error(found, CORNERS, consensus.transfer(wanted, CORNERS)).max().item()
+    return plane_maps.transfer_error(found, CORNERS, plane_maps.transfer(wanted, CORNERS)).max().item()
 
 
 def pairs(count: int = 200, noise: float = 0.0, wrong: float = 0.0, seed: int = 0, true=PROJECTIVE):
     """Points of two clips, where the true maps take them, and which of the pairs are right."""
     generator = torch.Generator().manual_seed(seed)
     p = torch.rand(2, count, 2, generator=generator) * torch.tensor([640.0, 480.0])
-    q = consensus.transfer(true, p) + noise * torch.randn(2, count, 2, generator=generator)
+    q = plane_maps.transfer(true, p) + noise * torch.randn(2, count, 2, generator=generator)
     right = torch.rand(2, count, generator=generator) >= wrong
     return p, torch.where(right[..., None], q, torch.rand(2, count, 2, generator=generator) * 500), right
 
@@ -50,12 +45,12 @@ def line(count: int = 30) -> torch.Tensor:
 
 
 def samples(count: int, points: int, size: int = 4, clips: int = 2) -> torch.Tensor:
-    return consensus.draw_samples(torch.Generator().manual_seed(1), clips, count, points, size=size)
+    return plane_maps.draw_samples(torch.Generator().manual_seed(1), clips, count, points, size=size)
 
 
 def test_solves_a_system_worked_by_hand_that_needs_a_row_exchange():
     matrix = torch.tensor([[[0.0, 2.0], [4.0, 2.0]]])
-    x, valid = homography.solve_linear(matrix, torch.tensor([[[6.0], [10.0]]]))
+    x, valid = plane_maps.solve_linear(matrix, torch.tensor([[[6.0], [10.0]]]))
     assert valid.all() and torch.equal(x, torch.tensor([[[1.0], [3.0]]]))
 
 
@@ -63,16 +58,16 @@ def test_agrees_with_lapack_on_random_systems_and_is_valid_in_any_unit():
     generator = torch.Generator().manual_seed(0)
     matrix = torch.randn(50, 8, 8, generator=generator, dtype=torch.float64)
     right = torch.randn(50, 8, 3, generator=generator, dtype=torch.float64)
-    x, valid = homography.solve_linear(matrix, right)
+    x, valid = plane_maps.solve_linear(matrix, right)
     assert valid.all()
     torch.testing.assert_close(x, torch.linalg.solve(matrix, right), rtol=1e-8, atol=1e-8)
     for unit in (1e-12, 1e12):
-        assert homography.solve_linear(torch.eye(3)[None] * unit, torch.ones(1, 3, 1))[1].all()
+        assert plane_maps.solve_linear(torch.eye(3)[None] * unit, torch.ones(1, 3, 1))[1].all()
 
 
 def test_a_singular_member_is_marked_and_leaves_the_others_alone():
     matrix = torch.stack([torch.eye(3), torch.ones(3, 3), torch.zeros(3, 3)])
-    x, valid = homography.solve_linear(matrix, torch.arange(9.0).reshape(3, 3, 1))
+    x, valid = plane_maps.solve_linear(matrix, torch.arange(9.0).reshape(3, 3, 1))
     assert valid.tolist() == [True, False, False]
     assert torch.equal(x, torch.tensor([[0.0, 1, 2], [0, 0, 0], [0, 0, 0]])[..., None])
 
@@ -80,7 +75,7 @@ def test_a_singular_member_is_marked_and_leaves_the_others_alone():
 def test_a_square_moved_and_doubled_gives_the_matrix_written_by_hand(model):
     module, _, size = model
     p = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[:size]
-    found, valid = minimal(module)(p, 2 * p + torch.tensor([3.0, -1.0]))
+    found, valid = module.minimal(p, 2 * p + torch.tensor([3.0, -1.0]))
     assert valid
     torch.testing.assert_close(found, torch.tensor([[2.0, 0, 3], [0, 2, -1], [0, 0, 1]]), atol=1e-6, rtol=0)
 
@@ -90,12 +85,12 @@ def test_the_fewest_points_give_what_opencv_gives(model):
     by_opencv: Any = cv2.getAffineTransform if size == 3 else cv2.getPerspectiveTransform
     p, q, _ = pairs(count=20 * size, true=true)
     p, q = p.reshape(2, 20, size, 2), q.reshape(2, 20, size, 2)
-    found, valid = minimal(module)(p, q)
+    found, valid = module.minimal(p, q)
     for clip, number in np.argwhere(valid.numpy()):
         wanted = torch.eye(3)
         wanted[: size - 1] = torch.from_numpy(by_opencv(p[clip, number].numpy(), q[clip, number].numpy()))
-        there = consensus.transfer(wanted, p[clip, number])
-        torch.testing.assert_close(consensus.transfer(found[clip, number], p[clip, number]), there, atol=2e-2, rtol=0)
+        there = plane_maps.transfer(wanted, p[clip, number])
+        torch.testing.assert_close(plane_maps.transfer(found[clip, number], p[clip, number]), there, atol=2e-2, rtol=0)
     assert valid.float().mean() > 0.9
 
 
@@ -113,13 +108,13 @@ def test_the_fewest_points_give_what_opencv_gives(model):
 )
 def test_points_that_fix_no_map_are_marked_and_finite(name, bad):
     q = torch.tensor([[0.0, 0], [0, 9], [9, 0], [9, 9]])[: len(bad)]
-    found, valid = minimal(MODELS[name][0])(torch.tensor(bad).float(), q)
+    found, valid = MODELS[name].minimal(torch.tensor(bad).float(), q)
     assert not valid and torch.isfinite(found).all()
 
 
 def test_an_affine_fit_is_the_least_squares_solution():
     p, q, _ = pairs(noise=2.0, true=AFFINE)
-    found, valid = affine.fit(p, q, torch.ones(2, 200))
+    found, valid = plane_maps.fit_affine(p, q, torch.ones(2, 200))
     rows = torch.cat([p, torch.ones(2, 200, 1)], -1).double()
     assert valid.all()
     wanted = torch.linalg.lstsq(rows, q.double()).solution.mT.float()
@@ -128,7 +123,7 @@ def test_an_affine_fit_is_the_least_squares_solution():
 
 def test_a_homography_fit_equals_the_normalised_dlt_to_a_fiftieth_of_the_noise():
     p, q, _ = pairs(noise=0.5)
-    found, _ = homography.fit(p, q, torch.ones(2, 200))
+    found, _ = fit_homography(p, q, torch.ones(2, 200))
     for clip in range(2):
         wanted, _ = cv2.findHomography(p[clip].numpy(), q[clip].numpy(), 0)
         assert corner_error(found[clip], torch.from_numpy(wanted).float()) < 0.1
@@ -154,11 +149,11 @@ def _dlt(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
 
 def test_a_fit_leaves_out_pairs_of_weight_zero_even_where_they_hold_no_numbers():
     p, q, right = pairs(wrong=0.3)
-    wanted, _ = homography.fit(p, q, right.float())
+    wanted, _ = fit_homography(p, q, right.float())
     assert corner_error(wanted, PROJECTIVE) < 2e-3
     for nonsense in (q + 100, torch.full_like(q, torch.nan), torch.full_like(q, torch.inf)):
         other = torch.where(right[..., None], q, nonsense)
-        found, valid = homography.fit(torch.where(right[..., None], p, nonsense), other, right.float())
+        found, valid = fit_homography(torch.where(right[..., None], p, nonsense), other, right.float())
         assert valid.all()
         torch.testing.assert_close(found, wanted)
 
@@ -175,7 +170,7 @@ def test_a_fit_of_too_few_points_or_of_a_line_is_marked(model):
 def test_fit_with_a_point_behind_the_horizon_is_marked():
     p = torch.tensor([[[0.0, 0], [1, 0], [1, 1], [0, 1]]], dtype=torch.float64)
     for tilt, seen in ((-0.999, True), (-1.001, False)):
-        assert homography.fit(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
+        assert fit_homography(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
 
 
 @pytest.mark.parametrize("count", [4, 7, 16])
@@ -186,37 +181,37 @@ def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
     there = p[:, :2] + 3  # of pixels, as the matrix itself has entries of all sizes there
     inputs = (p.requires_grad_(), q.requires_grad_(), weight.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: consensus.transfer(homography.fit(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
+        lambda *x: plane_maps.transfer(fit_homography(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
     )
 
 
 def test_the_source_as_printed_agrees_with_least_squares_about_the_origin_and_not_far_from_it():
     p, q, _ = pairs(count=6)
-    p, q = p[:1].double() / 100, consensus.transfer(PROJECTIVE[:1].double(), p[:1].double()) / 100
-    near, valid = homography.fit_raw(p, q)
+    p, q = p[:1].double() / 100, plane_maps.transfer(PROJECTIVE[:1].double(), p[:1].double()) / 100
+    near, valid = plane_maps.fit_raw(p, q)
     assert valid.all()
-    assert consensus.transfer_error(near, p, q).max() < 1e-8
+    assert plane_maps.transfer_error(near, p, q).max() < 1e-8
     for count, low, high in ((6, 1e-3, torch.inf), (4, 0, 1e-3)):
-        far, valid = homography.fit_raw(p[:, :count] / 1e4 + 100, q[:, :count])
+        far, valid = plane_maps.fit_raw(p[:, :count] / 1e4 + 100, q[:, :count])
         assert valid.all()
-        assert low <= consensus.transfer_error(far, p[:, :count] / 1e4 + 100, q[:, :count]).max() < high
+        assert low <= plane_maps.transfer_error(far, p[:, :count] / 1e4 + 100, q[:, :count]).max() < high
 
 
 def test_the_source_as_printed_refuses_only_what_is_exactly_singular():
     same = torch.ones(1, 4, 2, dtype=torch.float64)
-    found, valid = homography.fit_raw(same, same)
+    found, valid = plane_maps.fit_raw(same, same)
     assert not valid.any() and torch.equal(found[0], torch.eye(3, dtype=torch.float64))
-    assert not homography.fit_raw(same[:, :3], same[:, :3])[1].any()
+    assert not plane_maps.fit_raw(same[:, :3], same[:, :3])[1].any()
 
 
 def test_ransac_finds_the_map_among_half_wrong_pairs(model):
     module, true, size = model
     p, q, right = pairs(noise=0.2, wrong=0.5, true=true)
-    found, inliers, valid = module.ransac(p, q, torch.ones(2, 200).bool(), samples(256, 200, size))
+    found, inliers, valid = ransac(p, q, torch.ones(2, 200).bool(), samples(256, 200, size), module)
     assert valid.all()
     assert corner_error(found, true) < 0.4
     assert (inliers & right).sum() >= 0.99 * right.sum() and (inliers & ~right).sum() <= 3
-    if module is affine:
+    if size == 3:
         assert torch.equal(found[:, 2], torch.tensor([[0.0, 0, 1]] * 2))
         return
     for clip in range(2):
@@ -227,7 +222,7 @@ def test_ransac_finds_the_map_among_half_wrong_pairs(model):
 def test_ransac_uses_valid_points_only_even_when_few():
     p, q, _ = pairs(noise=0.1)
     known = (torch.arange(200) % 10 == 0).expand(2, -1)
-    found, inliers, valid = homography.ransac(p, torch.where(known[..., None], q, q + 50), known, samples(128, 200))
+    found, inliers, valid = ransac(p, torch.where(known[..., None], q, q + 50), known, samples(128, 200))
     assert valid.all() and torch.equal(inliers, known)
     assert corner_error(found, PROJECTIVE) < 1.0
 
@@ -235,19 +230,19 @@ def test_ransac_uses_valid_points_only_even_when_few():
 @pytest.mark.parametrize("count", [0, 3])
 def test_ransac_without_four_valid_points_or_on_one_line_is_marked_and_gives_the_identity(count):
     p, q, _ = pairs()
-    found, inliers, valid = homography.ransac(p, q, (torch.arange(200) < count).expand(2, -1), samples(16, 200))
+    found, inliers, valid = ransac(p, q, (torch.arange(200) < count).expand(2, -1), samples(16, 200))
     assert not valid.any() and (count or not inliers.any())
     assert torch.equal(found, torch.eye(3).expand(2, 3, 3))
-    assert not homography.ransac(line(), line() + 3, torch.ones(1, 30).bool(), samples(16, 30, clips=1))[2].any()
+    assert not ransac(line(), line() + 3, torch.ones(1, 30).bool(), samples(16, 30, clips=1))[2].any()
 
 
 def test_what_a_pair_gives_does_not_depend_on_its_company():
     p, q, right = (part.repeat(2, *[1] * (part.ndim - 1)) for part in pairs(count=300, noise=0.3, wrong=0.4))
     p, q = p.double() + torch.arange(4.0)[:, None, None], q.double()
     drawn = samples(64, 300, clips=1)
-    together = homography.ransac(p, q, right, drawn.expand(4, -1, -1))
+    together = ransac(p, q, right, drawn.expand(4, -1, -1))
     for k in range(4):
-        alone = homography.ransac(p[k : k + 1], q[k : k + 1], right[k : k + 1], drawn)
+        alone = ransac(p[k : k + 1], q[k : k + 1], right[k : k + 1], drawn)
         # BLAS takes other paths for other batch sizes: the last digits may differ.
         torch.testing.assert_close(together[0][k], alone[0][0], atol=1e-9, rtol=1e-9)
         assert torch.equal(together[1][k], alone[1][0])
@@ -267,29 +262,4 @@ def test_samples_repeat_with_the_seed_and_never_draw_a_point_twice():
 
 def test_a_point_on_the_horizon_stays_finite():
     matrix = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [-0.01, 0, 1]]])
-    assert torch.isfinite(consensus.transfer(matrix, torch.tensor([[[100.0, 5.0]]]))).all()
-
-
-def test_soft_weights_tend_to_the_count_of_inliers() -> None:
-    error_px = torch.tensor([0.1, 1.9, 2.1, 40.0], dtype=torch.float64)
-    hard = inlier_weights(error_px, 2.0)
-    assert hard.tolist() == [1, 1, 0, 0]
-    misses = [float((inlier_weights(error_px, 2.0, softness) - hard).abs().max()) for softness in (0.5, 0.05, 0.005)]
-    assert misses[0] > misses[1] > misses[2] and misses[2] < 1e-4
-
-
-def test_a_refit_on_soft_inliers_leaves_out_what_does_not_fit_and_its_tolerance_has_a_gradient() -> None:
-    random = torch.Generator().manual_seed(0)
-    earlier = torch.rand(1, 40, 2, generator=random, dtype=torch.float64) * 300
-    later = earlier + torch.tensor([3.0, -1.0]) + 0.1 * torch.randn(1, 40, 2, generator=random, dtype=torch.float64)
-    later[:, 30:] += 25 * torch.rand(1, 10, 2, generator=random, dtype=torch.float64) + 10
-    valid, guess = torch.ones(1, 40, dtype=torch.bool), torch.eye(3, dtype=torch.float64)[None]
-    guess[:, 0, 2], guess[:, 1, 2] = 3.2, -0.8
-    for softness in (0.0, 0.05, 0.2):
-        matrix, share = fit_to_inliers(earlier, later, valid, guess, 3.0, homography.fit, softness)
-        assert abs(float(share) - 0.75) < 0.02
-        torch.testing.assert_close(matrix[0, :2, 2], torch.tensor([3.0, -1.0]).double(), atol=0.4, rtol=0)
-    tolerance = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        lambda t: fit_to_inliers(earlier, later, valid, guess, t, homography.fit, 0.3)[0], (tolerance,)
-    )
+    assert torch.isfinite(plane_maps.transfer(matrix, torch.tensor([[[100.0, 5.0]]]))).all()

@@ -7,7 +7,7 @@ import pytest
 from tests.evaluation.studies.world import filmed, followed, study
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.runner import read_spec
-from torchvision_dddas.tuning.family import FAMILIES, load_family, prepare
+from torchvision_dddas.tuning.family import prepare
 
 
 @pytest.fixture(scope="module")
@@ -38,17 +38,3 @@ def test_a_clip_without_the_truth_that_is_needed_is_named(clips) -> None:
 def test_knobs_of_several_families_are_told_apart(clips) -> None:
     with pytest.raises(InputError, match=r"motion: difference\.threshold; tracking: track\.speed"):
         prepare(read_spec(clips), clips.parent, ["difference.threshold", "track.speed"])
-
-
-def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
-    with pytest.raises(InputError, match="wanted one of motion"):
-        load_family("weather")
-
-
-@pytest.mark.parametrize("name", FAMILIES)
-def test_every_family_is_there_and_says_what_it_is(name: str) -> None:
-    family = load_family(name)
-    assert family.name == name
-    assert family.measure.split(".")[0] == family.task
-    first, last = family.softness
-    assert first >= last >= 0

@@ -18,7 +18,7 @@ from torchvision_dddas.detection.interval import interval_from_flow, interval_fr
 from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
 
 if TYPE_CHECKING:
-    from torchvision_dddas.detection.torch_engine import TorchEngine, absolute_difference, find_seen_by_both
+    from torchvision_dddas.detection.torch_engine import TorchEngine
 
 __all__ = [
     "EVIDENCE_CAP",
@@ -32,13 +32,11 @@ __all__ = [
     "TorchEngine",
     "View",
     "Window",
-    "absolute_difference",
     "cell_side",
     "check_length",
     "detect_keypoints",
     "detect_motion",
     "fill_hull",
-    "find_seen_by_both",
     "fit_motion",
     "interval_from_flow",
     "interval_from_telemetry",

@@ -28,7 +28,7 @@ from torchvision_dddas.detection.engine import (
     judge_points,
     match_exposure,
 )
-from torchvision_dddas.functional import affine, consensus, difference, filters, flow, homography, keypoints, warp
+from torchvision_dddas.functional import difference, filters, flow, keypoints, plane_maps, warp
 from torchvision_dddas.functional import morphology as morph
 from torchvision_dddas.types import Registration
 
@@ -201,30 +201,20 @@ class WarpedWindows:
 
     def both(self, pair: tuple[int, int]) -> Tensor:
         """Where both neighbours of a pair are seen."""
-        return find_seen_by_both(self.seen[pair[0]], self.seen[pair[1]], self.grey.shape[-1])
+        return warp.seen_by_both(self.seen[pair[0]], self.seen[pair[1]], self.grey.shape[-1])
 
     def least(self, pair: tuple[int, int]) -> Tensor:
         """What the settings compare of a pair, a new tensor."""
         if self.between_later:
-            return absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
+            return difference.absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
         return self.smaller(pair)
 
     def smaller(self, pair: tuple[int, int]) -> Tensor:
         """The difference from the reference that both neighbours of a pair show, a new tensor."""
         for k in pair:
             if k not in self._distance:
-                self._distance[k] = absolute_difference(self.grey, self.warped[k])
+                self._distance[k] = difference.absolute_difference(self.grey, self.warped[k])
         return torch.minimum(self._distance[pair[0]], self._distance[pair[1]])
-
-
-def absolute_difference(a: Tensor, b: Tensor) -> Tensor:
-    """|a - b| of unsigned bytes."""
-    return torch.maximum(a, b).sub_(torch.minimum(a, b))
-
-
-def find_seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Tensor:
-    """Where both neighbours are seen, as a Boolean mask."""
-    return warp.between(torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1]), width)
 
 
 def _close_masks(mask: Tensor, side: int) -> Tensor:
@@ -249,7 +239,7 @@ def _match_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor])
     columns = torch.arange(0, reference.shape[-1], 4, device=reference.device)
     inside = (columns >= first) & (columns <= last)
     wanted, given = (picture[..., ::4, ::4] / LEVEL for picture in (reference, warped))
-    gain, offset = difference.exposure(wanted, given, inside[:, None], stride=1)
+    gain, offset = difference.exposure(wanted, given, inside[:, None])
     enough = inside.sum((1, 2)) >= 100
     return _apply_light(reference, warped, torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0))
 
@@ -292,7 +282,7 @@ class _PairRegistration:
 
     def __init__(self, parameters: RegistrationParameters, device: torch.device) -> None:
         self.parameters, self.device = parameters, device
-        self.model = affine if parameters.model == "affine" else homography
+        self.model = plane_maps.MODELS[parameters.model]
 
     def __call__(self, pairs: list[tuple[View, View]]) -> list[Registration]:
         """The background's motion from the first to the second frame of each pair."""
@@ -358,13 +348,13 @@ class _PairRegistration:
             return points, valid, torch.eye(3).expand(len(points), 3, 3)
         if points.shape[1] < 2 * _SCOUTS:
             return self._search_everywhere(batch)
-        scouts = consensus.spread(valid, _SCOUTS)
+        scouts = plane_maps.spread(valid, _SCOUTS)
         start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
         # A scout that has not arrived after a few steps does not count.
         ahead, found = flow.track(start, batch.earlier, batch.later, rounds=2, **self._search(most_steps=8))
         found = found & valid.gather(1, scouts)
         motion = self._ransac(start.double(), ahead.double(), found, parameters.hypotheses // 2, (1.5, 1.0)).float()
-        near = found & (consensus.transfer_error(motion, start, ahead) < parameters.ransac_px)
+        near = found & (plane_maps.transfer_error(motion, start, ahead) < parameters.ransac_px)
         agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
         end, kept, motion = torch.zeros_like(points), torch.zeros_like(valid), motion.double()
         for choice, search in ((agreed, self._search_near), (~agreed, self._search_everywhere)):
@@ -384,11 +374,11 @@ class _PairRegistration:
     def _search_near(self, batch: _Batch, motion: Tensor) -> Tracked:
         """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
         finest = batch._replace(earlier=batch.earlier[:1], later=batch.later[:1])
-        guess = consensus.transfer(motion.float(), batch.points)
+        guess = plane_maps.transfer(motion.float(), batch.points)
         end, found = self._track(finest, guess, self._search(most_steps=10) | {"reach_px": 3})
         gates_px = tuple(share * self.parameters.ransac_px for share in _REFITS)
         start, valid, model = batch.points.double(), batch.valid & found, self.model
-        return end, found, consensus.refit(start, end.double(), valid, motion, gates_px, model.SAMPLE_SIZE, model.fit)
+        return end, found, plane_maps.refit(start, end.double(), valid, motion, gates_px, model)
 
     def _track(self, batch: _Batch, guess: Tensor | None, settings: dict[str, Any]) -> tuple[Tensor, Tensor]:
         pictures, limit_px = (batch.points, batch.earlier, batch.later), self.parameters.forward_backward_px
@@ -410,13 +400,12 @@ class _PairRegistration:
     ) -> Tensor:
         """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own."""
         model, (batch, count) = self.model, tracked.shape
-        if count < model.SAMPLE_SIZE:
+        if count < model.size:
             return torch.eye(3, dtype=start.dtype, device=start.device).expand(batch, 3, 3)
         # The same numbers for every pair and call: what one pair gives does not depend on its company.
         generator = torch.Generator().manual_seed(0)
-        samples = consensus.draw_samples(generator, 1, hypotheses, count, model.SAMPLE_SIZE)
+        samples = plane_maps.draw_samples(generator, 1, hypotheses, count, model.size)
         samples = samples.to(start.device).expand(batch, -1, -1)
         tolerance_px = self.parameters.ransac_px
         refits = tuple(share * tolerance_px for share in shares)
-        matrix: Tensor = model.ransac(start, end, tracked, samples, tolerance_px, refits)[0]
-        return matrix
+        return plane_maps.ransac(start, end, tracked, samples, model, tolerance_px, refits)[0]

@@ -1,7 +1,7 @@
 """ONNX graphs of our functions, each compared with torch before it is written: `dddas export`. Needs torch and onnx.
 
 The graphs of people are built node by node (people_graphs.py), as ONNX Runtime runs them on a small CPU. The others are
-traced from `functional` by torch's exporter (traced_graphs.py). The package ships those of people and of homographies.
+traced from `nn` by torch's exporter (traced_graphs.py). The package ships those of people and of homographies.
 The same versions write the same bytes.
 """
 

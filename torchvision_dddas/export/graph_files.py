@@ -1,7 +1,18 @@
-"""Exported graphs with what they were compared with, and the folder that holds them under one manifest."""
+"""From a torch module to an ONNX file of standard operations, and the folder that holds such files under one manifest.
 
+Uses torch's older exporter, which traces: on the whole step the newer one takes minutes and this one 20 seconds. It has
+no `.mT`, which is added here, and it counts a negative dimension of `unfold` wrongly without an error, so every graph
+must be compared with torch.
+"""
+
+import contextlib
 import hashlib
+import io
 import json
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,10 +20,14 @@ from typing import Any
 import onnx
 import onnxruntime
 import torch
+from torch import Tensor, nn
+from torch.onnx import symbolic_helper
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
 from torchvision_dddas.runtime import MANIFEST, VERSION, manifest, seal
+
+OPSET = 20
 
 
 @dataclass(frozen=True)
@@ -53,7 +68,9 @@ def write_graphs(folder: Path, files: dict[str, ExportedGraph]) -> None:
         kept = {}
     contents = {name: graph.content for name, graph in files.items()}
     entries = kept | {name: _manifest_entry(graph) for name, graph in files.items()}
-    contents[MANIFEST] = _manifest_json(entries)  # the last to take its place
+    listed: dict[str, Any] = {"package": VERSION, "graphs": dict(sorted(entries.items()))}
+    # The last to take its place.
+    contents[MANIFEST] = (json.dumps({**listed, "seal": seal(listed)}, indent=1) + "\n").encode()
     parts = {folder / name: temporary(folder / name) for name in contents}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -78,11 +95,6 @@ def refuse_failed(files: dict[str, ExportedGraph]) -> None:
                 f"{name} does not agree with {graph.source}: {off}. Nothing was written; "
                 "try other versions of torch, onnx and onnxruntime"
             )
-
-
-def _manifest_json(graphs: dict[str, dict[str, Any]]) -> bytes:
-    content: dict[str, Any] = {"package": VERSION, "graphs": dict(sorted(graphs.items()))}
-    return (json.dumps({**content, "seal": seal(content)}, indent=1) + "\n").encode()
 
 
 def _manifest_entry(graph: ExportedGraph) -> dict[str, Any]:
@@ -111,3 +123,98 @@ def _type_and_shape(value: onnx.ValueInfoProto) -> dict[str, Any]:
         "type": onnx.TensorProto.DataType.Name(kind.elem_type).lower(),
         "shape": [d.dim_param or d.dim_value for d in kind.shape.dim],  # sizes that are free have names
     }
+
+
+def trace_graph(
+    module: nn.Module,
+    name: str,
+    inputs: Mapping[str, Tensor],
+    outputs: Sequence[str],
+    free_axes: Mapping[str, Mapping[int, str]] | None = None,
+) -> bytes:
+    """The ONNX file of a module, traced on the tensors given; the same versions give the same bytes.
+
+    free_axes: names of axes of any length, by input or output. Raises InputError if the result is not of standard
+    operations.
+    """
+    file = io.BytesIO()
+    with _quiet(), _transpose_known(), torch.no_grad():
+        torch.onnx.export(
+            module,
+            tuple(inputs.values()),
+            file,  # type: ignore[arg-type]  # the older exporter takes it
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(inputs),
+            output_names=list(outputs),
+            dynamic_axes=free_axes,
+        )
+    # Without nodes that do not depend on the inputs, nearly two of three, the graph opens sooner.
+    with tempfile.TemporaryDirectory() as folder:
+        options = _options()
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC  # standard operations
+        options.log_severity_level = 3  # "the model may only work here" is true of the levels above
+        options.optimized_model_filepath = str(Path(folder) / "folded.onnx")
+        onnxruntime.InferenceSession(file.getvalue(), options, providers=["CPUExecutionProvider"])
+        return _strip(onnx.load(options.optimized_model_filepath), name)
+
+
+def open_session(content: bytes) -> onnxruntime.InferenceSession:
+    """A session of a graph on one thread."""
+    return onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
+
+
+def _options() -> onnxruntime.SessionOptions:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return options
+
+
+def _strip(model: onnx.ModelProto, name: str) -> bytes:
+    """The model without what tells where and how it was made."""
+    graph = model.graph
+    graph.name, model.doc_string, model.producer_name, model.producer_version = name, "", "", ""
+    del model.metadata_props[:], graph.value_info[:], model.functions[:]
+    for held in (graph, *graph.node, *graph.initializer, *graph.input, *graph.output):
+        held.doc_string = ""
+        del held.metadata_props[:]
+    if strange := {node.domain for node in graph.node} - {""}:
+        raise InputError(
+            f"torch's exporter made {name} of operations of {', '.join(strange)}, wanted standard ones; "
+            "try another version of torch"
+        )
+    opsets = [held for held in model.opset_import if held.domain == ""]
+    del model.opset_import[:]
+    model.opset_import.extend(opsets)
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString(deterministic=True)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    noisy = logging.getLogger("torch.onnx")
+    level = noisy.level
+    noisy.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        noisy.setLevel(level)
+
+
+@contextlib.contextmanager
+def _transpose_known() -> Iterator[None]:
+    """Teach the exporter `.mT` meanwhile."""
+
+    def last_two_swapped(context: Any, matrix: Any) -> Any:
+        rank = symbolic_helper._get_tensor_rank(matrix)
+        assert rank is not None, "traced with tensors, so known"
+        order = [*range(rank - 2), rank - 1, rank - 2]
+        return context.op("Transpose", matrix, perm_i=order)
+
+    torch.onnx.register_custom_op_symbolic("aten::mT", last_two_swapped, 9)  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.onnx.unregister_custom_op_symbolic("aten::mT", 9)  # type: ignore[attr-defined]

@@ -22,8 +22,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from torchvision_dddas.config import PeopleParameters
-from torchvision_dddas.export.graph_files import Check, ExportedGraph
-from torchvision_dddas.export.tracing import OPSET, open_session
+from torchvision_dddas.export.graph_files import OPSET, Check, ExportedGraph, open_session
 from torchvision_dddas.functional import hog
 from torchvision_dddas.people.onnx_scorer import BAKED
 from torchvision_dddas.people.torch_scorer import layout

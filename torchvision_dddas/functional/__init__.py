@@ -6,35 +6,31 @@ is fixed by the shapes of the inputs, and what is missing is marked by a validit
 """
 
 from torchvision_dddas.functional import (
-    affine,
     affinity,
     assignment,
     color,
-    consensus,
     difference,
     filters,
     flow,
     hog,
-    homography,
     keypoints,
     morphology,
+    plane_maps,
     soft,
     warp,
 )
 
 __all__ = [
-    "affine",
     "affinity",
     "assignment",
     "color",
-    "consensus",
     "difference",
     "filters",
     "flow",
     "hog",
-    "homography",
     "keypoints",
     "morphology",
+    "plane_maps",
     "soft",
     "warp",
 ]

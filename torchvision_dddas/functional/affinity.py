@@ -1,8 +1,8 @@
 """How alike the targets of two or three frames are: the generalised Jaccard coefficient (appendix C, eq. 1, 4, 5).
 
 Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), histograms
-(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0.
-`tracking.source_tracker` has the twin for one window without torch.
+(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0, and so is that of two vectors of
+zeros, which resemble nothing. `tracking.source_tracker` is the twin for one window without torch.
 """
 
 import torch
@@ -10,7 +10,29 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def overlap(
+def pairs(
+    a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"], a_valid: Bool[Tensor, "B N"], b_valid: Bool[Tensor, "B M"]
+) -> Float[Tensor, "B N M"]:
+    """S = Σ min / Σ max in [0, 1]."""
+    return _divide(*_sums(a, b), a_valid[..., :, None] & b_valid[..., None, :])
+
+
+def triplets(
+    a: Float[Tensor, "B N D"],
+    b: Float[Tensor, "B M D"],
+    c: Float[Tensor, "B L D"],
+    a_valid: Bool[Tensor, "B N"],
+    b_valid: Bool[Tensor, "B M"],
+    c_valid: Bool[Tensor, "B L"],
+) -> Float[Tensor, "B N M L"]:
+    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first."""
+    valid = a_valid[..., :, None, None] & b_valid[..., None, :, None] & c_valid[..., None, None, :]
+    both = zip(_sums(a, b), _sums(b, c), strict=True)
+    smaller, larger = (first[..., None] + second[..., None, :, :] for first, second in both)
+    return _divide(smaller, larger, valid)
+
+
+def _sums(
     a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"]
 ) -> tuple[Float[Tensor, "B N M"], Float[Tensor, "B N M"]]:
     """Numerator Σ min(a, b) and denominator Σ max(a, b) of each pair.
@@ -24,37 +46,7 @@ def overlap(
     return ((total - apart) / 2).clamp(min=0), (total + apart) / 2
 
 
-def pairs(
-    a: Float[Tensor, "B N D"],
-    b: Float[Tensor, "B M D"],
-    a_valid: Bool[Tensor, "B N"],
-    b_valid: Bool[Tensor, "B M"],
-) -> Float[Tensor, "B N M"]:
-    """S = Σ min / Σ max in [0, 1]; 0 for padding, and for two vectors of zeros, which resemble nothing."""
-    smaller, larger = overlap(a, b)
-    return _share(smaller, larger, a_valid[..., :, None] & b_valid[..., None, :])
-
-
-def triplets(
-    a: Float[Tensor, "B N D"],
-    b: Float[Tensor, "B M D"],
-    c: Float[Tensor, "B L D"],
-    a_valid: Bool[Tensor, "B N"],
-    b_valid: Bool[Tensor, "B M"],
-    c_valid: Bool[Tensor, "B L"],
-) -> Float[Tensor, "B N M L"]:
-    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first."""
-    ab_smaller, ab_larger = overlap(a, b)
-    bc_smaller, bc_larger = overlap(b, c)
-    valid = a_valid[..., :, None, None] & b_valid[..., None, :, None] & c_valid[..., None, None, :]
-    return _share(
-        ab_smaller[..., None] + bc_smaller[..., None, :, :], ab_larger[..., None] + bc_larger[..., None, :, :], valid
-    )
-
-
-def _share(
-    smaller: Float[Tensor, "*shape"], larger: Float[Tensor, "*shape"], valid: Bool[Tensor, "*shape"]
-) -> Float[Tensor, "*shape"]:
+def _divide(smaller: Tensor, larger: Tensor, valid: Tensor) -> Tensor:
     there = valid & (larger > 0)
     # The inner `where` keeps 0 / 0 out of the gradient.
     share = smaller / torch.where(there, larger, torch.ones_like(larger))

@@ -82,26 +82,20 @@ def rgb_histogram(
     inside = (down < tall[..., None])[..., :, None] & (across < wide[..., None])[..., None, :]
     place = (v[..., :, None] * width + u[..., None, :]).flatten(1)
     pixels = image.flatten(2).gather(2, place[:, None].expand(-1, 3, -1))
-    counts = _counts(pixels, inside.flatten(1), box_px.shape[1], softness)
-    if normalize:
-        counts = counts / counts.sum(-1, keepdim=True).clamp(min=1)
-    return counts.flatten(2), valid
-
-
-def _counts(
-    pixels: Float[Tensor, "B 3 NP"], inside: Bool[Tensor, "B NP"], boxes: int, softness: float
-) -> Float[Tensor, "B N 3 256"]:
-    """Add every pixel to the level, or the two levels, that it is nearest to in its box's histogram."""
-    batch, _, many = pixels.shape
+    # Every pixel counts in the level, or the two levels, that it is nearest to, of its box's histogram.
     level = pixels.clamp(0, 1) * (BINS - 1)
-    weight = inside[:, None].to(pixels.dtype).expand(-1, 3, -1)
-    owner = torch.arange(boxes, device=pixels.device).repeat_interleave(many // max(boxes, 1)) * BINS
-    total = torch.zeros(batch, 3, boxes * BINS, dtype=pixels.dtype, device=pixels.device)
+    weight = inside.flatten(1)[:, None].to(pixels.dtype).expand_as(level)
+    batch, boxes = valid.shape
+    owner = torch.arange(boxes, device=image.device).repeat_interleave(rows * columns) * BINS
+    counts = torch.zeros(batch, 3, boxes * BINS, dtype=image.dtype, device=image.device)
     if softness > 0:
         below = level.detach().floor().clamp(max=BINS - 2)
         upper = ((level - below - 0.5) / softness + 0.5).clamp(0, 1)
         at = below.long() + owner
-        total = total.scatter_add(2, at, weight * (1 - upper)).scatter_add(2, at + 1, weight * upper)
+        counts = counts.scatter_add(2, at, weight * (1 - upper)).scatter_add(2, at + 1, weight * upper)
     else:
-        total = total.scatter_add(2, level.round().long() + owner, weight)
-    return total.view(batch, 3, boxes, BINS).transpose(1, 2)
+        counts = counts.scatter_add(2, level.round().long() + owner, weight)
+    counts = counts.view(batch, 3, boxes, BINS).transpose(1, 2)
+    if normalize:
+        counts = counts / counts.sum(-1, keepdim=True).clamp(min=1)
+    return counts.flatten(2), valid

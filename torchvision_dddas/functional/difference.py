@@ -11,24 +11,18 @@ def exposure(
     reference: Float[Tensor, "B C H W"],
     warped: Float[Tensor, "B C H W"],
     inside: Bool[Tensor, "B 1 H W"],
-    rounds: int = 4,
     floor: float = 3 / 255,
-    stride: int | None = None,
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
     Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
-    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Every `stride`-th pixel is used
-    (default: about 80 rows of them). Without inside pixels, or on a frame of one single grey, the gain stays 1 (and the
-    offset is the difference of the means).
+    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Without inside pixels, or on a frame
+    of one single grey, the gain stays 1 (and the offset is the difference of the means).
     """
-    if stride is None:
-        stride = max(1, min(reference.shape[-2:]) // 80)
-    wanted = reference[..., ::stride, ::stride].flatten(1)
-    given = warped[..., ::stride, ::stride].flatten(1)
-    seen = inside[..., ::stride, ::stride].expand(-1, reference.shape[1], -1, -1).flatten(1)
+    wanted, given = reference.flatten(1), warped.flatten(1)
+    seen = inside.expand_as(reference).flatten(1)
     gain, offset = torch.ones_like(wanted[:, :1]), masked_median((wanted - given).detach(), seen)
-    for _ in range(rounds):
+    for _ in range(4):
         error = (wanted - gain * given - offset).abs().detach()
         kept = (seen & (error <= (3.7 * masked_median(error, seen)).clamp(min=floor))).to(wanted.dtype)
         count = kept.sum(1, keepdim=True).clamp(min=1.0)
@@ -41,6 +35,11 @@ def exposure(
         gain = torch.where(fitted, together / torch.where(fitted, spread, one), one)
         offset = wanted_mean - gain * given_mean
     return gain[:, 0], offset[:, 0]
+
+
+def absolute_difference(a: UInt8[Tensor, "*any"], b: UInt8[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
+    """|a - b| of unsigned bytes."""
+    return torch.maximum(a, b).sub_(torch.minimum(a, b))
 
 
 def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:

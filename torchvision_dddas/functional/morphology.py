@@ -11,6 +11,7 @@ float32 pictures goes to the pixel that decides; values within a 500,000th of th
 
 import math
 from collections.abc import Callable
+from functools import reduce
 from typing import Literal
 
 import torch
@@ -39,16 +40,14 @@ def dilate(
     if softness == 0.0:
         return _extremum(mask, size_px, shape, highest=False)
     width, height = (size_px, size_px) if isinstance(size_px, int) else size_px
-    rows = element_rows(width, height, shape)
+    rows, columns = mask.shape[-2:]
     padded = functional.pad(mask / softness, _margins(width, height), value=_NOTHING / softness)
-    runs = {last - first: _log_sum_of_run(padded, last - first) for first, last in rows if last > first}
-    result: Tensor | None = None
-    for number, (first, last) in enumerate(rows):
-        if last > first:
-            part = runs[last - first][..., number : number + mask.shape[-2], first : first + mask.shape[-1]]
-            result = part if result is None else torch.logaddexp(result, part)
-    assert result is not None, "every element has its middle row"
-    return result * softness
+    shifted = [
+        padded[..., row : row + rows, column : column + columns]
+        for row, (first, last) in enumerate(element_rows(width, height, shape))
+        for column in range(first, last)
+    ]
+    return torch.stack(shifted).logsumexp(0) * softness
 
 
 def erode(
@@ -102,7 +101,9 @@ def _extremum(mask: Tensor, size_px: Size, shape: Shape, highest: bool) -> Tenso
     if mask.requires_grad and torch.is_grad_enabled() and mask.dtype == torch.float32 and max(width, height) < _TILE:
         return _gather_extremum(mask, (width, height), shape, highest)
     rows = element_rows(width, height, shape)
-    padded = functional.pad(mask, _margins(width, height), value=_neutral(mask.dtype, highest))
+    is_float = mask.dtype.is_floating_point
+    ends = (-math.inf, math.inf) if is_float else (torch.iinfo(mask.dtype).min, torch.iinfo(mask.dtype).max)
+    padded = functional.pad(mask, _margins(width, height), value=ends[highest])
     pitch = padded.shape[-1]
     # One flat row of memory: a shift by k columns is a shift by k, one by a row a shift by `pitch`. What runs over a
     # row's end lands in the padding of the next, which is cut away.
@@ -111,7 +112,10 @@ def _extremum(mask: Tensor, size_px: Size, shape: Shape, highest: bool) -> Tenso
     if all(row == (0, width) for row in rows):
         result = _running(_running(flat, width, 1, better), height, pitch, better)
     else:
-        result = _union_of_runs(flat, rows, pitch, size, better)
+        # One running extremum per distinct run length, shifted into its rows.
+        runs = {last - first: _running(flat, last - first, 1, better) for first, last in rows}
+        parts = [runs[last - first].narrow(0, row * pitch + first, size) for row, (first, last) in enumerate(rows)]
+        result = reduce(better, parts)
     result = functional.pad(result, (0, flat.numel() - size)).reshape(padded.shape)
     return result[..., : mask.shape[-2], : mask.shape[-1]].contiguous()
 
@@ -126,44 +130,6 @@ def _running(flat: Tensor, length: int, stride: int, better: Extremum) -> Tensor
     return better(flat[: flat.numel() - rest], flat[rest:]) if rest else flat
 
 
-def _union_of_runs(flat: Tensor, rows: list[tuple[int, int]], pitch: int, size: int, better: Extremum) -> Tensor:
-    """Extremum over an element given as runs: one running extremum per distinct run length, shifted into its rows."""
-    runs = {last - first: _running(flat, last - first, 1, better) for first, last in rows if last > first}
-    result: Tensor | None = None
-    for number, (first, last) in enumerate(rows):
-        if last > first:
-            part = runs[last - first].narrow(0, number * pitch + first, size)
-            result = part if result is None else better(result, part)
-    assert result is not None, "every element has its middle row"
-    return result
-
-
-def _neutral(dtype: torch.dtype, highest: bool) -> float | int:
-    if dtype.is_floating_point:
-        return math.inf if highest else -math.inf
-    limits = torch.iinfo(dtype)
-    return limits.max if highest else limits.min
-
-
-def _log_sum_of_run(x: Tensor, length: int) -> Tensor:
-    """Log-sum-exp over `length` columns from each on; spans double, and the binary digits of the length are joined.
-
-    Spans must not overlap, as those of a running maximum may: a number that counts twice makes the sum larger.
-    """
-    result: Tensor | None = None
-    taken, span, spans = 0, 1, x
-    while True:
-        if length & span:
-            part = spans[..., taken:]
-            result = part if result is None else torch.logaddexp(result[..., : part.shape[-1]], part)
-            taken += span
-        if taken == length:
-            assert result is not None, "a length is at least 1"
-            return result
-        spans = torch.logaddexp(spans[..., : spans.shape[-1] - span], spans[..., span:])
-        span *= 2
-
-
 def _gather_extremum(x: Tensor, size_px: tuple[int, int], shape: Shape, highest: bool) -> Tensor:
     """As `_extremum`, by finding the pixel that decides, to which the gradient goes.
 
@@ -173,17 +139,13 @@ def _gather_extremum(x: Tensor, size_px: tuple[int, int], shape: Shape, highest:
     sign = -1.0 if highest else 1.0
     rows = torch.arange(x.shape[-2], device=x.device, dtype=torch.int32)[:, None]
     columns = torch.arange(x.shape[-1], device=x.device, dtype=torch.int32)
-    numbered = _quantize(sign * x.detach()) | (rows % _TILE * _TILE + columns % _TILE)
+    low, high = (sign * x.detach()).aminmax()
+    # Values as whole numbers whose lowest bits are free for a place within a tile.
+    value = ((sign * x.detach() - low) / ((high - low).clamp(min=1e-30) / _STEPS)).round_().int() * _TILE**2
+    numbered = value | (rows % _TILE * _TILE + columns % _TILE)
     decided = _extremum(numbered, size_px, shape, highest=False)
     # The element is smaller than a tile, so that the place within one identifies the pixel.
     row = rows + (decided // _TILE - rows + _TILE // 2) % _TILE - _TILE // 2
     column = columns + (decided - columns + _TILE // 2) % _TILE - _TILE // 2
     place = row * x.shape[-1] + column
     return x.flatten(-2).gather(-1, place.long().flatten(-2)).reshape(x.shape)
-
-
-def _quantize(x: Tensor) -> Tensor:
-    """Values as whole numbers whose lowest bits are free for a place within a tile."""
-    low, high = x.aminmax()
-    step = (high - low).clamp(min=1e-30) / _STEPS
-    return ((x - low) / step).round_().int() * _TILE**2

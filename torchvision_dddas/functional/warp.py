@@ -73,6 +73,11 @@ def between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], width: int)
     return ((columns >= first[..., None]) & (columns <= last[..., None]))[:, None]
 
 
+def seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Bool[Tensor, "B 1 h w"]:
+    """Where two frames are seen. one, other: as `seen_columns` returns them."""
+    return between(torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1]), width)
+
+
 def resize(
     levels: Float[Tensor, "B C H W"],
     size: tuple[int, int],

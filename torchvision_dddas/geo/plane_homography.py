@@ -29,7 +29,7 @@ class PlaneSolver:
     """Batched solver of plane homographies in float64: the shipped ONNX graphs, or torch; they agree to 1e-6 px."""
 
     def __init__(self, fit: Callable[..., Solution], fit_raw: Callable[..., Solution]) -> None:
-        """The functions of `functional.homography` on arrays."""
+        """The functions of `functional.plane_maps` on arrays."""
         self._fit, self._fit_raw = fit, fit_raw
 
     def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> Solution:
@@ -66,12 +66,12 @@ def load_solver(backend: str) -> PlaneSolver:
         )
     import torch
 
-    from torchvision_dddas.functional import homography
+    from torchvision_dddas.functional import plane_maps
 
     def on_arrays(function: Callable[..., Any]) -> Callable[..., Solution]:
         return lambda *arrays: tuple(result.numpy() for result in function(*map(torch.from_numpy, arrays)))
 
-    return PlaneSolver(on_arrays(homography.fit), on_arrays(homography.fit_raw))
+    return PlaneSolver(on_arrays(plane_maps.fit_homography), on_arrays(plane_maps.fit_raw))
 
 
 @cache

@@ -1,43 +1,20 @@
 """The state of a descent on disk, with what it depends on, so that only the same descent is resumed."""
 
-import hashlib
 import io
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
 
-from torchvision_dddas.config import changes
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, save_file
-from torchvision_dddas.tuning.family import Family
-from torchvision_dddas.tuning.parameters import Parameters
 
 FORMAT = 3
 
 
-def describe_descent(
-    family: Family, parameters: Parameters, plan: Mapping[str, Any], seen: Sequence[str], cost: object
-) -> dict[str, Any]:
-    """What a descent depends on, in texts and numbers. seen: its examples, in order."""
-    return {
-        "family": family.name,
-        "task": family.task,
-        "interval": family.interval,
-        "loss": family.loss_name,
-        "knobs": ", ".join(parameters.names),
-        "settings": json.dumps(changes(parameters.base), default=str),
-        **plan,
-        "examples": hashlib.sha256("\n".join(seen).encode()).hexdigest()[:16],
-        "cost": "" if cost is None else repr(cost),
-    }
-
-
 def write_checkpoint(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write a state. asked: as `describe_descent` returns it. Raises InputError where the disk refuses."""
+    """Write a state. asked: what the descent depends on, by name. Raises InputError where the disk refuses."""
     content = io.BytesIO()
     torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
     save_file(place, content.getvalue())
@@ -56,14 +33,17 @@ def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
         raise InputError(f"{place} is a checkpoint of another version; begin again without --resume")
     for name, value in asked.items():
         if written.get(name) != value:
+            held, wanted = (
+                text if len(text) <= 80 else f"{text[:79]}…" for text in (str(written.get(name)), str(value))
+            )
             raise InputError(
-                f"{place} is of a descent with other {name.replace('_', ' ')}, {_short(written.get(name))} and not "
-                f"{_short(value)}; ask for the same, or begin again without --resume"
+                f"{place} is of a descent with other {name.replace('_', ' ')}, {held} and not {wanted}; ask for the "
+                "same, or begin again without --resume"
             )
     return state
 
 
-def set_aside(place: Path, aside: Path, more: Mapping[Path, Path] = MappingProxyType({})) -> int:
+def set_aside(place: Path, aside: Path, more: Mapping[Path, Path]) -> int:
     """Keep an unfinished checkpoint that a new descent would overwrite; return its steps, 0 if none was kept.
 
     One of more steps that lies at `aside` already is left there. more: files that belong to it, and where they go.
@@ -92,8 +72,3 @@ def _unfinished_steps(place: Path) -> int:
 def _load(place: Path) -> Any:
     # weights_only: a checkpoint is tensors, numbers and texts, and runs no code.
     return torch.load(place, weights_only=True, map_location="cpu")
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 80 else f"{text[:79]}…"

@@ -39,20 +39,23 @@ def fit_colours(
     overlap, so that one landmark would be taken for another.
     """
     bgr, worn = _pixels(pictures, labels, len(names), seed)
-    soft = about(bgr, worn)
+    soft = start_ranges(bgr, worn)
     if start is not None:
         if start.names != tuple(names):
             raise InputError(f"the ranges to begin with are of {', '.join(start.names)}; wanted {', '.join(names)}")
         soft = SoftColours(*(torch.as_tensor(np.array(end, float)) for end in (start.low, start.high)))
     adam = torch.optim.Adam(soft.parameters(), lr=RATE)
-    best, least = soft.ranges(), _hard(soft.ranges(), bgr, worn)
-    for step in range(steps):
-        softness = SOFTNESS[0] * (SOFTNESS[1] / SOFTNESS[0]) ** (step / max(steps - 1, 1))
-        adam.zero_grad()
-        confusion(soft(bgr, softness), worn).sum().backward()
-        adam.step()
-        if (wrong := _hard(soft.ranges(), bgr, worn)) < least:
-            best, least = soft.ranges(), wrong
+    best, least, hsv = soft.ranges(), float("inf"), bgr_to_hsv(bgr)
+    for step in range(steps + 1):
+        ranges = soft.ranges()
+        wrong = float(confusion(within_ranges(hsv, ranges[0].to(bgr), ranges[1].to(bgr)), worn).sum())
+        if wrong < least:
+            best, least = ranges, wrong
+        if step < steps:
+            softness = SOFTNESS[0] * (SOFTNESS[1] / SOFTNESS[0]) ** (step / max(steps - 1, 1))
+            adam.zero_grad()
+            confusion(soft(bgr, softness), worn).sum().backward()
+            adam.step()
     low, high = (end.numpy() for end in best)
     for a, b in find_overlaps(low, high):
         raise InputError(
@@ -60,13 +63,6 @@ def fit_colours(
             "paint one of them anew, or label more pictures"
         )
     return Colours(tuple(names), low, high)
-
-
-def _hard(ranges: tuple[Tensor, Tensor], bgr: Tensor, worn: Tensor) -> float:
-    from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
-
-    low, high = (end.to(bgr) for end in ranges)
-    return float(confusion(within_ranges(bgr_to_hsv(bgr), low, high), worn).sum())
 
 
 def _pixels(
@@ -107,30 +103,25 @@ class SoftColours(nn.Module):
     def __init__(self, low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"]) -> None:
         """low, high: as `color.within_ranges` takes them; a lowest hue above the highest goes over 0."""
         super().__init__()
-        if low.shape != high.shape or low.ndim != 2 or low.shape[-1] != 3:
-            raise InputError(
-                f"ranges of colour of shapes {tuple(low.shape)} and {tuple(high.shape)}; wanted lowest and highest "
-                "hue, saturation and value, (K, 3) each"
-            )
         low, high = low.double(), high.double()
         high = high + torch.where(low > high, TURN, 0.0) * torch.tensor([1.0, 0.0, 0.0])
         half = ((high - low) / 2 - LEAST_HALF).clamp(min=1e-3)
         self.middle = nn.Parameter((low + high) / 2)
         self.free = nn.Parameter(half + torch.log(-torch.expm1(-half)))  # softplus, undone
 
-    def ends(self) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3"]]:
-        """Lowest and highest, with gradients; a lowest hue below 0 or a highest above 180 is one that goes over 0."""
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest (K, 3), with gradients; a lowest hue below 0 or a highest above 180 goes over 0."""
         half = LEAST_HALF + functional.softplus(self.free)
         return self.middle - half, self.middle + half
 
     def forward(self, bgr: Float[Tensor, "B 3 H W"], softness: float) -> Float[Tensor, "B K H W"]:
         """How much each pixel of pictures in [0, 1] is of each colour; softness in levels, hard at 0."""
-        low, high = self.ends()
+        low, high = self._ends()
         return within_ranges(bgr_to_hsv(bgr), low.to(bgr), high.to(bgr), softness)
 
     def ranges(self) -> tuple[Int[Tensor, "K 3"], Int[Tensor, "K 3"]]:
         """Lowest and highest in whole levels, as `Colours` has them: hues from 0 to 180."""
-        low, high = (end.detach().round().long() for end in self.ends())
+        low, high = (end.detach().round().long() for end in self._ends())
         whole = high[:, 0] - low[:, 0] >= int(TURN)
         low[:, 0], high[:, 0] = torch.remainder(low[:, 0], int(TURN)), torch.remainder(high[:, 0], int(TURN))
         low[whole, 0], high[whole, 0] = 0, int(TURN)
@@ -138,8 +129,8 @@ class SoftColours(nn.Module):
         return low, high
 
 
-def about(bgr: Float[Tensor, "B 3 H W"], worn: Float[Tensor, "B K H W"]) -> SoftColours:
-    """Ranges to begin with: about the mean colour of what wears each. Raises InputError where nothing wears one."""
+def start_ranges(bgr: Float[Tensor, "B 3 H W"], worn: Float[Tensor, "B K H W"]) -> SoftColours:
+    """Ranges about the mean colour of what wears each. Raises InputError where nothing wears one."""
     hsv = bgr_to_hsv(bgr)
     angle = hsv[:, 0] * (2 * torch.pi / TURN)
     middles = []

@@ -1,21 +1,23 @@
 """Gradient descent on parameters: Adam, annealed softness, early stopping on watched examples."""
 
+import hashlib
+import json
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, changes
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tuning import checkpoint
-from torchvision_dddas.tuning.examples import clip_shares, draw_batch, split_examples
+from torchvision_dddas.tuning.checkpoint import read_checkpoint, write_checkpoint
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
+from torchvision_dddas.tuning.time_cost import TimeCost
 
 FINAL_RATE = 0.1
 """The rate at the last step, as a share of the first."""
@@ -35,6 +37,7 @@ class Plan:
     the descent. watched: share of each clip's examples, its last, that is held back for this. most_watched: of all
     clips together. most_s: no step begins after this many seconds. pull: weight of half the squared distance from the
     start in the loss, in the rate's units; it keeps parameters in place that few examples determine weakly.
+    Raises InputError for a value out of its range.
     """
 
     steps: int = 100
@@ -49,7 +52,6 @@ class Plan:
     pull: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raises InputError for a value out of its range."""
         for name in ("steps", "batch", "look_every", "patience", "most_watched"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be 1 or more, got {getattr(self, name)}")
@@ -59,14 +61,6 @@ class Plan:
             raise InputError(f"watched must be between 0 and 0.9, got {self.watched:g}")
         if not 0 <= self.pull < math.inf:
             raise InputError(f"pull must be 0 or more, got {self.pull:g}")
-
-
-class Cost(Protocol):
-    """A charge for time: see `time_cost`."""
-
-    def term(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """To be added to a loss: a tensor without axes."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -112,7 +106,7 @@ def descend(
     parameters: Parameters,
     examples: Sequence[Example],
     plan: Plan | None = None,
-    cost: Cost | None = None,
+    cost: TimeCost | None = None,
     tell: Callable[[Step], object] = lambda step: None,
     place: Path | None = None,
     resume: bool = False,
@@ -145,31 +139,59 @@ def descend(
             tell(taken)
         if taken is None or taken.watched is not None:
             run.save(place)
-    return run.result(time.perf_counter() - began, resumed)
+    parameters.load_state_dict(run.best)
+    return Descended(
+        parameters,
+        run.best_step,
+        run.history,
+        run.ended or "a loss was not finite",
+        run.failed,
+        time.perf_counter() - began,
+        tuple(name for name in parameters.names if len(run.history) > 1 and name not in run.moved),
+        run.history[-1].step - resumed,
+    )
 
 
 class _Run:
-    """A descent under way."""
+    """A descent under way.
+
+    moved: parameters that had a gradient. best, least, best_step: the best state, its watched loss and its step. since:
+    measurements without a gain.
+    """
+
+    _SAVED = ("best", "least", "best_step", "since", "ended", "failed")
 
     def __init__(
-        self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan, cost: Cost | None
+        self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan, cost: TimeCost | None
     ) -> None:
         self._family, self._parameters, self._plan, self._cost = family, parameters, plan, cost
         self._learned, self._watched = split_examples(examples, plan.watched, plan.most_watched)
-        self._clips = [example.clip for example in self._learned]
         self._adam = torch.optim.Adam(parameters.parameters(), lr=plan.rate, betas=(0.9, 0.99))
-        self._moved: set[str] = set()
-        self._best: dict[str, Tensor] = {}
-        self._least, self._best_step, self._since = math.inf, 0, 0
         self._hardest = family.softness[1]
+        self.moved: set[str] = set()
+        self.best: dict[str, Tensor] = {}
+        self.least, self.best_step, self.since = math.inf, 0, 0
         self.history: list[Step] = []
         self.ended = self.failed = ""
+        # What the descent depends on, which a checkpoint must agree with.
+        used = "\n".join(f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched))
+        self._facts = {
+            "family": family.name,
+            "task": family.task,
+            "interval": family.interval,
+            "loss": family.loss_name,
+            "knobs": ", ".join(parameters.names),
+            "settings": json.dumps(changes(parameters.base), default=str),
+            **{name: value for name, value in asdict(plan).items() if name != "most_s"},
+            "examples": hashlib.sha256(used.encode()).hexdigest()[:16],
+            "cost": "" if cost is None else repr(cost),
+        }
 
     def begin(self) -> Step:
         """Measure the start."""
         with torch.no_grad():
             values = self._parameters.values()
-        if cause := self._blame(self._watched, values, self._hardest):
+        if cause := self._explain(self._watched, values, self._hardest):
             raise InputError(f"{cause}, before the first step")
         return self._record(0, self._softness(1), math.nan, measure=True)
 
@@ -177,8 +199,9 @@ class _Run:
         """One step; None where it failed."""
         plan, number = self._plan, self.history[-1].step + 1
         softness = self._softness(number)
-        batch = [self._learned[i] for i in draw_batch(number - 1, self._clips, plan.batch, plan.seed)]
-        has_others = any(TUNABLE[name].rounding == "none" for name in self._moved)
+        clips = [example.clip for example in self._learned]
+        batch = [self._learned[i] for i in draw_batch(number - 1, clips, plan.batch, plan.seed)]
+        has_others = any(TUNABLE[name].rounding == "none" for name in self.moved)
         whole = number > SIZES_FIXED * plan.steps and has_others
         values = self._parameters.values(whole)
         for value in values.values():
@@ -189,15 +212,19 @@ class _Run:
         if not bool(torch.isfinite(loss)):
             self._fail(number, batch, values, softness)
             return None
-        if not (charged.requires_grad or self._moved or self._has_effect(values, softness)):
-            raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(self._parameters.names)}")
+        # The examples of one batch may depend on no parameter; all together must.
+        if not charged.requires_grad and not self.moved:
+            parts = self._parts(self._learned)
+            if not any(self._family.loss(values, part, softness).requires_grad for part in parts):
+                raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(values)}")
         self._adam.zero_grad()
         if loss.requires_grad:
             loss.backward()
-        if any(value.grad is not None and not bool(torch.isfinite(value.grad).all()) for value in values.values()):
+        gradients = {name: value.grad for name, value in values.items() if value.grad is not None}
+        if not all(bool(torch.isfinite(gradient).all()) for gradient in gradients.values()):
             self._fail(number, batch, values, softness)
             return None
-        self._moved |= {name for name, value in values.items() if value.grad is not None and bool(value.grad.any())}
+        self.moved |= {name for name, gradient in gradients.items() if bool(gradient.any())}
         for group in self._adam.param_groups:
             group["lr"] = plan.rate * (1 - (1 - FINAL_RATE) * (number - 1) / plan.steps)
         self._adam.step()
@@ -217,74 +244,46 @@ class _Run:
 
     def load(self, place: Path) -> None:
         """Take up a checkpoint. Raises InputError for one of another descent."""
-        state = checkpoint.read_checkpoint(place, self._facts())
+        state = read_checkpoint(place, self._facts)
         self._parameters.load_state_dict(state["knobs"])
         self._adam.load_state_dict(state["adam"])
-        self._best, self._least, self._best_step = state["best"], state["least"], state["best_step"]
-        self._since, self._moved = state["since"], set(state["moved"])
-        self.history = [Step(**step) for step in state["history"]]
-        self.ended, self.failed = state["ended"], state["failed"]
+        self.moved, self.history = set(state["moved"]), [Step(**step) for step in state["history"]]
+        for name in self._SAVED:
+            setattr(self, name, state[name])
 
     def save(self, place: Path | None) -> None:
         """Write a checkpoint. Raises InputError where the disk refuses."""
-        if place is None:
-            return
-        state = {
-            "knobs": self._parameters.state_dict(),
-            "adam": self._adam.state_dict(),
-            "best": self._best,
-            "least": self._least,
-            "best_step": self._best_step,
-            "since": self._since,
-            "moved": sorted(self._moved),
-            "history": [asdict(step) for step in self.history],
-            "ended": self.ended,
-            "failed": self.failed,
-        }
-        checkpoint.write_checkpoint(place, self._facts(), state)
-
-    def result(self, seconds: float, resumed: int) -> Descended:
-        """The parameters in their best state, and how they got there."""
-        self._parameters.load_state_dict(self._best)
-        names = self._parameters.names if len(self.history) > 1 else []
-        return Descended(
-            self._parameters,
-            self._best_step,
-            self.history,
-            self.ended or "a loss was not finite",
-            self.failed,
-            seconds,
-            tuple(name for name in names if name not in self._moved),
-            self.history[-1].step - resumed,
-        )
+        if place is not None:
+            state = {
+                "knobs": self._parameters.state_dict(),
+                "adam": self._adam.state_dict(),
+                "moved": sorted(self.moved),
+                "history": [asdict(step) for step in self.history],
+            }
+            write_checkpoint(place, self._facts, state | {name: getattr(self, name) for name in self._SAVED})
 
     def _record(self, number: int, softness: float, loss: float, measure: bool) -> Step:
         """Note the parameters as they are now; measure: and the loss of the watched examples."""
         watched = None
         with torch.no_grad():
-            values = self._parameters.values()
+            values = {name: float(value) for name, value in self._parameters.values().items()}
             if measure:
                 # Rounded as the settings are: a blend of two sizes may do well where either alone does badly.
                 settled = self._parameters.settled()
                 watched = self._watched_mean(settled)
         if watched is not None and not math.isfinite(watched):
             self._fail(number, self._watched, settled, self._hardest)
-            watched = None
-        step = Step(number, softness, loss, watched, {name: float(value) for name, value in values.items()})
-        if watched is not None:
-            self._judge(number, watched)
-        if not self.failed:
-            self.history.append(step)
+            return Step(number, softness, loss, None, values)
+        step = Step(number, softness, loss, watched, values)
+        self.history.append(step)
+        if watched is not None and (not self.best or watched < self.least - GAIN):
+            self.least, self.best_step, self.since = watched, number, 0
+            self.best = {name: value.clone() for name, value in self._parameters.state_dict().items()}
+        elif watched is not None:
+            self.since += 1
+            if self.since >= self._plan.patience:
+                self.ended = f"no gain on the watched examples since step {self.best_step}"
         return step
-
-    def _judge(self, number: int, watched: float) -> None:
-        if not self._best or watched < self._least - GAIN:
-            self._least, self._best_step, self._since = watched, number, 0
-            self._best = {name: value.clone() for name, value in self._parameters.state_dict().items()}
-            return
-        self._since += 1
-        if self._since >= self._plan.patience:
-            self.ended = f"no gain on the watched examples since step {self._best_step}"
 
     def _watched_mean(self, values: Mapping[str, Tensor]) -> float:
         """The mean loss of the watched examples at the final softness, every clip with the same weight, charged."""
@@ -298,81 +297,109 @@ class _Run:
         return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
 
     def _pull_term(self, whole: bool = False) -> Tensor:
-        if not self._plan.pull:
-            return torch.zeros((), dtype=torch.float64)
-        return self._plan.pull / 2 * self._parameters.moved(whole)
-
-    def _has_effect(self, values: Mapping[str, Tensor], softness: float) -> bool:
-        """Whether any example depends on a parameter, as those of one batch may not."""
-        return any(self._family.loss(values, part, softness).requires_grad for part in self._parts(self._learned))
+        pull = self._plan.pull
+        return pull / 2 * self._parameters.moved(whole) if pull else torch.zeros((), dtype=torch.float64)
 
     def _parts(self, examples: Sequence[Example]) -> Iterator[Sequence[Example]]:
         return (examples[i : i + self._plan.batch] for i in range(0, len(examples), self._plan.batch))
-
-    def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
-        self.failed = f"{self._blame(batch, values, softness) or 'the cost is not finite'}, at step {number}"
-
-    def _blame(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
-        known = [self.history[i].parameters for i in (-1, self._best_step, 0)] if self.history else []
-        before = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
-        return explain_nonfinite(self._family, batch, values, before, softness, self._plan.batch)
 
     def _softness(self, number: int) -> float:
         first, last = self._family.softness
         share = (number - 1) / max(self._plan.steps - 1, 1)
         return first ** (1 - share) * last**share if first > 0 and last > 0 else first + (last - first) * share
 
-    def _facts(self) -> dict[str, Any]:
-        """What a descent depends on, which a checkpoint must agree with."""
-        plan = {name: value for name, value in asdict(self._plan).items() if name != "most_s"}
-        seen = [f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched)]
-        return checkpoint.describe_descent(self._family, self._parameters, plan, seen, self._cost)
+    def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
+        self.failed = f"{self._explain(batch, values, softness) or 'the cost is not finite'}, at step {number}"
 
+    def _explain(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
+        """Name the first example whose loss or gradient is not finite, and the parameter; empty where all are finite.
 
-def explain_nonfinite(
-    family: Family,
-    batch: Sequence[Example],
-    values: Mapping[str, Tensor],
-    before: Sequence[Mapping[str, Tensor]],
-    softness: float,
-    size: int = 8,
-) -> str:
-    """Name the first example whose loss or gradient is not finite, and the parameter; empty where all are finite.
+        A parameter is named if its earlier value alone makes the loss finite, or if its gradient is not finite.
+        """
 
-    values: the parameters now; before: at other times, the most similar first. A parameter is named if its earlier
-    value alone makes the loss finite, or if its gradient is not finite. size: examples computed at once.
-    """
-    if all(_is_finite(family, batch[i : i + size], values, softness) for i in range(0, len(batch), size)):
-        return _explain_gradient(family, batch, values, softness)
-    example = next((one for one in batch if not _is_finite(family, [one], values, softness)), None)
-    if example is None:
-        return (
-            f"the loss of {family.name} is not finite for {batch[0].clip}, frame {batch[0].frame} and those beside it"
-        )
-    where = f"the loss of {family.name} is not finite for {example.clip}, frame {example.frame}"
-    good = next((known for known in before if _is_finite(family, [example], known, softness)), None)
-    if good is None:
-        return f"{where}, whatever the parameters"
-    guilty = [name for name in values if _is_finite(family, [example], {**values, name: good[name]}, softness)]
-    return f"{where}, with {', '.join(f'{name} = {float(values[name].detach()):.6g}' for name in guilty or values)}"
+        def finite(part: Sequence[Example], values: Mapping[str, Tensor]) -> bool:
+            with torch.no_grad():
+                return bool(torch.isfinite(self._family.loss(values, part, softness)).all())
 
+        if all(finite(part, values) for part in self._parts(batch)):
+            return self._explain_gradient(batch, values, softness)
+        problem = f"the loss of {self._family.name} is not finite for"
+        example = next((one for one in batch if not finite([one], values)), None)
+        if example is None:
+            return f"{problem} {batch[0].clip}, frame {batch[0].frame} and those beside it"
+        where = f"{problem} {example.clip}, frame {example.frame}"
+        known = [self.history[i].parameters for i in (-1, self.best_step, 0)] if self.history else []
+        earlier = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
+        good = next((before for before in earlier if finite([example], before)), None)
+        if good is None:
+            return f"{where}, whatever the parameters"
+        guilty = [name for name in values if finite([example], {**values, name: good[name]})]
+        return f"{where}, with {', '.join(f'{name} = {float(values[name].detach()):.6g}' for name in guilty or values)}"
 
-def _explain_gradient(family: Family, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
-    if not any(value.requires_grad for value in values.values()):
+    def _explain_gradient(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
+        if not any(value.requires_grad for value in values.values()):
+            return ""
+        for example in batch:
+            leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+            loss = self._family.loss(leaves, [example], softness).sum()
+            if loss.requires_grad:
+                loss.backward()
+            for name, value in leaves.items():
+                if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
+                    where = f"{example.clip}, frame {example.frame}"
+                    return f"the gradient of the loss in {name} = {float(value.detach()):.6g} is not finite for {where}"
         return ""
-    for example in batch:
-        leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
-        loss = family.loss(leaves, [example], softness).sum()
-        if not loss.requires_grad:
-            continue
-        gradients = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
-        for (name, value), gradient in zip(leaves.items(), gradients, strict=True):
-            if gradient is not None and not bool(torch.isfinite(gradient).all()):
-                where = f"{example.clip}, frame {example.frame}"
-                return f"the gradient of the loss in {name} = {float(value.detach()):.6g} is not finite for {where}"
-    return ""
 
 
-def _is_finite(family: Family, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> bool:
-    with torch.no_grad():
-        return bool(torch.isfinite(family.loss(values, batch, softness)).all())
+def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
+    """The examples to learn from, and those to watch: the last ones of each clip.
+
+    Of a clip of three or more at least one is learned from and one watched. most: to watch; of more, some evenly among
+    them. Neighbouring frames are alike, so that one piece in time says more than single frames. Where no clip has
+    three, or watched is 0, all are learned from and watched.
+    """
+    clips: dict[str, list[Example]] = {}
+    for example in examples:
+        clips.setdefault(example.clip, []).append(example)
+    learned, kept = list[Example](), list[Example]()
+    for mine in clips.values():
+        count = min(max(1, round(watched * len(mine))), len(mine) - 1) if watched and len(mine) >= 3 else 0
+        learned += mine[: len(mine) - count]
+        kept += mine[len(mine) - count :]
+    kept = kept or learned
+    if len(kept) > most:
+        kept = [kept[i * len(kept) // most] for i in range(most)]
+    return learned, kept
+
+
+def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
+    """The places of the examples that a step takes, from step 0; clips: the clip of each example.
+
+    All examples come in a random order, those of clips with fewer several times, so that every clip has the same
+    weight; then all in another order. The result depends on the arguments alone, so that a descent can be resumed.
+    """
+    batch = min(batch, len(clips))
+    of_clip: dict[str, list[int]] = {}
+    for place, clip in enumerate(clips):
+        of_clip.setdefault(clip, []).append(place)
+    most = max(len(places) for places in of_clip.values())
+
+    def draw_order(turn: int) -> list[int]:
+        """One turn: as many examples of each clip as the largest has."""
+        generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
+        drawn: list[int] = []
+        for places in of_clip.values():
+            rounds = [torch.randperm(len(places), generator=generator) for _ in range(-(-most // len(places)))]
+            drawn += [places[i] for i in torch.cat(rounds)[:most].tolist()]
+        return [drawn[i] for i in torch.randperm(len(drawn), generator=generator).tolist()]
+
+    first, count = step * batch, len(of_clip) * most
+    turns = range(first // count, (first + batch - 1) // count + 1)
+    order = [place for turn in turns for place in draw_order(turn)]
+    return order[first - turns[0] * count :][:batch]
+
+
+def clip_shares(clips: Sequence[str]) -> list[float]:
+    """The weight of each example in a mean in which every clip has the same weight; clips: the clip of each."""
+    count = Counter(clips)
+    return [1 / (len(count) * count[clip]) for clip in clips]

@@ -1,6 +1,5 @@
-"""Examples to learn from: batches and watched shares, labelled boxes and masks of clips, owners of detections."""
+"""The truth of clips as families take it: masks, boxes with identities, owners of detections, padded batches."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple, TypeVar
@@ -14,109 +13,12 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, pair
 from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth, labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.types import DetectionTable
-
-
-def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
-    """The examples to learn from, and those to watch: the last ones of each clip.
-
-    Of a clip of three or more at least one is learned from and one watched. most: to watch; of more, some evenly among
-    them. Neighbouring frames are alike, so that one piece in time says more than single frames. Where no clip has
-    three, or watched is 0, all are learned from and watched.
-    """
-    clips: dict[str, list[Example]] = {}
-    for example in examples:
-        clips.setdefault(example.clip, []).append(example)
-    learned, kept = list[Example](), list[Example]()
-    for mine in clips.values():
-        count = min(max(1, round(watched * len(mine))), len(mine) - 1) if watched and len(mine) >= 3 else 0
-        learned += mine[: len(mine) - count]
-        kept += mine[len(mine) - count :]
-    kept = kept or learned
-    if len(kept) > most:
-        kept = [kept[i * len(kept) // most] for i in range(most)]
-    return learned, kept
-
-
-def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
-    """The places of the examples that a step takes, from step 0; clips: the clip of each example.
-
-    All examples come in a random order, those of clips with fewer several times, so that every clip has the same
-    weight; then all in another order. The result depends on the arguments alone, so that a descent can be resumed.
-    """
-    batch = min(batch, len(clips))
-    mine: dict[str, list[int]] = {}
-    for place, clip in enumerate(clips):
-        mine.setdefault(clip, []).append(place)
-    count = len(mine) * max(len(places) for places in mine.values())
-    first = step * batch
-    orders: dict[int, list[int]] = {}
-    found = []
-    for place in range(first, first + batch):
-        turn, here = divmod(place, count)
-        if turn not in orders:
-            orders[turn] = _draw_order(list(mine.values()), seed, turn)
-        found.append(orders[turn][here])
-    return found
-
-
-def clip_shares(clips: Sequence[str]) -> list[float]:
-    """The weight of each example in a mean in which every clip has the same weight; clips: the clip of each."""
-    count = Counter(clips)
-    return [1 / (len(count) * count[clip]) for clip in clips]
-
-
-def _draw_order(clips: Sequence[Sequence[int]], seed: int, turn: int) -> list[int]:
-    """One turn: as many examples of each clip as the largest has."""
-    generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
-    most = max(len(places) for places in clips)
-    drawn = [
-        places[i]
-        for places in clips
-        for i in [i for _ in range(-(-most // len(places))) for i in _shuffled(len(places), generator)][:most]
-    ]
-    return [drawn[i] for i in _shuffled(len(drawn), generator)]
-
-
-def _shuffled(count: int, generator: torch.Generator) -> list[int]:
-    order: list[int] = torch.randperm(count, generator=generator).tolist()
-    return order
-
-
-class BoxedFrame(NamedTuple):
-    """The boxes of a frame. identity: (n,). box_px: (n, 4). image: (H, W[, 3]) uint8, None without pictures."""
-
-    number: int
-    identity: np.ndarray
-    box_px: np.ndarray
-    image: np.ndarray | None
-
-
-def boxed_frames(clip: Clip, table: TrackTable, interval: int) -> Iterator[BoxedFrame]:
-    """Every `interval`-th frame to the last with boxes, from the first picture, or without pictures the first box."""
-
-    def at(number: int, image: np.ndarray | None) -> BoxedFrame:
-        rows = table.frame == number
-        return BoxedFrame(number, table.identity[rows], np.asarray(table.box_px[rows], float), image)
-
-    if not len(table.frame):
-        return
-    last = int(table.frame.max())
-    if not clip.pictures:
-        for number in range(int(table.frame.min()), last + 1, interval):
-            yield at(number, None)
-        return
-    for frame in open_clip(clip).every(interval):
-        if frame.number > last:
-            return
-        yield at(frame.number, frame.image)
 
 
 def check_masks(clips: Sequence[Clip], still: bool = False) -> None:
     """Raises InputError for clips without masks. still: clips in which nothing moves need none."""
-    masked = [clip.truth is not None and bool(clip.truth.masks) for clip in clips]
-    bare = [clip.name for clip, has in zip(clips, masked, strict=True) if not (has or (still and clip.still))]
+    bare = [c.name for c in clips if not (c.truth is not None and c.truth.masks) and not (still and c.still)]
     if bare:
         lack = "have" if len(bare) > 1 else "has"
         raise InputError(f"{', '.join(bare)} {lack} no masks of what moves; choose clips that have them with --clips")
@@ -131,6 +33,35 @@ def labels_at(truth: Truth, frame: int, shape: tuple[int, ...]) -> np.ndarray:
     return labels
 
 
+def true_tracks(clip: Clip, interval: int) -> TrackTable:
+    """The true boxes of frames 1, 1 + interval, ... Raises InputError for a clip without identities."""
+    if clip.truth is None or clip.truth.tracks is None or not len(clip.truth.tracks.frame):
+        raise InputError(f"{clip.name} has no true identities, which tuning the tracker needs; leave it out")
+    return clip.truth.tracks.every(interval)
+
+
+def boxed_frames(
+    clip: Clip, table: TrackTable, interval: int
+) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
+    """Number, identities (n,), boxes (n, 4) and picture of every `interval`-th frame to the last with boxes.
+
+    From the first picture; of a clip without pictures, whose pictures are None, from the first frame with boxes.
+    """
+    if not len(table.frame):
+        return
+    last = int(table.frame.max())
+    frames: Iterator[tuple[int, np.ndarray | None]]
+    if clip.pictures:
+        frames = ((frame.number, frame.image) for frame in open_clip(clip).every(interval))
+    else:
+        frames = ((number, None) for number in range(int(table.frame.min()), last + 1, interval))
+    for number, image in frames:
+        if number > last:
+            return
+        rows = table.frame == number
+        yield number, table.identity[rows], np.asarray(table.box_px[rows], float), image
+
+
 class OwnedBoxes(NamedTuple):
     """Boxes with their true identities, ordered by frame; each false alarm has an identity of its own below 0.
 
@@ -140,7 +71,7 @@ class OwnedBoxes(NamedTuple):
 
     table: TrackTable
     score: np.ndarray
-    size: tuple[float, float] | None = None
+    size: tuple[float, float] | None
     own: bool = False
 
 
@@ -150,39 +81,27 @@ def match_owners(found: DetectionTable, truth: Truth, interval: int, min_score: 
     min_score: detections below it are left out, where scores are probabilities. Targets that the measures ignore own
     boxes too. Raises InputError if an identity occurs twice in a frame.
     """
+    assert truth.tracks is not None
+    parts = [truth.tracks]
+    if truth.ignoring == "removed":
+        parts += [table for table in (truth.ignored, truth.others) if table is not None]
+    frame, identity, true_px = (np.concatenate(column) for column in zip(*parts, strict=True))
+    # The same identity in two tables is two targets.
+    table = np.repeat(np.arange(len(parts)), [len(part.frame) for part in parts])
+    _, number = np.unique(np.stack([table, identity]), axis=1, return_inverse=True)
+    tracks = TrackTable(frame, number.reshape(-1), true_px.astype(float)).every(interval)
+    named = np.unique(tracks.identity)
+
     score = np.ones(len(found)) if found.certain else found.score
     rows = np.flatnonzero(((found.frame - 1) % interval == 0) & (score >= min_score))
     boxes = TrackTable(found.frame[rows], np.arange(len(rows)), found.box_px[rows])
-    identity = -1 - np.arange(len(rows))
-    tracks = _all_tracks(truth).every(interval)
-    named = np.unique(tracks.identity)
+    owner = -1 - np.arange(len(rows))
     for true, here, overlap in pair(tracks, boxes).frames:
         overlap = np.where(overlap >= LEAST - EPSILON, overlap, 0)
         i, j = linear_sum_assignment(overlap, maximize=True)
         sure = overlap[i, j] > 0
-        identity[here[j[sure]]] = named[true[i[sure]]]
-    return OwnedBoxes(boxes._replace(identity=identity), score[rows], found.extent, found.own)
-
-
-def _all_tracks(truth: Truth) -> TrackTable:
-    """The counted tracks, and the ignored ones where found boxes on them are removed, under numbers of their own."""
-    assert truth.tracks is not None
-    more = [t for t in (truth.ignored, truth.others) if t is not None] if truth.ignoring == "removed" else []
-    parts = [truth.tracks, *more]
-    first, columns = 0, []
-    for part in parts:
-        _, number = np.unique(part.identity, return_inverse=True)
-        columns.append(part._replace(identity=number + first))
-        first += int(number.max(initial=-1)) + 1
-    frame, identity, box_px = (np.concatenate(values) for values in zip(*columns, strict=True))
-    return TrackTable(frame, identity, np.asarray(box_px, float))
-
-
-def check_identities(clips: Sequence[Clip]) -> None:
-    """Raises InputError for the first clip without true identities."""
-    for clip in clips:
-        if clip.truth is None or clip.truth.tracks is None or not len(clip.truth.tracks.frame):
-            raise InputError(f"{clip.name} has no true identities, which tuning the tracker needs; leave it out")
+        owner[here[j[sure]]] = named[true[i[sure]]]
+    return OwnedBoxes(boxes._replace(identity=owner), score[rows], found.extent, found.own)
 
 
 _Record = TypeVar("_Record")
@@ -198,16 +117,15 @@ def stack_padded(
     batch: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
         arrays = [np.asarray(row[field.name]) for row in rows]
-        shape = np.max([array.shape for array in arrays], axis=0).astype(int).tolist() if arrays[0].ndim else []
-        batch[field.name] = torch.as_tensor(np.stack([_fill(array, shape, pad) for array in arrays]), device=device)
+        if arrays[0].ndim:
+            shape = np.max([array.shape for array in arrays], axis=0)
+            for place, array in enumerate(arrays):
+                wider = [(0, int(size)) for size in shape - array.shape]
+                if pad == "zero" or array.dtype == bool:
+                    arrays[place] = np.pad(array, wider)
+                elif array.size:
+                    arrays[place] = np.pad(array, wider, mode="edge")
+                else:  # there is nothing to repeat; any number will do, as no target is there
+                    arrays[place] = np.pad(array, wider, constant_values=1.0)
+        batch[field.name] = torch.as_tensor(np.stack(arrays), device=device)
     return kind(**batch)
-
-
-def _fill(array: np.ndarray, shape: Sequence[int], pad: str) -> np.ndarray:
-    wider = [(0, size - had) for size, had in zip(shape, array.shape, strict=True)]
-    if not array.ndim:
-        return array
-    if pad == "edge" and array.dtype != bool:
-        # Where there is nothing to repeat any number will do, as no target is there.
-        return np.pad(array, wider, mode="edge") if array.size else np.pad(array, wider, constant_values=1.0)
-    return np.pad(array, wider)

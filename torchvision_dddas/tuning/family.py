@@ -3,7 +3,7 @@
 import glob
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Self, cast
@@ -35,19 +35,25 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled piece of a clip. clip, frame: named in messages. content: what the loss takes, on the CPU."""
+    """One labelled piece of a clip. clip, frame: named in messages. content: what the loss takes, on the CPU.
+
+    settings: those it was prepared with, for what is not tuned; the same for all examples of a descent.
+    """
 
     clip: str
     frame: int
     content: Any
+    settings: Settings = field(default_factory=Settings)
 
 
 class Family(ABC):
     """A stage of the pipeline whose parameters can be tuned: examples of what is true, and a loss on them.
 
-    name: a key of FAMILIES. task: of a study, whose clips are used. measure: judged before and after, such as
-    motion.pixels.f. softness: of the loss at the first and at the last step. losses: names to choose from, the first is
-    the default; empty where there is one loss only. loss_name: the chosen one. interval: frames between examples.
+    A family defines `clip_examples`, and `loss` or `_losses`. name: a key of FAMILIES. task: of a study, whose clips
+    are used. measure: judged before and after, such as motion.pixels.f. softness: of the loss at the first and at the
+    last step. losses: names to choose from, the first is the default; empty where there is one loss only. loss_name:
+    the chosen one. interval: frames between examples. empty: why a clip may give no example; a clip without any is an
+    error where this is set.
     """
 
     name: str
@@ -58,7 +64,6 @@ class Family(ABC):
     loss_name: str = ""
     interval: int = 1
     empty = ""
-    """Why a clip may give no example; a clip without any is an error where this is set."""
 
     @abstractmethod
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterable[tuple[int, Any]]:
@@ -91,7 +96,7 @@ class Family(ABC):
         for clip in clips:
             before = len(found)
             for frame, content in self.clip_examples(clip, settings):
-                found.append(Example(clip.name, frame, content))
+                found.append(Example(clip.name, frame, content, settings))
                 tick()
             if self.empty and len(found) == before:
                 raise InputError(f"{clip.name}: {self.empty}")
@@ -101,13 +106,13 @@ class Family(ABC):
         """(B,) how wrong each example is, with a gradient in the parameters, on their device.
 
         parameters: the tuned values by name, in the units of the settings; all others are as the examples were prepared
-        with. The result depends on nothing else. Unless a family overrides this, it computes on the CPU.
+        with. The result depends on nothing else. Unless a family overrides this, `_losses` computes it on the CPU.
         """
         device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
         values = {name: value.cpu() for name, value in parameters.items()}
-        return torch.stack(self._losses([example.content for example in batch], values, softness)).to(device)
+        return torch.stack(self._losses(batch, values, softness)).to(device)
 
-    def _losses(self, contents: Sequence[Any], values: dict[str, Tensor], softness: float) -> list[Tensor]:
+    def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:
         raise NotImplementedError
 
 
@@ -156,7 +161,16 @@ def prepare(
     as `plan_study` does.
     """
     settings = load_config(spec.config, spec.overrides)
-    family = _common_family(names)
+    by_family: dict[str, list[str]] = {}
+    for name in expand_names(names):
+        by_family.setdefault(TUNABLE[name].family, []).append(name)
+    if len(by_family) > 1:
+        groups = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
+        raise InputError(
+            f"the parameters are of several families, {groups}; tune one of them, then the next with --config "
+            "tuned.toml"
+        )
+    family = load_family(*by_family)
     parameters = Parameters(settings, names)
     family.check(parameters.names, settings)
     goal = parse_goal(measure or family.measure)
@@ -167,18 +181,4 @@ def prepare(
     tuned, held = split_clips(spec, base, clips, holdout)
     used = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)
     check_possible(goal, used)
-    examples = family.examples(used, settings, tick)
-    return Prepared(spec, base, family, parameters, used, tuned, held, goal, examples)
-
-
-def _common_family(names: Sequence[str]) -> Family:
-    by_family: dict[str, list[str]] = {}
-    for name in expand_names(names):
-        by_family.setdefault(TUNABLE[name].family, []).append(name)
-    if len(by_family) > 1:
-        groups = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
-        raise InputError(
-            f"the parameters are of several families, {groups}; tune one of them, then the next with --config "
-            "tuned.toml"
-        )
-    return load_family(next(iter(by_family)))
+    return Prepared(spec, base, family, parameters, used, tuned, held, goal, family.examples(used, settings, tick))

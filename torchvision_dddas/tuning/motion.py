@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import repeat
 from typing import Any
 
@@ -16,26 +17,22 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import (
     EVIDENCE_CAP,
     EVIDENCE_SCALE,
-    Engine,
     Foreground,
     MotionDetector,
-    TorchEngine,
     View,
     Window,
     fill_hull,
-    load_engine,
 )
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional.soft import straight_through
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Family
-from torchvision_dddas.types import Registration, Scene
-
-Loss = Callable[[Tensor, Tensor, Tensor], Tensor]
+from torchvision_dddas.types import Scene
 
 # Soft masks reach this many softnesses below the threshold, where they are 0.05.
 _REACH = 3.0
@@ -47,7 +44,34 @@ _FREER = 0.6
 _SPARE_PX = 1.0
 # Pixels further from any region than this do not join it when the core grows a little.
 _FAR_PX = 40.0
-_NUMBER = "number of the frame"
+
+Masks = Float[Tensor, "B 1 H W"]
+Labels = Bool[Tensor, "B 1 H W"]
+
+
+def overlap_loss(mask: Masks, truth: Labels, known: Labels, power: int = 1) -> Float[Tensor, "B"]:
+    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11). known: where the truth is known.
+
+    power: of the found mask; with squares doubtful pixels cost less (Milletari et al. 2016).
+    """
+    seen, axes = mask * known, (1, 2, 3)
+    found, true = (seen**power).sum(axes), (truth & known).sum(axes).to(mask.dtype)
+    return 1 - (2 * (seen * truth).sum(axes) + _SPARE_PX) / (found + true + _SPARE_PX)
+
+
+def focal_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"]:
+    """Mean of -(1 - p)² ln p, where p is the mask's value for the truth, movers weighed 3 : 1 (Lin et al. 2017)."""
+    right = torch.where(truth, mask, 1 - mask).clamp(min=1e-6)
+    weight = torch.where(truth, 0.75, 0.25) * known
+    return (-((1 - right) ** 2) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
+
+
+LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "f": overlap_loss,
+    "dice": partial(overlap_loss, power=2),
+    "focal": focal_loss,
+}
+"""By the names that `dddas tune --loss` takes; the first is the default."""
 
 
 @dataclass(frozen=True)
@@ -64,52 +88,11 @@ class LabelledFrames:
     known: Bool[Tensor, "B 1 H W"]
     removed: Bool[Tensor, "B 1 H W"]
     added: Bool[Tensor, "B 1 H W"]
-    settings: Settings
-
-
-def f_loss(
-    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
-) -> Float[Tensor, "B"]:
-    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11)."""
-    right, found, true = _sums(mask, truth, known)
-    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
-
-
-def dice_loss(
-    mask: Float[Tensor, "B 1 H W"], truth: Bool[Tensor, "B 1 H W"], known: Bool[Tensor, "B 1 H W"]
-) -> Float[Tensor, "B"]:
-    """As `f_loss` with squares of the found mask, so that doubtful pixels cost less (Milletari et al. 2016)."""
-    right, found, true = _sums(mask, truth, known, power=2)
-    return 1 - (2 * right + _SPARE_PX) / (found + true + _SPARE_PX)
-
-
-def focal_loss(
-    mask: Float[Tensor, "B 1 H W"],
-    truth: Bool[Tensor, "B 1 H W"],
-    known: Bool[Tensor, "B 1 H W"],
-    focus: float = 2.0,
-    movers: float = 0.75,
-) -> Float[Tensor, "B"]:
-    """Mean of -(1 - p)^focus ln p, where p is the mask's value for the truth (Lin et al. 2017). movers: weight."""
-    right = torch.where(truth, mask, 1 - mask).clamp(min=1e-6)
-    weight = torch.where(truth, movers, 1 - movers) * known
-    return (-((1 - right) ** focus) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
-
-
-def _sums(mask: Tensor, truth: Tensor, known: Tensor, power: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums for each mask: found and true, found, true."""
-    seen = mask * known
-    right = (seen * truth).sum((1, 2, 3))
-    return right, (seen**power).sum((1, 2, 3)), (truth & known).sum((1, 2, 3)).to(mask.dtype)
-
-
-LOSSES: Mapping[str, Loss] = {"f": f_loss, "dice": dice_loss, "focal": focal_loss}
-"""By the names that `dddas tune --loss` takes; the first is the default."""
 
 
 @dataclass(frozen=True)
 class MotionFamily(Family):
-    """The family `motion`. hard: masks are hard, with the gradients of soft ones.
+    """The family `motion`.
 
     with_later_steps: keep what the hard steps after the hulls do near the original settings (see `LabelledFrames`);
     without it tuning works better from a bad start. softness: a share of each threshold; above a tenth, background just
@@ -117,7 +100,6 @@ class MotionFamily(Family):
     """
 
     loss_name: str = "f"
-    hard: bool = False
     with_later_steps: bool = True
     name: str = "motion"
     task: Task = "motion"
@@ -134,27 +116,31 @@ class MotionFamily(Family):
 
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, LabelledFrames]]:
         """The frames with masks, and some of a clip in which nothing moves."""
-        truth = clip.truth
-        if truth is not None and truth.masks:
-            wanted = set(truth.masks)
-        else:
-            pitch = max((clip.frames or len(clip.pictures)) // _STILL_FRAMES, 1)
-            wanted = set(range(1, _STILL_FRAMES * pitch + 1, pitch))
+        truth = clip.truth if clip.truth is not None and clip.truth.masks else None
+        pitch = max((clip.frames or len(clip.pictures)) // _STILL_FRAMES, 1)
+        wanted = set(truth.masks) if truth else set(range(1, _STILL_FRAMES * pitch + 1, pitch))
         freer = with_parameters(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
-        later: Iterable[RecordedFrame | None] = repeat(None)
+        freer_frames: Iterable[tuple[int, Window | None, np.ndarray | None]] = repeat((0, None, None))
         if self.with_later_steps:
-            later = record_frames(clip, freer, wanted)
-        for frame, freer_frame in zip(record_frames(clip, settings, wanted), later, strict=False):
-            if truth is not None and truth.masks:
-                labels = labels_at(truth, frame.number, frame.mask.shape)
-            else:
-                labels = np.zeros(frame.mask.shape, np.int32)
+            freer_frames = record_frames(clip, freer, wanted)
+        recorded = zip(record_frames(clip, settings, wanted), freer_frames, strict=False)
+        for (number, window, mask), (_, _, freer_mask) in recorded:
+            labels = labels_at(truth, number, mask.shape) if truth else np.zeros(mask.shape, np.int32)
             # A frame without a window has no mask, whatever the parameters.
-            if frame.window is not None and (labels >= 0).any():
-                example = _label(differences_of(frame.window, settings), labels, settings)
-                if freer_frame is not None:
-                    example = _with_later_steps(example, frame.mask, freer_frame.mask, freer)
-                yield frame.number, example
+            if window is None or not (labels >= 0).any():
+                continue
+            pictures = labels > 0, labels >= 0, mask, mask if freer_mask is None else freer_mask
+            moves, known, final, freer_final = (torch.from_numpy(picture)[None, None] for picture in pictures)
+            none = torch.zeros_like(moves)
+            frame = LabelledFrames(differences_of(window, settings), moves, known, none, none)
+            if freer_mask is not None:
+                batch = stack_frames([frame], torch.device("cpu"))
+                with torch.no_grad():
+                    hull, freer_hull = (soft_masks(batch, one, {}, 0.0) > 0.5 for one in (settings, freer))
+                # Without the freer run, whatever a lower threshold adds would seem to stay.
+                removed = (hull & ~final) | (freer_hull & ~hull & ~freer_final)
+                frame = replace(frame, removed=removed, added=final & ~hull)
+            yield number, frame
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) one loss a frame; frames of one size are computed together. See `Family.loss`."""
@@ -165,65 +151,31 @@ class MotionFamily(Family):
         losses: list[Tensor] = [torch.empty(0)] * len(batch)
         for places in groups.values():
             frames = stack_frames([batch[place].content for place in places], device)
-            mask = soft_masks(frames, parameters, softness)
-            if self.hard and softness > 0:
-                with torch.no_grad():
-                    hard = soft_masks(frames, parameters, 0.0)
-                mask = straight_through(hard, mask)
+            mask = soft_masks(frames, batch[0].settings, parameters, softness)
             for place, loss in zip(places, LOSSES[self.loss_name](mask, frames.truth, frames.known), strict=True):
                 losses[place] = loss
         return torch.stack(losses)
 
 
-def soft_masks(frames: LabelledFrames, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
+def soft_masks(frames: LabelledFrames, settings: Settings, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
     """The masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
-    motion = MotionSegmenter(frames.settings)
+    motion = MotionSegmenter(settings)
     core = motion(frames.differences, values, softness)
-    reach = _REACH * softness * frames.settings.difference.threshold
-    found = label_regions(core, frames.settings.morphology.hull, reach)
-    mask = motion.outlined(core, found, values, softness)
+    reach = _REACH * softness * settings.difference.threshold
+    mask = motion.outlined(core, label_regions(core, settings.morphology.hull, reach), values, softness)
     return torch.where(frames.added, 1.0, torch.where(frames.removed, 0.0, mask))
 
 
 def stack_frames(frames: Sequence[LabelledFrames], device: torch.device) -> LabelledFrames:
     """One batch of frames of one size, on a device."""
 
-    def stack(records: Sequence[Any]) -> dict[str, Any]:
-        columns = {name: [vars(record)[name] for record in records] for name in vars(records[0])}
-        tensors = {name: column for name, column in columns.items() if isinstance(column[0], Tensor)}
-        return {name: torch.cat(column).to(device) for name, column in tensors.items()}
+    def stack(parts: Sequence[object], *names: str) -> dict[str, Any]:
+        return {name: torch.cat([getattr(part, name) for part in parts]).to(device) for name in names}
 
-    differences = replace(frames[0].differences, **stack([frame.differences for frame in frames]))
-    differences = replace(differences, texture=differences.texture.float())
-    return replace(frames[0], differences=differences, **stack(frames))
-
-
-@dataclass(frozen=True)
-class RecordedFrame:
-    """A frame and what the hard pipeline made of it. window: None where it had none. mask: (H, W) bool, its targets."""
-
-    number: int
-    window: Window | None
-    mask: np.ndarray
-
-
-def _label(differences: Differences, labels: np.ndarray, settings: Settings) -> LabelledFrames:
-    truth, known = (torch.from_numpy(picture)[None, None] for picture in (labels > 0, labels >= 0))
-    none = torch.zeros_like(truth)
-    return LabelledFrames(differences, truth, known, none, none, settings)
-
-
-def _with_later_steps(
-    frame: LabelledFrames, mask: np.ndarray, freer_mask: np.ndarray, freer: Settings
-) -> LabelledFrames:
-    """A frame with the differences between the hulls and the final masks of the hard pipeline."""
-    final, freer_final = (torch.from_numpy(drawn)[None, None] for drawn in (mask, freer_mask))
-    batch = stack_frames([frame], torch.device("cpu"))
-    with torch.no_grad():
-        hull = soft_masks(batch, {}, 0.0) > 0.5
-        freer_hull = soft_masks(replace(batch, settings=freer), {}, 0.0) > 0.5
-    # Without the freer run, whatever a lower threshold adds would seem to stay.
-    return replace(frame, removed=(hull & ~final) | (freer_hull & ~hull & ~freer_final), added=final & ~hull)
+    columns = stack([frame.differences for frame in frames], "least", "both", "texture", "textured")
+    columns["texture"] = columns["texture"].float()
+    differences = replace(frames[0].differences, **columns)
+    return LabelledFrames(differences, **stack(frames, "truth", "known", "removed", "added"))
 
 
 def label_regions(core: Core, hull: bool, reach: float = 0.0) -> Regions:
@@ -233,12 +185,10 @@ def label_regions(core: Core, hull: bool, reach: float = 0.0) -> Regions:
     the nearest region, or make one of their own where there is none.
     """
     margins = core.margin.detach()[:, 0].cpu().numpy()
-    near, filled = np.zeros((2, *margins.shape), np.int64)
-    counts = [_label_picture(margin, hull, reach, *maps) for margin, *maps in zip(margins, near, filled, strict=True)]
-    device = core.mask.device
-    return Regions(
-        torch.from_numpy(near)[:, None].to(device), torch.from_numpy(filled)[:, None].to(device), max(counts)
-    )
+    maps = np.zeros((2, *margins.shape), np.int64)
+    counts = [_label_picture(margin, hull, reach, *maps[:, k]) for k, margin in enumerate(margins)]
+    near, filled = torch.from_numpy(maps)[:, :, None].to(core.mask.device)
+    return Regions(near, filled, max(counts))
 
 
 def _label_picture(margin: np.ndarray, hull: bool, reach: float, near: np.ndarray, filled: np.ndarray) -> int:
@@ -254,29 +204,50 @@ def _label_picture(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
     if reach <= 0:
         return count - 1
     weak, weak_parts = cv2.connectedComponents((margin > -reach).astype(np.uint8), ltype=cv2.CV_32S)
-    strong = np.zeros(weak, bool)
-    strong[weak_parts[parts > 0]] = True
-    strong[0] = False
+    holds_region = np.zeros(weak, bool)
+    holds_region[weak_parts[parts > 0]] = True
+    holds_region[0] = False
     if count > 1:
         away, nearest = cv2.distanceTransformWithLabels(
             (parts == 0).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
         )
         of_place = np.zeros(int(nearest.max()) + 1, np.int64)
         of_place[nearest[parts > 0]] = parts[parts > 0]
-        joins = strong[weak_parts] & (parts == 0) & (away < _FAR_PX)
+        joins = holds_region[weak_parts] & (parts == 0) & (away < _FAR_PX)
         near[joins] = of_place[nearest[joins]]
+    alone = np.flatnonzero(~holds_region[1:]) + 1
     numbers = np.zeros(weak, np.int64)
-    alone = np.flatnonzero(~strong[1:]) + 1
     numbers[alone] = count + np.arange(len(alone))
-    lone = numbers[weak_parts]
-    near[lone > 0] = lone[lone > 0]
+    near[:] = np.where(numbers[weak_parts] > 0, numbers[weak_parts], near)
     return count - 1 + len(alone)
 
 
-def record_frames(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[RecordedFrame]:
-    """The wanted frames of a clip, in order. Raises InputError as `dddas detect` does."""
-    source = open_clip(clip)
-    engine = _Recorder(load_engine("onboard", settings), wanted)
+class _RecordingEngine(OpenCVEngine):
+    """Keeps the windows of wanted frames. number: of the frame that is prepared."""
+
+    def __init__(self, settings: Settings, wanted: Set[int]) -> None:
+        super().__init__(settings)
+        self.number, self.wanted, self.windows = 0, wanted, dict[int, Window]()
+
+    def prepare(self, image: np.ndarray) -> View:
+        view = super().prepare(image)
+        view.kept["number"] = self.number
+        return view
+
+    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+        by_number = {window.reference.kept["number"]: window for window in windows}
+        self.windows |= {number: window for number, window in by_number.items() if number in self.wanted}
+        return super().foreground(windows)
+
+
+def record_frames(
+    clip: Clip, settings: Settings, wanted: Set[int]
+) -> Iterator[tuple[int, Window | None, Bool[np.ndarray, "H W"]]]:
+    """The wanted frames of a clip, in order: number, window if it had one, and mask by the hard pipeline.
+
+    Raises InputError as `dddas detect` does.
+    """
+    source, engine = open_clip(clip), _RecordingEngine(settings, wanted)
     loop = MotionDetector(settings, engine, source.rate_hz)
 
     def scenes() -> Iterator[Scene]:
@@ -288,38 +259,7 @@ def record_frames(clip: Clip, settings: Settings, wanted: Set[int]) -> Iterator[
     for scene in scenes():
         number = scene.frame.number
         if number in wanted:
-            yield RecordedFrame(number, engine.windows.pop(number, None), scene.mask > 0)
-
-
-class _Recorder:
-    """An engine that keeps the windows of wanted frames."""
-
-    def __init__(self, engine: Engine, wanted: Set[int]) -> None:
-        self.name, self.number = engine.name, 0
-        self.windows: dict[int, Window] = {}
-        self._engine, self._wanted = engine, wanted
-
-    @property
-    def parameters(self) -> Settings:
-        return self._engine.parameters
-
-    @parameters.setter
-    def parameters(self, settings: Settings) -> None:
-        self._engine.parameters = settings
-
-    def prepare(self, image: np.ndarray) -> View:
-        view = self._engine.prepare(image)
-        view.kept[_NUMBER] = self.number
-        return view
-
-    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
-        return self._engine.register(pairs)
-
-    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
-        for window in windows:
-            if (number := window.reference.kept[_NUMBER]) in self._wanted:
-                self.windows[number] = window
-        return self._engine.foreground(windows)
+            yield number, engine.windows.pop(number, None), scene.mask > 0
 
 
 @torch.inference_mode()

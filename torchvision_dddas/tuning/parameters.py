@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import torch
 from pydantic import BaseModel
@@ -13,12 +13,8 @@ from torch import Tensor, nn
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 
-FamilyName = Literal["motion", "registration", "tracking", "paper", "people", "location"]
-Rounding = Literal["none", "whole", "odd"]
-
-# A value at the very end of its range has no gradient; it starts this share of the range away from it.
+# A value at the end of its range has no gradient; it starts this share of the range away from it.
 _EDGE = 1e-3
-_DIGITS = 4
 
 
 @dataclass(frozen=True)
@@ -30,31 +26,31 @@ class Tunable:
     """
 
     name: str
-    family: FamilyName
+    family: str
     low: float
     high: float
     unit: str = "-"
-    log: bool = False
+    log: bool = True
     offset: float = 0.0
-    rounding: Rounding = "none"
+    rounding: Literal["none", "whole", "odd"] = "none"
 
     def value(self, free: Tensor) -> Tensor:
         """The value for an unconstrained number; mid-range, one free unit is about a factor e (or an amount of 1)."""
-        low, span = self._scaled(self.low), self._span
-        scaled = low + span * torch.sigmoid(free * (4.0 / span))
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        scaled = low + (high - low) * torch.sigmoid(free * (4.0 / (high - low)))
         return scaled.exp() - self.offset if self.log else scaled
 
     def free(self, value: float) -> float:
         """The unconstrained number for a value; a value at the end of the range is moved in by a thousandth of it."""
-        share = (self._scaled(value) - self._scaled(self.low)) / self._span
-        share = min(max(share, _EDGE), 1.0 - _EDGE)
-        return math.log(share / (1.0 - share)) * self._span / 4.0
+        low, high = self._scaled(self.low), self._scaled(self.high)
+        share = min(max((self._scaled(value) - low) / (high - low), _EDGE), 1.0 - _EDGE)
+        return math.log(share / (1.0 - share)) * (high - low) / 4.0
 
     def rounded(self, value: float) -> float | int:
         """The value as the settings take it: whole, odd, or with four digits, within the range."""
         value = min(max(value, self.low), self.high)
         if self.rounding == "none":
-            return min(max(float(f"{value:.{_DIGITS}g}"), self.low), self.high)
+            return min(max(float(f"{value:.4g}"), self.low), self.high)
         if self.rounding == "whole":
             return round(value)
         return min(2 * math.floor(value / 2) + 1, int(self.high) - 1 + int(self.high) % 2)
@@ -64,26 +60,20 @@ class Tunable:
         """Such as `0.1 to 255` or `1 to 31, odd`."""
         return f"{self.low:g} to {self.high:g}" + (", odd" if self.rounding == "odd" else "")
 
-    @property
-    def _span(self) -> float:
-        return self._scaled(self.high) - self._scaled(self.low)
-
     def _scaled(self, value: float) -> float:
         return math.log(value + self.offset) if self.log else float(value)
 
 
-def _from_settings(
-    family: FamilyName, group: str, names: str, log: bool = True, offset: float = 0.0, rounding: Rounding = "none"
-) -> dict[str, Tunable]:
+def _from_settings(family: str, group: str, names: str, **options: object) -> dict[str, Tunable]:
     found = {}
     for key in names.split():
         field = type(Settings.model_fields[group].default).model_fields[key]
-        low = next(rule.ge for rule in field.metadata if getattr(rule, "ge", None) is not None)
-        high = next(rule.le for rule in field.metadata if getattr(rule, "le", None) is not None)
-        extra = field.json_schema_extra
-        unit = str(extra["unit"]) if isinstance(extra, dict) else "-"
-        name = f"{group}.{key}"
-        found[name] = Tunable(name, family, float(low), float(high), unit, log, offset, rounding)
+        low, high = (
+            float(next(limit for rule in field.metadata if (limit := getattr(rule, end, None)) is not None))
+            for end in ("ge", "le")
+        )
+        unit = str(field.json_schema_extra["unit"]) if isinstance(field.json_schema_extra, dict) else "-"
+        found[f"{group}.{key}"] = Tunable(f"{group}.{key}", family, low, high, unit, **options)  # type: ignore[arg-type]
     return found
 
 
@@ -140,12 +130,12 @@ class Parameters(nn.Module):
     def __init__(self, settings: Settings, names: Iterable[str]) -> None:
         """names: as `expand_names` takes them. Raises InputError for one that cannot be tuned."""
         super().__init__()
-        self.base = settings
-        self.names = expand_names(names)
-        starts = [TUNABLE[name].free(value_of(settings, name)) for name in self.names]
+        self.base, self.names = settings, expand_names(names)
+        self._starts = [TUNABLE[name].free(value_of(settings, name)) for name in self.names]
         # In double precision, for geometry; a number without axes leaves a picture's own precision alone.
-        self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in starts])
-        self._starts = starts
+        self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in self._starts])
+        sizes = {name for name in self.names if TUNABLE[name].rounding != "none"}
+        self._sizes = sizes if len(sizes) < len(self.names) else set()
 
     def values(self, whole: bool = False) -> dict[str, Tensor]:
         """Each parameter's value: a float64 tensor without axes, with its gradient.
@@ -153,24 +143,15 @@ class Parameters(nn.Module):
         whole: sizes are rounded and without a gradient, unless all parameters are sizes.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
-        if whole and self._fixed_sizes:
-            settled = self.settled()
-            found |= {name: settled[name] for name in self._fixed_sizes}
+        if whole and self._sizes:
+            found |= {name: value for name, value in self.settled().items() if name in self._sizes}
         return found
-
-    @property
-    def _fixed_sizes(self) -> tuple[str, ...]:
-        sizes = tuple(name for name in self.names if TUNABLE[name].rounding != "none")
-        return sizes if len(sizes) < len(self.names) else ()
 
     def moved(self, whole: bool = False) -> Tensor:
         """The sum of squares of the unconstrained steps from the start, with its gradient. whole: as in `values`."""
-        held = self._fixed_sizes if whole else ()
-        ways = [
-            ((free.detach() if name in held else free) - start) ** 2
-            for name, free, start in zip(self.names, self.free, self._starts, strict=True)
-        ]
-        return torch.stack(ways).sum()
+        held = self._sizes if whole else set()
+        ends = [free.detach() if name in held else free for name, free in zip(self.names, self.free, strict=True)]
+        return torch.stack([(end - start) ** 2 for end, start in zip(ends, self._starts, strict=True)]).sum()
 
     def settled(self) -> dict[str, Tensor]:
         """The values as the settings round them, without a gradient; otherwise as `values`."""
@@ -200,7 +181,5 @@ _Group = TypeVar("_Group", bound=BaseModel)
 
 def with_tensors(group: _Group, prefix: str, values: Mapping[str, Tensor]) -> _Group:
     """A group of parameters in which those named `prefix.key` are tensors; nothing is checked."""
-    mine: dict[str, Any] = {
-        name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{prefix}.")
-    }
-    return type(group).model_construct(**(dict(group) | mine))
+    mine = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{prefix}.")}
+    return type(group).model_construct(**{**dict(group), **mine})

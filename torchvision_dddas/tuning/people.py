@@ -1,9 +1,7 @@
 """The family of people: calibrated probabilities, fitting boxes, and the best threshold by F1."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,15 +21,14 @@ from torchvision_dddas.functional.soft import step
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.detector import WindowScorer, check_image, load_scorer
 from torchvision_dddas.people.suppression import body_sides, log_odds, people_from_windows
-from torchvision_dddas.tuning.family import Family
+from torchvision_dddas.tuning.family import Example, Family
+from torchvision_dddas.tuning.parameters import with_tensors
 
 MOST = 80
 """Pictures of a clip at most, evenly over it: scoring takes about a second each, and only six numbers are tuned."""
 
 BELOW = 1.0
 """Windows are kept down to this far below the threshold of the settings, in units of the score."""
-
-PARAMETERS = ("height_share", "width_share", "feet_share", "probability_slope", "probability_even", "threshold")
 
 
 @dataclass(frozen=True)
@@ -42,13 +39,12 @@ class ScoredPicture:
     (R, 4) windows of the right ones among them, and the true boxes of their bodies.
     """
 
-    margin: Tensor
-    right: Tensor
+    margin: Float[Tensor, " N"]
+    right: Float[Tensor, " N"]
     shown: int
-    window_px: Tensor
-    true_px: Tensor
+    window_px: Float[Tensor, "R 4"]
+    true_px: Float[Tensor, "R 4"]
     people: int
-    settings: PeopleParameters
 
 
 @dataclass(frozen=True)
@@ -76,32 +72,25 @@ class PeopleFamily(Family):
         truth = clip.truth
         if truth is None or truth.kind != "boxes" or not truth.boxes:
             raise InputError(f"{clip.name} has no boxes of people; give pictures with labelled people")
-        parameters = settings.people
-        scorer = load_scorer(parameters)
-        numbers = sorted(truth.boxes)
-        wanted = {numbers[i * len(numbers) // MOST] for i in range(MOST)} if len(numbers) > MOST else set(numbers)
+        scorer, numbers = load_scorer(settings.people), sorted(truth.boxes)
+        count = min(len(numbers), MOST)
+        wanted = {numbers[i * len(numbers) // count] for i in range(count)}
         for frame in open_clip(clip):
             if frame.number in wanted:
                 image = check_image(frame.image, f"{clip.name}, frame {frame.number}")
-                true_px = np.asarray(truth.boxes[frame.number], float).reshape(-1, 4)
-                counts = partial(_counted_boxes, truth, frame.number)
-                yield frame.number, score_picture(image, true_px, parameters, scorer, counts)
+                yield frame.number, score_picture(image, truth, frame.number, settings.people, scorer)
 
-    def _losses(self, contents: Sequence[Any], values: dict[str, Tensor], softness: float) -> list[Tensor]:
-        return [_picture_loss(content, values, softness) for content in contents]
+    def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:
+        return [
+            picture_loss(example.content, with_tensors(example.settings.people, "people", values), softness)
+            for example in batch
+        ]
 
 
 def score_picture(
-    image: np.ndarray,
-    truth_px: np.ndarray,
-    parameters: PeopleParameters,
-    scorer: WindowScorer,
-    counted: Callable[[np.ndarray], np.ndarray] = lambda box_px: np.ones(len(box_px), bool),
+    image: np.ndarray, truth: Truth, number: int, parameters: PeopleParameters, scorer: WindowScorer
 ) -> ScoredPicture:
-    """Detect people in one picture, 8 bits grey or BGR, and compare them with the truth.
-
-    truth_px: (M, 4). counted: which of boxes (N, 4) are right or wrong; the others are left out.
-    """
+    """Detect people in one picture, 8 bits grey or BGR, and compare them with the truth of a frame."""
     size = (image.shape[1], image.shape[0])
     parts = pyramid.everywhere(size, parameters)
     (maps,) = scorer.scores([image], [parts])
@@ -112,63 +101,44 @@ def score_picture(
     # Boxes are means of windows, weighed by how far they are above the threshold: those of the settings' own.
     shown = people_from_windows(window_px[above], margin[above], size, parameters)
     box_px = np.concatenate([shown.box_px, every.box_px[len(shown) :]])
-    kept = counted(box_px)
+    kept = counted(truth, np.full(len(box_px), number), box_px)
     count = int(kept[: len(shown)].sum())
     box_px, margin = box_px[kept], every.margin[kept]
-    right = judged(box_px, margin, truth_px)
-    whose = _match_true_boxes(box_px[:count], right[:count], truth_px)
-    window_px = shown.window_px[kept[: len(shown)]][whose >= 0]
-    columns = margin, right, window_px, truth_px[whose[whose >= 0]].reshape(-1, 4)
-    margin_, right_, windows_, true_ = (torch.as_tensor(np.asarray(column, float)) for column in columns)
-    return ScoredPicture(margin_, right_, count, windows_, true_, len(truth_px), parameters)
-
-
-def _counted_boxes(truth: Truth, number: int, box_px: np.ndarray) -> np.ndarray:
-    return counted(truth, np.full(len(box_px), number), box_px)
-
-
-def _match_true_boxes(box_px: np.ndarray, right: np.ndarray, truth_px: np.ndarray) -> np.ndarray:
-    """(N,) the true box of each right detection, best first, each once; -1 for the others."""
-    whose, free = np.full(len(box_px), -1), iou(box_px, truth_px)
-    for row in np.flatnonzero(right > 0).tolist():
+    true_px = np.asarray(truth.boxes[number], float).reshape(-1, 4)
+    right = judged(box_px, margin, true_px)
+    # The true box of each right detection, best first, each once.
+    rows, owners, free = [], [], iou(box_px[:count], true_px)
+    for row in np.flatnonzero(right[:count] > 0).tolist():
         best = int(free[row].argmax())
         if free[row, best] >= SAME:
-            whose[row], free[:, best] = best, -1
-    return whose
+            rows.append(row)
+            owners.append(best)
+            free[:, best] = -1
+    found_px = shown.window_px[kept[: len(shown)]][rows], true_px[owners].reshape(-1, 4)
+    tensors = [torch.as_tensor(np.asarray(column, float)) for column in (margin, right, *found_px)]
+    return ScoredPicture(tensors[0], tensors[1], count, tensors[2], tensors[3], len(true_px))
 
 
-def _picture_loss(content: ScoredPicture, parameters: Mapping[str, Tensor], softness: float) -> Tensor:
-    values = {f"people.{name}": torch.tensor(float(getattr(content.settings, name))) for name in PARAMETERS} | dict(
-        parameters
-    )
-    total = 1 - soft_f1(content.margin, content.right, content.people, values["people.threshold"], softness)
+def picture_loss(content: ScoredPicture, parameters: PeopleParameters, softness: float) -> Float[Tensor, ""]:
+    """1 - F1, the doubt about what is shown, and how much bodies and true boxes do not have in common.
+
+    parameters: numbers or tensors. The doubt is the mean negative log-likelihood of detections being right or wrong, in
+    nats: least where the probabilities are the shares that are right.
+    """
+    total = 1 - soft_f1(content.margin, content.right, content.people, parameters.threshold, softness)
     if content.shown:
-        total = total + right_nll(content.margin[: content.shown], content.right[: content.shown], values).mean()
+        odds = log_odds(content.margin[: content.shown], parameters.probability_slope, parameters.probability_even)
+        total = total + functional.binary_cross_entropy_with_logits(odds, content.right[: content.shown])
     if len(content.true_px):
-        common, union = areas(body_boxes(content.window_px, values), content.true_px)
+        x, y, width, height = content.window_px.unbind(1)
+        shares = parameters.height_share, parameters.width_share, parameters.feet_share
+        common, union = areas(torch.stack(body_sides(x, y, width, height, *shares), 1), content.true_px)
         total = total + (1 - common / union).mean()
     return total
 
 
-def body_boxes(window_px: Float[Tensor, "N 4"], parameters: Mapping[str, Tensor]) -> Float[Tensor, "N 4"]:
-    """The boxes of the bodies in windows, x, y, width, height, by the shares of height, width and feet."""
-    shares = (parameters[f"people.{name}_share"] for name in ("height", "width", "feet"))
-    return torch.stack(body_sides(*window_px.unbind(1), *shares), 1)
-
-
-def right_nll(
-    margin: Float[Tensor, " N"], right: Float[Tensor, " N"], parameters: Mapping[str, Tensor]
-) -> Float[Tensor, " N"]:
-    """Negative log-likelihood, in nats, of detections with these scores being right (1) or wrong (0).
-
-    It is least where the probabilities by probability_slope and probability_even are the shares that are right.
-    """
-    odds = log_odds(margin, parameters["people.probability_slope"], parameters["people.probability_even"])
-    return functional.binary_cross_entropy_with_logits(odds, right, reduction="none")
-
-
 def soft_f1(
-    margin: Float[Tensor, " N"], right: Float[Tensor, " N"], people: int, threshold: Tensor, softness: float
+    margin: Float[Tensor, " N"], right: Float[Tensor, " N"], people: int, threshold: float | Tensor, softness: float
 ) -> Float[Tensor, ""]:
     """F1 of the detections of one picture that score above a threshold; 1 where there are no people and none is found.
 

@@ -1,9 +1,9 @@
 """The family of registration: how far the background motion is off where masks say that nothing moves."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,11 +25,10 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional import affine, homography
-from torchvision_dddas.functional.consensus import Fit, fit_to_inliers, inlier_weights, transfer_error
+from torchvision_dddas.functional.plane_maps import MODELS, Fit, transfer_error
 from torchvision_dddas.functional.soft import step
 from torchvision_dddas.tuning.examples import check_masks, labels_at
-from torchvision_dddas.tuning.family import Family
+from torchvision_dddas.tuning.family import Example, Family
 
 RANSAC, CHECK = "registration.ransac_px", "registration.forward_backward_px"
 
@@ -55,14 +54,6 @@ class TrackedPoints:
 
 
 @dataclass(frozen=True)
-class FramePair:
-    """A pair of frames: its points, and the parameters of what is not tuned."""
-
-    points: TrackedPoints
-    parameters: RegistrationParameters
-
-
-@dataclass(frozen=True)
 class RegistrationFamily(Family):
     """The family `registration`. softness: shares of the tolerances."""
 
@@ -83,21 +74,20 @@ class RegistrationFamily(Family):
         """See `Family.check_clips`."""
         check_masks(clips)
 
-    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, FramePair]]:
+    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, TrackedPoints]]:
         """The frames with masks that have a next one."""
         truth, engine = clip.truth, load_engine("onboard", settings)
         assert truth is not None
         for frame, later in pairwise(open_clip(clip)):
-            if frame.number not in truth.masks or later.number != frame.number + 1:
-                continue
-            labels = labels_at(truth, frame.number, frame.image.shape)
-            points = track_points(engine, frame.image, later.image, labels)
-            if int(points.still.sum()) >= _FEWEST:
-                yield frame.number, FramePair(points, settings.registration)
+            if frame.number in truth.masks and later.number == frame.number + 1:
+                labels = labels_at(truth, frame.number, frame.image.shape)
+                points = track_points(engine, frame.image, later.image, labels)
+                if int(points.still.sum()) >= _FEWEST:
+                    yield frame.number, points
 
-    def _losses(self, contents: Sequence[Any], values: dict[str, Tensor], softness: float) -> list[Tensor]:
+    def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:
         """Pixels by which each pair's motion misses the background."""
-        return [_pair_loss(pair, values, softness) for pair in contents]
+        return [_pair_loss(example.content, example.settings.registration, values, softness) for example in batch]
 
 
 def track_points(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels: np.ndarray) -> TrackedPoints:
@@ -107,9 +97,8 @@ def track_points(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels:
     unchecked = parameters.model_copy(update={"forward_backward_px": np.inf})
     views = engine.prepare(earlier), engine.prepare(later)
     start = detect_keypoints(views[0].grey, parameters, halved=parameters.redetect_frames > 1)
-    if not len(start):
-        end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
-    else:
+    end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
+    if len(start):
         end, found, missed_px = track_both_ways(*match_exposure(*views), start, unchecked)
     # A point whose search window touches what moves is drawn along by it.
     near = cv2.dilate((labels != 0).astype(np.uint8), np.ones((parameters.window_px, parameters.window_px), np.uint8))
@@ -118,25 +107,22 @@ def track_points(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels:
     return TrackedPoints(numbers[0], numbers[1], numbers[2], torch.from_numpy(near[row, column] == 0))
 
 
-def _pair_loss(pair: FramePair, values: Mapping[str, Tensor], softness: float) -> Tensor:
-    fixed, points = pair.parameters, pair.points
-    tolerance_px = values.get(RANSAC, torch.tensor(fixed.ransac_px, dtype=torch.float64))
-    check_px = values.get(CHECK, torch.tensor(fixed.forward_backward_px, dtype=torch.float64))
-    kept = (points.missed_px <= check_px).numpy() if fixed.forward_backward_px else np.ones(len(points.still), bool)
+def _pair_loss(
+    points: TrackedPoints, parameters: RegistrationParameters, values: dict[str, Tensor], softness: float
+) -> Tensor:
+    tolerance_px, check_px = (
+        values.get(name, torch.tensor(value, dtype=torch.float64))
+        for name, value in ((RANSAC, parameters.ransac_px), (CHECK, parameters.forward_backward_px))
+    )
+    has_check = parameters.forward_backward_px > 0
+    kept = (points.missed_px <= check_px).numpy() if has_check else np.ones(len(points.still), bool)
     guess = np.eye(3)
     if kept.sum() >= 4:
         start, end = (side.numpy()[kept].astype(np.float32) for side in (points.earlier_px, points.later_px))
-        guess = fit_motion(start, end, fixed.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
-    found = refit_motion(
-        points,
-        torch.from_numpy(guess),
-        tolerance_px,
-        check_px if fixed.forward_backward_px else None,
-        LAST_TOLERANCE,
-        affine.fit if fixed.model == "affine" else homography.fit,
-        softness,
-    )
-    least = max(fixed.min_inlier_share, 1e-3)
+        guess = fit_motion(start, end, parameters.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
+    fit, limit_px = MODELS[parameters.model].fit, check_px if has_check else None
+    found = refit_motion(points, torch.from_numpy(guess), tolerance_px, limit_px, fit, softness)
+    least = max(parameters.min_inlier_share, 1e-3)
     return found.off_px + REJECTED_PX * step(1 - found.share / least, softness)
 
 
@@ -153,21 +139,22 @@ def refit_motion(
     guess: Float[Tensor, "3 3"],
     tolerance_px: Tensor,
     check_px: Tensor | None,
-    last_share: float,
     fit: Fit,
     softness: float = 0.0,
 ) -> Refit:
     """The motion of the points that agree with a guess and were tracked there and back.
 
-    tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None without a check.
-    last_share: of the tolerance, for the refit. fit: as `functional.homography.fit`. softness: a share of each.
+    tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None without a check. fit: as
+    `fit_homography`. softness: a share of each. The gradient of the guess is left out: a refit forgets it.
     """
     earlier, later = points.earlier_px[None], points.later_px[None]
     trusted = torch.ones_like(earlier[..., 0])
     if check_px is not None:
-        trusted = inlier_weights(points.missed_px[None], check_px, softness)
-    matrix, _ = fit_to_inliers(earlier, later, trusted, guess[None], last_share * tolerance_px, fit, softness)
+        trusted = step(1 - points.missed_px[None] / check_px, softness)
+    error_px = transfer_error(guess[None].detach(), earlier, later)
+    matrix, solved = fit(earlier, later, step(1 - error_px / (LAST_TOLERANCE * tolerance_px), softness) * trusted)
+    matrix = torch.where(solved[:, None, None], matrix, guess)
     error_px = transfer_error(matrix, earlier, later)
-    agreeing = inlier_weights(error_px, tolerance_px, softness) * trusted
+    agreeing = step(1 - error_px / tolerance_px, softness) * trusted
     # Distances, not squares: a background point that was tracked wrongly counts no more than another.
     return Refit(matrix[0], error_px[0, points.still].mean(), agreeing.sum() / trusted.sum().clamp(min=1))

@@ -19,6 +19,14 @@ def tuning_report(run: Mapping[str, Any]) -> str:
     """The HTML. run: the content of run.json of `dddas tune`, NaN as None."""
     parameters, verdict = run["knobs"], run.get("verdict")
     _, group, name = verdict["measure"].split(".", 2) if verdict else ("", "", "f")
+    times = ""
+    if run.get("cost"):
+        columns = [Column(name, text=True) for name in ("parameter", "values", "times as long")]
+        rows = [
+            [curve["knob"], *(", ".join(f"{v:.3g}" for v in curve[part]) for part in ("values", "times"))]
+            for curve in run["cost"]["curves"]
+        ]
+        times = table("time by parameter", columns, [[text_cell(text) for text in row] for row in rows])
     return render_page(
         "tuning.html",
         title=f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient",
@@ -28,7 +36,7 @@ def tuning_report(run: Mapping[str, Any]) -> str:
         sides=[_side(side, heading, verdict[side], group, name) for side, heading in SIDES.items() if verdict],
         charts=_charts(run),
         parameters=_parameter_table(parameters),
-        times=_time_table(run["cost"]["curves"]) if run.get("cost") else "",
+        times=times,
         meaning=MEANING,
     )
 
@@ -54,33 +62,30 @@ def _side(anchor: str, heading: str, side: Mapping[str, Any] | None, group: str,
 
 def _gain(side: Mapping[str, Any], entry: Mapping[str, Any] | None, digits: int) -> dict[str, Any]:
     """The texts of a card. entry: the goal in the comparison."""
+
+    def signed(value: float) -> str:
+        text = format_number(value, digits)
+        return f"+{text}" if value > 0 and not text.startswith("−") else text
+
+    def arrow(pair: Mapping[str, float | None], digits: int) -> str:
+        ends = [end for end in (pair["before"], pair["after"]) if end is not None]
+        return " → ".join(format_number(end, digits) for end in ends) if len(ends) == 2 else ""
+
     before, after = side["pooled"]["before"], side["pooled"]["after"]
     if before is None or after is None:
         return {"figure": ""}
     ways = [way["interval"] for over in ("over_clips", "over_frames") if entry and (way := entry.get(over))]
     span = next((interval for interval in ways if interval), None)
-    interval = "" if span is None else f", 95 %: {_signed(span[0], digits)} to {_signed(span[1], digits)}"
+    interval = "" if span is None else f", 95 %: {signed(span[0])} to {signed(span[1])}"
     return {
         "before": format_number(before, digits),
         "after": format_number(after, digits),
-        "figure": f"{_signed(after - before, digits)}{interval}",
+        "figure": f"{signed(after - before)}{interval}",
         "says": side["says"],
         "clips": side["clips"],
-        "means": _arrow(side["mean"], digits) if len(side["clips"]) > 1 else "",
-        "frame_ms": _arrow(side["frame_ms"], 1),
+        "means": arrow(side["mean"], digits) if len(side["clips"]) > 1 else "",
+        "frame_ms": arrow(side["frame_ms"], 1),
     }
-
-
-def _arrow(pair: Mapping[str, float | None], digits: int) -> str:
-    before, after = pair["before"], pair["after"]
-    return (
-        "" if before is None or after is None else f"{format_number(before, digits)} → {format_number(after, digits)}"
-    )
-
-
-def _signed(value: float, digits: int) -> str:
-    text = format_number(value, digits)
-    return f"+{text}" if value > 0 and not text.startswith("−") else text
 
 
 def _charts(run: Mapping[str, Any]) -> list[Markup]:
@@ -125,12 +130,3 @@ def _parameter_table(parameters: Mapping[str, Mapping[str, Any]]) -> Markup:
         texts = map(text_cell, (parameter["unit"], parameter["range"], idle + parameter["meaning"]))
         rows.append([text_cell(name), *cells, number_cell(after / before if before else None, 2), *texts])
     return table("parameters before and after", columns, rows)
-
-
-def _time_table(curves: Sequence[Mapping[str, Any]]) -> Markup:
-    columns = [Column(name, text=True) for name in ("parameter", "values", "times as long")]
-    rows = [
-        [curve["knob"], *(", ".join(f"{v:.3g}" for v in curve[part]) for part in ("values", "times"))]
-        for curve in curves
-    ]
-    return table("time by parameter", columns, [[text_cell(text) for text in row] for row in rows])

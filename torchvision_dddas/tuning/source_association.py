@@ -11,7 +11,6 @@ from torch import Tensor
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.functional.soft import step
@@ -25,7 +24,7 @@ from torchvision_dddas.tracking.source_tracker import (
     pair_gain_over_alone,
     rgb_histograms,
 )
-from torchvision_dddas.tuning.examples import boxed_frames, check_identities, stack_padded
+from torchvision_dddas.tuning.examples import boxed_frames, stack_padded, true_tracks
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import with_tensors
 
@@ -39,13 +38,8 @@ wrong: the expected number of wrongly linked targets. likelihood: of the true li
 dominate it, the more so the lower the softness.
 """
 
-
-@dataclass(frozen=True)
-class Stretch:
-    """Consecutive windows, each with the fields of one row of `Windows`; and the settings."""
-
-    windows: Sequence[Mapping[str, np.ndarray]]
-    settings: Settings
+# Rounds of messages; more change the loss by less than a hundredth in a crowd.
+_ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -71,15 +65,14 @@ class SourceFamily(Family):
     def check(self, names: Sequence[str], settings: Settings) -> None:
         """Raises InputError for parameters without effect under these settings, and settings that have no loss."""
         paper = settings.paper
-        idle = {
-            "dispersion": ("paper.weight",),
-            "fixed": ("paper.lowest_dispersion", "paper.location_cut", "paper.appearance_cut"),
-        }[paper.rule]
-        other = "fixed" if paper.rule == "dispersion" else "dispersion"
         if settings.track.mode != "paper":
             mode = settings.track.mode
             raise InputError(f"{', '.join(names)}: no effect under track.mode={mode}; use --config paper")
-        if mine := [name for name in names if name in idle]:
+        idle, other = {
+            "dispersion": ("weight", "fixed"),
+            "fixed": ("lowest_dispersion location_cut appearance_cut", "dispersion"),
+        }[paper.rule]
+        if mine := [name for name in names if name.removeprefix("paper.") in idle.split()]:
             raise InputError(
                 f"{', '.join(mine)}: no effect under paper.rule={paper.rule}; add --set paper.rule={other} or leave out"
             )
@@ -92,22 +85,27 @@ class SourceFamily(Family):
         if paper.gated != "features":
             raise InputError(f"paper.gated={paper.gated}: its gate cannot be softened; add --set paper.gated=features")
 
-    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Stretch]]:
-        """Stretches of windows of the clip's true boxes."""
-        check_identities([clip])
-        assert clip.truth is not None and clip.truth.tracks is not None
-        windows = list(_clip_windows(clip, clip.truth.tracks.every(self.interval), settings.paper, self.interval))
+    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Sequence[Mapping[str, np.ndarray]]]]:
+        """Stretches of windows of the clip's true boxes, each window a row of `Windows`."""
+        windows: list[tuple[int, Mapping[str, np.ndarray]]] = []
+        before: tuple[Features, np.ndarray] | None = None
+        for number, identity, box_px, image in boxed_frames(clip, true_tracks(clip, self.interval), self.interval):
+            histograms = None if image is None else rgb_histograms(image, box_px)
+            now = Features(box_px, None if histograms is None else lambda held=histograms: held), identity  # type: ignore[misc]
+            if before is not None:
+                windows.append((number, build_window((now[0], before[0]), (now[1], before[1]), settings.paper)))
+            before = now
         for start in range(0, len(windows), WINDOWS):
-            piece = windows[start : start + WINDOWS]
-            yield piece[0][0], Stretch([window for _, window in piece], settings)
+            numbers, rows = zip(*windows[start : start + WINDOWS], strict=True)
+            yield numbers[0], rows
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) per box of the newer frames: the share of wrong links, or nats. See `Family.loss`."""
-        paper = with_tensors(batch[0].content.settings.paper, "paper", parameters)
+        paper = with_tensors(batch[0].settings.paper, "paper", parameters)
         device = next(iter(parameters.values())).device
-        windows = stack_padded(Windows, [window for example in batch for window in example.content.windows], device)
+        windows = stack_padded(Windows, [window for example in batch for window in example.content], device)
         loss = (wrong_links if self.loss_name == "wrong" else links_nll)(paper, windows, softness)
-        owner = np.repeat(np.arange(len(batch)), [len(example.content.windows) for example in batch])
+        owner = np.repeat(np.arange(len(batch)), [len(example.content) for example in batch])
         row, boxes = torch.as_tensor(owner, device=device), windows.now.sum(1).to(loss)
         total, count = (loss.new_zeros(len(batch)).index_add(0, row, part) for part in (loss, boxes))
         return total / count.clamp(min=1)
@@ -117,10 +115,11 @@ class SourceFamily(Family):
 class Windows:
     """W windows of two frames: targets of the newer one (N) as rows, of the older one (M) as columns; float64 and bool.
 
-    similarity, alternative: of both features, with a dummy first on both axes, as `source_tracker.affinity` and
-    `source_tracker.best_alternatives` return them. now, before: whether a target is there. true: the true links.
-    joined_at: of each two of P targets of the newer and of the older frame, as `source_tracker.joined_at` returns it;
-    there: whether a target is there. speaks: frames that count in the dispersion. pictured: appearance is known.
+    similarity, alternative: of both features, location first, with a dummy first on both axes, as
+    `source_tracker.affinity` and `source_tracker.best_alternatives` return them. now, before: whether a target is
+    there. true: the true links. joined_at: of each two of P targets of the newer and of the older frame, as
+    `source_tracker.joined_at` returns it; there: whether a target is there. speaks: frames that count in the
+    dispersion. pictured: appearance is known.
     """
 
     similarity: Float[Tensor, "W 2 N1 M1"]
@@ -134,21 +133,8 @@ class Windows:
     pictured: Bool[Tensor, "W"]
 
 
-def _clip_windows(
-    clip: Clip, table: TrackTable, parameters: PaperParameters, interval: int
-) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-    """Each window with the number of its newer frame."""
-    before: tuple[np.ndarray, Features] | None = None
-    for number, identity, box_px, image in boxed_frames(clip, table, interval):
-        histograms = None if image is None else rgb_histograms(image, box_px)
-        features = Features(box_px, None if histograms is None else lambda histograms=histograms: histograms)  # type: ignore[misc]
-        if before is not None:
-            yield number, build_window((features, before[1]), (identity, before[0]), parameters)
-        before = identity, features
-
-
 def build_window(
-    features: tuple[Features, Features], identities: tuple[np.ndarray, np.ndarray], parameters: PaperParameters
+    features: Sequence[Features], identities: Sequence[np.ndarray], parameters: PaperParameters
 ) -> dict[str, np.ndarray]:
     """The fields of one row of `Windows`. features, identities: of both frames, the newer one first."""
     counts = [len(frame) for frame in features]
@@ -174,20 +160,13 @@ def build_window(
     }
 
 
-# Rounds of messages; more change the loss by less than a hundredth in a crowd.
-_ROUNDS = 10
-
-LOCATION, APPEARANCE = 0, 1
-"""Indices of the two features on their axis."""
-
-
 def links_nll(parameters: PaperParameters, windows: Windows, softness: float) -> Float[Tensor, "W"]:
     """Negative log-likelihood of the true links, in nats a window.
 
     parameters: numbers or tensors; `gated` must be features. softness: above 0, in the unit of affinities: an
     assignment worse by this is e times less likely; also the width of the soft thresholds of gate and rule.
     """
-    score = _possible(link_gains(parameters, windows, softness), windows)
+    score = _possible_gains(parameters, windows, softness)
     true = torch.where(windows.true, score, 0.0).sum((1, 2))
     return (log_partition(score, softness, _ROUNDS) - true) / softness
 
@@ -199,7 +178,7 @@ def wrong_links(parameters: PaperParameters, windows: Windows, softness: float) 
     links is the slope of the log-partition along it. It is taken as a difference over one softness, so that a link that
     no parameter can save counts once at most. parameters, softness: as in `links_nll`.
     """
-    score = _possible(link_gains(parameters, windows, softness), windows)
+    score = _possible_gains(parameters, windows, softness)
     known = windows.true.any(2, keepdim=True)
     # One wrong for each who was there before; a true link is one less, any link of a newcomer one more.
     more = torch.where(windows.true, -1.0, torch.where(known, 0.0, 1.0)).to(score)
@@ -207,8 +186,9 @@ def wrong_links(parameters: PaperParameters, windows: Windows, softness: float) 
     return known.sum((1, 2)) + (with_more - plain) / softness
 
 
-def _possible(score: Float[Tensor, "W N M"], windows: Windows) -> Float[Tensor, "W N M"]:
-    return score.masked_fill(~(windows.now[:, :, None] & windows.before[:, None]), -torch.inf)
+def _possible_gains(parameters: PaperParameters, windows: Windows, softness: float) -> Float[Tensor, "W N M"]:
+    gain = link_gains(parameters, windows, softness)
+    return gain.masked_fill(~(windows.now[:, :, None] & windows.before[:, None]), -torch.inf)
 
 
 def link_gains(parameters: PaperParameters, windows: Windows, softness: float = 0.0) -> Float[Tensor, "W N M"]:
@@ -225,14 +205,11 @@ def location_weight(parameters: PaperParameters, windows: Windows, softness: flo
     if parameters.rule == "fixed":
         fixed = torch.as_tensor(parameters.weight).to(windows.similarity)
         return torch.where(windows.pictured, fixed, 1.0)
-    by_location, by_appearance = (
-        step(_window_dispersion(windows, feature, cut, softness) - parameters.lowest_dispersion, softness)
-        for feature, cut in ((LOCATION, parameters.location_cut), (APPEARANCE, parameters.appearance_cut))
-    )
+    by_feature = []
+    for feature, cut in enumerate((parameters.location_cut, parameters.appearance_cut)):
+        # The smallest dispersion of the frames that count.
+        of_frames = dispersion(windows.joined_at[:, feature], windows.there, cut, softness)
+        smallest = of_frames.masked_fill(~windows.speaks, torch.inf).amin(1)
+        by_feature.append(step(smallest - parameters.lowest_dispersion, softness))
+    by_location, by_appearance = by_feature
     return torch.where(windows.pictured, by_location + (1 - by_location) * (1 - by_appearance) / 2, 1.0)
-
-
-def _window_dispersion(windows: Windows, feature: int, cut: float | Tensor, softness: float) -> Float[Tensor, "W"]:
-    """The smallest dispersion of the frames that count."""
-    of_frames = dispersion(windows.joined_at[:, feature], windows.there, cut, softness)
-    return of_frames.masked_fill(~windows.speaks, torch.inf).amin(1)

@@ -14,9 +14,8 @@ from torch import Tensor
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.records import Found, Task
+from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import find, upstream_task
-from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.tuning.parameters import TUNABLE, value_of
 
 FACTORS = (0.5, 2.0)
@@ -74,61 +73,65 @@ class TimeCost:
 
 
 def measure_cost(
-    clip: Clip,
-    task: Task,
+    timed: Callable[[Settings], float],
     settings: Settings,
     names: Sequence[str],
     weight: float,
-    backend: str = "auto",
-    repeats: int = REPEATS,
-    timed: Callable[[Settings], float] | None = None,
     tick: Callable[[], object] = lambda: None,
 ) -> TimeCost:
-    """Time a task on a clip with each parameter at other values, in interleaved turns.
+    """Time the settings with each parameter at other values, REPEATS times in interleaved turns.
 
-    timed: seconds a frame for some settings, in place of the hard pipeline. tick: called after each of `timed_points` ×
-    repeats. Raises InputError as the task does.
+    timed: seconds a frame for some settings, such as of `frame_timer`. tick: called after each of `timed_points` ×
+    REPEATS.
     """
-    timed = timed or _timer(clip, task, settings, backend)
-    todo = timed_points(settings, names)
-    took: dict[tuple[str, float], list[float]] = {point: [] for point in todo}
-    for turn in range(repeats):
-        for point in todo if turn % 2 == 0 else reversed(todo):
-            took[point].append(timed(_at(settings, point)))
+    points = timed_points(settings, names)
+    took: dict[tuple[str, float], list[float]] = {point: [] for point in points}
+    for turn in range(REPEATS):
+        for point, changed in points.items() if turn % 2 == 0 else reversed(points.items()):
+            took[point].append(timed(changed))
             tick()
     base = median(took["", 0.0])
     # Logarithms, as times differ by factors; what repeats of the same settings differ by is noise.
-    spread = median(stdev(map(math.log, ts)) for ts in took.values()) if repeats > 1 else 0.0
+    spread = median(stdev(map(math.log, ts)) for ts in took.values())
     curves = []
     for name in names:
-        start = value_of(settings, name)
         known = {value: median(ts) / base for (of, value), ts in took.items() if of == name}
         if any(abs(math.log(factor)) > NOISE * spread for factor in known.values()):
-            both = sorted({**known, start: 1.0}.items())
-            curves.append(Curve(name, tuple(v for v, _ in both), tuple(f for _, f in both)))
+            values, times = zip(*sorted({**known, value_of(settings, name): 1.0}.items()), strict=True)
+            curves.append(Curve(name, values, times))
     return TimeCost(weight, base, tuple(curves))
 
 
-def timed_points(settings: Settings, names: Sequence[str]) -> list[tuple[str, float]]:
-    """The parameters and values that are timed; first ("", 0.0), the settings as they are."""
-    found = [("", 0.0)]
+def timed_points(settings: Settings, names: Sequence[str]) -> dict[tuple[str, float], Settings]:
+    """The settings that are timed, by parameter and value; first ("", 0.0), the settings as they are."""
+    found = {("", 0.0): settings}
     for name in names:
         tunable, start = TUNABLE[name], value_of(settings, name)
         for factor in FACTORS:
             value = tunable.rounded((start + tunable.offset) * factor - tunable.offset)
-            point = (name, float(value))
-            if value != start and point not in found and _possible(settings, point):
-                found.append(point)
+            if value != start:
+                try:
+                    found.setdefault((name, float(value)), with_parameters(settings, {name: value}))
+                except InputError:  # the value and another parameter exclude each other
+                    continue
     return found
 
 
-def write_cost(place: Path, cost: TimeCost) -> None:
-    """Keep the measured times for a resumed run. Raises InputError where the disk refuses."""
-    save_file(place, (json.dumps(cost.as_json(), indent=2) + "\n").encode())
+def frame_timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
+    """Seconds a frame of a task on a clip, as a function of the settings. Raises InputError as the task does."""
+    need = upstream_task(clip, task)
+    before = None if need is None else find(clip, need, settings, backend)
+
+    def timed(changed: Settings) -> float:
+        found = find(clip, task, changed, backend, before=before)
+        return sum(found.seconds.values()) / max(len(found.looked), 1)
+
+    timed(settings)  # warm up
+    return timed
 
 
 def read_cost(place: Path) -> TimeCost:
-    """Read what `write_cost` wrote. Raises InputError where it is damaged."""
+    """Read a cost.json, the JSON of `TimeCost.as_json`. Raises InputError where it is damaged."""
     try:
         content = json.loads(place.read_text(encoding="utf-8"))
         curves = [
@@ -140,28 +143,3 @@ def read_cost(place: Path) -> TimeCost:
         return TimeCost(float(content["weight"]), float(content["seconds"]), tuple(curves))
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         raise InputError(f"{place} does not hold the cost of parameters; begin again without --resume") from None
-
-
-def _timer(clip: Clip, task: Task, settings: Settings, backend: str) -> Callable[[Settings], float]:
-    need = upstream_task(clip, task)
-    before: Found | None = None if need is None else find(clip, need, settings, backend)
-
-    def timed(changed: Settings) -> float:
-        found = find(clip, task, changed, backend, before=before)
-        return sum(found.seconds.values()) / max(len(found.looked), 1)
-
-    timed(settings)  # warm up
-    return timed
-
-
-def _at(settings: Settings, point: tuple[str, float]) -> Settings:
-    name, value = point
-    return with_parameters(settings, {name: TUNABLE[name].rounded(value)}) if name else settings
-
-
-def _possible(settings: Settings, point: tuple[str, float]) -> bool:
-    try:
-        _at(settings, point)
-    except InputError:
-        return False
-    return True

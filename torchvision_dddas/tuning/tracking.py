@@ -34,7 +34,7 @@ from torchvision_dddas.tracking.scores import (
     visible_shares,
 )
 from torchvision_dddas.tracking.smoother import FILLED
-from torchvision_dddas.tuning.examples import OwnedBoxes, boxed_frames, check_identities, match_owners, stack_padded
+from torchvision_dddas.tuning.examples import OwnedBoxes, boxed_frames, match_owners, stack_padded, true_tracks
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import with_tensors
 from torchvision_dddas.types import DetectionTable
@@ -47,18 +47,13 @@ MISSED = 4.0
 gate, but all that follows a broken track counts as another target. Chosen of 0, 2, 4 and 6, not each with all margins
 of wrong links, pulls and sets of parameters, by IDF1 of MOT15 sequences held out."""
 
-
-@dataclass(frozen=True)
-class Stretch:
-    """The fields of one row of `Stretches`, and the settings of what is not tuned."""
-
-    arrays: Mapping[str, np.ndarray]
-    settings: Settings
+# Rounds of messages a frame; more change the loss by less than a hundredth in a crowd.
+_ROUNDS = 10
 
 
 @dataclass(frozen=True)
 class TrackingFamily(Family):
-    """The family `tracking`. interval: frames between examples. missed, wrong: margins, as `link_nll` takes them."""
+    """The family `tracking`. interval: frames between examples. missed: margin, as `link_nll` takes it."""
 
     interval: int = 1
     name: str = "tracking"
@@ -67,7 +62,6 @@ class TrackingFamily(Family):
     softness: tuple[float, float] = (1.0, 1.0)
     """A likelihood needs softness 1: below it, the loss asks for the best assignment whatever the others are."""
     missed: float = 0.0
-    wrong: float = 0.0
 
     def at(self, interval_frames: int, task: Task) -> "TrackingFamily":
         """With the boxes that the task tracks: true ones for association, detections for tracking."""
@@ -82,20 +76,18 @@ class TrackingFamily(Family):
             mine = f"{', '.join(names)}: no effect under track.mode={settings.track.mode}"
             raise InputError(f"{mine}; add --set track.mode=default, or tune paper.threshold and its like")
 
-    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Stretch]]:
-        """Stretches of the clip's true tracks; the last one may be shorter, but has two frames or more."""
-        check_identities([clip])
+    def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
+        """Stretches of the clip's true tracks, each a row of `Stretches`; the last may be shorter, with two frames."""
         frames = list(_tracked_frames(clip, self._boxes(clip, settings), settings, self.interval))
         for start in range(0, len(frames), FRAMES):
             piece = frames[start : start + FRAMES]
             if len(piece) > 1:
-                yield piece[0].frame, Stretch(_stack_frames(piece, settings.track.birth_score), settings)
+                yield piece[0]["frame"], _stack_frames(piece, settings.track.birth_score)
 
     def _boxes(self, clip: Clip, settings: Settings) -> OwnedBoxes:
         """The boxes to track. Raises InputError where detections are wanted and the clip has none."""
-        assert clip.truth is not None and clip.truth.tracks is not None
+        table = true_tracks(clip, self.interval)
         if self.task == "association":
-            table = clip.truth.tracks.every(self.interval)
             certain = np.ones(len(table.frame))
             box_px = np.asarray(table.box_px, float)
             extent = DetectionTable("", table.frame, box_px, certain, np.arange(len(certain))).extent
@@ -105,6 +97,7 @@ class TrackingFamily(Family):
                 f"{clip.name} has no public detections, which tuning for the task 'tracking' needs; leave it out, or "
                 "tune for true boxes: --measure association.tracks.idf1"
             )
+        assert clip.truth is not None
         found = match_owners(read_detections(clip.given), clip.truth, self.interval, settings.track.min_score)
         if not len(found.score):
             raise InputError(
@@ -115,10 +108,10 @@ class TrackingFamily(Family):
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) nats a link, at softness 1. See `Family.loss`."""
-        track = with_tensors(batch[0].content.settings.track, "track", parameters)
+        track = with_tensors(batch[0].settings.track, "track", parameters)
         device = next(iter(parameters.values())).device
-        stretches = stack_padded(Stretches, [example.content.arrays for example in batch], device, pad="edge")
-        return link_nll(track, stretches, softness, self.missed, self.wrong)
+        stretches = stack_padded(Stretches, [example.content for example in batch], device, pad="edge")
+        return link_nll(track, stretches, softness, self.missed)
 
 
 @dataclass(frozen=True)
@@ -149,23 +142,11 @@ class Stretches:
     own: Bool[Tensor, "B"]
 
 
-@dataclass
-class _Frame:
-    """The boxes of a frame, and what the tracker knows by then."""
-
-    frame: int
-    identity: np.ndarray
-    box_px: np.ndarray
-    score: np.ndarray
-    step: np.ndarray | None
-    signature: np.ndarray | None
-    known: dict[str, Any]
-
-
-def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval: int) -> Iterator[_Frame]:
+def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval: int) -> Iterator[dict[str, Any]]:
+    """The boxes of each frame, and what the tracker knows by then."""
     speed_prior, before = SpeedPrior(settings.track.speed), None
     camera = CameraMotion(load_engine("onboard", settings))
-    size = _picture_size(clip, boxes)
+    size = open_clip(clip).size if clip.pictures else boxes.size or (1e6, 1e6)
     seen, doubtful, births, known = 0, 0, 0, set[int]()
     for number, identity, box_px, image in boxed_frames(clip, boxes.table, interval):
         step = signature = None
@@ -178,7 +159,13 @@ def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval:
         seen += len(box_px)
         doubtful += int((score < 1).sum())
         doubt = doubtful / max(seen, 1)
-        state = {
+        yield {
+            "frame": number,
+            "identity": identity,
+            "box_px": box_px,
+            "score": score,
+            "step": np.eye(3) if step is None else step,
+            "signature": signature,
             "interval": float(interval),
             "size": np.array(size, float),
             "usual": speed_prior.usual,
@@ -187,55 +174,40 @@ def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval:
             "doubt": doubt,
             "own": boxes.own,
         }
-        yield _Frame(number, identity, box_px, score, step, signature, state)
         begun = (score >= settings.track.birth_score) & ~np.isin(identity, list(known))
         births += int((begun & ~is_near_border(box_px, size)).sum()) if before is not None else 0
         known |= set(identity[begun].tolist())
         before = box_px
 
 
-def _picture_size(clip: Clip, boxes: OwnedBoxes) -> tuple[float, float]:
-    if clip.pictures:
-        width, height = open_clip(clip).size
-        return float(width), float(height)
-    return boxes.size if boxes.size is not None else (1e6, 1e6)
-
-
-def _stack_frames(frames: Sequence[_Frame], birth_score: float) -> dict[str, np.ndarray]:
+def _stack_frames(frames: Sequence[Mapping[str, Any]], birth_score: float) -> dict[str, np.ndarray]:
     """The fields of `Stretches`. birth_score: of a box that may begin a track."""
-    names = np.unique(np.concatenate([frame.identity for frame in frames]))
+    names = np.unique(np.concatenate([frame["identity"] for frame in frames]))
     shape = (len(frames), len(names))
     box_px, visible, score = np.ones((*shape, 4)), np.ones(shape), np.full(shape, -1.0)
     likeness = np.full((*shape, len(names)), np.nan)
     signature, hits = None, np.zeros(len(names), np.int64)
     for t, frame in enumerate(frames):
-        here = np.searchsorted(names, frame.identity)
-        box_px[t, here], score[t, here] = frame.box_px, frame.score
-        visible[t, here] = visible_shares(frame.box_px)
-        if frame.signature is not None and len(here):
+        here, seen = np.searchsorted(names, frame["identity"]), frame["signature"]
+        box_px[t, here], score[t, here] = frame["box_px"], frame["score"]
+        visible[t, here] = visible_shares(frame["box_px"])
+        if seen is not None and len(here):
             if signature is None:
-                signature = np.zeros((len(names), frame.signature.shape[1]))
-            likeness[t][:, here] = similarity(signature, frame.signature)
+                signature = np.zeros((len(names), seen.shape[1]))
+            likeness[t][:, here] = similarity(signature, seen)
             hits[here] += 1
-            signature[here] = blend_histograms(signature[here], frame.signature, visible[t, here], hits[here])
-    known = {key: np.stack([np.asarray(frame.known[key]) for frame in frames]) for key in frames[0].known}
-    of_clip = {key: known.pop(key)[0] for key in ("interval", "size", "own")}
+            signature[here] = blend_histograms(signature[here], seen, visible[t, here], hits[here])
+    by_frame = ("frame", "step", "usual", "known", "births", "doubt")
     return {
-        **known,
-        **of_clip,
-        "frame": np.array([frame.frame for frame in frames], float),
+        **{name: np.stack([np.asarray(frame[name], float) for frame in frames]) for name in by_frame},
+        **{name: np.asarray(frames[0][name]) for name in ("interval", "size", "own")},
         "box_px": box_px,
         "there": score >= 0,
         "certain": score >= 1,
         "begins": (score >= 0) & (score >= birth_score),
-        "step": np.stack([np.eye(3) if frame.step is None else frame.step for frame in frames]),
         "likeness": likeness,
         "visible": visible,
     }
-
-
-# Rounds of messages a frame; more change the loss by less than a hundredth in a crowd.
-_ROUNDS = 10
 
 
 @dataclass
@@ -267,6 +239,7 @@ def link_nll(
     data: Any = stretches
     has_motion = not bool(torch.equal(data.step, torch.eye(3).to(data.step).expand_as(data.step)))
     has_likeness = not bool(data.likeness.isnan().all())
+    no = torch.zeros_like(data.there[:, 0])
     tracks: _Tracks | None = None
     scores: list[Tensor] = []
     true_sum, boxes = (data.frame.new_zeros(len(data.frame)) for _ in range(2))
@@ -278,8 +251,7 @@ def link_nll(
         scene = SceneState(frame, data.interval[:, None], speed, data.births[:, t, None, None], doubt, size)
         begun: Any = kalman.start(box, frame, mine.scatter, speed, mine.size_scatter)
         if tracks is None:
-            no = torch.zeros_like(there)
-            tracks = _Tracks(begun, no, torch.zeros_like(there, dtype=torch.int64), no, no)
+            tracks = _Tracks(begun, no, no.long(), no, no)
         elif has_motion:
             tracks.state = kalman.transform(tracks.state, data.step[:, t])
         if tracks.alive.any():
@@ -327,11 +299,9 @@ def _update_tracks(
 
 def _with_own(parameters: TrackParameters, own: Bool[Tensor, "B"]) -> TrackParameters:
     """Scatter (B, 1) and births (B, 1, 1) by whether a stretch's boxes are own targets."""
-
-    def choose(name: str) -> Tensor:
+    chosen = {}
+    for name in ("scatter", "size_scatter", "births"):
         pair = (getattr(parameters, key) for key in (f"own_{name}", name))
         other, usual = (torch.as_tensor(value, dtype=torch.float64, device=own.device) for value in pair)
-        return torch.where(own[:, None], other, usual)
-
-    each = {"scatter": choose("scatter"), "size_scatter": choose("size_scatter"), "births": choose("births")[..., None]}
-    return TrackParameters.model_construct(**(dict(parameters) | each))
+        chosen[name] = torch.where(own[:, None], other, usual)
+    return TrackParameters.model_construct(**{**dict(parameters), **chosen, "births": chosen["births"][..., None]})

@@ -103,25 +103,29 @@ class Tuner:
         Raises InputError as `prepare`, `descend` and `judge` do, and where the folder cannot be written. A loss that is
         not finite is no error here: `Tuned.failed` says so, and the last good state is measured and written.
         """
-        self._check_folder()
         try:
-            return self._run(lambda tick: prepare(study, base, names, holdout, clips, measure, loss, tick))
+            self._folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=self._folder).close()
+        except OSError as error:
+            raise cannot_write(self._folder / RUN, error) from error
+        try:
+            with self._timed("examples"), self._display.progress("examples", None) as tick:
+                ready = prepare(study, base, names, holdout, clips, measure, loss, tick)
+            return self._run(ready)
         except BaseException:
             if self._state:  # otherwise the record of an earlier run in this folder is still there
                 with suppress(InputError):
-                    self._write(RUN, _json({**self._state, "state": "interrupted"}))
+                    self._write_json(RUN, {**self._state, "state": "interrupted"})
             raise
 
-    def _run(self, prepare_examples: Callable[[Callable[[], object]], Prepared]) -> Tuned:
-        with self._timed("examples"), self._display.progress("examples", None) as tick:
-            ready = prepare_examples(tick)
+    def _run(self, ready: Prepared) -> Tuned:
         ready.parameters.to(self._device)
         held = f", {count_clips(ready.held)} held out" if ready.held else ""
-        count = f"{len(ready.examples)} examples of {count_clips(ready.tuned)}"
-        self._display.message(f"{ready.family.name}: {count}{held}")
+        self._display.message(
+            f"{ready.family.name}: {len(ready.examples)} examples of {count_clips(ready.tuned)}{held}"
+        )
         cost = None if self._time_weight is None else self._measure_cost(ready, self._time_weight)
-        before = _values(ready)
-        place = self._folder / CHECKPOINT
+        before, place = _values(ready), self._folder / CHECKPOINT
         if self._resume and not place.is_file():
             self._display.message(f"there is no checkpoint at {place}: it begins anew")
 
@@ -133,32 +137,19 @@ class Tuner:
         with self._timed("descent"):
             found = descend(ready.family, ready.parameters, ready.examples, self._plan, cost, tell, place, self._resume)
         after = _values(ready)
-        self._write_settings(ready, found, ())
+        about = f"dddas tune: {', '.join(after)} on {', '.join(ready.tuned)}, step {found.best}."
+        self._write(TUNED, settings_toml(found.settings, [about]))
         with self._timed("before and after"):
             verdict = judge(
-                ready.spec,
-                ready.base,
-                ready.goal,
-                after,
-                ready.tuned,
-                ready.held,
-                self._jobs,
-                self._cache,
+                ready.spec, ready.base, ready.goal, after, ready.tuned, ready.held, self._jobs, self._cache,
                 self._display.study,
-            )
-        self._write_settings(ready, found, verdict.lines())
-        record = self._record(ready, found, cost, before, verdict)
+            )  # fmt: skip
+        self._write(TUNED, settings_toml(found.settings, [about, *(f"{line}." for line in verdict.lines())]))
+        record = self._record(ready, found, cost, before, after, verdict)
         self._write(REPORT, tuning_report(finite(record)))
-        self._write(RUN, _json(record))
+        self._write_json(RUN, record)
         last_good = f"{self._folder / TUNED} holds the last good state, of step {found.best}"
         return Tuned(found, verdict, before, after, f"{found.failed}; {last_good}" if found.failed else "")
-
-    def _check_folder(self) -> None:
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=self._folder).close()
-        except OSError as error:
-            raise cannot_write(self._folder / RUN, error) from error
 
     def _measure_cost(self, ready: Prepared, weight: float) -> time_cost.TimeCost:
         """The time that the parameters cost on the shortest clip; a resumed descent keeps what was measured for it."""
@@ -170,7 +161,8 @@ class Tuner:
         names, settings = ready.parameters.names, ready.parameters.base
         count = time_cost.REPEATS * len(time_cost.timed_points(settings, names))
         with self._timed("cost"), self._display.progress("what time costs", count) as tick:
-            return time_cost.measure_cost(clip, ready.goal.task, settings, names, weight, ready.spec.backend, tick=tick)
+            timed = time_cost.frame_timer(clip, ready.goal.task, settings, ready.spec.backend)
+            return time_cost.measure_cost(timed, settings, names, weight, tick)
 
     def _begin_record(self, ready: Prepared, cost: time_cost.TimeCost | None) -> None:
         """Called with the first step, so that a refused run leaves the files of an earlier one alone."""
@@ -179,14 +171,10 @@ class Tuner:
             if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
                 self._display.message(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
         if cost is not None:
-            time_cost.write_cost(self._folder / COST, cost)
+            self._write_json(COST, cost.as_json())
         state = {"state": "running", "study": ready.spec.name}
-        self._write(RUN, _json(state))
+        self._write_json(RUN, state)
         self._state = state
-
-    def _write_settings(self, ready: Prepared, found: Descended, lines: Sequence[str]) -> None:
-        about = f"dddas tune: {', '.join(ready.parameters.names)} on {', '.join(ready.tuned)}, step {found.best}."
-        self._write(TUNED, settings_toml(found.settings, [about, *(f"{line}." for line in lines)]))
 
     def _record(
         self,
@@ -194,10 +182,11 @@ class Tuner:
         found: Descended,
         cost: time_cost.TimeCost | None,
         before: Mapping[str, Any],
+        after: Mapping[str, Any],
         verdict: Verdict,
     ) -> dict[str, Any]:
         """The content of run.json and of the report."""
-        spec, after = ready.spec, _values(ready)
+        spec = ready.spec
         meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
         charged = None
         if cost is not None:
@@ -220,18 +209,15 @@ class Tuner:
                     "meaning": meaning[name],
                     "idle": name in found.idle,
                 }
-                for name in ready.parameters.names
+                for name in after
             },
-            "best": found.best,
-            "taken": found.taken,
-            "ended": found.ended,
-            "failed": found.failed,
+            **{name: getattr(found, name) for name in ("best", "taken", "ended", "failed")},
             "history": [
                 {"knobs" if name == "parameters" else name: value for name, value in asdict(step).items()}
                 for step in found.history
             ],
             "cost": charged,
-            "verdict": verdict.told(),
+            "verdict": verdict.as_json(),
             "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},
         }
 
@@ -244,12 +230,11 @@ class Tuner:
     def _write(self, name: str, text: str) -> None:
         save_file(self._folder / name, text.encode())
 
+    def _write_json(self, name: str, content: Any) -> None:
+        self._write(name, json.dumps(finite(content), indent=2) + "\n")
+
 
 def _values(ready: Prepared) -> dict[str, Any]:
     """The parameters as settings have them."""
-    dumped = ready.parameters.settings().model_dump()
-    return {name: dumped[name.split(".")[0]][name.split(".")[1]] for name in ready.parameters.names}
-
-
-def _json(content: Any) -> str:
-    return json.dumps(finite(content), indent=2) + "\n"
+    settings = ready.parameters.settings()
+    return {name: getattr(getattr(settings, name.split(".")[0]), name.split(".")[1]) for name in ready.parameters.names}

@@ -1,6 +1,6 @@
 """The soft association of the source beside the hard one: the same links, and parameters that are found again."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -9,12 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.config import PaperParameters, Settings
+from torchvision_dddas.config import PaperParameters, Settings, load_config, with_parameters
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.source_tracker import Features, associate
 from torchvision_dddas.tuning.examples import stack_padded
 from torchvision_dddas.tuning.parameters import Parameters
 from torchvision_dddas.tuning.source_association import (
+    SourceFamily,
     Windows,
     build_window,
     link_gains,
@@ -126,10 +128,9 @@ def test_the_order_of_targets_does_not_matter():
     looks, identities = looks_of(6, 1)
     plain = stack_padded(Windows, [build_window(looks, identities, paper())])
     order = np.array([2, 0, 1, 5, 4, 3])
-    mixed = Windows(**{field.name: getattr(plain, field.name) for field in fields(Windows)})
     rows = np.append(0, order + 1)
     mixed = replace(
-        mixed,
+        plain,
         similarity=plain.similarity[:, :, rows],
         alternative=plain.alternative[:, :, rows],
         true=plain.true[:, order],
@@ -146,6 +147,7 @@ def test_a_link_that_no_parameter_can_save_counts_no_more_than_once():
     assert (links_nll(paper(), exchanged, 0.001) > 10).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "group"), [({"threshold": 0.8}, "threshold"), ({"weight": 0.95}, "weight")])
 def test_a_wrong_parameter_is_brought_back_by_a_few_steps(start, group):
     """Of people who come and go, a gate that is never shut links the wrong ones; of a crowd, places alone do."""
@@ -170,3 +172,25 @@ def test_a_wrong_parameter_is_brought_back_by_a_few_steps(start, group):
     after = wrong(0.001, {group: getattr(parameters.settings().paper, group)}).item()
     assert before >= 4
     assert after < before / 2
+
+
+PAPER = with_parameters(load_config("paper"), {"paper.window": 2})
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "said"),
+    [
+        ("paper.threshold", {"track.mode": "default"}, "no effect under track.mode=default; use --config paper"),
+        ("paper.weight", {}, "paper.weight: no effect under paper.rule=dispersion; add --set paper.rule=fixed"),
+        ("paper.location_cut", {"paper.rule": "fixed"}, "no effect under paper.rule=fixed"),
+        ("paper.threshold", {"paper.gate": "off"}, "no effect under paper.gate=off"),
+        ("paper.threshold", {"paper.window": 3}, "add --set paper.window=2"),
+        ("paper.threshold", {"paper.gated": "affinity"}, "add --set paper.gated=features"),
+    ],
+)
+def test_a_parameter_that_would_be_tuned_for_nothing_is_refused_with_what_to_set(name, values, said):
+    settings = with_parameters(PAPER, values)
+    with pytest.raises(InputError) as raised:
+        SourceFamily().check([name], settings)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,276 @@
+"""Ellipses of positions: losses and gradients of the hard locators, from the air and from the ground."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from tests import airborne
+from tests.overflight import Overflight
+from tests.tuning.worlds import CAMERA, flown, ground_clip, ground_people
+from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.metrics.metres import inside
+from torchvision_dddas.geo.georeferencer import Georeferencer
+from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
+from torchvision_dddas.geo.ranging import range_people
+from torchvision_dddas.tuning.aerial_location import (
+    LinearFit,
+    build_view,
+    default_values,
+    gauss_newton_step,
+    gaussian_nll,
+    is_only_noise,
+    project_to_ground,
+)
+from torchvision_dddas.tuning.descent import Plan, descend
+from torchvision_dddas.tuning.family import Example
+from torchvision_dddas.tuning.location import GROUND, UNPLACED, GroundView, LocationFamily
+from torchvision_dddas.tuning.parameters import Parameters
+from torchvision_dddas.types import Poses
+
+FAMILY = LocationFamily()
+
+
+def from_air(count: int, settings: Settings, **how: Any) -> list[Example]:
+    """Simulated pictures whose landmarks are as exact as the settings say."""
+    found = []
+    for seed in range(count):
+        look = airborne.look(seed, **how)
+        n, landmarks = len(look.marks), settings.landmarks
+        sigmas = {"sigma_m": np.full(n, landmarks.sigma_m), "pixel_sigma": np.full(n, landmarks.pixel_sigma)}
+        flight = replace(look.flight, hfov_rad=float(np.radians(70.0)))
+        view = build_view(
+            airborne.CAMERA, flight, replace(look.marks, **sigmas), look.targets_px, look.targets, settings,
+            np.ones(n, bool), np.zeros(4), np.zeros(4),
+        )  # fmt: skip
+        found.append(Example("looks", seed, view, settings))
+    return found
+
+
+def from_ground(seed: int, settings: Settings, count: int = 12, **errors: float) -> Example:
+    box, true = ground_people(seed, count, **errors)
+    return Example("ground", seed, GroundView(CAMERA, box, np.zeros(count, bool), true), settings)
+
+
+def range_again(view: GroundView, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and covariances of the hard ranging."""
+    n = len(view.box_px)
+    place = np.tile(CAMERA.place, (n, 1))
+    poses = Poses(place, np.full(n, CAMERA.heading_rad), np.full(n, CAMERA.pitch_rad))
+    found = range_people(view.box_px, view.cut, CAMERA, poses, place, settings.ground)
+    return found.east_north_m - view.true_m, found.covariance_m2
+
+
+def mean_nll(off_m: np.ndarray, covariance_m2: np.ndarray) -> float:
+    densities = [-multivariate_normal(np.zeros(2), c).logpdf(o) for o, c in zip(off_m, covariance_m2, strict=True)]
+    return float(np.mean(densities))
+
+
+def test_the_loss_is_least_where_ellipses_are_as_large_as_errors() -> None:
+    off = torch.as_tensor(np.random.default_rng(0).normal(0, 1.5, (4000, 2)))
+    sigmas = torch.linspace(0.5, 4, 71, dtype=torch.float64)
+    mean = [
+        float(gaussian_nll(off, (s**2 * torch.eye(2, dtype=torch.float64)).expand(4000, 2, 2)).mean()) for s in sigmas
+    ]
+    assert float(sigmas[int(np.argmin(mean))]) == pytest.approx(float(off.std()), abs=0.05)
+
+
+def test_the_loss_is_that_of_the_hard_locators() -> None:
+    settings = with_parameters(Settings(), {"aerial.correlation_s": 0.0, "aerial.tilt_sigma_deg": 1.7})
+    found = FAMILY.loss({}, from_air(3, settings), 1.0)
+    for seed in range(3):
+        look = airborne.look(seed)
+        flight = replace(look.flight, hfov_rad=float(np.radians(70.0)))
+        fix = Georeferencer(airborne.CAMERA, settings, load_solver("onboard")).update(1, 0.0, flight, look.marks)
+        place, covariance = locate_pixels(fix, airborne.CAMERA, look.targets_px, 1.0)
+        assert float(found[seed]) == pytest.approx(mean_nll(place - look.targets, covariance), rel=1e-3)
+    one = from_ground(0, Settings())
+    assert float(FAMILY.loss({}, [one], 1.0)) == pytest.approx(mean_nll(*range_again(one.content, Settings())))
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 40.0, None])
+def test_the_gradient_is_that_of_the_hard_loss(tilt_deg: float | None) -> None:
+    """None: from the ground."""
+    settings = with_parameters(Settings(), {"landmarks.sigma_m": 1.0, "aerial.heading_sigma_deg": 3.0})
+    if tilt_deg is None:
+        batch = [from_ground(seed, settings) for seed in range(3)]
+        values = {name: value.detach() for name, value in Parameters(settings, GROUND).values().items()}
+    else:
+        batch, values = from_air(4, settings, tilt_deg=tilt_deg), default_values(settings)
+    parameters = {name: value.requires_grad_() for name, value in values.items() if float(value) > 0}
+    FAMILY.loss(parameters, batch, 1.0).sum().backward()
+    checked = 0
+    for name, value in parameters.items():
+        with torch.no_grad():
+            step = 1e-3 * value
+            more, less = (FAMILY.loss({**parameters, name: value + s}, batch, 1.0).sum() for s in (step, -step))
+        # By the parameter's logarithm, so that all are alike.
+        slope = float(more - less) / 2e-3
+        mine = 0.0 if value.grad is None else float(value.grad * value.detach())
+        assert mine == pytest.approx(slope, rel=0.03, abs=0.03), name
+        checked += abs(slope) > 0.1
+    assert checked >= (1 if tilt_deg is None else 3)
+
+
+def test_pictures_of_several_shapes_share_a_batch() -> None:
+    settings = Settings()
+    batch = [*from_air(1, settings), from_ground(0, settings), *from_air(1, settings, n=6), *from_air(2, settings)]
+    together = FAMILY.loss({}, batch, 1.0)
+    assert together.tolist() == pytest.approx([float(FAMILY.loss({}, [one], 1.0)) for one in batch])
+
+
+def test_what_gets_no_position_costs_and_has_no_gradient() -> None:
+    (air,) = from_air(1, Settings())
+    air = replace(air, content=replace(air.content, targets_px=np.full_like(air.content.targets_px, 1e7)))
+    ground = from_ground(0, Settings(), 1)
+    box = ground.content.box_px - [0, 400, 0, 0]  # above the horizon
+    ground = replace(ground, content=replace(ground.content, box_px=box, cut=np.ones(1, bool)))
+    for example, name in ((air, "aerial.tilt_sigma_deg"), (ground, "ground.feet_sigma")):
+        parameter = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+        found = FAMILY.loss({name: parameter}, [example], 1.0)
+        found.sum().backward()
+        assert float(found.detach()) == UNPLACED and float(parameter.grad or 0) == 0
+
+
+def test_swapped_landmarks_are_no_matter_of_noise() -> None:
+    settings = Settings()
+    (example,) = from_air(1, settings, sigma_m=0.02)
+    view, probability = example.content, settings.aerial.gate_probability
+    assert is_only_noise(view, default_values(settings), probability)
+    swapped = replace(view, marks=replace(view.marks, image_px=view.marks.image_px[[1, 0, 2, 3]]))
+    assert not is_only_noise(swapped, default_values(settings), probability)
+
+
+def test_noise_that_was_thought_too_small_is_found() -> None:
+    thought = with_parameters(Settings(), {"landmarks.sigma_m": 0.5})
+    parameters = Parameters(thought, ["landmarks.sigma_m"])
+    plan = Plan(steps=20, batch=12, rate=0.2, look_every=10, watched=0)
+    done = descend(FAMILY, parameters, from_air(24, thought), plan)
+    assert done.settings.landmarks.sigma_m == pytest.approx(airborne.GPS_M, rel=0.3)
+
+
+@pytest.mark.slow
+def test_ellipses_hold_as_many_places_as_they_say_on_people_not_tuned_on() -> None:
+    errors = {"feet": 0.015, "tall": 0.15, "body": 0.1}
+    thought = with_parameters(Settings(), {"ground.feet_sigma": 0.05, "ground.height_sigma": 0.03})
+    parameters = Parameters(thought, ["ground.feet_sigma", "ground.height_sigma"])
+    batch = [from_ground(seed, thought, 120, **errors) for seed in range(3)]
+    tuned = descend(FAMILY, parameters, batch, Plan(steps=40, batch=3, rate=0.2, look_every=20, watched=0)).settings
+
+    def held(settings: Settings) -> float:
+        views = [from_ground(seed, settings, 120, **errors).content for seed in range(100, 104)]
+        return float(np.nanmean(np.concatenate([inside(*range_again(view, settings)) for view in views])))
+
+    assert abs(held(tuned) - 0.95) < 0.03 < abs(held(thought) - 0.95)
+
+
+def linear_fit(seed: int = 0, landmarks: int = 3, batch: int = 2) -> LinearFit:
+    rng = np.random.default_rng(seed)
+    states = 7 + 2 * landmarks
+
+    def drawn(*shape: int) -> torch.Tensor:
+        return torch.as_tensor(rng.normal(0, 1, (batch, *shape)))
+
+    by_turn = torch.eye(states, dtype=torch.float64).repeat(batch, 1, 1)
+    by_turn[:, :3, :3] += 0.1 * drawn(3, 3)
+    known = torch.ones(batch, states, dtype=torch.float64)
+    least_squares = drawn(2 * landmarks), drawn(2 * landmarks, states), drawn(states), by_turn, known
+    return LinearFit(*least_squares, drawn(4, 2), drawn(4, 2, 7), drawn(4, 2, 2))
+
+
+PIXELS, VARIANCE = torch.full((2, 6), 0.5, dtype=torch.float64), torch.full((2, 13), 2.0, dtype=torch.float64)
+
+
+def test_the_step_is_that_of_weighted_least_squares() -> None:
+    fit = linear_fit()
+    step, covariance = gauss_newton_step(fit, PIXELS, VARIANCE)
+    for b in range(2):
+        rows = np.vstack([fit.slopes[b] / np.sqrt(0.5), fit.by_turn[b] / np.sqrt(2.0)])
+        wanted = np.concatenate([fit.missing[b] / np.sqrt(0.5), -fit.correction[b] / np.sqrt(2.0)])
+        assert step[b].numpy() == pytest.approx(np.linalg.lstsq(rows, wanted, rcond=None)[0][:7])
+        assert covariance[b].numpy() == pytest.approx(np.linalg.inv(rows.T @ rows)[:7, :7])
+
+
+def test_what_is_not_known_does_not_count() -> None:
+    fit, variance = linear_fit(), VARIANCE.clone()
+    fit.known[:, 2] = 0
+    before = gauss_newton_step(fit, PIXELS, variance)
+    variance[:, 2], fit.correction[:, 2] = 1e4, 77.0
+    for a, b in zip(before, gauss_newton_step(fit, PIXELS, variance), strict=True):
+        assert a.numpy() == pytest.approx(b.numpy())
+
+
+def test_gradients_by_variances_are_right() -> None:
+    fit, rng = linear_fit(), np.random.default_rng(1)
+    start = [torch.as_tensor(rng.uniform(0.5, 2, s)).requires_grad_() for s in ((2, 6), (2, 13), (2, 4))]
+
+    def lost(pixels: torch.Tensor, variance: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        # The scale that keeps digits is no part of the result: its slope must not be either.
+        return gaussian_nll(*project_to_ground(fit, *gauss_newton_step(fit, pixels, variance), targets))
+
+    assert torch.autograd.gradcheck(lost, start)
+
+
+def examples(clip, settings: Settings | None = None) -> list[Example]:
+    return FAMILY.examples([clip], settings or Settings())
+
+
+@pytest.mark.parametrize("geographic", [False, True])
+def test_an_exact_flight_asks_for_small_ellipses(tmp_path, geographic: bool) -> None:
+    found = examples(flown(tmp_path, Overflight(frames=3, geographic=geographic)))
+    assert [example.frame for example in found] == [1, 2, 3]
+    assert [len(example.content.true_m) for example in found] == [4, 4, 4]
+    wide, fine = (FAMILY.loss({"aerial.target_sigma_px": torch.tensor(px)}, found, 1.0) for px in (1.0, 0.05))
+    assert (fine < wide - 1).all()
+
+
+def test_the_people_of_a_ground_clip_are_those_whose_places_are_known(tmp_path) -> None:
+    found = examples(ground_clip(tmp_path))
+    assert [one.frame for one in found] == [1, 2]
+    assert [len(one.content.true_m) for one in found] == [5, 5]
+    assert float(FAMILY.loss({}, found, 1.0).mean()) < 5
+
+
+def test_landmarks_that_say_how_well_they_are_known_are_not_tuned(tmp_path) -> None:
+    flight = Overflight(frames=1, gps_m=0.5)
+    (said,) = examples(flown(tmp_path, flight))
+    assert said.content.own.tolist() == [0] * 4
+    assert said.content.reported_m2.tolist() == pytest.approx([0.25] * 4)
+    clip = flown(tmp_path, flight, sigma=False)
+    for settings in (Settings(), with_parameters(Settings(), {"landmarks.sigma_m": 0.0})):
+        (unsaid,) = examples(clip, settings)
+        assert unsaid.content.own.tolist() == pytest.approx([1] * 4)
+        assert unsaid.content.reported_m2.tolist() == pytest.approx([0] * 4, abs=1e-9)
+
+
+def test_a_frame_whose_landmarks_are_swapped_is_left_out(tmp_path) -> None:
+    clip = flown(tmp_path, Overflight(frames=3))
+    lines = [line.split(",") for line in (tmp_path / "landmarks.csv").read_text().splitlines()]
+    one, other = (next(cells for cells in lines if cells[:2] == ["2", name]) for name in ("ugv0", "ugv1"))
+    one[2:4], other[2:4] = other[2:4], one[2:4]
+    (tmp_path / "landmarks.csv").write_text("\n".join(",".join(cells) for cells in lines) + "\n")
+    assert [example.frame for example in examples(clip)] == [1, 3]
+
+
+def test_clips_that_cannot_be_used_are_refused(tmp_path) -> None:
+    clip = flown(tmp_path, Overflight(frames=1))
+    assert clip.truth is not None and clip.truth.positions is not None
+    in_metres = replace(clip.truth, positions=replace(clip.truth.positions, lonlat_deg=None))
+    with pytest.raises(InputError, match="give both in one unit"):
+        examples(replace(clip, truth=in_metres))
+    with pytest.raises(InputError, match="no pictures and no detections"):
+        examples(replace(clip, given=None))
+    ground = replace(clip, landmarks=None)
+    with pytest.raises(InputError, match="has no error model"):
+        examples(ground, with_parameters(Settings(), {"ground.mode": "paper"}))
+    with pytest.raises(InputError, match="locating from the ground needs both"):
+        examples(replace(ground, given=None))
+    (tmp_path / "camera.toml").write_text(
+        "focal_px = 1000\nwidth_px = 1280\nheight_px = 720\nheight_m = 1.6\nlatitude_deg = 45\nlongitude_deg = -75\n"
+    )
+    with pytest.raises(InputError, match="the camera is given in degrees"):
+        examples(ground)

@@ -1,0 +1,162 @@
+"""Small clips whose truth is known, one maker for each family of parameters."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.overflight import ORIGIN, Overflight
+from tests.synthetic_clip import film_into
+from torchvision_dddas.config import PeopleParameters
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.evaluation.metrics import truth as truths
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
+from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.people.suppression import body_boxes
+from torchvision_dddas.types import Camera
+
+PERSON = np.array([20.0, 50.0])
+CAMERA = Camera(
+    "ground", (1280, 720), (1000.0, 1000.0), (639.5, 359.5), height_m=1.6, focal_sigma=0.001, height_sigma_m=0.01,
+    pitch_sigma_rad=1e-4, heading_sigma_rad=1e-4, position_sigma_m=0.01,
+)  # fmt: skip
+
+
+def filmed_clip(place: Path, frames: int) -> Clip:
+    """Pictures of 240 x 180 with masks of what moves."""
+    film_into(place / "film", 3, frames, (240, 180))
+    (found,) = read(Source("folder", place), place).clips
+    return found
+
+
+def walk(name: str = "walk", people: int = 4, frames: int = 150, seed: int = 0, true: bool = True) -> Clip:
+    """People who walk about for a while."""
+    draw = np.random.default_rng(seed)
+    place = draw.uniform(100, 400, (people, 2)) + np.cumsum(draw.normal(0, 0.5, (frames, people, 2)), axis=0).cumsum(0)
+    frame = np.repeat(np.arange(1, frames + 1), people)
+    identity = np.tile(np.arange(1, people + 1), frames)
+    box_px = np.concatenate([place.reshape(-1, 2) - PERSON / 2, np.tile(PERSON, (len(frame), 1))], axis=1)
+    table = TrackTable(frame, identity, box_px)
+    truth = Truth("boxes", Path(name), {}, {int(f): box_px[frame == f] for f in np.unique(frame)}, table)
+    return Clip(name, Path(name), truth=truth if true else None)
+
+
+def seen(clip: Clip, place: Path, false: int = 1, miss: float = 0.1, seed: int = 1) -> Clip:
+    """The clip with public detections: some people missed, boxes that scatter, and false alarms in each frame."""
+    draw = np.random.default_rng(seed)
+    assert clip.truth is not None
+    lines = []
+    for frame, boxes in clip.truth.boxes.items():
+        for x, y, width, height in boxes[draw.uniform(size=len(boxes)) >= miss] + draw.normal(0, 0.5, (1, 4)):
+            lines.append(f"{frame},-1,{x:.2f},{y:.2f},{width:.2f},{height:.2f},{draw.choice([0.8, 0.99, 1.0])}")
+        for x, y in draw.uniform(-200, 700, (false, 2)):
+            lines.append(f"{frame},-1,{x:.2f},{y:.2f},20,50,{draw.choice([0.8, 0.99])}")
+    path = place / f"{clip.name}.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return replace(clip, given=path)
+
+
+def flown(folder: Path, flight: Overflight, sigma: bool = True) -> Clip:
+    """The clip of a flight, by tables alone. sigma: whether landmarks say how well they are known."""
+    table = flight.landmarks_csv()
+    if not sigma:
+        table = "\n".join(line.rpartition(",")[0] for line in table.splitlines()) + "\n"
+    for name, text in (
+        ("landmarks.csv", table),
+        ("telemetry.csv", flight.telemetry_csv()),
+        ("camera.toml", flight.camera_toml()),
+        ("gt.txt", flight.tracks_txt()),
+        ("det.txt", flight.tracks_txt(identities=False)),
+    ):
+        (folder / name).write_text(text)
+    where = np.concatenate([flight.targets(frame) for frame in flight.numbers()])
+    frames, who = np.repeat(list(flight.numbers()), 4), np.tile(np.arange(1, 5), flight.frames)
+    places = Positions(frames, who, where, lonlat(where, ORIGIN) if flight.geographic else None)
+    truth = replace(truths.load_truth(folder / "gt.txt"), positions=places)
+    return Clip(
+        "flown",
+        folder,
+        rate_hz=10.0,
+        truth=truth,
+        given=folder / "det.txt",
+        telemetry=folder / "telemetry.csv",
+        landmarks=folder / "landmarks.csv",
+        camera=folder / "camera.toml",
+    )
+
+
+def ground_people(seed: int, count: int = 12, feet: float = 0.03, tall: float = 0.05, body: float = 0.1):
+    """Boxes of people ahead of a level camera, with errors of foot rows and heights, and where they stand."""
+    rng = np.random.default_rng(seed)
+    ahead, aside = rng.uniform(6, 20, count), rng.uniform(-3, 3, count)
+    height = 1.75 + body * rng.normal(0, 1, count)
+    feet_px, head_px = (359.5 + 1000 * (1.6 - up) / ahead for up in (0 * height, height))
+    size = feet_px - head_px
+    foot = feet_px + feet * size * rng.normal(0, 1, count)
+    size = size * (1 + tall * rng.normal(0, 1, count))
+    u = 639.5 + 1000 * aside / ahead + feet * size * rng.normal(0, 1, count)
+    box = np.stack([u + 0.5 - size / 5, foot + 0.5 - size, 0.4 * size, size], axis=1)
+    return box, np.stack([aside, ahead], axis=1)
+
+
+def ground_clip(folder: Path) -> Clip:
+    """A clip of two pictures, with detections that are exact but for a box of nobody, and a camera."""
+    rows, found = [], []
+    for frame in (1, 2):
+        box, _ = ground_people(frame, 5, 0, 0, 0)
+        for who, (x, y, w, h) in enumerate(box.tolist(), 1):
+            rows.append(f"{frame},{who},{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n")
+            found.append(f"{frame},-1,{x:.3f},{y:.3f},{w:.3f},{h:.3f},1,-1,-1,-1\n")
+        found.append(f"{frame},-1,20,20,30,60,1,-1,-1,-1\n")
+    (folder / "gt.txt").write_text("".join(rows))
+    (folder / "det.txt").write_text("".join(found))
+    (folder / "camera.toml").write_text(
+        "focal_px = 1000\nwidth_px = 1280\nheight_px = 720\nheight_m = 1.6\neast_m = 0\nnorth_m = 0\nheading_deg = 0\n"
+    )
+    numbers = np.repeat([1, 2], 5), np.tile(np.arange(1, 6), 2)
+    where = Positions(*numbers, np.concatenate([ground_people(frame, 5, 0, 0, 0)[1] for frame in (1, 2)]))
+    truth = replace(truths.load_truth(folder / "gt.txt"), positions=where)
+    return Clip("ground", folder, truth=truth, given=folder / "det.txt", camera=folder / "camera.toml")
+
+
+class Spots:
+    """A recognizer for which the window about a white spot is a person, the more the whiter."""
+
+    name = "stub"
+
+    def scores(self, images, parts):
+        return [[self._map(image, part) for part in wanted] for image, wanted in zip(images, parts, strict=True)]
+
+    def _map(self, image, part):
+        level = cv2.resize(image, part.level).astype(np.float32)
+        rows, columns = ((side - length) // 8 + 1 for side, length in ((part.height, 128), (part.width, 64)))
+        found = np.full((rows, columns), -5.0, np.float32)
+        for j in range(rows):
+            for i in range(columns):
+                v, u = part.y + 8 * j + 64, part.x + 8 * i + 32
+                inside = 0 <= v < level.shape[0] and 0 <= u < level.shape[1]
+                if part.level == (image.shape[1], image.shape[0]) and inside and level[v, u] > 0:
+                    found[j, i] = level[v, u] / 100 - 1
+        return found
+
+
+def spotted() -> tuple[np.ndarray, np.ndarray]:
+    """A picture of 256 x 160 with spots of which windows score 1.5, 0.5 and -0.5, and the first one's body."""
+    image = np.zeros((160, 256), np.uint8)
+    for u, level in ((40, 250), (136, 150), (216, 50)):
+        image[80 - 3 : 80 + 4, u - 3 : u + 4] = level
+    return image, body_boxes(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleParameters())
+
+
+def spotted_clip(place: Path, monkeypatch: pytest.MonkeyPatch) -> Clip:
+    """Three pictures of spots that are scored by `Spots`; the second is not labelled, the third shows nobody."""
+    image, true = spotted()
+    files = [place / f"{number}.png" for number in (1, 2, 3)]
+    for file in files:
+        cv2.imwrite(str(file), image)
+    truth = Truth("boxes", place, {}, {1: true, 3: np.zeros((0, 4))})
+    monkeypatch.setattr("torchvision_dddas.tuning.people.load_scorer", lambda parameters: Spots())
+    return Clip("spots", place, tuple(files), truth=truth, shows=("people",))
