@@ -169,7 +169,7 @@ def with_signs(*verdicts, looks=()):
     """The map of a target that walks from west to east, above the legend, int."""
     signs = Signs()
     for place, kind in verdicts:
-        signs.add_verdict(1, kind, np.array(place))
+        signs.add_verdict(kind, np.array(place))
     for from_m, at_m in looks:
         signs.add_look("ugv1", np.array(from_m), np.array(at_m))
     east = tracks([positions(k, [(k, 0.0)]) for k in range(40)])
@@ -205,6 +205,6 @@ def test_looks_from_one_place_are_one_those_from_nowhere_none_and_memory_is_boun
     signs.add_look("ugv2", np.full(2, np.nan), np.zeros(2))
     assert len(signs.looks) == 1
     for k in range(3000):
-        signs.add_verdict(k, "human", np.zeros(2))
+        signs.add_verdict("human", np.zeros(2))
         signs.add_look("ugv1", np.array([10.0 * k, 0.0]), np.zeros(2))
     assert len(signs.verdicts) < 1000 and len(signs.looks) < 1000

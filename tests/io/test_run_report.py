@@ -11,10 +11,10 @@ import pytest
 
 from tests.io.ground import grounded
 from tests.pages import Page, points_inside
-from torchvision_dddas.io.output.run_log import LANDMARK, PROBLEM, WORLD, Clock, Entry, RunLog, format_log
+from torchvision_dddas.io.output.run_log import Clock, Entry, RunLog, format_log
 from torchvision_dddas.io.output.run_record import RunRecord
 from torchvision_dddas.io.output.run_report import MOST_KEY_FRAMES, MOST_TABLE_ROWS, KeyFrames, RunReport, format_span
-from torchvision_dddas.io.output.timelines import Timeline, chi2_limit
+from torchvision_dddas.io.output.timelines import PROBLEM, WORLD, Timeline, chi2_limit
 from torchvision_dddas.io.report.charts import TIME_LEFT, TIME_WIDTH
 from torchvision_dddas.types import Adjustment, Detections, Frame, FrameResult, TrackedFrame, Tracks
 
@@ -27,7 +27,7 @@ TIME_S = (FRAME - 1) / 10
 
 def text(log, frame=FRAME, time_s=TIME_S):
     """The lines below the heading, with single blanks."""
-    lines = format_log(log.ordered(), Clock(frame, time_s), ["clip"]).splitlines()[3:]
+    lines = format_log(log.ordered(), Clock(frame, time_s), "clip").splitlines()[3:]
     return [" ".join(line.split()) for line in lines]
 
 
@@ -56,14 +56,16 @@ def test_lines_have_time_frame_values_and_cause_in_the_order_of_the_frames():
 def test_what_lasts_is_one_line_that_says_how_long_though_its_numbers_differ(frames, step, ends):
     log = RunLog()
     for frame in frames:
-        log.add_lasting(frame, step, LANDMARK, f"seen {frame % 7 % 3} of 9" if len(ends) == 1 else "1 of 9")
+        log.add_lasting(frame, step, PROBLEM, f"seen {frame % 7 % 3} of 9" if len(ends) == 1 else "1 of 9")
     lines = text(log, FRAME[::step], TIME_S[::step])
     assert len(lines) == len(ends) and all(line.endswith(end) for line, end in zip(lines, ends, strict=True))
 
 
 @pytest.mark.parametrize(("frame", "time_s"), [(1, 0.0), (11, 1.0), (51, 5.0), (121, 12.0)])
 def test_the_time_of_a_frame_follows_from_those_around_it_or_goes_on_beyond_them(frame, time_s):
-    assert Clock(np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0])).at(frame) == pytest.approx(time_s)
+    assert Clock(np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0])).time_s(
+        Entry(frame, WORLD, "", frame)
+    ) == pytest.approx(time_s)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -154,7 +156,7 @@ def test_a_table_says_how_many_rows_it_leaves_out_and_an_empty_one_that_it_is_em
 # Timelines.
 
 
-def run(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=(), entries=(), causes=()):
+def run(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=(), events=(), causes=()):
     """The timeline of a run in which parameters are moved at frames: (frame, parameter, old, new)."""
     timeline = Timeline(names)
     for number in frames:
@@ -165,7 +167,7 @@ def run(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=(), entr
             adjustments=moved, seconds=seconds(number),
         )  # fmt: skip
         timeline.add_result(FrameResult(tracked))
-    timeline.entries = entries
+    timeline.events[WORLD] = list(events)
     return timeline
 
 
@@ -235,16 +237,15 @@ def test_stages_are_stacked_up_to_all_the_time_spent():
 
 
 def test_events_are_ticked_at_their_time_and_stay_inside_the_plot():
-    svg = run(entries=[Entry(6, WORLD, "crowds <1> join")]).chart()
+    svg = run(events=[(6, "crowds <1> join")]).chart()
     assert "crowds &lt;1&gt; join" in svg
     assert tick_places(svg) == [pytest.approx(TIME_LEFT + 5 / 9 * TIME_WIDTH, abs=1.5)]
-    entries = [Entry(1, WORLD, "early"), Entry(99, WORLD, "late")]
-    places = tick_places(run(frames=range(20, 41), entries=entries).chart())
+    places = tick_places(run(frames=range(20, 41), events=[(1, "early"), (99, "late")]).chart())
     assert min(places) >= TIME_LEFT and max(places) <= TIME_LEFT + TIME_WIDTH
 
 
 def test_a_long_run_with_thousands_of_adjustments_stays_a_light_chart():
     moves = {k: (k, "interval.frames", k % 5, (k + 1) % 5) for k in range(2, 1000)}
-    entries = [Entry(k, WORLD, f"event {k}") for k in range(1, 1001)]
-    timeline = run(moves.values(), range(1, 1001), lambda number: {"a": 0.001 * (number % 7), "b": 0.01}, (), entries)
+    events = [(k, f"event {k}") for k in range(1, 1001)]
+    timeline = run(moves.values(), range(1, 1001), lambda number: {"a": 0.001 * (number % 7), "b": 0.01}, (), events)
     assert len(timeline.chart()) < 300_000

@@ -35,14 +35,14 @@ class Signs:
     """
 
     def __init__(self) -> None:
-        self.verdicts: list[tuple[int, str, np.ndarray]] = []
+        self.verdicts: list[tuple[str, np.ndarray]] = []
         self.looks: list[tuple[np.ndarray, np.ndarray]] = []
         self._last: dict[str, np.ndarray] = {}
 
-    def add_verdict(self, target: int, kind: str, east_north_m: np.ndarray) -> None:
+    def add_verdict(self, kind: str, east_north_m: np.ndarray) -> None:
         """Add the place where a target was first found human or not_human, or otherwise than before."""
         if len(self.verdicts) < _MOST_SIGNS:
-            self.verdicts.append((target, kind, np.array(east_north_m, float)))
+            self.verdicts.append((kind, np.array(east_north_m, float)))
 
     def add_look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
         """Add the places of a vehicle and of a target that it saw."""
@@ -104,9 +104,9 @@ def map_picture(
         _disc(plot, frame.pixels(place), 4, _dark(target))
     for from_m, at_m in signs.looks:
         _draw_look(plot, frame.pixels(from_m), frame.pixels(at_m))
-    for _, kind, place in signs.verdicts:
+    for kind, place in signs.verdicts:
         _draw_verdict(plot, frame.pixels(place), kind)
-    labels = _Labels(picture, frame, [*(place for *_, place in signs.verdicts), *last.values(), *marked.values()])
+    labels = _Labels(picture, frame, [*(place for _, place in signs.verdicts), *last.values(), *marked.values()])
     for mark, place in marked.items():
         _draw_landmark(plot, frame.pixels(place))
         labels.add(place, names[mark], MARK)
@@ -280,7 +280,7 @@ def _draw_legend(picture: np.ndarray, frame: MapFrame, camera: CameraPath, has_l
     def look(picture: np.ndarray, at: np.ndarray) -> None:
         _draw_look(picture, at - (9.0 * FINE, 0.0), at)
 
-    kinds = {kind for _, kind, _ in signs.verdicts}
+    kinds = {kind for kind, _ in signs.verdicts}
     entries: list[tuple[bool, str, Callable[[np.ndarray, np.ndarray], None]]] = [
         (True, "target: number, way, 95 % ellipse of the last place", target),
         (has_landmarks, "landmark", _draw_landmark),

@@ -12,9 +12,9 @@ from torchvision_dddas.io.output.recorders import (
     PipelineRecorder,
     TrackRecorder,
 )
-from torchvision_dddas.io.output.run_log import NOTICED, PROBLEM, WORLD
 from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, clip_facts, finite, versions
 from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
+from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM, WORLD
 
 __all__ = [
     "CONFIRMATION_NAMES",

@@ -13,9 +13,9 @@ from torchvision_dddas.io.atomic_files import remove, write_whole
 from torchvision_dddas.io.maps.formats import cot, encode_geojson, geojson, kml
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
 from torchvision_dddas.io.maps.map_picture import CameraPath, map_picture, view_of
+from torchvision_dddas.io.output.run_log import RunStory
 from torchvision_dddas.io.output.run_record import RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, RunReport, location_tables
-from torchvision_dddas.io.output.run_story import RunStory
 from torchvision_dddas.io.output.timelines import Timeline
 from torchvision_dddas.types import AerialLocations, Camera, Fix, GroundLocations, Ortho, Positions
 

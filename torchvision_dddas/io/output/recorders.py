@@ -9,8 +9,8 @@ from torchvision_dddas.io.atomic_files import remove
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
-from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder, uninterrupted
-from torchvision_dddas.io.output.run_log import LOG_TXT
+from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder
+from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
 from torchvision_dddas.io.output.run_record import (
     RUN_JSON,
     LocationCounts,
@@ -20,7 +20,6 @@ from torchvision_dddas.io.output.run_record import (
     count_tracks,
 )
 from torchvision_dddas.io.output.run_report import REPORT
-from torchvision_dddas.io.output.run_story import RunStory
 from torchvision_dddas.io.overlay import LIKELY, RunPictures, TrackPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
 from torchvision_dddas.io.tables import detection_tables
@@ -194,7 +193,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         folder, save = self.folder, self.save
         names = () if site is None else site.names
         pictures = RunPictures(size, names)
-        self.story = RunStory(folder, names, pictures if "report" in save else None)
+        self.story = RunStory(folder, names, pictures if "report" in save else None, site is not None)
         parts: dict[str, Part[FrameResult]] = {}
         if site is not None:
             has_degrees = site.origin_deg is not None
@@ -232,14 +231,9 @@ class PipelineRecorder(RunRecorder[FrameResult]):
 
     def close(self, complete: bool) -> None:
         """Put everything in its place; a run that locates nothing removes the files of an earlier one that did."""
-        has_report = self._locations is None and "report" in self.save and self.record.frames > 0
-        if has_report:
-            with uninterrupted(), self._refusals():
-                self.story.report(complete)
         super().close(complete)
         if self._locations is None:
-            made = set(self.found_files) - (set() if has_report else {REPORT})
-            for name in set(PipelineRecorder.files) - made:
+            for name in set(PipelineRecorder.files) - set(self.found_files):
                 remove(self.folder / name)
 
 

@@ -1,30 +1,34 @@
-"""log.txt: the events of a run with their causes, a line each, in the order of the frames."""
+"""What happened in a run: log.txt, and the events, key frames and timelines of its report and map."""
 
 import math
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.io.overlay import ToMetres, command_metres
+from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.maps.map_picture import Signs
+from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
+from torchvision_dddas.io.output.run_report import REPORT, KeyFrames, RunReport, describe_state, format_span
+from torchvision_dddas.io.output.timelines import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Timeline
+from torchvision_dddas.io.overlay import RunPictures, ToMetres, command_metres
 from torchvision_dddas.types import Adjustment, FrameResult
 
 LOG_TXT = "log.txt"
-
-# Kinds of entries, as log.txt names them.
-ADJUSTED = "adjusted"  # a parameter that the feedback moved
-WORLD = "world"  # an event of a simulated world
-PROBLEM = "problem"  # something that went wrong
-NOTICED = "noticed"  # an instrument that is silent or frozen
-VERDICT = "told"  # a target's confirmation by ground vehicles
-ORDERED = "ordered"  # an order to a vehicle
 REPAIRED = "repaired"  # a landmark that was reassigned or excluded
 LANDMARK = "landmark"  # a landmark that the picture does not show
 
-_NUMBER = re.compile(r"\d+(\.\d+)?")
+_WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, VERDICT: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
+"""Weights of entries for the choice of key frames."""
+_LEAST_UNSEEN = 3  # a landmark that is unseen in fewer frames is not worth a line
+_MOST_CAPTION = 260
 _CLOSE_FRAMES = 10
 _FAR_M = 15.0  # a goal that moved by less counts as the same: it follows a crowd
+_NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass
@@ -37,13 +41,10 @@ class Entry:
     first: int
     kind: str
     text: str
-    last: int = 0
+    last: int
     count: int = 1
     time_s: float | None = None
     short: str = ""
-
-    def __post_init__(self) -> None:
-        self.last = max(self.last, self.first)
 
 
 class RunLog:
@@ -57,7 +58,7 @@ class RunLog:
     def add(self, frame: int, kind: str, text: str, time_s: float | None = None, short: str = "") -> None:
         """Add an entry."""
         text = " ".join(text.split())
-        self.entries.append(Entry(frame, kind, text, time_s=time_s, short=short or text))
+        self.entries.append(Entry(frame, kind, text, frame, time_s=time_s, short=short or text))
 
     def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
         """Add an event that may last: repeated within a few frames it stays one entry, also if its numbers differ.
@@ -78,38 +79,39 @@ class RunLog:
         change = f"{moved.parameter} {old} -> {new}"
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
-    def add_orders(self, result: FrameResult, explained: Collection[str] = ()) -> None:
+    def add_orders(self, result: FrameResult, explained: Iterable[str]) -> None:
         """Add the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
         command, frame = result.command, result.tracked.number
         if command is None:
             return
-        scale = command_metres(result)
-        if command.look_at is not None and "uav" not in explained and self._is_new("uav", command.look_at, scale):
+        to_metres = command_metres(result)
+
+        def words(place: np.ndarray) -> str:
+            return (
+                "{:.7g}, {:.7g}".format(*place) if to_metres is None else "({:.1f}, {:.1f}) m".format(*to_metres(place))
+            )
+
+        if command.look_at is not None and "uav" not in explained and self._is_new("uav", command.look_at, to_metres):
             height = "" if command.altitude_m is None else f" from {command.altitude_m:.0f} m"
-            text = f"the UAV keeps {_place(command.look_at, scale)} in view{height}"
-            self.add(frame, ORDERED, text, short="UAV sent")
+            self.add(frame, ORDERED, f"the UAV keeps {words(command.look_at)} in view{height}", short="UAV sent")
         for order in command.orders:
-            if order.vehicle not in explained and self._is_new(order.vehicle, order.goal, scale):
-                text = f"{order.vehicle} goes to {_place(order.goal, scale)} at {order.speed_m_s:g} m/s"
-                text += "" if order.look_at is None else f" and looks at {_place(order.look_at, scale)}"
+            if order.vehicle not in explained and self._is_new(order.vehicle, order.goal, to_metres):
+                text = f"{order.vehicle} goes to {words(order.goal)} at {order.speed_m_s:g} m/s"
+                text += "" if order.look_at is None else f" and looks at {words(order.look_at)}"
                 self.add(frame, ORDERED, text, short=f"{order.vehicle} sent")
 
-    def _is_new(self, vehicle: str, goal: np.ndarray, scale: ToMetres | None) -> bool:
+    def _is_new(self, vehicle: str, goal: np.ndarray, to_metres: ToMetres | None) -> bool:
         """Whether a goal is far from that of the vehicle's last order."""
-        there, far = (np.asarray(goal, float), 0.0) if scale is None else (scale(goal), _FAR_M)
-        last = self._goal.get(vehicle)
-        if last is not None and float(np.linalg.norm(there - last)) <= far:
+        place, far = (np.asarray(goal, float), 0.0) if to_metres is None else (to_metres(goal), _FAR_M)
+        if vehicle in self._goal and float(np.linalg.norm(place - self._goal[vehicle])) <= far:
             return False
-        self._goal[vehicle] = there
+        self._goal[vehicle] = place
         return True
 
     def ordered(self) -> list[Entry]:
-        """All entries by frame, those of one frame in the order of their logging."""
-        return sorted(self.entries, key=lambda entry: entry.first)
-
-
-def _place(place: np.ndarray, scale: ToMetres | None) -> str:
-    return "{:.7g}, {:.7g}".format(*place) if scale is None else "({:.1f}, {:.1f}) m".format(*scale(place))
+        """All entries by frame, those of one frame in the order of their logging; no landmark that is hardly unseen."""
+        entries = [e for e in self.entries if e.kind != LANDMARK or e.count >= _LEAST_UNSEEN]
+        return sorted(entries, key=lambda entry: entry.first)
 
 
 class Clock:
@@ -117,13 +119,14 @@ class Clock:
 
     def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
         """frame, time_s: (N,) of the processed frames, growing; NaN where a time is not known."""
-        self._processed = np.array(frame, float)
-        known = np.isfinite(time_s)
-        self._frame, self._time_s = self._processed[known], np.array(time_s, float)[known]
+        self._processed, known = frame, np.isfinite(time_s)
+        self._frame, self._time_s = frame[known], time_s[known]
 
-    def at(self, number: int) -> float:
-        """The time of a frame, extrapolated beyond the first and the last; NaN where no time is known."""
-        frame, time_s = self._frame, self._time_s
+    def time_s(self, entry: Entry) -> float:
+        """The time of an entry, extrapolated beyond the first and the last frame; NaN where no time is known."""
+        number, frame, time_s = entry.first, self._frame, self._time_s
+        if entry.time_s is not None:
+            return entry.time_s
         if not len(frame):
             return math.nan
         if len(frame) > 1 and not frame[0] <= number <= frame[-1]:
@@ -132,25 +135,185 @@ class Clock:
             return max(float(time_s[other] + (number - frame[other]) * rate), 0.0)
         return float(np.interp(number, frame, time_s))
 
-    def of(self, entry: Entry) -> float:
-        """The time of an entry."""
-        return self.at(entry.first) if entry.time_s is None else entry.time_s
-
     def occurrence(self, entry: Entry) -> str:
         """`in 3 of 8 frames`: the processed frames in which it occurred; empty if in all."""
-        if entry.last == entry.first:
-            return ""
-        since = np.searchsorted(self._processed, entry.first)
-        among = int(np.searchsorted(self._processed, entry.last, side="right") - since)
-        return f"in {entry.count} of {among} frames" if entry.count < among else ""
+        first, end = (
+            np.searchsorted(self._processed, entry.first),
+            np.searchsorted(self._processed, entry.last, "right"),
+        )
+        return (
+            f"in {entry.count} of {end - first} frames"
+            if entry.first < entry.last and entry.count < end - first
+            else ""
+        )
 
 
-def format_log(entries: Iterable[Entry], clock: Clock, heading: Sequence[str]) -> str:
-    """The text of log.txt. heading: its first lines."""
-    out = [*(f"# {line}" for line in heading), "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
+def format_log(entries: Iterable[Entry], clock: Clock, heading: str) -> str:
+    """The text of log.txt. heading: its first line."""
+    out = [f"# {heading}", "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
     for entry in entries:
-        at, occurrence = clock.of(entry), clock.occurrence(entry)
-        when = f"{at:9.3f}" if math.isfinite(at) else f"{'':9}"
+        time_s, occurrence = clock.time_s(entry), clock.occurrence(entry)
+        when = f"{time_s:9.3f}" if math.isfinite(time_s) else f"{'':9}"
         lasted = "" if entry.last == entry.first else f" (to frame {entry.last}{occurrence and f', {occurrence}'})"
         out.append(f"{when}  {entry.first:>7}  {entry.kind:<9} {entry.text}{lasted}")
     return "\n".join(out) + "\n"
+
+
+class RunStory:
+    """A part that writes log.txt, and collects events, timeline, key frames and map signs for report.html.
+
+    Of a run that locates nothing it writes report.html too.
+    record: of the run; set before the first frame.
+    """
+
+    record: RunRecord
+
+    def __init__(self, folder: Path, names: Sequence[str], pictures: RunPictures | None, is_located: bool) -> None:
+        """names: of the landmarks. pictures: draws key frames, None for a run without a report."""
+        self.log, self.signs, self.timeline = RunLog(), Signs(), Timeline(names)
+        self._folder, self._names, self._pictures, self._is_located = folder, tuple(names), pictures, is_located
+        self._key_frames = KeyFrames()
+        self._explained: set[str] = set()
+        self._measures: dict[str, Any] = {}
+        self._sentences: tuple[str, ...] = ()
+        self._waiting: list[Entry] = []  # logged for frames that are still to come
+        self._read = self._before = 0
+        self._kind_of: dict[int, str] = {}
+
+    def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
+        """Log an event that the results do not hold, best before its frame is written.
+
+        time_s: None where it follows from the frame. kind: as log.txt names them.
+        """
+        self.log.add(frame, kind, text, time_s)
+
+    def score(self, measures: Mapping[str, Any], sentences: Sequence[str] = ()) -> None:
+        """Set how good the run was against the truth: measures by name, and the main ones in sentences."""
+        self._measures, self._sentences = dict(measures), tuple(sentences)
+
+    def write(self, result: FrameResult) -> None:
+        """Add a frame."""
+        tracked, located = result.tracked, result.locations
+        adjustments = tracked.adjustments if located is None else located.adjustments
+        self.timeline.add_result(result)
+        for moved in adjustments:
+            self.log.add_adjustment(moved)
+        if tracked.cause:
+            self._add_lasting(tracked.number, PROBLEM, f"nothing found: {tracked.cause}")
+        self._log_location(result)
+        self._log_confirmations(result)
+        self._explained |= {moved.parameter.partition(".")[0] for moved in adjustments}
+        self.log.add_orders(result, self._explained)
+        if self._pictures is not None:
+            self._consider_key_frame(result, self._pictures)
+        self._before = tracked.number
+
+    def close(self, complete: bool) -> None:
+        """Write log.txt and add the run's counts to its record. Raises OSError if it cannot be written."""
+        record, entries, clock = self.record, self.log.ordered(), self._clock()
+        heading = f"{record.input_name or 'run'}: {describe_state(complete)}, {len(self.timeline)} frames looked at"
+        text = format_log(entries, clock, f"{heading}; settings and totals are in run.json")
+        write_whole(self._folder / LOG_TXT, text.encode())
+        if events := [e for e in entries if e.kind == WORLD]:
+            record.counts["events"] = [{"frame": e.first, "time_s": clock.time_s(e), "what": e.text} for e in events]
+        if self._measures:
+            record.counts["truth_score"] = self._measures
+        if not self._is_located and self._pictures is not None and record.frames:
+            identities = record.counts.get("identities", 0)
+            counts = (("frames", record.frames), ("detections", record.targets), ("identities", identities))
+            figures = [(name, f"{count}") for name, count in counts]
+            report = RunReport(f"Found and followed: {record.input_name}", record, complete, self.timeline, figures)
+            self.extend(report)
+            write_whole(self._folder / REPORT, report.html().encode())
+        elif not self._is_located:
+            remove(self._folder / REPORT)
+
+    def discard(self) -> None:
+        """Nothing is begun before the end."""
+
+    def extend(self, report: RunReport) -> None:
+        """Add events, key frames, timelines and the score to a report."""
+        clock, rows, entries = self._clock(), [], self.log.ordered()
+        for entry in entries:
+            time_s, occurrence = clock.time_s(entry), clock.occurrence(entry)
+            text = f"{entry.text} ({occurrence})" if occurrence else entry.text
+            when = f"{time_s:.2f}" if math.isfinite(time_s) else ""
+            rows.append((when, format_span(entry.first, entry.last), entry.kind, text))
+            self.timeline.events.setdefault(entry.kind, []).append((entry.first, entry.text))
+        title = f"What happened and why ({LOG_TXT})"
+        report.tables.insert(0, (title, ("time, s", "frames", "what", "how and why"), rows, "nothing"))
+        kinds = Counter(self._kind_of.values())
+        report.figures += [(f"told {kind.replace('_', ' ')}", f"{count}") for kind, count in kinds.items()]
+        report.figures.append(("adjustments", f"{sum(e.kind == ADJUSTED for e in entries)}"))
+        measures = ("measure", "value"), list(self._measures.items()), ""
+        if self._sentences:
+            sentences = [(line,) for line in self._sentences]
+            report.first_tables.append(("Against the truth", ("in words",), sentences, ""))
+            report.tables.append(("All measures against the truth", *measures))
+        elif self._measures:
+            report.first_tables.append(("Against the truth", *measures))
+        report.key_frames = self._key_frames.chosen()
+
+    def _clock(self) -> Clock:
+        return Clock(self.timeline["frame"], self.timeline["time_s"])
+
+    def _add_lasting(self, frame: int, kind: str, text: str, key: str = "") -> None:
+        self.log.add_lasting(frame, frame - self._before, kind, text, key)
+
+    def _log_location(self, result: FrameResult) -> None:
+        """Log why a frame was not located or only partly, repairs, and unseen landmarks."""
+        located = result.locations
+        if located is None:
+            return
+        frame, fix, marks = located.frame, located.fix, located.marks
+        if not fix.by:
+            self._add_lasting(frame, PROBLEM, f"not located: {fix.cause or NO_POSE}")
+        elif fix.cause:
+            self._add_lasting(frame, PROBLEM, f"located by {fix.by}, but {fix.cause}")
+        for change in fix.changes:
+            self._add_lasting(frame, REPAIRED, change)
+        shown = set(marks.landmark[np.isfinite(marks.image_px).all(axis=1)].tolist())
+        for which, name in enumerate(self._names):
+            if which not in shown:
+                self._add_lasting(frame, LANDMARK, f"{name} is not seen in the picture", key=name)
+
+    def _log_confirmations(self, result: FrameResult) -> None:
+        """Count confirmations by ground vehicles, and log a target's if it is new."""
+        confirmed, located = result.confirmed, result.locations
+        if confirmed is None or located is None:
+            return
+        at, marks, counts = located.positions, located.marks, self.record.counts
+        vehicle_m = dict(zip((self._names[k] for k in marks.landmark.tolist()), marks.east_north_m, strict=True))
+        for i, row in enumerate(confirmed.row.tolist()):
+            target, kind, by = int(at.target[row]), confirmed.kind[i], confirmed.seen_by[i]
+            kinds = counts.setdefault("kinds", {})
+            kinds[kind] = kinds.get(kind, 0) + 1
+            counts["rows_looked_at"] = counts.get("rows_looked_at", 0) + bool(by)
+            for name in vehicle_m.keys() & set(by):
+                self.signs.add_look(name, vehicle_m[name], at.east_north_m[row])
+            before = self._kind_of.get(target)
+            if kind in ("unseen", before):
+                continue
+            self._kind_of[target] = kind
+            short = f"target {target} is {kind.replace('_', ' ')}"
+            text = f"{short} (probability of being human {confirmed.probability[i]:.2f})"
+            text += f", seen by {' and '.join(by)}" if by else ""
+            text += f"; it was told {before.replace('_', ' ')} before" if before else ""
+            self.log.add(located.frame, VERDICT, text, short=short)
+            self.signs.add_verdict(kind, at.east_north_m[row])
+
+    def _consider_key_frame(self, result: FrameResult, pictures: RunPictures) -> None:
+        """World events and targets each are a kind; adjustments and problems are grouped by parameter or first word."""
+        pictures.show(result)
+        number = result.tracked.number
+        self._waiting += self.log.entries[self._read :]
+        self._read = len(self.log.entries)
+        due = [e for e in self._waiting if self._before < e.first <= number and e.kind != LANDMARK]
+        self._waiting = [e for e in self._waiting if e.first > number]
+        text = "; ".join(dict.fromkeys(e.short for e in due))
+        text = text if len(text) < _MOST_CAPTION else f"{text[: _MOST_CAPTION - 4]} ..."
+        kinds = {}
+        for e in due:
+            word = re.sub(r"\d+", "", e.short.split(" ")[0])
+            kinds[e.short if e.kind in (WORLD, VERDICT) else f"{e.kind} {word}"] = _WEIGHTS[e.kind]
+        self._key_frames.add(number, self.timeline.last_time_s, kinds, text, lambda: pictures(result))

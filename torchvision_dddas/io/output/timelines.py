@@ -8,12 +8,19 @@ from itertools import cycle
 import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.io.output.run_log import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Entry
 from torchvision_dddas.io.report.charts import Events, Line, Panel, time_chart
 from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult
 
-_KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours
+# Kinds of events, as log.txt names them.
+ADJUSTED = "adjusted"  # a parameter that the feedback moved
+WORLD = "world"  # an event of a simulated world
+PROBLEM = "problem"  # something that went wrong
+NOTICED = "noticed"  # an instrument that is silent or frozen
+VERDICT = "told"  # a target's confirmation by ground vehicles
+ORDERED = "ordered"  # an order to a vehicle
+
 _EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2}
+_KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours
 _COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)  # of stages and parameters
 _MOST_PARAMETERS, _MOST_STAGES = 12, 7
 
@@ -22,12 +29,12 @@ class Timeline:
     """Figures of the frames of a run by name, 8 bytes each, 4 for the time spent in a stage.
 
     `frame` and `time_s` are the time axis; frames with `located` 0 are shaded.
-    entries: those of the log that are shown as events.
+    events: frame and text of those of each kind.
     """
 
     def __init__(self, vehicles: Collection[str] = ()) -> None:
         """vehicles: names of the ground vehicles; the same parameter of all of them shares a panel."""
-        self.entries: Sequence[Entry] = ()
+        self.events: dict[str, list[tuple[int, str]]] = {}
         self._vehicles = frozenset(vehicles)
         self._figures: dict[str, array[float]] = {}
         self._seconds: dict[str, array[float]] = {}
@@ -126,10 +133,9 @@ class Timeline:
         at, _ = self.axis()
         found = []
         for kind, colour in _EVENT_COLOURS.items():
-            entries = [entry for entry in self.entries if entry.kind == kind]
-            if entries and len(at):
-                places = np.interp([entry.first for entry in entries], self["frame"], at)
-                found.append(Events(kind, places, [f"frame {e.first}: {e.text}" for e in entries], colour))
+            if len(at) and (events := self.events.get(kind)):
+                places = np.interp([frame for frame, _ in events], self["frame"], at)
+                found.append(Events(kind, places, [f"frame {frame}: {text}" for frame, text in events], colour))
         return found
 
     def _parameters(self) -> list[Panel]:
