@@ -28,12 +28,11 @@ TALL_ROWS = 30
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table. value: what it sorts by, None last. small: a second line. link: an address."""
+    """A cell of a table. value: what it sorts by, None last. small: a second line."""
 
     text: str
     value: float | str | None = None
     small: str = ""
-    link: str = ""
 
     @property
     def sort_key(self) -> str:
@@ -73,9 +72,9 @@ def table(
     return Markup(macros.table(caption, columns, rows, foot, sorts, len(rows) > TALL_ROWS))
 
 
-def text_cell(text: str, link: str = "") -> Cell:
+def text_cell(text: str) -> Cell:
     """A cell of words."""
-    return Cell(text, text, link=link)
+    return Cell(text, text)
 
 
 def number_cell(value: float | None, digits: int = 3, interval: tuple[float, float] | None = None) -> Cell:

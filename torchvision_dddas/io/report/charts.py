@@ -67,13 +67,12 @@ class Dots:
 
 @dataclass(frozen=True)
 class Interval:
-    """A named value with an interval, NaN where unknown. link: the address that its name leads to."""
+    """A named value with an interval, NaN where unknown."""
 
     name: str
     value: float
     low: float = math.nan
     high: float = math.nan
-    link: str = ""
 
 
 @dataclass(frozen=True)
@@ -146,8 +145,7 @@ def interval_chart(
         parts.append(_text(x, plot.low + 31, said if whole.value else whole.name, anchor, "f2"))
     for k, row in enumerate(shown):
         y = plot.top + 19 * k + 9.5
-        name = _text(142, y + 4, row.name if len(row.name) <= 21 else f"{row.name[:20]}…", "end", "name")
-        parts.append(f'<a href="{escape(row.link)}">{name}</a>' if row.link else name)
+        parts.append(_text(142, y + 4, row.name if len(row.name) <= 21 else f"{row.name[:20]}…", "end", "name"))
         said = f"{row.name} {format_number(row.value)}"
         if math.isfinite(row.low) and math.isfinite(row.high):
             said += f", 95 %: {format_number(row.low)} to {format_number(row.high)}"
