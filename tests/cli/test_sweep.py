@@ -31,53 +31,41 @@ def study(tmp_path_factory) -> Path:
     return place / "study.toml"
 
 
-def asked(study: Path, *words: str, measure: str = "motion.pixels.f"):
+def run(study: Path, *words: str, command: str = "sweep"):
     files = ["--dataset", str(study), "--cache", str(study.parent / "cache")]
     one = [] if "--jobs" in words or "--scheduler" in words else ["--jobs", "1"]  # others take seconds to start
-    return CliRunner().invoke(app, ["sweep", *files, "--measure", measure, *one, *words])
+    measure = ["--measure", "motion.pixels.f"] if command == "sweep" and "--measure" not in words else []
+    return CliRunner().invoke(app, [command, *files, *measure, *one, *words])
 
 
 @pytest.fixture(scope="module")
 def swept(study) -> tuple[Path, str]:
-    """The folder of a sweep, and what it said."""
+    """The folder of a sweep, and what it printed."""
     out = study.parent / "first"
-    result = asked(study, *GRID, "--holdout", "h*", "--out", str(out))
+    result = run(study, *GRID, "--holdout", "h*", "--out", str(out))
     assert result.exit_code == 0, result.output
     return out, result.output
 
 
-def test_the_best_of_a_grid_is_written_for_config_and_beats_the_settings_as_they_were(swept) -> None:
-    told = json.loads((swept[0] / "sweep.json").read_text())
-    assert [trial["number"] for trial in told["trials"]] == [0, 1, 2]
-    values = [trial["value"] for trial in told["trials"]]
-    assert told["best"] == 1 and values[1] > values[0] > values[2] - 1e-9
+def test_the_best_of_a_grid_is_written_for_config_and_measured_on_clips_held_out(swept) -> None:
+    record = json.loads((swept[0] / "sweep.json").read_text())
+    assert [trial["number"] for trial in record["trials"]] == [0, 1, 2]
+    values = [trial["value"] for trial in record["trials"]]
+    assert record["best"] == 1 and values[1] > values[0] > values[2] - 1e-9
     best = load_config(swept[0] / "best.toml")
     assert best.difference.threshold == 10 and best.morphology.erode_px == 1
     assert best.difference.kind == load_config("fast").difference.kind
+    assert record["clips"] == ["one", "two"] and record["held_out"] == ["held"]
+    assert set(record["on_held_out"]) == {"before", "best"} and "Held out (held)" in swept[1]
 
 
-def test_clips_held_out_have_no_say_and_are_told_apart(swept) -> None:
-    told = json.loads((swept[0] / "sweep.json").read_text())
-    assert told["clips"] == ["one", "two"] and told["held_out"] == ["held"]
-    assert set(told["on_held_out"]) == {"before", "best"}
-    assert "Held out (held)" in swept[1]
-
-
-def test_a_sweep_that_is_asked_for_again_computes_nothing_and_writes_the_same(study, swept, monkeypatch) -> None:
-    def none(*_, **__):
-        raise AssertionError("something was computed again")
-
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", none)
-    out = study.parent / "again"
-    assert asked(study, *GRID, "--holdout", "h*", "--out", str(out), "--quiet").exit_code == 0
+def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(study, swept, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", lambda *_: pytest.fail("computed again"))
+    assert run(study, *GRID, "--holdout", "h*", "--out", str(tmp_path), "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):
-        assert (out / name).read_bytes() == (swept[0] / name).read_bytes()
-
-
-def test_a_study_of_the_best_takes_from_the_cache_what_the_sweep_has_computed(study, swept, tmp_path) -> None:
-    words = ["--cache", str(study.parent / "cache"), "--jobs", "1", "--out", str(tmp_path), "--config"]
-    asks = ["evaluate", "--dataset", str(study), "--clips", "one,two", *words, str(swept[0] / "best.toml"), "--quiet"]
-    result = CliRunner().invoke(app, asks)
+        assert (tmp_path / name).read_bytes() == (swept[0] / name).read_bytes()
+    words = ("--clips", "one,two", "--out", str(tmp_path), "--config", str(swept[0] / "best.toml"), "--quiet")
+    result = run(study, *words, command="evaluate")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "run.json").read_text())["computed"] == 0
     f = json.loads((tmp_path / "metrics.json").read_text())["tasks"]["motion"]["pooled"]["pixels"]["f"]
@@ -85,7 +73,7 @@ def test_a_study_of_the_best_takes_from_the_cache_what_the_sweep_has_computed(st
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ((), "nothing to try"),
         (("--range", "difference.threshold=1:9"), "--optuna"),
@@ -96,33 +84,18 @@ def test_a_study_of_the_best_takes_from_the_cache_what_the_sweep_has_computed(st
         ((*GRID, "--holdout", "x*"), "fits no clip"),
         ((*GRID, "--holdout", "*"), "leaves no clip"),
         ((*GRID, "--by", "median"), "pooled, mean, worst"),
-        ((*GRID, "--jobs", "0"), "--jobs must be 1 or more"),
         ((*GRID, "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "give only one"),
         ((*GRID, "--clips", "none*"), "no clip is left"),
+        ((*GRID, "--measure", "motion.tracks.idf1"), "no group of measures of motion; wanted pixels"),
+        ((*GRID, "--measure", "tracking.tracks.idf1", "--clips", "one,two"), "no clip is left"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(study, tmp_path, words, told) -> None:
-    assert told in bad(asked(study, *words, "--out", str(tmp_path / "out")))
+def test_bad_input_is_one_line_and_leaves_nothing(study, swept, tmp_path, words, message) -> None:
+    assert message in bad(run(study, *words, "--out", str(tmp_path / "out")))
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("measure", "told"),
-    [
-        ("f", "wanted task.group.measure"),
-        ("sight.pixels.f", "no task"),
-        ("motion.voxels.f", "no group"),
-        ("motion.pixels.n_tp", "neither more nor less"),
-        ("motion.tracks.idf1", "no group of measures of motion; wanted pixels"),
-        ("motion.pixels.beauty", "no measure of motion.pixels; wanted accuracy, "),
-        ("tracking.tracks.idf1", "no clip is left"),
-    ],
-)
-def test_a_measure_that_is_none_is_one_line(study, swept, tmp_path, measure, told) -> None:
-    assert told in bad(asked(study, *GRID, "--clips", "one,two", "--out", str(tmp_path / "out"), measure=measure))
-
-
-def test_without_optuna_it_is_said_how_to_get_it(study, tmp_path, monkeypatch) -> None:
+def test_without_optuna_the_line_says_how_to_get_it(study, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torchvision_dddas.evaluation.studies.sweep.find_spec", lambda name: None)
-    asks = ("--optuna", "2", "--range", "difference.threshold=5:40", "--out", str(tmp_path / "out"))
-    assert "torchvision-dddas[tune]" in bad(asked(study, *asks))
+    words = ("--optuna", "2", "--range", "difference.threshold=5:40", "--out", str(tmp_path / "out"))
+    assert "torchvision-dddas[tune]" in bad(run(study, *words))
