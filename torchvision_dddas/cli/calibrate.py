@@ -10,6 +10,8 @@ from torchvision_dddas.cli.options import Config, Overrides, parse_size, report_
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from torchvision_dddas.config import Settings
 
 BODY_HEIGHTS_M = 0.1, 10.0  # of a person, or of what stands in for one
@@ -50,9 +52,11 @@ def calibrate(
 
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
+    import numpy as np
+
     from torchvision_dddas.config import format_toml, load_config
     from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input, save_file
-    from torchvision_dddas.io.camera_files import has_measurements, read_camera_keys, read_measurements
+    from torchvision_dddas.io.camera_files import LIMITS, has_measurements, read_camera_keys, read_measurements
 
     settings = load_config(config, set_ or [])
     body_m, (low, high) = settings.ground.body_height_m if body_height is None else body_height, BODY_HEIGHTS_M
@@ -71,18 +75,26 @@ def calibrate(
     if table is not None and has_measurements(table):
         if distance is not None:
             raise InputError(f"{table} has its own distances, and --distance was given as well; leave one out")
-        distances, heights = read_measurements(table)
-        found, lines = _find_focal_length(distances.tolist(), heights.tolist(), body_m)
+        found, lines = _find_focal_length(*read_measurements(table), body_m)
     elif distance is not None:
-        heights_px = pixels or [] if table is None else _read_heights(table)
-        found, lines = _find_focal_length([distance] * len(heights_px), heights_px, body_m)
+        heights_px = np.array(pixels, float) if table is None else _read_heights(table)
+        found, lines = _find_focal_length(np.full(len(heights_px), distance), heights_px, body_m)
     elif table is not None:
         found, lines = _find_pose(table, camera, body_m, settings)
     else:
         raise InputError("--pixels needs --distance: how far from the camera the person stood, in metres")
-    replaced = FOCAL_KEYS if "focal_px" in found else ()
-    keys = {key: value for key, value in known.items() if key not in replaced} | found
-    text = format_toml({key: value if key in UNROUNDED else _rounded(value) for key, value in keys.items()})
+    key, unit = ("focal_px", "px") if "focal_px" in found else ("height_m", "m")
+    low, high = LIMITS[key]
+    if not low <= found[key] <= high:
+        raise InputError(
+            f"{key} would be {found[key]:g} {unit}, which no camera has ({low:g} to {high:g}); check the distances in "
+            "metres, the heights in pixels and the body height in metres"
+        )
+    keys = {name: value for name, value in known.items() if key != "focal_px" or name not in FOCAL_KEYS} | found
+    for name, value in keys.items():
+        if isinstance(value, float) and name not in UNROUNDED:
+            keys[name] = float(f"{value:.6g}")
+    text = format_toml(keys)
     for line in lines:
         typer.echo(line, err=out is None)
     if out is None:
@@ -93,7 +105,7 @@ def calibrate(
     typer.echo(f"{out}: the camera{missing}")
 
 
-def _read_heights(table: Path) -> list[float]:
+def _read_heights(table: Path) -> "np.ndarray":
     """The heights of one person's whole boxes, px. Raises InputError for several people in a frame."""
     import numpy as np
 
@@ -106,24 +118,19 @@ def _read_heights(table: Path) -> list[float]:
             f"{table} has {count.max()} boxes in frame {frames[count.argmax()]}; "
             "--distance needs one person alone in each picture"
         )
-    heights = read.box_px[:, 3] if read.cut is None else read.box_px[~read.cut, 3]
-    if not len(heights):
+    heights_px = read.box_px[:, 3] if read.cut is None else read.box_px[~read.cut, 3]
+    if not len(heights_px):
         raise InputError(f"{table} has no whole person to calibrate by")
-    return [float(height) for height in heights]
+    return heights_px
 
 
-def _find_focal_length(distances_m: list[float], heights_px: list[float], body_height_m: float) -> Found:
-    import numpy as np
-
+def _find_focal_length(distances_m: "np.ndarray", heights_px: "np.ndarray", body_height_m: float) -> Found:
     from torchvision_dddas.geo.camera_calibration import calibrate_focal_length
 
-    found = calibrate_focal_length(np.array(distances_m), np.array(heights_px), body_height_m)
-    _check("focal_px", found.focal_px, "px")
-    n = len(heights_px)
+    found, n = calibrate_focal_length(distances_m, heights_px, body_height_m), len(heights_px)
     spread = "" if math.isnan(found.spread_px) else f", one measurement ± {found.spread_px:.1f} px"
-    lines = [
-        f"focal length {found.focal_px:.1f} ± {found.sigma_px:.1f} px from {n} measurement{'s' * (n != 1)}{spread}"
-    ]
+    figure = f"focal length {found.focal_px:.1f} ± {found.sigma_px:.1f} px"
+    lines = [f"{figure} from {n} measurement{'s' * (n != 1)}{spread}"]
     if found.outlier.any():
         first = int(found.outlier.argmax())
         lines.append(
@@ -147,32 +154,11 @@ def _find_pose(table: Path, camera: Path | None, body_height_m: float, settings:
     known, read = read_camera(camera), read_detections(table)
     cut = touches_border(read.box_px, known.size_px) if read.cut is None else read.cut
     found = calibrate_pose(read.box_px[~cut], known, body_height_m, settings.ground.height_sigma)
-    _check("height_m", found.height_m, "m")
-    keys = {
-        "height_m": found.height_m,
-        "pitch_deg": math.degrees(found.pitch_rad),
-        "height_sigma_m": found.height_sigma_m,
-        "pitch_sigma_deg": math.degrees(found.pitch_sigma_rad),
-    }
+    pitch_deg, sigma_deg = math.degrees(found.pitch_rad), math.degrees(found.pitch_sigma_rad)
     line = (
-        f"camera {found.height_m:.2f} ± {found.height_sigma_m:.2f} m above the ground, {keys['pitch_deg']:.2f} ± "
-        f"{keys['pitch_sigma_deg']:.2f}° down, from {int((~cut).sum())} boxes; half of them miss by less than "
+        f"camera {found.height_m:.2f} ± {found.height_sigma_m:.2f} m above the ground, {pitch_deg:.2f} ± "
+        f"{sigma_deg:.2f}° down, from {int((~cut).sum())} boxes; half of them miss by less than "
         f"{found.miss:.1%} of their height"
     )
-    return keys, [line]
-
-
-def _rounded(value: object) -> object:
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
-def _check(key: str, value: float, unit: str) -> None:
-    """Raise InputError for a value that no camera's file may hold."""
-    from torchvision_dddas.io.camera_files import LIMITS
-
-    low, high = LIMITS[key]
-    if not low <= value <= high:
-        raise InputError(
-            f"{key} would be {value:g} {unit}, which no camera has ({low:g} to {high:g}); check the distances in "
-            "metres, the heights in pixels and the body height in metres"
-        )
+    keys = {"height_m": found.height_m, "pitch_deg": pitch_deg}
+    return keys | {"height_sigma_m": found.height_sigma_m, "pitch_sigma_deg": sigma_deg}, [line]

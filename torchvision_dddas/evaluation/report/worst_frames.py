@@ -55,7 +55,7 @@ class Worst:
     trouble: str = ""
 
 
-def find_worst_frames(cases: Sequence[Case], most: int = MAX_PICTURES) -> tuple[list[Worst], int]:
+def find_worst_frames(cases: Sequence[Case]) -> tuple[list[Worst], int]:
     """The frames with the most faults, of many clips rather than of one, and the number of other frames with faults."""
     by_rank: list[list[Worst]] = [[] for _ in range(_MAX_OF_A_CLIP)]
     total = 0
@@ -64,7 +64,7 @@ def find_worst_frames(cases: Sequence[Case], most: int = MAX_PICTURES) -> tuple[
         total += n_wrong
         for rank, one in enumerate(chosen):
             by_rank[rank].append(one)
-    shown = [one for rank in by_rank for one in sorted(rank, key=lambda w: -w.wrong)][:most]
+    shown = [one for rank in by_rank for one in sorted(rank, key=lambda w: -w.wrong)][:MAX_PICTURES]
     return shown, total - len(shown)
 
 

@@ -187,25 +187,24 @@ class Cache:
         return False
 
 
-class CarriedRecords:
-    """Records that travel with a job to another machine: known ones there; new ones, in `made`, back."""
+class CarriedRecords(Cache):
+    """A cache that travels with a job to another machine: known records there; new ones, in `made`, back."""
 
     def __init__(self, known: dict[str, bytes]) -> None:
         self._known = known
         self.notes: list[str] = []
         self.made: dict[str, bytes] = {}
 
-    def get(self, key: str) -> Any | None:
-        """The record of a key; None if there is none, or it is damaged."""
-        content = self.made.get(key) or self._known.get(key)
-        try:
-            return None if content is None else unpack(content)
-        except DamagedError:
-            return None
+    def read(self, key: str) -> bytes | None:
+        """The bytes of an entry, unchecked; None if there is none."""
+        return self.made.get(key) or self._known.get(key)
 
-    def put(self, key: str, record: Any) -> None:
-        """Keep a record."""
-        self.made[key] = pack(record)
+    def write(self, key: str, content: bytes) -> None:
+        """Keep the bytes of a record."""
+        self.made[key] = content
+
+    def _drop(self, key: str) -> bool:
+        return False  # the cache that it comes from notes the damage
 
 
 def write_scores(folder: Path, name: str, cases: Iterable[ScoredCase]) -> None:

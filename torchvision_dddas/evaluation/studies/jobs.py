@@ -161,7 +161,7 @@ def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
     return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
-def do_job(job: Job, keys: Keys, store: Cache | CarriedRecords, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
+def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
     """Do all tasks of a job. Bad input of one does not stop the others. on_frame: called once per frame."""
 
     def find_or_get(task: Task, on_frame: OnFrame, computed: list[str]) -> Found:
@@ -195,9 +195,7 @@ def do_job(job: Job, keys: Keys, store: Cache | CarriedRecords, on_frame: OnFram
     return tuple(map(do_task, job.tasks))
 
 
-def _do_on_one_thread(
-    job: Job, keys: Keys, store: Cache | CarriedRecords, report: OnEvent
-) -> tuple[tuple[Done, ...], str]:
+def _do_on_one_thread(job: Job, keys: Keys, store: Cache, report: OnEvent) -> tuple[tuple[Done, ...], str]:
     """Do a job and report the number of new frames a few times a second; its outcome, and the store's notes."""
     frames, reported_s = 0, time.monotonic()
 
@@ -272,7 +270,7 @@ class Workers:
                 # No more jobs than threads: Dask blames a worker's death on the jobs that wait there, too.
                 threads = sum(client.nthreads().values())
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
-                    store: Cache | CarriedRecords = cache
+                    store: Cache = cache
                     if self._scheduler is not None:
                         wanted = {key: cache.read(key) for key in (*keys.found.values(), *keys.scored.values())}
                         store = CarriedRecords({key: known for key, known in wanted.items() if known is not None})
@@ -326,9 +324,7 @@ class Workers:
         )
 
 
-def _do_remotely(
-    job: Job, keys: Keys, store: Cache | CarriedRecords, code: str
-) -> tuple[tuple[Done, ...], str, dict[str, bytes]]:
+def _do_remotely(job: Job, keys: Keys, store: Cache, code: str) -> tuple[tuple[Done, ...], str, dict[str, bytes]]:
     """A job on a worker: its outcome, notes, and records that have to travel back. code: what its package must be."""
     from distributed import get_worker
 

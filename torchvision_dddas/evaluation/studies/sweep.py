@@ -264,9 +264,9 @@ class StudyMeasure:
     spec: Spec
     base: Path
     goal: Goal
-    workers: Workers = field(default_factory=lambda: Workers(1))
-    cache: Path | None = None
-    on_progress: Callable[[int, int], object] = lambda done, of: None
+    workers: Workers
+    cache: Path | None
+    on_progress: Callable[[int, int], object]
 
     def measure(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
         """The goal's value over clips of these names; if it has none, why."""
