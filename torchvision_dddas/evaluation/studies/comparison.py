@@ -95,7 +95,7 @@ def _changes(
     before, after = (measures(side) for side in sides)
     estimates = {**estimates, "over_frames": over_frames([*sides[0], *sides[1]])}
     effects = {
-        way: {group: found for group, one in groups.items() if (found := _effects(group, one))}
+        way: {group: found for group, one in groups.items() if (found := _effects(one))}
         for way, groups in estimates.items()
     }
     changes: dict[str, dict[str, Entry]] = {}
@@ -114,7 +114,7 @@ def _changes(
     return changes
 
 
-def _effects(group: str, estimate: Estimate) -> dict[str, Effect]:
+def _effects(estimate: Estimate) -> dict[str, Effect]:
     """The effects between the two halves of an estimate's units; none for fewer than FEWEST clips."""
     half = len(estimate.strata) // 2
     if half:  # a clip's frames are drawn in the longer of the blocks that its two results ask for
@@ -124,7 +124,7 @@ def _effects(group: str, estimate: Estimate) -> dict[str, Effect]:
         strata = [Stratum(estimate.strata[0].units // 2)]
         if strata[0].units < FEWEST:
             return {}
-    return bootstrap.effects(estimate.statistic, tuple(strata), estimate.seed(group))
+    return bootstrap.effects(estimate.statistic, tuple(strata), estimate.seed)
 
 
 def verdict(entry: Mapping[str, Any], name: str) -> str:

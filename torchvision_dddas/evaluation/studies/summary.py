@@ -15,7 +15,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics import bootstrap, metres, tracking
-from torchvision_dddas.evaluation.metrics.bootstrap import Statistic, Stratum
+from torchvision_dddas.evaluation.metrics.bootstrap import Statistic, Stratum, seed_of
 from torchvision_dddas.evaluation.metrics.boxes import Ranking, ranking
 from torchvision_dddas.evaluation.metrics.pixels import ratio
 from torchvision_dddas.evaluation.metrics.registry import (
@@ -51,7 +51,10 @@ def summarize(results: Results) -> dict[str, Any]:
         scored = {case.clip.name: case.scored for case in _by_name(results, task) if case.scored is not None}
         if not scored:
             continue
-        clips = {name: _clip_measures(one) for name, one in scored.items()}
+        clips: dict[str, dict[str, Any]] = {}
+        for name, one in scored.items():
+            intervals = {group: _intervals(estimate) for group, estimate in over_frames([one]).items()}
+            clips[name] = {"frames": len(one.frames), **measures([one]), "intervals": intervals}
         tasks[task] = {
             "what": meaning,
             "clips": clips,
@@ -72,11 +75,6 @@ def _by_name(results: Results, task: Task) -> list[Case]:
     return sorted((case for case in results.cases if case.task == task), key=lambda case: case.clip.name)
 
 
-def _clip_measures(scored: Scored) -> dict[str, Any]:
-    spread = {group: _intervals(group, estimate) for group, estimate in over_frames([scored]).items()}
-    return {"frames": len(scored.frames), **measures([scored]), "intervals": spread}
-
-
 def _pooled_measures(cases: Sequence[Scored]) -> dict[str, Any]:
     """The measures of all counts together. Cases in the order of their names: sums of reals depend on it."""
     by_frame = over_frames(cases)
@@ -85,7 +83,7 @@ def _pooled_measures(cases: Sequence[Scored]) -> dict[str, Any]:
         enough = bootstrap.parts(estimate.strata) >= bootstrap.FEWEST
         over[group] = "clips" if enough else "frames"
         if enough or group in by_frame:
-            spread[group] = _intervals(group, estimate if enough else by_frame[group])
+            spread[group] = _intervals(estimate if enough else by_frame[group])
     return {**measures(cases), "intervals": spread, "over": over}
 
 
@@ -154,20 +152,16 @@ def sum_costs(cases: Sequence[Case]) -> dict[str, Any]:
 class Estimate(NamedTuple):
     """Measures of a group as a function of how often each unit counts, which is what resampling asks for.
 
-    content: what the measures come from, which seeds the resampling.
+    seed: of the resampling; it comes from the group and the content alone.
     """
 
     statistic: Statistic
     strata: tuple[Stratum, ...]
-    content: tuple[np.ndarray, ...]
-
-    def seed(self, group: str) -> int:
-        """Of the resampling."""
-        return bootstrap.seed_of(group, *self.content)
+    seed: int
 
 
-def _intervals(group: str, estimate: Estimate) -> dict[str, list[float] | None]:
-    found = bootstrap.intervals(estimate.statistic, estimate.strata, estimate.seed(group))
+def _intervals(estimate: Estimate) -> dict[str, list[float] | None]:
+    found = bootstrap.intervals(*estimate)
     return {name: None if span is None else list(span) for name, span in found.items()}
 
 
@@ -183,7 +177,7 @@ def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
         blocks = [bootstrap.block_length(_influence(table, of_sums)) for table in tables]
         strata = tuple(Stratum(len(t), block) for t, block in zip(tables, blocks, strict=True) if len(t))
         if strata:
-            found[group] = _of_table(np.concatenate(tables), of_sums, strata, tuple(tables))
+            found[group] = Estimate(_of_sums(np.concatenate(tables), of_sums), strata, seed_of(group, *tables))
     if having := [scored for scored in cases if "boxes" in scored.ranked]:
         found[RANKED] = _of_ranking(rank(having, by_frame=True), found["boxes"].strata)
     if having := [scored for scored in cases if "error_m" in scored.samples]:
@@ -212,7 +206,7 @@ def over_clips(cases: Sequence[Scored]) -> dict[str, Estimate]:
         def of_sums(sums: np.ndarray, like: Any = counts[0], group: str = group) -> dict[str, float]:
             return measure(group, _shaped(sums, like))
 
-        found[group] = _of_table(table, of_sums, (Stratum(len(table)),), (table,))
+        found[group] = Estimate(_of_sums(table, of_sums), (Stratum(len(table)),), seed_of(group, table))
     if having := [scored for scored in cases if "boxes" in scored.ranked]:
         found[RANKED] = _of_ranking(rank(having), (Stratum(len(having)),))
     if having := [scored for scored in cases if "error_m" in scored.samples]:
@@ -221,22 +215,17 @@ def over_clips(cases: Sequence[Scored]) -> dict[str, Estimate]:
     return found
 
 
-def _of_table(
-    table: np.ndarray,
-    of_sums: Callable[[np.ndarray], dict[str, float]],
-    strata: tuple[Stratum, ...],
-    content: tuple[np.ndarray, ...],
-) -> Estimate:
-    return Estimate(lambda weight: of_sums(weight @ table), strata, content)
+def _of_sums(table: np.ndarray, measure_sums: Callable[[np.ndarray], dict[str, float]]) -> Statistic:
+    return lambda weight: measure_sums(weight @ table)
 
 
 def _of_ranking(ranked: Ranking, strata: tuple[Stratum, ...]) -> Estimate:
-    return Estimate(ranked.measures, strata, (ranked.right, ranked.unit, ranked.score, ranked.true))
+    return Estimate(ranked.measures, strata, seed_of(RANKED, ranked.right, ranked.unit, ranked.score, ranked.true))
 
 
 def _of_samples(samples: dict[str, np.ndarray], unit: np.ndarray, strata: tuple[Stratum, ...]) -> Estimate:
-    content = samples["error_m"], samples["inside"], unit
-    return Estimate(lambda weight: metres.measures(samples, weight[unit]), strata, content)
+    seed = seed_of(METRES, samples["error_m"], samples["inside"], unit)
+    return Estimate(lambda weight: metres.measures(samples, weight[unit]), strata, seed)
 
 
 def _samples_of(cases: Sequence[Scored]) -> dict[str, np.ndarray]:
