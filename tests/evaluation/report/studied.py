@@ -1,14 +1,16 @@
 """A small study whose clips, results and faults are known, for its report."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from tests.evaluation.studies.scored_clips import found_of
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
-from torchvision_dddas.evaluation.studies.records import Case, Found, Results, Scored, Spec, Task
+from torchvision_dddas.evaluation.studies.records import Case, Found, Results, Spec, Task
 from torchvision_dddas.evaluation.studies.scoring import score
 
 SIZE = (160, 120)
@@ -16,30 +18,14 @@ FRAMES = 6
 HOSTILE = 'a <b>bold</b> & "quoted" clip'
 
 
-def found(frame, box_px, identity=None, masks=None, east_north_m=None, seconds=0.5) -> Found:
+def found(frame, box_px, identity=None, masks=None, east_north_m=None) -> Found:
     """A result by its boxes."""
-    count = len(frame)
-    return Found(
-        np.array(frame, np.int64).reshape(-1),
-        np.array(box_px, float).reshape(-1, 4),
-        np.linspace(0.9, 0.3, count),
-        np.full(count, -1) if identity is None else np.array(identity, np.int64),
-        np.full((count, 2), np.nan) if east_north_m is None else np.array(east_north_m, float),
-        np.tile(np.eye(2), (count, 1, 1)),
-        np.arange(1, FRAMES + 1),
-        masks or {},
-        seconds={"register": seconds, "foreground": 2 * seconds},
-        peak_mb=101.0,
-    )
-
-
-def picture(folder: Path, number: int, at: int) -> Path:
-    """Noise with a bright square at x = at."""
-    image = np.random.default_rng(number).integers(60, 120, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
-    image[40:60, at : at + 20] = 230
-    path = folder / f"{number:05d}.png"
-    cv2.imwrite(str(path), image)
-    return path
+    names = np.full(len(frame), -1) if identity is None else identity
+    rows = np.c_[np.array(frame), names, np.reshape(box_px, (-1, 4)), np.linspace(0.9, 0.3, len(frame))]
+    result = found_of(rows, FRAMES, masks)
+    places = result.east_north_m if east_north_m is None else east_north_m
+    covariance, seconds = np.tile(np.eye(2), (len(frame), 1, 1)), {"register": 0.5, "foreground": 1.0}
+    return replace(result, east_north_m=places, covariance_m2=covariance, seconds=seconds, peak_mb=101.0)
 
 
 def masked_clip(folder: Path, name: str, off: int) -> Case:
@@ -49,7 +35,10 @@ def masked_clip(folder: Path, name: str, off: int) -> Case:
     pictures, masks, boxes, true = [], {}, [], {}
     for k in range(1, FRAMES + 1):
         at = 10 * k
-        pictures.append(picture(folder / name / "frames", k, at))
+        image = np.random.default_rng(k).integers(60, 120, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
+        image[40:60, at : at + 20] = 230
+        pictures.append(folder / name / "frames" / f"{k:05d}.png")
+        cv2.imwrite(str(pictures[-1]), image)
         label = np.zeros(SIZE[::-1], np.uint8)
         label[40:60, at : at + 20] = 1
         true[k] = folder / name / "masks" / f"{k:05d}.png"
@@ -87,8 +76,7 @@ def tracked_clip(folder: Path, task: Task, name: str) -> Case:
 
 
 def scored(clip: Clip, task: Task, result: Found) -> Case:
-    kept: Scored = score(clip, task, result)
-    return Case(clip, task, result, kept)
+    return Case(clip, task, result, score(clip, task, result))
 
 
 def study(folder: Path) -> Results:

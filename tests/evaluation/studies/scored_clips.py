@@ -50,11 +50,11 @@ def found_of(rows, frames, masks=None, identities=True) -> Found:
     )
 
 
-def blobs(boxes, values=True) -> np.ndarray:
+def blobs(boxes) -> np.ndarray:
     """A mask of boxes, each of its own number."""
     mask = np.zeros(SIZE, np.uint8)
     for number, (x, y, w, h) in enumerate(np.round(boxes).astype(int).tolist(), 1):
-        cv2.rectangle(mask, (x, y), (x + w - 1, y + h - 1), number if values else 1, -1)
+        cv2.rectangle(mask, (x, y), (x + w - 1, y + h - 1), number, -1)
     return mask
 
 

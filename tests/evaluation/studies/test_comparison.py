@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.browser import evaluate, needs_browser
 from tests.evaluation.studies.scored_clips import found_of, masked, tracked, walk
 from tests.pages import Page
 from torchvision_dddas.errors import InputError
@@ -164,14 +163,3 @@ def test_the_page_begins_with_what_changed_by_how_much_and_whether_that_is_beyon
     rows = [text.index(f">{name}</text>") for name in ("down", "quiet", "up &lt;i&gt;")]
     assert rows == sorted(rows)
     assert "1 the same" in words(comparison_report(comparison({})))
-
-
-@pytest.mark.browser
-@needs_browser
-def test_in_a_browser_the_page_fits_a_phone_and_its_rows_sort(tmp_path):
-    script = """var table=page.querySelector("table[aria-label='clip by clip']");
-      table.querySelectorAll("thead button")[4].click();
-      var names=Array.from(table.querySelectorAll("tbody th")).map(e=>e.textContent);
-      return [page.documentElement.scrollWidth, names];"""
-    width, rows = evaluate(comparison_report(comparison(CLIPS)), script, tmp_path, 390, dark=True)
-    assert width <= 390 and rows == ["down", "quiet", "up <i>"]
