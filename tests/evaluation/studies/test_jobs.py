@@ -103,14 +103,14 @@ def test_other_code_is_another_key(folder, monkeypatch) -> None:
     monkeypatch.setattr(jobs, "code_digest", lambda function, engine="": "another")
     after = make_keys(job)
     for task in TASKS:
-        assert before.found[task] != after.found[task] and before.scored[task] != after.scored[task]
+        assert before[task].found != after[task].found and before[task].scored != after[task].scored
 
 
 def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
     cache, job = Cache(folder / "cache"), job_of(folder)
     keys = make_keys(job)
     assert find_cached(job, keys, cache) == do(folder, job)
-    cache.path(keys.found["tracking"]).write_bytes(b"damaged")
+    cache.path(keys["tracking"].found).write_bytes(b"damaged")
     assert find_cached(job, keys, cache) is None
     assert [stage for d in do(folder, job, cache) for stage in d.computed] == ["tracking"]
     assert len(cache.notes) == 1 and "computed again" in cache.notes[0]

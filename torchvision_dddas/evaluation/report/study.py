@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.registry import GROUPS, HEADLINES, describe, title_of_group
 from torchvision_dddas.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
 from torchvision_dddas.evaluation.report.worst_frames import draw_pictures, find_worst_frames
@@ -47,7 +48,9 @@ def study_report(metrics: Mapping[str, Any], results: Results) -> str:
     for case in results.cases:
         if case.cause and not any(case.cause in line for line in left_out):
             left_out.append(f"{case.clip.name}, {case.task}: {case.cause}")
-    costs = _costs(results.cases)
+    timed = [case for case in results.cases if case.found is not None and case.found.seconds]
+    sizes = {number: _megapixels(clip) for number, clip in {id(case.clip): case.clip for case in timed}.items()}
+    costs = [_Cost(case, sum_costs([case]), sizes[id(case.clip)]) for case in timed]
     return render_page(
         "study.html",
         title=f"{results.spec.name}: study",
@@ -146,34 +149,33 @@ def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> 
 
     Where none has any, the first that any clip has; None without one.
     """
-    count = {
-        pair: sum(pair[1] in clip.get(pair[0], {}) for clip in metrics["clips"].values()) for pair in HEADLINES[task]
-    }
-    group, name = max(count, key=lambda pair: count[pair])
-    if not any(count.values()):
-        chosen = next(((group, names[0]) for group in groups if (names := _shown(metrics, group))), None)
-        if chosen is None:
-            return None
-        group, name = chosen
-    known, figures = describe(name), _known_figures(metrics, group, name)
+    of_clips, pooled = metrics["clips"].values(), metrics["pooled"]
+    counts = {(group, name): sum(name in clip.get(group, {}) for clip in of_clips) for group, name in HEADLINES[task]}
+    named = [pair for pair in counts if counts[pair] == max(counts.values()) > 0]
+    named += [(group, name) for group in groups for name in _shown(metrics, group)]
+    if not named:
+        return None
+    group, name = named[0]
+    known, figures, whole = describe(name), _known_figures(metrics, group, name), _figure(pooled, group, name)
     clips = f"one clip: {figures[0].name if figures else 'none'}"
     if len(figures) > 1:
         worst = (max if known.better < 0 else min)(figures, key=lambda figure: figure.value)
-        value = format_number(worst.value, known.digits)
-        clips = f"pooled over {len(figures)} clips; worst: {worst.name}, {value}"
-    found = {"value": "", "clips": clips, "meaning": known.meaning}
-    if name in metrics["pooled"].get(group, {}):
-        pooled = _figure(metrics["pooled"], group, name)
-        found["value"] = format_number(pooled.value, known.digits)
-        found["metric"] = f"{known.title}, {title_of_group(group)}"
-        if known.unit == "m":
-            found["metric"] = f"m, {known.meaning.removesuffix(', metres')}"
-        found["interval"] = "no interval: too few clips or frames"
-        if math.isfinite(pooled.low) and math.isfinite(pooled.high):
-            over = "clips" if metrics["pooled"]["over"].get(group) == "clips" else "blocks of frames"
-            ends = (format_number(end, known.digits) for end in (pooled.low, pooled.high))
-            found["interval"] = f"95 % interval over {over}: {' to '.join(ends)}"
-    return found
+        clips = f"pooled over {len(figures)} clips; worst: {worst.name}, {format_number(worst.value, known.digits)}"
+    interval = "no interval: too few clips or frames"
+    if math.isfinite(whole.low) and math.isfinite(whole.high):
+        over = "clips" if pooled["over"].get(group) == "clips" else "blocks of frames"
+        ends = (format_number(end, known.digits) for end in (whole.low, whole.high))
+        interval = f"95 % interval over {over}: {' to '.join(ends)}"
+    is_metres = known.unit == "m"
+    return {
+        "value": format_number(whole.value, known.digits) if name in pooled.get(group, {}) else "",
+        "metric": f"m, {known.meaning.removesuffix(', metres')}"
+        if is_metres
+        else f"{known.title}, {title_of_group(group)}",
+        "meaning": known.meaning,
+        "interval": interval,
+        "clips": clips,
+    }
 
 
 class _Cost(NamedTuple):
@@ -184,21 +186,9 @@ class _Cost(NamedTuple):
     megapixels: float
 
 
-def _costs(cases: Sequence[Case]) -> list[_Cost]:
-    sizes: dict[str, float] = {}
-    costs = []
-    for case in cases:
-        if case.found is not None and case.found.seconds:
-            name = str(case.clip.place) + case.clip.name
-            if name not in sizes:
-                sizes[name] = _megapixels(case)
-            costs.append(_Cost(case, sum_costs([case]), sizes[name]))
-    return costs
-
-
-def _megapixels(case: Case) -> float:
+def _megapixels(clip: Clip) -> float:
     """The size of a clip's first picture; NaN if it cannot be read."""
-    files = case.clip.pictures
+    files = clip.pictures
     try:
         if not files:
             return math.nan

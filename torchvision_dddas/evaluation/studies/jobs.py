@@ -9,9 +9,9 @@ import os
 import queue
 import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, islice
 from pathlib import Path
@@ -68,17 +68,8 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Keys:
-    """The keys of a job's results in the cache, by task. causes: why a task has none."""
-
-    found: dict[Task, str] = field(default_factory=dict)
-    scored: dict[Task, str] = field(default_factory=dict)
-    causes: dict[Task, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Done:
-    """The outcome of a task. found, scored: keys in the cache, empty if there is no result; cause: why there is none.
+    """The outcome of a task. found, scored: keys in the cache, empty without a result; cause: why there is none.
 
     computed: the stages that were not in the cache. trace: the traceback of a fault of the program.
     """
@@ -102,50 +93,49 @@ class Event:
 
 
 OnEvent = Callable[[Event], object]
+Keys = Mapping[Task, Done]
+"""The outcomes of a job's tasks, and of those they build upon, once all of it is computed."""
 
 
 def make_keys(job: Job, memory: Path | None = None) -> Keys:
-    """The keys of a job's tasks and of the tasks they build upon: all that a result depends on, and nothing else.
+    """The keys of a job's results: digests of all that they depend on, and of nothing else.
 
     memory: as in `files_digest`.
     """
-    keys, clip = Keys(), job.clip
+    clip, settings, keys = job.clip, job.settings, dict[Task, Done]()
     needed = [need for task in job.tasks if (need := upstream_task(clip, task)) is not None]
     for task in dict.fromkeys([*needed, *job.tasks]):
+        need = upstream_task(clip, task)
+        before = Done(task) if need is None else keys[need]
+        truth: Any = sorted(labelled_frames(clip)) if task == "motion" else None
+        if task == "association" and clip.truth is not None:
+            truth = clip.truth.tracks
+        files = files_of(clip, task)
+        if "people" in PARAMETER_GROUPS[task]:
+            for path in (Path(settings.people.classifier), Path(settings.people.graphs)):
+                files += sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
         try:
-            keys.found[task] = _found_key(job, task, keys, memory)
-            truth: Any = None  # its content, without where it is written
+            if before.cause:
+                raise InputError(before.cause)
+            found = digest(
+                ("found", task, code_digest(STAGES[task], job.backend), job.backend),
+                {group: getattr(settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
+                files_digest(files, memory),
+                clip.rate_hz,
+                truth,
+                None if task in ("motion", "people") else job.interval,
+                before.found,
+            )
+            whole: Any = None  # the content of the truth, without where it is written
             if clip.truth is not None:
                 numbers = sorted(clip.truth.masks)
                 rest = {name: value for name, value in vars(clip.truth).items() if name not in ("masks", "place")}
-                truth = (numbers, files_digest([clip.truth.masks[number] for number in numbers], memory), rest)
-            known = (clip.still, clip.shows, truth)
-            keys.scored[task] = digest("scored", task, code_digest(score), keys.found[task], job.interval, known)
+                whole = (numbers, files_digest([clip.truth.masks[number] for number in numbers], memory), rest)
+            known = (clip.still, clip.shows, whole)
+            keys[task] = Done(task, found, digest("scored", task, code_digest(score), found, job.interval, known))
         except InputError as error:
-            keys.causes[task] = str(error)
+            keys[task] = Done(task, cause=str(error))
     return keys
-
-
-def _found_key(job: Job, task: Task, keys: Keys, memory: Path | None) -> str:
-    clip, before = job.clip, upstream_task(job.clip, task)
-    if before in keys.causes:
-        raise InputError(keys.causes[before])
-    truth: Any = sorted(labelled_frames(clip)) if task == "motion" else None
-    if task == "association" and clip.truth is not None:
-        truth = clip.truth.tracks
-    files = files_of(clip, task)
-    if "people" in PARAMETER_GROUPS[task]:
-        for path in (Path(job.settings.people.classifier), Path(job.settings.people.graphs)):
-            files += sorted(path.iterdir()) if path.is_dir() else [path] if path.is_file() else []
-    return digest(
-        ("found", task, code_digest(STAGES[task], job.backend), job.backend),
-        {group: getattr(job.settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
-        files_digest(files, memory),
-        clip.rate_hz,
-        truth,
-        None if task in ("motion", "people") else job.interval,
-        "" if before is None else keys.found[before],
-    )
 
 
 def code_identity(backend: str) -> str:
@@ -155,22 +145,20 @@ def code_identity(backend: str) -> str:
 
 def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
     """The outcome of a job if all of it is in the cache, else None."""
-    if any(task not in keys.scored for task in job.tasks):
-        return None
-    done = tuple(Done(task, keys.found[task], keys.scored[task]) for task in job.tasks)
-    return done if all(cache.has(d.found) and cache.has(d.scored) for d in done) else None
+    done = tuple(keys[task] for task in job.tasks)
+    return done if all(not d.cause and cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
 def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
     """Do all tasks of a job. Bad input of one does not stop the others. on_frame: called once per frame."""
 
     def find_or_get(task: Task, on_frame: OnFrame, computed: list[str]) -> Found:
-        found: Found | None = store.get(keys.found[task])
+        found: Found | None = store.get(keys[task].found)
         if found is None:
             need = upstream_task(job.clip, task)
             before = None if need is None else find_or_get(need, lambda: None, computed)
             found = find(job.clip, task, job.settings, job.backend, job.interval, before, on_frame)
-            store.put(keys.found[task], found)
+            store.put(keys[task].found, found)
             computed.append(task)
         return found
 
@@ -179,18 +167,18 @@ def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None)
         try:
             if task not in allowed_tasks(job.clip):
                 raise InputError(f"its pictures and truth do not allow {task}")
-            if task in keys.causes:
-                raise InputError(keys.causes[task])
+            if keys[task].cause:
+                raise InputError(keys[task].cause)
             found = find_or_get(task, on_frame, computed)
-            if store.get(keys.scored[task]) is None:
-                store.put(keys.scored[task], score(job.clip, task, found, job.interval))
+            if store.get(keys[task].scored) is None:
+                store.put(keys[task].scored, score(job.clip, task, found, job.interval))
                 computed.append(f"{task}: score")
+            return replace(keys[task], computed=tuple(computed))
         except InputError as error:
             return Done(task, cause=str(error), computed=tuple(computed))
         except Exception as error:
             cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
             return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
-        return Done(task, keys.found[task], keys.scored[task], computed=tuple(computed))
 
     return tuple(map(do_task, job.tasks))
 
@@ -272,7 +260,7 @@ class Workers:
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
                     store: Cache = cache
                     if self._scheduler is not None:
-                        wanted = {key: cache.read(key) for key in (*keys.found.values(), *keys.scored.values())}
+                        wanted = {key: cache.read(key) for done in keys.values() for key in (done.found, done.scored)}
                         store = CarriedRecords({key: known for key, known in wanted.items() if known is not None})
                     code = "" if self._scheduler is None else code_identity(job.backend)
                     future = client.submit(_do_remotely, job, keys, store, code, pure=False)
