@@ -1,0 +1,359 @@
+"""Videos, folders and globs: what is whole is read, what is damaged is reported, and every frame keeps its number."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.io.clips import mark_rotated, number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.sources import open_source
+
+
+@pytest.fixture
+def avi(tmp_path):
+    return write_video(tmp_path / "clip.avi", "MJPG")
+
+
+def save(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def numbers_of(source):
+    return [frame.number for frame in source]
+
+
+def check_tail(source):
+    """Frames are missing, but the last one has its own number."""
+    frames = list(source)
+    numbers = [frame.number for frame in frames]
+    assert len(numbers) < 30 and numbers == sorted(set(numbers)) and numbers[-1] == 30 and source.problems
+    assert abs(number_of(frames[-1].image) - 30) <= 1
+    return frames
+
+
+# -- Videos ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "codec"), [("clip.mp4", "mp4v"), ("clip.avi", "MJPG")])
+@pytest.mark.parametrize("interval", [1, 4, 50])
+def test_a_whole_video_is_read_in_order_with_its_times(tmp_path, name, codec, interval):
+    source = open_source(write_video(tmp_path / name, codec))
+    for frame in source:  # left in the middle
+        if frame.number == 3:
+            break
+    frames = list(source.every(interval))
+    numbers = np.arange(1, 31, interval)
+    assert (source.count, source.rate_hz, source.size) == (30, 10.0, (64, 48))
+    assert [frame.number for frame in frames] == numbers.tolist()
+    assert [number_of(frame.image) for frame in frames] == pytest.approx(numbers, abs=1)
+    assert [frame.time_s for frame in frames] == pytest.approx((numbers - 1) / 10, abs=1e-3)
+    assert frames[0].image.shape == (48, 64, 3) and frames[0].image.dtype == np.uint8
+    assert (source.last, source.problems, source.exact) == (30, [], True)
+
+
+def test_a_given_rate_replaces_the_files(tmp_path):
+    source = open_source(write_video(tmp_path / "clip.mp4", "mp4v", frames=4), rate_hz=25)
+    assert source.rate_hz == 25
+    assert [frame.time_s for frame in source] == pytest.approx([0, 0.04, 0.08, 0.12])
+
+
+def test_a_rotated_video_comes_upright(tmp_path):
+    path = write_video(tmp_path / "clip.mp4", "mp4v", frames=3)
+    flat = [frame.image for frame in open_source(path)]
+    mark_rotated(path)
+    source = open_source(path)
+    assert source.size == (48, 64)
+    np.testing.assert_array_equal([f.image for f in source][2], cv2.rotate(flat[2], cv2.ROTATE_90_CLOCKWISE))
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "problems"),
+    [
+        (
+            [12, 20, 21],
+            ["frame 12 could not be decoded and was left out", "frames 20 to 21 could not be decoded and were"],
+        ),
+        ([29, 30], ["frames 29 to 30 could not be decoded and were left out"]),
+    ],
+)
+def test_undecodable_frames_leave_gaps_in_the_numbers_and_are_named(avi, spoiled, problems):
+    for number in spoiled:
+        spoil_avi_frame(avi, number)
+    source = open_source(avi)
+    for _ in range(2):  # problems do not pile up
+        frames = list(source)
+        assert [frame.number for frame in frames] == [n for n in range(1, 31) if n not in spoiled]
+        assert all(abs(number_of(frame.image) - frame.number) <= 1 for frame in frames)
+        assert len(source.problems) == len(problems) and source.last == 30
+        assert all(str(found).startswith(words) for found, words in zip(source.problems, problems, strict=True))
+    assert [n for n in numbers_of(source.every(3)) if n in spoiled] == []
+    assert len(source.problems) == len(problems)  # named whether or not they are wanted
+
+
+def test_a_truncated_video_gives_what_it_holds_and_says_where_it_ends(avi):
+    avi.write_bytes(avi.read_bytes()[: avi.stat().st_size // 2])
+    source = open_source(avi)
+    numbers = numbers_of(source)
+    assert 3 <= len(numbers) < 30 and numbers == list(range(1, len(numbers) + 1)) and source.last == len(numbers)
+    (problem,) = source.problems
+    assert f"ends after frame {len(numbers)} but announces 30" in str(problem)
+
+
+def test_a_damaged_stretch_of_an_mp4_does_not_shift_the_frames_after_it(tmp_path):
+    path = write_video(tmp_path / "clip.mp4", "mp4v")
+    data = bytearray(path.read_bytes())
+    middle = (data.index(b"mdat") + data.index(b"moov")) // 2
+    data[middle : middle + 200] = bytes(200)
+    path.write_bytes(data)
+    check_tail(open_source(path))
+
+
+def test_a_damaged_h264_keeps_order_numbers_and_times(tmp_path):
+    path = write_by_av(tmp_path / "clip.mp4", "libx264", list(range(0, 3000, 100)), g="8", bf="2")
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat")
+    place = start + (data.index(b"moov") - start) * 2 // 3
+    data[place : place + 300] = b"\xff" * 300
+    path.write_bytes(data)
+    frames = check_tail(open_source(path))
+    assert [frame.time_s for frame in frames] == pytest.approx([(frame.number - 1) / 10 for frame in frames])
+
+
+def cut_mp4(folder):
+    path = write_video(folder / "whole.mp4", "mp4v")
+    return path.read_bytes()[: path.stat().st_size // 2]  # it has lost its index
+
+
+@pytest.mark.parametrize("content", [b"", b"no video\n" * 500, bytes(range(256)) * 40, cut_mp4])
+@pytest.mark.parametrize("name", ["clip.mp4", "clip.avi", "clip.txt"])
+def test_a_file_that_is_no_video_gets_one_line_and_no_word_of_a_decoder(refused, tmp_path, capfd, name, content):
+    data = content if isinstance(content, bytes) else content(tmp_path)
+    assert name in refused(open_source, data, name)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_video_whose_first_frame_is_damaged_and_a_camera_that_is_none_are_refused(avi):
+    spoil_avi_frame(avi, 1)
+    for spec, words in ((avi, "first frame"), ("camera:97", "cannot open camera 97"), ("camera:front", "no camera")):
+        with pytest.raises(InputError, match=words):
+            open_source(spec)
+
+
+def test_odd_sizes_are_kept(tmp_path):
+    source = open_source(write_by_av(tmp_path / "clip.mkv", "ffv1", [0, 100, 200], size=(63, 47)))
+    assert source.size == (63, 47)
+    np.testing.assert_array_equal(next(iter(source)).image, picture(1, 63, 47))
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        np.cumsum(np.random.default_rng(0).integers(60, 180, 30)),  # a varying rate
+        np.arange(0, 3000, 100) + 500 * (np.arange(30) >= 8),  # a pause of the recorder is no lost frame
+    ],
+)
+def test_a_clip_of_varying_rate_is_numbered_by_counting_and_timed_by_its_stamps(tmp_path, stamps):
+    source = open_source(write_by_av(tmp_path / "clip.mkv", "mjpeg", stamps.tolist()))
+    frames = list(source)
+    assert [frame.number for frame in frames] == list(range(1, 31)) and source.problems == []
+    assert [frame.time_s for frame in frames] == pytest.approx((stamps - stamps[0]) / 1000, abs=2e-3)
+
+
+class ScriptedCapture:
+    """Stands for a decoder: a stamp in frames for each read, None for one that fails; afterwards every read fails."""
+
+    def __init__(self, script: list[float | None]) -> None:
+        self.script, self.stamp = list(script), 0.0
+
+    def grab(self) -> bool:
+        stamp = self.script.pop(0) if self.script else None
+        self.stamp = self.stamp if stamp is None else stamp
+        return stamp is not None
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, picture(1)
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        return self.grab(), picture(1)
+
+    def get(self, _property: int) -> float:
+        return self.stamp * 100.0
+
+    def release(self) -> None:
+        self.script.clear()
+
+
+@pytest.mark.parametrize(
+    ("script", "numbers", "problems"),
+    [
+        ([0, 1, None, 3], [1, 2, 4], ["frame 3 could not"]),
+        ([0, 1, None, 5, 2, 6, 3, 7], [1, 2, 6, 7, 8], ["frames 3 to 5 could not", "out of order", "out of order"]),
+        ([0, 1, 2.4, None, 4.6], [1, 2, 3, 5], ["frame 4 could not"]),  # a varying rate: counted
+        ([0, 0, 0, None, 0], [1, 2, 3, 5], ["frame 4 could not"]),  # no stamps: counted
+        ([0, 2, 4, 6], [1, 2, 3, 4], []),  # the rate is announced twice too high
+    ],
+)
+@pytest.mark.parametrize("is_live", [False, True])
+def test_frames_are_numbered_by_stamps_where_these_can_be_believed(
+    avi, monkeypatch, script, numbers, problems, is_live
+):
+    source = open_source(avi)
+    for name, value in (("count", None), ("_open", lambda: ScriptedCapture(script)), ("_live", is_live)):
+        monkeypatch.setattr(source, name, value)
+    frames = list(source)
+    if is_live:  # a stream is numbered by counting reads, failed ones included
+        assert [frame.number for frame in frames] == [k for k, stamp in enumerate(script, 1) if stamp is not None]
+        assert len(source.problems) == script.count(None)
+    else:
+        assert [frame.number for frame in frames] == numbers
+        assert len(source.problems) == len(problems)
+        assert all(words in str(problem) for problem, words in zip(source.problems, problems, strict=True))
+    times = [frame.time_s for frame in frames]
+    assert times == sorted(set(times))
+
+
+# -- Images ------------------------------------------------------------------------------------------------------------
+
+
+def test_images_come_in_natural_order_and_only_those_that_are_wanted_are_opened(tmp_path):
+    source = open_source(write_images(tmp_path, range(1, 13)), rate_hz=4)
+    frames = list(source)
+    assert source.count == 12 and open_source(tmp_path).rate_hz == 10
+    assert [(f.number, number_of(f.image), f.time_s) for f in frames] == [(n, n, (n - 1) / 4) for n in range(1, 13)]
+    (tmp_path / "frame5.png").unlink()
+    assert [(frame.number, number_of(frame.image)) for frame in source.every(5)] == [(1, 1), (6, 6), (11, 11)]
+    assert (source.last, source.problems, source.exact) == (12, [], True)
+
+
+def test_what_is_no_image_is_passed_over_and_a_glob_takes_what_it_matches(tmp_path):
+    write_images(tmp_path, range(1, 21))
+    (tmp_path / "notes.txt").write_text("not a frame")
+    (tmp_path / "._frame1.png").write_bytes(b"hidden")
+    (tmp_path / "old.png").mkdir()
+    assert len(list(open_source(tmp_path))) == 20
+    frames = list(open_source(str(tmp_path / "frame1?.png")))
+    assert [(frame.number, number_of(frame.image)) for frame in frames] == [(n, n + 9) for n in range(1, 11)]
+
+
+@pytest.mark.parametrize(
+    ("make", "shape"),
+    [
+        (lambda image: image[..., 0], (48, 64)),
+        (lambda image: image, (48, 64, 3)),
+        (lambda image: np.dstack([image, image[..., 0]]), (48, 64, 3)),
+        (lambda image: image[:47, :63], (47, 63, 3)),
+    ],
+    ids=["grey", "colour", "alpha", "odd size"],
+)
+def test_pixels_are_those_of_the_file_without_alpha(tmp_path, make, shape):
+    written = make(picture(7))
+    save(tmp_path / "a.png", written)
+    (frame,) = open_source(tmp_path)
+    assert frame.image.shape == shape
+    np.testing.assert_array_equal(frame.image, written[..., :3] if written.ndim == 3 else written)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_sixteen_bit_files_are_scaled_by_the_sensor_that_holds_their_brightest_pixel(tmp_path, bits):
+    top = 2**bits - 1
+    ramp = np.linspace(0, 0.6, 64 * 48).reshape(48, 64)
+    for k, gain in enumerate((1.0, 1.6), 1):
+        save(tmp_path / f"{k}.png", (ramp * gain * top).astype(np.uint16))
+    first, second = (frame.image for frame in open_source(tmp_path))
+    assert first.dtype == np.uint8
+    np.testing.assert_allclose(first, ramp * 255, atol=1)
+    np.testing.assert_allclose(second, ramp * 1.6 * 255, atol=1)  # one factor for the clip: no flicker
+
+
+def test_a_given_scale_saturates_what_is_above_it_and_says_so_once(tmp_path):
+    save(tmp_path / "colour" / "1.png", picture(7).astype(np.uint16) * 16)
+    (frame,) = open_source(tmp_path / "colour", full_scale=255 * 16)
+    np.testing.assert_array_equal(frame.image, picture(7))
+    for number in range(1, 4):
+        save(tmp_path / "grey" / f"{number}.png", np.full((48, 64), 1000 * number, np.uint16))
+    source = open_source(tmp_path / "grey", full_scale=1500)
+    assert [int(frame.image.max()) for frame in source] == [170, 255, 255]
+    assert [problem.frame for problem in source.problems] == [2]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_exif_rotation_is_honoured(tmp_path, suffix):
+    exif = Image.Exif()
+    exif[0x0112] = 6  # turn clockwise to show
+    image = picture(20)
+    Image.fromarray(image[..., ::-1].copy()).save(tmp_path / f"a{suffix}", exif=exif)
+    source = open_source(tmp_path)
+    (frame,) = source
+    assert source.size == (48, 64)
+    assert np.abs(frame.image.astype(int) - cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)).mean() < 8
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp"])
+@pytest.mark.parametrize("keep", [0, 40, 0.5, 0.95])
+def test_a_damaged_image_is_left_out_and_the_others_keep_their_numbers(tmp_path, suffix, keep):
+    write_images(tmp_path, range(1, 6), suffix)
+    damaged = tmp_path / f"frame3{suffix}"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[: int(keep * len(whole)) if keep < 1 else int(keep)])
+    source = open_source(tmp_path)
+    assert numbers_of(source) == [1, 2, 4, 5] and source.last == source.count
+    (problem,) = source.problems
+    assert problem.frame == 3 and damaged.name in str(problem)
+
+
+def test_the_first_image_decides_on_colour_size_and_depth(tmp_path):
+    write_images(tmp_path, range(1, 3))
+    save(tmp_path / "frame3.png", picture(3)[..., 0])
+    assert [frame.image.shape for frame in open_source(tmp_path)] == [(48, 64, 3)] * 3
+    for odd, words in (
+        (picture(4, 32, 24), "is 32x24 but frame1.png is 64x48"),
+        (picture(4).astype(np.uint16), "uint16"),
+    ):
+        save(tmp_path / "frame4.png", odd)
+        with pytest.raises(InputError, match=rf"frame4\.png .*{words}"):
+            list(open_source(tmp_path))
+        source = open_source(tmp_path)
+        source.tolerant = True  # type: ignore[attr-defined]
+        assert numbers_of(source) == [1, 2, 3] and "left out" in str(source.problems[0])
+
+
+def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path):
+    for name in ("empty", "outer", "films"):
+        (tmp_path / name).mkdir()
+    frames = write_images(tmp_path / "outer" / "frames")
+    film = write_video(tmp_path / "films" / "clip.avi", "MJPG", frames=2)
+    save(tmp_path / "floats" / "1.tiff", picture(1).astype(np.float32))
+    save(tmp_path / "broken" / "1.png", picture(1))
+    (tmp_path / "broken" / "1.png").write_bytes(b"nothing")
+    mistakes = {
+        "absent": "does not exist",
+        "empty": "holds no images",
+        "outer": f"did you mean {frames}?",
+        "films": f"did you mean {film}?",
+        "broken": "the first image",
+        "floats": "float32",
+        "*.png": "no image matches",
+        "films/*": "1 other files",
+        "outer/frames/frame1.png": "one image",
+    }
+    for spec, words in mistakes.items():
+        with pytest.raises(InputError) as error:
+            open_source(f"{tmp_path}/{spec}")
+        assert words in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(InputError, match="name is empty"):
+        open_source("")
+    for option, value in (("rate_hz", 0), ("rate_hz", -1), ("rate_hz", float("nan")), ("full_scale", 0)):
+        with pytest.raises(InputError, match="must be"):
+            open_source(frames, **{option: value})
+
+
+def test_a_single_image_is_a_clip_of_one_frame_where_that_is_asked_for(tmp_path):
+    file = write_images(tmp_path, range(1, 4)) / "frame2.png"
+    source = open_source(file, single=True)
+    (frame,) = source
+    assert (source.count, source.exact, source.last, frame.number, number_of(frame.image)) == (1, True, 1, 1, 2)
+    assert source.name == str(file)
