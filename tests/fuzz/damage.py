@@ -29,112 +29,88 @@ _CELL = re.compile(r"[^\s,;:=\[\](){}<>\"'*$]+")
 _REWRITES = ((",", ";"), (",", "\t"), (".", ","), ("\n", "\r"), ("\n", "\r\n"), ("\n", ""), ("=", ":"), ("-", ""))
 
 
-class Damage:
-    """Ways in which content breaks. seeds: whole files. words: what means something to the reader."""
+def damaged(seeds: Sequence[bytes], rng: random.Random, text: bool, words: Sequence[str] = ()) -> bytes:
+    """One of the seeds after one to six changes. words: what means something to the reader, put in here and there."""
 
-    def __init__(self, seeds: Sequence[bytes], rng: random.Random, words: Sequence[str]) -> None:
-        self.seeds, self.rng, self.words = seeds, rng, words
+    def odd() -> str:
+        return rng.choice(rng.choice((ODD_NUMBERS, ODD_NUMBERS, ODD_WORDS, words or ODD_WORDS)))
 
-    def odd(self) -> str:
-        return self.rng.choice(self.rng.choice((ODD_NUMBERS, ODD_NUMBERS, ODD_WORDS, self.words or ODD_WORDS)))
-
-    def place(self, content: str | bytes) -> int:
-        return self.rng.randrange(len(content) + 1)
-
-    def cell(self, text: str) -> str:
-        """A number or word becomes another."""
-        cells = list(_CELL.finditer(text))
-        if not cells:
-            return self.odd()
-        cell = self.rng.choice(cells)
-        return text[: cell.start()] + self.odd() + text[cell.end() :]
-
-    def same_cells(self, text: str) -> str:
-        cells = _CELL.findall(text)
-        return text.replace(self.rng.choice(cells), self.odd(), 50) if cells else text
-
-    def swapped_cells(self, text: str) -> str:
-        cells = list(_CELL.finditer(text))
+    def other_cells(content: str) -> str:
+        """One number or word, or all like it, become another; or two change places."""
+        cells = list(_CELL.finditer(content))
         if len(cells) < 2:
-            return text
-        a, b = (cells[k] for k in sorted(self.rng.sample(range(len(cells)), 2)))
-        return text[: a.start()] + b[0] + text[a.end() : b.start()] + a[0] + text[b.end() :]
+            return odd()
+        a, b = (cells[k] for k in sorted(rng.sample(range(len(cells)), 2)))
+        one = content[: a.start()] + odd() + content[a.end() :]
+        swapped = content[: a.start()] + b[0] + content[a.end() : b.start()] + a[0] + content[b.end() :]
+        return rng.choice((one, one, one, content.replace(a[0], odd(), 50), swapped))
 
-    def put_in(self, text: str) -> str:
-        place = self.place(text)
-        return text[:place] + self.odd() + text[place:]
+    def put_in(content: str) -> str:
+        place = rng.randrange(len(content) + 1)
+        return content[:place] + odd() + content[place:]
 
-    def lines(self, text: str) -> str:
+    def other_lines(content: str) -> str:
         """Lines are lost, repeated, shuffled, joined, or come from another file."""
-        lines, rng = text.splitlines(keepends=True), self.rng
-        if not lines:
-            return text
+        lines = content.splitlines(keepends=True) or [""]
+        others = rng.choice(seeds).decode("utf-8", "surrogateescape").splitlines(keepends=True) or [""]
         k = rng.randrange(len(lines))
-        other = rng.choice(self.seeds).decode("utf-8", "surrogateescape").splitlines(keepends=True)
+        joined, repeated = [lines[k].rstrip("\r\n")], [lines[k]] * rng.choice((2, 3, 101))
         lines[k : k + 1] = rng.choice(
             (
                 [],
-                [lines[k]] * rng.choice((2, 3, 101)),
+                repeated,
                 rng.sample(lines, len(lines)),
-                [lines[k].rstrip("\r\n")],
-                [rng.choice(other or [""]), lines[k]],
-                [self.odd() + "\n", lines[k]],
+                joined,
+                [rng.choice(others), lines[k]],
+                [odd() + "\n", lines[k]],
             )
         )
         return "".join(lines if rng.random() < 0.85 else lines[:k] + lines[k + rng.randrange(1, len(lines) + 2) :])
 
-    def rewritten(self, text: str) -> str:
+    def rewritten(content: str) -> str:
         """The whole in other separators, capitals or ends of line."""
-        changed = text.replace(*self.rng.choice(_REWRITES))
-        return self.rng.choice((changed, text.upper(), text.lower(), text.replace(" ", ""), f"\ufeff{text}", text * 3))
+        changed = content.replace(*rng.choice(_REWRITES))
+        plain = content.replace(" ", "")
+        return rng.choice((changed, content.upper(), content.lower(), plain, f"\ufeff{content}", content * 3))
 
-    def cut(self, content: bytes) -> bytes:
-        return content[: self.place(content)]
+    def cut(content: bytes) -> bytes:
+        return content[: rng.randrange(len(content) + 1)]
 
-    def hole(self, content: bytes) -> bytes:
-        place = self.place(content)
-        return content[:place] + content[place + self.rng.choice((1, 2, 10, 200)) :]
-
-    def bits(self, content: bytes) -> bytes:
+    def bits(content: bytes) -> bytes:
         changed = bytearray(content)
-        for _ in range(self.rng.choice((1, 1, 3, 30)) if changed else 0):
-            changed[self.rng.randrange(len(changed))] ^= 1 << self.rng.randrange(8)
+        for _ in range(rng.choice((1, 1, 3, 30)) if changed else 0):
+            changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
         return bytes(changed)
 
-    def overwritten(self, content: bytes) -> bytes:
-        odd = self.rng.choice(ODD_BYTES) * self.rng.choice((1, 1, 1, 8, 100))
-        place = self.place(content)
-        return content[:place] + odd + content[place + len(odd) :]
-
-    def inserted(self, content: bytes) -> bytes:
-        """Bytes of any kind, or a piece of this file or another one, once or many times."""
-        rng, place = self.rng, self.place(content)
-        other = rng.choice((content, rng.choice(self.seeds)))
-        first = self.place(other)
+    def other_bytes(content: bytes) -> bytes:
+        """A hole, odd bytes in place of others, or noise or a piece of this file or another one between them."""
+        place = rng.randrange(len(content) + 1)
+        noise = rng.choice(ODD_BYTES) * rng.choice((1, 1, 1, 8, 100))
+        other = rng.choice((content, rng.choice(seeds)))
+        first = rng.randrange(len(other) + 1)
         piece = other[first : first + rng.choice((1, 4, 16, 200, 2000))] * rng.choice((1, 1, 2, 50))
-        noise = rng.randbytes(rng.randrange(1, 60))
-        return content[:place] + rng.choice((piece, piece, noise, self.odd().encode())) + content[place:]
+        put, skipped = rng.choice(
+            (
+                (b"", rng.choice((1, 2, 10, 200))),
+                (noise, len(noise)),
+                (noise, len(noise)),
+                *((found, 0) for found in (piece, rng.randbytes(rng.randrange(1, 60)), odd().encode())),
+            )
+        )
+        return content[:place] + put + content[place + skipped :]
 
-    def other_encoding(self, content: bytes) -> bytes:
-        text = content.decode("utf-8", "replace")
+    def other_encoding(content: bytes) -> bytes:
+        plain = content.decode("utf-8", "replace")
         marked = (b"\xef\xbb\xbf" + content, b"\xff\xfe" + content)
-        return self.rng.choice((text.encode("utf-16"), text.encode("latin-1", "replace"), *marked))
+        return rng.choice((plain.encode("utf-16"), plain.encode("latin-1", "replace"), *marked))
 
-
-def damaged(seeds: Sequence[bytes], rng: random.Random, text: bool, words: Sequence[str] = ()) -> bytes:
-    """One of the seeds after one to six changes. words: what means something to the reader, put in here and there."""
-    content, do = rng.choice(seeds), Damage(seeds, rng, words)
-    of_text: tuple[Callable[[str], str], ...] = (
-        do.cell, do.cell, do.cell, do.cell, do.same_cells, do.swapped_cells, do.put_in, do.lines, do.lines,
-        do.rewritten,
-    )  # fmt: skip
-    of_bytes: tuple[Callable[[bytes], bytes], ...] = (
-        do.cut, do.hole, do.bits, do.bits, do.overwritten, do.overwritten, do.inserted, do.inserted, do.other_encoding,
-    )  # fmt: skip
+    of_text: tuple[Callable[[str], str], ...] = (*(other_cells,) * 5, put_in, other_lines, other_lines, rewritten)
+    of_bytes: tuple[Callable[[bytes], bytes], ...] = (cut, bits, bits, *(other_bytes,) * 4, other_encoding)
+    content = rng.choice(seeds)
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 6))):
         if text and rng.random() < 0.85:
-            words_damaged = rng.choice(of_text)(content.decode("utf-8", "surrogateescape"))
-            content = words_damaged.encode("utf-8", "surrogateescape")
+            changed = rng.choice(of_text)(content.decode("utf-8", "surrogateescape"))
+            content = changed.encode("utf-8", "surrogateescape")
         else:
             content = rng.choice(of_bytes)(content)
         content = content[:LONGEST]

@@ -110,6 +110,7 @@ class Parser:
 # -- What is done with each --------------------------------------------------------------------------------------------
 
 _CAMERA = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)
+_GRAPHS = ("people_histograms.onnx", "people_scores.onnx")
 _CORNERS = np.array([[0.0, 0.0], [10.0, 10.0]])
 _CLIP = {
     "true/gt.txt": seeds.TEXT["mot"][0].encode(),
@@ -120,7 +121,7 @@ _CLIP = {
 }
 
 
-def _finite(*arrays: np.ndarray) -> None:
+def _check_finite(*arrays: np.ndarray) -> None:
     assert all(np.isfinite(array).all() for array in arrays), "what was read holds numbers that are none"
 
 
@@ -130,13 +131,12 @@ def _words(path: Path) -> str:
 
 def _detections(path: Path) -> None:
     table = read_detections(path)
-    _finite(table.box_px, table.score)
+    _check_finite(table.box_px, table.score)
     assert (np.diff(table.frame) >= 0).all()
-    _ = (table.extent, table.probable, table.at(table.first))
+    _ = (table.extent, table.probable, table.at(table.first), table.targets)
     read_header(path)
     if len(table):
         read_rows(path)
-    _ = table.targets
     check_table(table, 2)
 
 
@@ -150,28 +150,20 @@ def _evaluated(path: Path) -> None:
     evaluate(path.parents[1] / "true", path.parents[1] / "found")
 
 
-def _clip(without: str) -> Mapping[str, bytes]:
-    return {name: content for name, content in _CLIP.items() if name != without}
-
-
 def _record(path: Path) -> None:
     read_run_record(path.parent)
     load_result(path.parent)
 
 
-def _positions(path: Path) -> None:
-    _finite(read_positions(path).east_north_m)
-
-
 def _landmarks(path: Path) -> None:
     found = read_landmarks(path, 10.0, 0.5)
-    _finite(found.frame)
+    _check_finite(found.frame)
     looks_swapped(found, (-110.95, 32.23))
 
 
 def _measurements(path: Path) -> None:
     has_measurements(path)
-    _finite(*read_measurements(path))
+    _check_finite(*read_measurements(path))
 
 
 def _camera(path: Path) -> None:
@@ -181,7 +173,7 @@ def _camera(path: Path) -> None:
 
 def _poses(path: Path) -> None:
     _, poses = poses_at(_CAMERA, read_poses(path), np.array([1, 3, 5]), 10.0)
-    _finite(*(np.asarray(values) for values in vars(poses).values()))
+    _check_finite(*(np.asarray(values) for values in vars(poses).values()))
 
 
 def _overrides(path: Path) -> None:
@@ -197,8 +189,7 @@ def _scenario(path: Path) -> None:
 
 def _telemetry(path: Path) -> None:
     found = read_telemetry(path)
-    rising = bool((np.diff(found.time_s) > 0).all()) and bool(np.isfinite(found.time_s).all())
-    assert rising, "times that do not rise"
+    assert (np.diff(found.time_s) > 0).all() and np.isfinite(found.time_s).all(), "times that do not rise"
     columns = (found.altitude_m, found.speed_m_s, found.above_sea_m, found.heading_rad, found.pitch_rad, found.place)
     assert not any(np.isinf(column).any() for column in columns), "infinite numbers in a record"
     assert found.at(float(found.time_s[len(found) // 2])) is not None
@@ -207,16 +198,11 @@ def _telemetry(path: Path) -> None:
 
 
 def _classifier(path: Path) -> None:
-    _finite(read_classifier(path, seeds.FEATURES, PeopleParameters().descriptor).weights)
+    _check_finite(read_classifier(path, seeds.FEATURES, PeopleParameters().descriptor).weights)
 
 
 def _folder(path: Path) -> None:
-    for frame in open_source(path.parent):
-        assert frame.image.dtype == np.uint8
-
-
-def _names_of_images(path: Path) -> None:
-    sorted((name[:4096] for name in _words(path).splitlines()), key=natural_order)  # no path is longer
+    assert all(frame.image.dtype == np.uint8 for frame in open_source(path.parent))
 
 
 def _video(path: Path) -> None:
@@ -233,13 +219,18 @@ def _input_name(path: Path) -> None:
         open_source(words)
 
 
+def _other_words(path: Path) -> None:
+    """Names of images, cameras and colours."""
+    words = _words(path)
+    sorted((name[:4096] for name in words.splitlines()), key=natural_order)  # no path is longer
+    without_secrets(words)
+    stream_target(words)
+    parse_names(words)
+    parse_box(words)
+
+
 def _address(path: Path) -> None:
     assert 0 <= parse_address(_words(path))[1] <= 65535
-
-
-def _camera_word(path: Path) -> None:
-    without_secrets(_words(path))
-    stream_target(_words(path))
 
 
 def _stream_word(path: Path) -> None:
@@ -250,13 +241,8 @@ def _stream_word(path: Path) -> None:
             open_stream(words, About(0.0), lambda kind, text: None).close()
 
 
-def _boxes_of_colours(path: Path) -> None:
-    parse_names(_words(path))
-    parse_box(_words(path))
-
-
 def _dataset(kind: str, path: Path) -> None:
-    """What is wrong with a clip is told, and the clip left out; where none is left that counts as a refusal."""
+    """What is wrong with a clip is said, and the clip left out; where none is left that counts as a refusal."""
     folder = next(place for place in path.parents if place.name == ROOT)
     found = kinds.read(Source(kind, folder), folder.parent)
     for line in found.missing:
@@ -265,108 +251,104 @@ def _dataset(kind: str, path: Path) -> None:
         raise InputError(found.missing[0])
     for true in (one.truth for one in found.clips if one.truth is not None):
         for table in (true.tracks, true.ignored, true.others, true.regions):
-            _finite(*(table or ()))
-        _finite(*([] if true.positions is None else [true.positions.east_north_m]))
+            _check_finite(*(table or ()))
+        _check_finite(*([] if true.positions is None else [true.positions.east_north_m]))
         assert true.frames and true.frames[0] >= 1
-
-
-def _text(kind: str) -> Callable[[], Sequence[bytes]]:
-    return partial(seeds.text, kind)
 
 
 _PLACES = ("east_m", "north_m", "longitude_deg", "latitude_deg", "frame", "time_s", "score", "1", "10000001")
 _TOML = (
-    "[[", "]]", "[a]", "low", "high", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "0x7fffffffffffffffff",
-    "1e400",
-)  # fmt: skip
+    *("[[", "]]", "[a]", "low", "high", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "1e400"),
+    "0x7fffffffffffffffff",
+)
+_JSON = ("Infinity", "NaN", "null", "[]", "{}", '"x"')
+
+# Name, file, seeds, what is done, words, share.
+_TEXTS: tuple[tuple[str, str, str, Callable[[Path], object], Sequence[str], float], ...] = (
+    ("MOT text", "gt.txt", "mot", _truth, (), 1),
+    ("truth of a clip", "true/gt.txt", "mot", _evaluated, (), 1),
+    ("tracks of a result", "found/tracks.txt", "mot", _evaluated, (), 1),
+    ("seqinfo.ini", "true/seqinfo.ini", "seqinfo", _evaluated, (), 0.5),
+    ("run.json", "found/run.json", "record", _record, _JSON, 0.5),
+    ("detections as text", "detections.txt", "mot", _detections, (), 1),
+    ("detections as CSV", "detections.csv", "detections", _detections, _PLACES, 1),
+    ("positions CSV", "p.csv", "positions", lambda path: _check_finite(read_positions(path).east_north_m), _PLACES, 1),
+    ("landmarks CSV", "landmarks.csv", "landmarks", _landmarks, _PLACES, 1),
+    ("measurements CSV", "measured.csv", "measurements", _measurements, (), 0.5),
+    ("poses CSV", "poses.csv", "poses", _poses, _PLACES, 1),
+    ("camera TOML", "camera.toml", "camera", _camera, _TOML, 1),
+    ("colours TOML", "colours.toml", "colours", read_colours, _TOML, 1),
+    ("settings TOML", "settings.toml", "settings", lambda path: changes(load_config(path)), _TOML, 1),
+    ("overrides", "override.txt", "overrides", _overrides, ("=", ".", "world.side_m=1", "crowd.1.people=2"), 1),
+    ("scenario TOML", "scenario.toml", "scenario", _scenario, _TOML, 1),
+    ("telemetry CSV", "flight.csv", "own telemetry", _telemetry, _PLACES, 1),
+    ("tables of other programs", "flight.csv", "program telemetry", _telemetry, ("frame", "date", "(rad)"), 1),
+    ("SRT", "a.SRT", "subtitles", _telemetry, ("-->", "GPS(", "[latitude:", "H 5m", "00:00:01,000 --> "), 1),
+    ("NMEA 0183", "track.nmea", "nmea", _telemetry, ("$GPGGA,", "*00", "$", "A", "V", "W"), 1),
+    ("classifier as text", "a.txt", "classifier text", _classifier, (), 0.3),
+    ("addresses to serve at", "address.txt", "addresses", _address, (), 0.3),
+    ("names of streams", "stream.txt", "streams", _stream_word, ("json:", "cot:"), 0.3),
+    ("names of inputs", "input.txt", "input names", _input_name, (), 0.5),
+    ("other words", "words.txt", "other words", _other_words, ("camera:", "://", "@"), 1),
+    ("studies", "study.toml", "studies", read_spec, (*_TOML, "[[dataset]]", "kind = ", "folder = "), 1),
+)
+# Name, file, what is done, seeds, a library that is needed, share.
+_BYTES: tuple[tuple[str, str, Callable[[Path], object], Callable[[], Sequence[bytes]], str, float], ...] = (
+    ("MISB ST 0601 in MPEG-TS", "video.ts", _telemetry, seeds.misb, "", 1),
+    ("KLV", "flight.klv", _telemetry, seeds.klv, "", 1),
+    ("MAVLink tlog", "flight.tlog", _telemetry, seeds.mavlink, "pymavlink", 1),
+    ("PX4 ULog", "flight.ulg", _telemetry, seeds.px4, "pyulog", 0.7),
+    *(
+        (f"classifier .{e}", f"a.{e}", _classifier, partial(seeds.classifiers, f".{e}"), "", 0.3)
+        for e in ("npy", "npz")
+    ),
+    ("folder of PNGs", "clip/frame2.png", _folder, partial(seeds.pictures, ".png", True), "", 1),
+    ("folder of JPEGs", "clip/frame1.jpg", _folder, partial(seeds.pictures, ".jpg"), "", 1),
+    ("folder of TIFFs", "clip/frame1.tif", _folder, partial(seeds.pictures, ".tiff", True), "", 1),
+    ("folder of BMPs", "clip/a.bmp", _folder, partial(seeds.pictures, ".bmp"), "", 0.5),
+    ("masks", "000001.png", truth.read_mask, partial(seeds.pictures, ".png", True), "", 0.5),
+    ("video .avi", "a.avi", _video, partial(seeds.videos, ".avi", "MJPG"), "", 0.15),
+    ("video .mp4", "a.mp4", _video, partial(seeds.videos, ".mp4", "mp4v"), "", 0.15),
+    ("video H.264", "a.mp4", _video, seeds.h264, "av", 0.15),
+    ("elevation", "a.tif", lambda p: read_elevation(p, _CORNERS, None, 30), partial(seeds.raster, 1), "rasterio", 0.3),
+    ("photo", "a.tif", lambda p: read_ortho(p, _CORNERS, None, 30), partial(seeds.raster, 3), "rasterio", 0.3),
+)
 
 
-def _graphs() -> Mapping[str, bytes]:
-    return {name: (SHIPPED / name).read_bytes() for name in ("people_histograms.onnx", "people_scores.onnx")}
+def _beside(file: str) -> Mapping[str, bytes]:
+    """The other files of a clip or a folder of pictures."""
+    if file.startswith(("true/", "found/")):
+        return {name: content for name, content in _CLIP.items() if name != file}
+    if file == "clip/frame2.png":
+        return {"clip/frame1.png": seeds.pictures(".png")[0], "clip/frame3.png": seeds.pictures(".png")[1]}
+    return {"clip/frame2.jpg": seeds.pictures(".jpg")[0]} if file == "clip/frame1.jpg" else {}
 
 
 PARSERS: tuple[Parser, ...] = (
-    Parser("MOT text", "gt.txt", _text("mot"), _truth),
-    Parser("truth of a clip", "true/gt.txt", _text("mot"), _evaluated, beside=partial(_clip, "true/gt.txt")),
-    Parser(
-        "tracks of a result", "found/tracks.txt", _text("mot"), _evaluated, beside=partial(_clip, "found/tracks.txt"),
-    ),
-    Parser(
-        "seqinfo.ini", "true/seqinfo.ini", _text("seqinfo"), _evaluated, beside=partial(_clip,
-        "true/seqinfo.ini"), share=0.5,
-    ),
-    Parser(
-        "run.json", "found/run.json", _text("record"), _record, words=("Infinity", "NaN", "null", "[]", "{}", '"x"'),
-        beside=partial(_clip, "found/run.json"), share=0.5,
-    ),
-    Parser("detections as text", "detections.txt", _text("mot"), _detections),
-    Parser("detections as CSV", "detections.csv", _text("detections"), _detections, words=_PLACES),
-    Parser("positions CSV", "positions.csv", _text("positions"), _positions, words=_PLACES),
-    Parser("landmarks CSV", "landmarks.csv", _text("landmarks"), _landmarks, words=_PLACES),
-    Parser("measurements CSV", "measured.csv", _text("measurements"), _measurements, share=0.5),
-    Parser("poses CSV", "poses.csv", _text("poses"), _poses, words=_PLACES),
-    Parser("camera TOML", "camera.toml", _text("camera"), _camera, words=_TOML),
-    Parser("colours TOML", "colours.toml", _text("colours"), read_colours, words=_TOML),
-    Parser("settings TOML", "knobs.toml", _text("settings"), lambda path: changes(load_config(path)), words=_TOML),
-    Parser(
-        "overrides", "override.txt", _text("overrides"), _overrides, words=("=", ".", "world.side_m=1",
-        "crowd.1.people=2"),
-    ),
-    Parser("scenario TOML", "scenario.toml", _text("scenario"), _scenario, words=_TOML),
-    Parser("telemetry CSV", "flight.csv", _text("own telemetry"), _telemetry, words=_PLACES),
-    Parser(
-        "tables of other programs", "flight.csv", _text("program telemetry"), _telemetry, words=("frame",
-        "date", "(rad)"),
-    ),
-    Parser(
-        "SRT", "flight.SRT", _text("subtitles"), _telemetry, words=("-->", "GPS(", "[latitude:", "H 5m",
-        "00:00:01,000 --> "),
-    ),
-    Parser(
-        "NMEA 0183", "track.nmea", _text("nmea"), _telemetry, words=("$GPGGA,", "*00", "$", "A", "V", "W"),
-        needs="pynmea2",
-    ),
-    Parser("MISB ST 0601 in MPEG-TS", "video.ts", seeds.misb, _telemetry, text=False),
-    Parser("KLV", "flight.klv", seeds.klv, _telemetry, text=False),
-    Parser("MAVLink tlog", "flight.tlog", seeds.mavlink, _telemetry, text=False, needs="pymavlink"),
-    Parser("PX4 ULog", "flight.ulg", seeds.px4, _telemetry, text=False, needs="pyulog", share=0.7),
-    Parser("classifier as text", "a.txt", _text("classifier text"), _classifier, share=0.3),
-    Parser("classifier .npy", "a.npy", partial(seeds.classifiers, ".npy"), _classifier, text=False, share=0.3),
-    Parser("classifier .npz", "a.npz", partial(seeds.classifiers, ".npz"), _classifier, text=False, share=0.3),
-    Parser("classifier .yml", "a.yml", partial(seeds.classifiers, ".yml"), _classifier, share=0.3),
-    Parser("classifier .xml", "a.xml", partial(seeds.classifiers, ".xml"), _classifier, share=0.3),
-    Parser("classifier .json", "a.json", partial(seeds.classifiers, ".json"), _classifier, share=0.3),
-    Parser("manifest of graphs", "manifest.json", lambda: [(SHIPPED / MANIFEST).read_bytes()],
-        lambda path: find_graphs(PeopleParameters(graphs=str(path.parent))), beside=_graphs),
-    Parser("addresses to serve at", "address.txt", _text("addresses"), _address, share=0.3),
-    Parser("names of cameras", "camera.txt", _text("cameras"), _camera_word, words=("camera:", "://", "@"), share=0.3),
-    Parser("names of streams", "stream.txt", _text("streams"), _stream_word, words=("json:", "cot:"), share=0.3),
-    Parser(
-        "folder of PNGs", "clip/frame2.png", partial(seeds.pictures, ".png", True), _folder, text=False,
-        beside=lambda: {"clip/frame1.png": seeds.pictures(".png")[0], "clip/frame3.png": seeds.pictures(".png")[1]},
-    ),
-    Parser(
-        "folder of JPEGs", "clip/frame1.jpg", partial(seeds.pictures, ".jpg"), _folder, text=False,
-        beside=lambda: {"clip/frame2.jpg": seeds.pictures(".jpg")[0]},
-    ),
-    Parser("folder of TIFFs", "clip/frame1.tif", partial(seeds.pictures, ".tiff", True), _folder, text=False),
-    Parser("folder of other images", "clip/a.ppm", partial(seeds.pictures, ".ppm"), _folder, share=0.5),
-    Parser("folder of BMPs", "clip/a.bmp", partial(seeds.pictures, ".bmp"), _folder, text=False, share=0.5),
-    Parser("names of images", "names.txt", _text("names of images"), _names_of_images, share=0.5),
-    Parser("masks", "000001.png", partial(seeds.pictures, ".png", True), truth.read_mask, text=False, share=0.5),
-    Parser("video .avi", "a.avi", partial(seeds.videos, ".avi", "MJPG"), _video, text=False, share=0.15),
-    Parser("video .mp4", "a.mp4", partial(seeds.videos, ".mp4", "mp4v"), _video, text=False, share=0.15),
-    Parser("video H.264", "a.mp4", seeds.h264, _video, text=False, needs="av", share=0.15),
-    Parser("names of inputs", "input.txt", _text("input names"), _input_name, share=0.5),
-    Parser("colours by boxes", "box.txt", _text("boxes of colours"), _boxes_of_colours, share=0.3),
-    Parser("studies", "study.toml", _text("studies"), read_spec, words=(*_TOML, "[[dataset]]", "kind = ", "folder = ")),
     *(
-        Parser(one.name, f"{ROOT}/{one.file}", one.seeds, partial(_dataset, one.kind), words=one.words,
-        beside=one.others, share=0.5)
+        Parser(name, file, partial(seeds.text, kind), read, True, words, partial(_beside, file), share=share)
+        for name, file, kind, read, words, share in _TEXTS
+    ),
+    *(
+        Parser(name, file, whole, read, False, (), partial(_beside, file), needs, share)
+        for name, file, read, whole, needs, share in _BYTES
+    ),
+    *(
+        Parser(f"classifier .{ending}", f"a.{ending}", partial(seeds.classifiers, f".{ending}"), _classifier, share=0.3)
+        for ending in ("yml", "xml", "json")
+    ),
+    Parser("folder of other images", "clip/a.ppm", partial(seeds.pictures, ".ppm"), _folder, share=0.5),
+    Parser(
+        "manifest of graphs",
+        "manifest.json",
+        lambda: [(SHIPPED / MANIFEST).read_bytes()],
+        lambda path: find_graphs(PeopleParameters(graphs=str(path.parent))),
+        beside=lambda: {name: (SHIPPED / name).read_bytes() for name in _GRAPHS},
+    ),
+    *(
+        Parser(
+            one.name, f"{ROOT}/{one.file}", one.seeds, partial(_dataset, one.kind), True, one.words, one.others, "", 0.5
+        )
         for one in LAYOUTS
     ),
-    Parser("elevation GeoTIFF", "a.tif", partial(seeds.raster, 1),
-        lambda path: read_elevation(path, _CORNERS, None, 30.0), text=False, needs="rasterio", share=0.3),
-    Parser("photo GeoTIFF", "a.tif", partial(seeds.raster, 3),
-        lambda path: read_ortho(path, _CORNERS, None, 30.0), text=False, needs="rasterio", share=0.3),
-)  # fmt: skip
+)
