@@ -346,9 +346,9 @@ def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path):
         assert words in str(error.value) and "\n" not in str(error.value)
     with pytest.raises(InputError, match="name is empty"):
         open_source("")
-    for option, value in (("rate_hz", 0), ("rate_hz", -1), ("rate_hz", float("nan")), ("full_scale", 0)):
+    for rate_hz, full_scale in ((0, None), (-1, None), (float("nan"), None), (None, 0)):
         with pytest.raises(InputError, match="must be"):
-            open_source(frames, **{option: value})
+            open_source(frames, rate_hz=rate_hz, full_scale=full_scale)
 
 
 def test_a_single_image_is_a_clip_of_one_frame_where_that_is_asked_for(tmp_path):
