@@ -5,22 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import (
-    LandmarkParameters,
-    Settings,
-    SteeringParameters,
-    with_parameters,
-)
-from torchvision_dddas.control.rules import (
-    SAMPLING,
-    Load,
-    every_wanted,
-    rungs,
-    sampled,
-    shed,
-)
-from torchvision_dddas.geo.landmark_trajectories import LandmarkUse, best_spread, select_landmarks, spread_m2
-from torchvision_dddas.types import Adjustment, LandmarkObservations
+from torchvision_dddas.config import Settings, SteeringParameters, with_parameters
+from torchvision_dddas.control.rules import SAMPLING, Load, every_wanted, rungs, sampled, shed
+from torchvision_dddas.types import Adjustment
 
 # Of how many frames one is looked at.
 
@@ -49,38 +36,6 @@ def test_the_sampling_is_rounded_and_bounded_and_its_change_recorded(wanted, eve
     assert [(a.frame, a.parameter, a.old, a.new, a.cause) for a in made] == (
         [] if every == 1 else [(5, "sampling.every", 1, every, "altitude 50 m")]
     )
-
-
-# The 4-or-more rule.
-
-SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
-SOURCE = LandmarkParameters(rule="source", poor_speed_m_s=2.0)
-
-
-def marks_at(places, seen=None):
-    image = np.array(places, float) * 20
-    image[[k for k in range(len(places)) if seen is not None and k not in seen]] = np.nan
-    n = len(places)
-    return LandmarkObservations(np.arange(n), image, np.array(places, float), np.ones(n), np.ones(n), np.zeros(n))
-
-
-def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
-    rows, use, record = select_landmarks(1, LandmarkUse(), marks_at(SIX), np.full(6, 1.0), SOURCE)
-    assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
-    rows, use, (more,) = select_landmarks(2, use, marks_at(SIX), np.full(6, 2.5), SOURCE)
-    assert len(rows) == 6 and use.poor
-    assert (more.frame, more.parameter, more.old, more.new) == (2, "landmarks.used", 4, 6)
-    assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
-    _, use, (fewer,) = select_landmarks(3, use, marks_at(SIX), np.full(6, 1.0), SOURCE)
-    assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
-
-
-def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmarks_in_one_place():
-    assert spread_m2(np.array([[0, 0], [4, 0], [0, 2], [4, 3.0]])) == pytest.approx(4.0)
-    assert best_spread(SIX, 4).tolist() == [0, 1, 2, 3]
-    crowd = np.concatenate([np.full((20, 2), 5.0), SIX[:4]])
-    assert best_spread(crowd, 4).tolist() == [20, 21, 22, 23]
-    assert best_spread(np.full((9, 2), 5.0), 4).tolist() == sorted(set(best_spread(np.full((9, 2), 5.0), 4).tolist()))
 
 
 # -- a run that must keep up with a camera -----------------------------------------------------------------------------

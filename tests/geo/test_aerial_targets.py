@@ -1,4 +1,4 @@
-"""Crowds, speeds, shadows and the height of the ground: what is derived for targets seen from the air."""
+"""Crowds, speeds and shadows: what is derived for targets seen from the air."""
 
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.geo.aerial_targets import BODY_WIDTH_M, TargetSpeeds, remove_shadow, shadow_m, sun_at
 from torchvision_dddas.geo.landmark_watch import group_targets, merge_detections
-from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.geometry import middles_of
 from torchvision_dddas.simulation.cameras import camera_axes, view_from_pose
-from torchvision_dddas.types import Camera, CameraPose, Detections, Elevation
+from torchvision_dddas.types import Camera, CameraPose, Detections
 
 STILL = np.zeros((3, 2))
 
@@ -47,21 +46,12 @@ def test_crowds_do_not_depend_on_the_order_of_targets(places, chance):
     assert (same[np.ix_(order, order)] == (shuffled[:, None] == shuffled[None])).all()
 
 
-def scene():
+def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
     mask = np.zeros((20, 30), np.uint16)
     mask[2:6, 3:7], mask[10:12, 20:28], mask[3:5, 9:11] = 1, 2, 3
-    found = Detections(
-        np.array([[3.0, 2, 4, 4], [20, 10, 8, 2], [9, 3, 2, 2]]),
-        np.array([0.5, 0.7, 0.9]),
-        np.array([16.0, 16, 4]),
-        np.array([0.0, np.nan, np.pi / 2]),
-        np.array([2.0, np.nan, 2.0]),
-    )
-    return found, mask
-
-
-def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
-    found, mask = scene()
+    boxes = np.array([[3.0, 2, 4, 4], [20, 10, 8, 2], [9, 3, 2, 2]])
+    heading, speed = np.array([0.0, np.nan, np.pi / 2]), np.array([2.0, np.nan, 2.0])
+    found = Detections(boxes, np.array([0.5, 0.7, 0.9]), np.array([16.0, 16, 4]), heading, speed)
     found = replace(found, middle_px=middles_of(found.box_px, mask))
     crowds, numbered = merge_detections(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
@@ -142,22 +132,3 @@ def test_the_feet_of_a_strip_of_body_and_one_of_shadow_are_found_from_the_mean_o
     # Without a shadow it is the body's middle that counts, half its height up.
     alone = remove_shadow(body.mean(axis=0)[None], foot[None], pose, CAMERA, height, np.zeros(2))
     assert np.abs(alone[0] - start).max() < 0.1
-
-
-GRID = Elevation(np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]]), (100.0, 50.0), 2.0)
-
-
-def test_between_four_heights_it_is_bilinear():
-    places = [[100, 50], [104, 50], [100, 52], [104, 52], [101, 51], [103.5, 50.5]]
-    assert ground_height(GRID, np.array(places, float)) == pytest.approx([0, 2, 10, 12, 5.5, 4.25])
-
-
-def test_outside_the_grid_nothing_is_known():
-    places = np.array([[99.9, 51], [104.1, 51], [102, 49.9], [102, 52.1], [np.nan, 51]])
-    assert np.isnan(ground_height(GRID, places)).all()
-
-
-def test_beside_a_hole_nothing_is_known():
-    holed = Elevation(np.array([[0.0, 1.0, np.nan], [10.0, 11.0, 12.0]]), (0.0, 0.0), 1.0)
-    assert np.isfinite(ground_height(holed, np.array([[0.5, 0.5]]))).all()
-    assert np.isnan(ground_height(holed, np.array([[1.5, 0.5]]))).all()

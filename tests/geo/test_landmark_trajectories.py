@@ -1,11 +1,17 @@
-"""Where landmarks are in every frame: between reports, in dropouts, along their plans."""
+"""Where landmarks are in every frame: between reports, in dropouts, along their plans; and which of them are used."""
 
 import numpy as np
 import pytest
 
 from torchvision_dddas.config import LandmarkParameters
-from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
-from torchvision_dddas.types import Landmarks
+from torchvision_dddas.geo.landmark_trajectories import (
+    LandmarkTrajectories,
+    LandmarkUse,
+    best_spread,
+    select_landmarks,
+    spread_m2,
+)
+from torchvision_dddas.types import LandmarkObservations, Landmarks
 
 RATE = 25.0
 KNOBS = LandmarkParameters(sigma_m=1.0, gap_s=4.0, drift_m_s=0.5, pixel_sigma=2.0, height_m=1.5)
@@ -78,3 +84,31 @@ def test_degrees_are_refused():
     degrees = landmarks([(1, 0, 0, 0)])
     with pytest.raises(ValueError, match="wanted local metres"):
         LandmarkTrajectories(Landmarks(**{**vars(degrees), "geographic": True}), KNOBS, RATE)
+
+
+# The 4-or-more rule.
+
+SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
+SOURCE = LandmarkParameters(rule="source", poor_speed_m_s=2.0)
+
+
+MARKS = LandmarkObservations(np.arange(6), SIX * 20, SIX, np.ones(6), np.ones(6), np.zeros(6))
+
+
+def test_the_source_rule_takes_four_of_six_slow_landmarks_and_all_six_fast_ones_and_says_why():
+    rows, use, record = select_landmarks(1, LandmarkUse(), MARKS, np.full(6, 1.0), SOURCE)
+    assert (rows.tolist(), record) == ([0, 1, 2, 3], ())
+    rows, use, (more,) = select_landmarks(2, use, MARKS, np.full(6, 2.5), SOURCE)
+    assert len(rows) == 6 and use.poor
+    assert (more.frame, more.parameter, more.old, more.new) == (2, "landmarks.used", 4, 6)
+    assert more.cause == "6 landmarks in view go at 2.5 m/s on average, above 2: they are detected poorly"
+    _, use, (fewer,) = select_landmarks(3, use, MARKS, np.full(6, 1.0), SOURCE)
+    assert (fewer.old, fewer.new, use.poor) == (6, 4, False)
+
+
+def test_the_best_spread_is_that_of_an_exhaustive_search_also_with_many_landmarks_in_one_place():
+    assert spread_m2(np.array([[0, 0], [4, 0], [0, 2], [4, 3.0]])) == pytest.approx(4.0)
+    assert best_spread(SIX, 4).tolist() == [0, 1, 2, 3]
+    crowd = np.concatenate([np.full((20, 2), 5.0), SIX[:4]])
+    assert best_spread(crowd, 4).tolist() == [20, 21, 22, 23]
+    assert best_spread(np.full((9, 2), 5.0), 4).tolist() == sorted(set(best_spread(np.full((9, 2), 5.0), 4).tolist()))

@@ -1,125 +1,223 @@
-"""Picture to ground and back: the bare homography with its errors, the source's raw degrees, rays on the ground."""
+"""Plane homographies: both solvers against NumPy and OpenCV; picture to ground and back, with errors, and refusals."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring
-from torchvision_dddas.geo.plane_homography import fix_by_homography, load_solver, locate_pixels
-from torchvision_dddas.geo.pose_estimation import move_pose
-from torchvision_dddas.geo.projection import project
+from torchvision_dddas.geo.plane_homography import PlaneSolver, fix_by_homography, load_solver, locate_pixels
+from torchvision_dddas.geo.projection import ground_with_slopes, project
 from torchvision_dddas.geometry import lonlat, transfer
 from torchvision_dddas.types import Fix
 
 SOLVER = load_solver("onboard")
-FAR = np.array([4000.0, -3000.0])
-UTM = np.array([500_000.0, 3_500_000.0])
-TUCSON = (-110.9, 31.9)
+FAR, UTM, TUCSON = np.array([4000.0, -3000.0]), np.array([500_000.0, 3_500_000.0]), (-110.9, 31.9)
 
 
-def posed(seen, sigma=1e-4):
-    return Fix(1, "pose", seen.pose, sigma**2 * np.eye(7))
+@pytest.fixture(scope="module", params=["onboard", "torch"])
+def solver(request) -> PlaneSolver:
+    if request.param == "torch":
+        pytest.importorskip("torch")
+    return load_solver(request.param)
 
 
-@pytest.mark.parametrize("n", [4, 6])
-@pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
-def test_exact_landmarks_give_exact_ground(n, tilt_deg):
-    seen = look(1, n=n, errors=0, tilt_deg=tilt_deg)
-    fix = fix_by_homography(1, seen.marks, SOLVER)
-    ground, _ = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
-    assert fix.by == "homography" and fix.state == ("used",) * n
-    assert np.allclose(ground, seen.targets, atol=1e-6)
-    assert fix.image_from_ground is not None
-    assert np.allclose(transfer(fix.image_from_ground, seen.targets), seen.targets_px, atol=1e-6)
+def view(altitude_m: float, tilt_deg: float, heading_deg: float, middle_m: tuple[float, float]) -> np.ndarray:
+    """image_from_ground of a camera of 1080p and 70 degrees that looks at a point from so high."""
+    tilt, heading = np.radians([tilt_deg, heading_deg])
+    forward = np.array([np.sin(tilt) * np.sin(heading), np.sin(tilt) * np.cos(heading), -np.cos(tilt)])
+    right = np.array([np.cos(heading), -np.sin(heading), 0])
+    axes = np.stack([right, np.cross(forward, right), forward])
+    place = np.array([*middle_m, 0]) - forward * altitude_m / np.cos(tilt)
+    pixels = np.array([[1371.0, 0, 959.5], [0, 1371, 539.5], [0, 0, 1]])
+    return np.asarray(pixels @ np.column_stack([axes[:, :2], -axes @ place]))
 
 
-@pytest.mark.parametrize("far", [FAR, UTM])
-@pytest.mark.parametrize(("tilt_deg", "sigma_m"), [(0.0, GPS_M), (0.0, 0.01), (50.0, 0.01)])
-def test_landmarks_far_from_the_origin_do_as_well_and_their_errors_are_the_same(far, tilt_deg, sigma_m):
-    seen = look(1, errors=0, tilt_deg=tilt_deg, sigma_m=sigma_m)
-    moved_away = replace(seen.marks, east_north_m=seen.marks.east_north_m + far)
-    ground, covariance = locate_pixels(fix_by_homography(1, moved_away, SOLVER), CAMERA, seen.targets_px, 1.0)
-    near = locate_pixels(fix_by_homography(1, seen.marks, SOLVER), CAMERA, seen.targets_px, 1.0)[1]
-    assert np.allclose(ground, seen.targets + far, atol=1e-6)
-    assert np.allclose(covariance, near, rtol=1e-5)
+def seen(matrix: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    found = np.concatenate([ground, np.ones_like(ground[..., :1])], -1) @ matrix.swapaxes(-1, -2)
+    return np.asarray(found[..., :2] / found[..., 2:])
+
+
+def around(count: int, middle_m: tuple[float, float] = (0, 0), radius_m: float = 12.5, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    turn = np.linspace(0, 2 * np.pi, count, endpoint=False) + rng.uniform(-0.3, 0.3, count)
+    return np.asarray(middle_m + radius_m * np.stack([np.sin(turn), np.cos(turn)], 1) * rng.uniform(0.7, 1))
+
+
+def by_svd(ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The same least squares by NumPy: h33 = 1 at the weighted mean of the ground."""
+    share = weight / weight.sum()
+
+    def scaling(points: np.ndarray) -> np.ndarray:
+        mean = share @ points
+        scale = np.sqrt(2 / (share @ ((points - mean) ** 2).sum(1)))
+        return np.array([[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1]])
+
+    into, out = scaling(ground), scaling(image)
+    (x, y), (u, v) = seen(into, ground).T, seen(out, image).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], 1)
+    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], 1)
+    root = np.sqrt(np.tile(share, 2))
+    found = np.linalg.lstsq(np.concatenate([rows_u, rows_v]) * root[:, None], np.concatenate([u, v]) * root)[0]
+    matrix = np.linalg.inv(out) @ np.append(found, 1).reshape(3, 3) @ into
+    return np.asarray(matrix / matrix[2, 2])
+
+
+@pytest.mark.parametrize("away_m", [0, 3000])
+@pytest.mark.parametrize(("altitude", "tilt"), [(50, 0), (200, 0), (60, 45), (50, 65)])
+def test_four_landmarks_are_met_to_a_millionth_of_a_pixel_also_kilometres_from_the_origin(
+    solver, altitude, tilt, away_m
+):
+    middle, rng = (away_m, -away_m), np.random.default_rng(1)
+    ground = np.stack([around(4, middle, seed=k) for k in range(10)])
+    image = seen(view(altitude, tilt, 30, middle), ground) + rng.normal(0, 1, (10, 4, 2))
+    matrix, valid = solver.solve(ground, image, rng.uniform(0.01, 1, (10, 4)))
+    assert valid.all() and np.abs(seen(matrix, ground) - image).max() < 1e-6
+    for k in range(10):
+        corners = (ground[k] - middle).astype(np.float32), image[k].astype(np.float32)
+        wanted = cv2.getPerspectiveTransform(*corners, cv2.DECOMP_SVD)
+        assert np.abs(seen(wanted, ground[k] - middle) - seen(matrix[k], ground[k])).max() < 0.01  # float32
+
+
+@pytest.mark.parametrize("count", [4, 5, 9, 16])
+def test_the_least_squares_are_those_of_numpy(solver, count):
+    rng = np.random.default_rng(count)
+    for k, (altitude, tilt) in enumerate([(50, 0), (200, 20), (70, 50)]):
+        ground = around(count, (800.0, 250.0), seed=k)
+        image = seen(view(altitude, tilt, 200, (800, 250)), ground) + rng.normal(0, 2, (count, 2))
+        weight = rng.uniform(0.05, 1, count)
+        (matrix,), valid = solver.solve(ground[None], image[None], weight[None])
+        places = np.concatenate([ground, around(8, (800.0, 250.0), 25)])
+        assert valid and np.abs(seen(matrix, places) - seen(by_svd(ground, image, weight), places)).max() < 1e-6
+
+
+def test_landmarks_of_weight_zero_are_as_if_absent_whatever_they_hold(solver):
+    ground, matrix = around(6), view(60, 30, 0, (0, 0))
+    image = seen(matrix, ground) + np.random.default_rng(0).normal(0, 1, (6, 2))
+    wanted, _ = solver.solve(ground[None], image[None], np.ones((1, 6)))
+    for nonsense in (np.nan, np.inf, 0.0, 1e9):
+        more = [np.concatenate([held, np.full((2, 2), nonsense)])[None] for held in (ground, image)]
+        found, valid = solver.solve(*more, np.array([[1.0] * 6 + [0.0] * 2]))
+        assert valid
+        np.testing.assert_allclose(seen(found[0], ground), seen(wanted[0], ground), atol=1e-9)
+
+
+LINES = {
+    "on one line": [[0.0, 0], [5, 5], [10, 10], [20, 20]],
+    "on a line eastwards": [[0.0, 7], [5, 7], [10, 7], [20, 7]],
+    "three on one line": [[0.0, 0], [10, 10], [20, 20], [0, 20]],
+    "two at one place": [[0.0, 0], [0, 0], [20, 20], [0, 20]],
+    "all at one place": [[5.0, 5]] * 4,
+    "five on one line": [[0.0, 0], [5, 5], [10, 10], [20, 20], [1, 1], [-9, 12]],
+}
+
+
+@pytest.mark.parametrize("away_m", [0, 2000])
+@pytest.mark.parametrize("ground", LINES.values(), ids=LINES)
+def test_landmarks_that_fix_no_homography_are_marked_and_the_matrix_is_the_identity(solver, ground, away_m):
+    place = np.array([ground]) + away_m
+    matrix, valid = solver.solve(place, seen(view(60, 30, 10, (away_m, away_m)), place), np.ones(place.shape[:2]))
+    assert not valid.any() and np.array_equal(matrix, np.eye(3)[None])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_fewer_than_four_landmarks_are_marked_by_number_and_by_weight(solver, count):
+    ground = around(6)[None]
+    matrix, valid = solver.solve(ground[:, :count], ground[:, :count], np.ones((1, count)))
+    assert matrix.shape == (1, 3, 3) and valid.tolist() == [False]
+    assert not solver.solve(ground, ground * 3 + 7, np.array([[1.0] * count + [0.0] * (6 - count)]))[1].any()
+    assert not solver.solve_raw(ground[:, :count], ground[:, :count])[1].any()
+
+
+def test_the_onboard_solver_needs_no_torch():
+    load = "from torchvision_dddas.geo.plane_homography import load_solver; load_solver('auto')"
+    script = f"import sys; {load}; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "False"
+
+
+# Fixes.
+
+
+def posed(look_, sigma=1e-4):
+    return Fix(1, "pose", look_.pose, sigma**2 * np.eye(7))
+
+
+@pytest.mark.parametrize("far", [np.zeros(2), FAR, UTM])
+@pytest.mark.parametrize(("n", "tilt_deg", "sigma_m"), [(4, 0.0, GPS_M), (6, 45.0, GPS_M), (4, 50.0, 0.01)])
+def test_exact_landmarks_give_exact_ground_wherever_the_origin_is_and_the_same_errors(n, tilt_deg, sigma_m, far):
+    shown = look(1, n=n, errors=0, tilt_deg=tilt_deg, sigma_m=sigma_m)
+    near = locate_pixels(fix_by_homography(1, shown.marks, SOLVER), CAMERA, shown.targets_px, 1.0)[1]
+    fix = fix_by_homography(1, replace(shown.marks, east_north_m=shown.marks.east_north_m + far), SOLVER)
+    ground, covariance = locate_pixels(fix, CAMERA, shown.targets_px, 1.0)
+    assert fix.by == "homography" and fix.state == ("used",) * n and fix.image_from_ground is not None
+    assert np.allclose(ground, shown.targets + far, atol=1e-6)
+    assert np.allclose(covariance, near, atol=1e-5 * near.max())
+    if not far.any():
+        assert np.allclose(transfer(fix.image_from_ground, shown.targets), shown.targets_px, atol=1e-6)
 
 
 def test_beyond_the_horizon_there_is_no_ground():
-    seen = look(1, errors=0, tilt_deg=75.0, places=ring(4) * 0.4)
+    shown = look(1, errors=0, tilt_deg=75.0, places=ring(4) * 0.4)
     sky = np.array([[960.0, -400.0], [960.0, 600.0]])
-    for fix in (fix_by_homography(1, replace(seen.marks, sigma_m=np.zeros(4)), SOLVER), posed(seen)):
+    for fix in (fix_by_homography(1, replace(shown.marks, sigma_m=np.zeros(4)), SOLVER), posed(shown)):
         ground, covariance = locate_pixels(fix, CAMERA, sky, 1.0)
         assert np.isfinite(ground).all(axis=1).tolist() == [False, True]
         assert np.isfinite(covariance).all(axis=(1, 2)).tolist() == [False, True]
 
 
 def test_raw_degrees_lose_what_local_metres_keep():
-    seen = look(4, n=6, errors=0)
-    degrees = (lonlat(seen.marks.east_north_m, TUCSON), TUCSON)
-    fix = fix_by_homography(1, seen.marks, SOLVER, degrees=degrees, paper=True)
-    ground, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 1.0)
-    off = np.linalg.norm(ground - seen.targets, axis=1)
-    assert fix.by == "paper" and 1e-3 < np.median(off) < 10
-    assert np.isnan(covariance).all()
+    shown = look(4, n=6, errors=0)
+    degrees = (lonlat(shown.marks.east_north_m, TUCSON), TUCSON)
+    fix = fix_by_homography(1, shown.marks, SOLVER, degrees=degrees, paper=True)
+    ground, covariance = locate_pixels(fix, CAMERA, shown.targets_px, 1.0)
+    off = np.linalg.norm(ground - shown.targets, axis=1)
+    assert fix.by == "paper" and 1e-3 < np.median(off) < 10 and np.isnan(covariance).all()
 
 
 def test_the_covariance_of_rays_is_that_of_the_pose_and_of_the_pixel():
-    seen = look(6, errors=0, tilt_deg=30.0)
-    fix = Fix(1, "pose", seen.pose, np.diag([0.01, 0.02, 0.05, 1.0, 0.5, 2.0, 0.01]) ** 2)
-    _, covariance = locate_pixels(fix, CAMERA, seen.targets_px, 2.0)
-    columns = []
-    for step in 1e-5 * np.eye(7):
-        there, back = (
-            locate_pixels(replace(fix, pose=move_pose(seen.pose, sign * step)), CAMERA, seen.targets_px, 2.0)[0]
-            for sign in (1, -1)
-        )
-        columns.append((there - back) / 2e-5)
-    by_pose = np.stack(columns, axis=2)
-    columns = [
-        (locate_pixels(fix, CAMERA, seen.targets_px + step, 2.0)[0] - seen.targets) / 1e-3 for step in 1e-3 * np.eye(2)
-    ]
-    by_pixel = np.stack(columns, axis=2)
+    shown = look(6, errors=0, tilt_deg=30.0)
+    fix = Fix(1, "pose", shown.pose, np.diag([0.01, 0.02, 0.05, 1.0, 0.5, 2.0, 0.01]) ** 2)
+    place, by_pose, by_pixel = ground_with_slopes(shown.pose, CAMERA, shown.targets_px)
+    ground, covariance = locate_pixels(fix, CAMERA, shown.targets_px, 2.0)
     expected = by_pose @ fix.covariance @ by_pose.swapaxes(1, 2) + 4 * by_pixel @ by_pixel.swapaxes(1, 2)
-    assert np.allclose(covariance, expected, rtol=1e-3, atol=1e-6)
+    assert np.allclose(ground, shown.targets) and np.allclose(place, ground)
+    assert np.allclose(covariance, expected, rtol=1e-9)
 
 
 def test_rays_meet_a_slope_where_it_is():
-    seen = look(7, errors=0, tilt_deg=45.0)
+    shown = look(7, errors=0, tilt_deg=45.0)
 
     def slope(east_north_m):
         return 0.2 * east_north_m[:, 0] - 0.1 * east_north_m[:, 1]
 
     there = np.array([[3.0, 4.0], [-9.0, 2.0]])
-    pixels = project(np.c_[there, slope(there)], seen.pose, CAMERA)
-    ground, _ = locate_pixels(posed(seen), CAMERA, pixels, 1.0, surface=slope)
-    assert np.allclose(ground, there, atol=0.02)
-    nowhere, _ = locate_pixels(posed(seen), CAMERA, pixels, 1.0, surface=lambda p: np.full(len(p), np.nan))
+    pixels = project(np.c_[there, slope(there)], shown.pose, CAMERA)
+    assert np.allclose(locate_pixels(posed(shown), CAMERA, pixels, 1.0, surface=slope)[0], there, atol=0.02)
+    nowhere, _ = locate_pixels(posed(shown), CAMERA, pixels, 1.0, surface=lambda p: np.full(len(p), np.nan))
     assert np.isnan(nowhere).all()
 
 
 @pytest.mark.parametrize("paper", [False, True])
 def test_landmarks_on_one_line_or_in_one_spot_are_refused_in_words(paper):
-    seen = look(1, n=5)
-    row = replace(seen.marks, east_north_m=np.outer(np.arange(5), [3.0, 4.0]))
-    spot = replace(seen.marks, image_px=np.tile(seen.marks.image_px[:1], (5, 1)))
-    for marks, words in ((row, "stand on one line"), (spot, "show in one spot of the picture")):
-        fix = fix_by_homography(7, marks, SOLVER, paper=paper)
+    marks = look(1, n=5).marks
+    row = replace(marks, east_north_m=np.outer(np.arange(5), [3.0, 4.0]))
+    spot = replace(marks, image_px=np.tile(marks.image_px[:1], (5, 1)))
+    for wrong, words in ((row, "stand on one line"), (spot, "show in one spot of the picture")):
+        fix = fix_by_homography(7, wrong, SOLVER, paper=paper)
         assert fix.by == "" and f"the 5 landmarks of frame 7 {words}" in fix.cause
 
 
-def test_landmarks_nearer_to_a_line_than_their_places_are_known_are_refused():
+def test_landmarks_too_few_or_nearer_to_a_line_than_their_places_are_known_are_refused():
     row = np.array([[-25.0, 0.0], [-8.0, 1.0], [8.0, 0.0], [25.0, 1.0]])
     assert "for how well they are known" in fix_by_homography(1, look(1, places=row, errors=0).marks, SOLVER).cause
     assert fix_by_homography(1, look(1, places=row, errors=0, sigma_m=0.0, pixel_sigma=0.1).marks, SOLVER).by
-
-
-def test_three_of_four_on_a_line_are_refused():
     corner = np.array([[-20.0, 0.0], [0.0, 0.0], [20.0, 0.0], [0.0, 20.0]])
     assert fix_by_homography(1, look(1, places=corner, errors=0).marks, SOLVER).by == ""
-
-
-def test_too_few_landmarks_are_refused_with_how_many_are_missing_and_where():
     fix = fix_by_homography(17, look(1, n=3).marks, SOLVER)
     assert fix.by == "" and fix.cause == "frame 17 has 3 landmarks, 1 missing of the 4 that are needed"
     assert np.isnan(locate_pixels(fix, CAMERA, np.zeros((2, 2)), 1.0)[0]).all()

@@ -1,4 +1,4 @@
-"""The likeliest pose: exact on exact data, honest about its errors, at home with telemetry that says little."""
+"""The likeliest pose and the test of landmarks against telemetry: swaps and outliers are found and repaired."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,13 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.airborne import CAMERA, look, ring
+from tests.airborne import CAMERA, GPS_M, look, ring
 from torchvision_dddas.config import AerialParameters
+from torchvision_dddas.geo.landmark_faults import check_landmarks
 from torchvision_dddas.geo.pose_estimation import find_pose, focal_prior, independent_expectation, pose_prior
+from torchvision_dddas.types import Camera, LandmarkObservations
 
-KNOBS = AerialParameters()
+PARAMETERS = AerialParameters()
 NAN = float("nan")
-SAYS_NOT: dict[str, dict[str, Any]] = {
+NAMES = ("red", "green", "blue", "white", "black", "pink")
+LACKING: dict[str, dict[str, Any]] = {
     "nothing": {},
     "heading": {"heading_rad": NAN},
     "place": {"place": (NAN, NAN)},
@@ -22,9 +25,9 @@ SAYS_NOT: dict[str, dict[str, Any]] = {
 }
 
 
-def solved(seen, flight, used=None, camera=CAMERA):
-    prior = pose_prior(flight, camera, KNOBS) or focal_prior(camera, KNOBS)
-    return find_pose(seen.marks, camera, independent_expectation(prior, seen.marks.sigma_m), used)
+def solved(seen, flight, camera=CAMERA):
+    prior = pose_prior(flight, camera, PARAMETERS) or focal_prior(camera, PARAMETERS)
+    return find_pose(seen.marks, camera, independent_expectation(prior, seen.marks.sigma_m))
 
 
 def same(found, pose):
@@ -34,10 +37,17 @@ def same(found, pose):
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 45.0])
-@pytest.mark.parametrize("says_not", SAYS_NOT)
-def test_exact_data_give_the_exact_pose_whatever_the_telemetry_leaves_out(says_not, tilt_deg):
+@pytest.mark.parametrize("lacking", LACKING.values(), ids=LACKING)
+def test_exact_data_give_the_exact_pose_whatever_the_telemetry_leaves_out(lacking, tilt_deg):
     seen = look(1, n=5, tilt_deg=tilt_deg, errors=0)
-    same(solved(seen, replace(seen.flight, **SAYS_NOT[says_not])), seen.pose)
+    same(solved(seen, replace(seen.flight, **lacking)), seen.pose)
+
+
+def test_the_field_of_view_of_the_telemetry_gives_the_focal_length():
+    seen = look(1, n=5, errors=0)
+    found = solved(seen, replace(seen.flight, hfov_rad=2 * np.arctan(960 / CAMERA.focal_px[0])))
+    same(found, seen.pose)
+    assert found.covariance[6, 6] <= PARAMETERS.focal_sigma**2
 
 
 def test_a_bent_lens_is_allowed_for():
@@ -56,9 +66,7 @@ def test_the_true_pose_lies_where_the_covariance_says(case):
         found = solved(seen, seen.flight)
         turn = seen.pose.axes @ found.pose.axes.T
         off = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-        off = np.concatenate(
-            [off, seen.pose.place_m - found.pose.place_m, [np.log(seen.pose.focal / found.pose.focal)]]
-        )
+        off = np.r_[off, seen.pose.place_m - found.pose.place_m, np.log(seen.pose.focal / found.pose.focal)]
         distance.append(off @ np.linalg.solve(found.covariance[:7, :7], off))
     assert 5.2 < np.mean(distance) < 8.8
 
@@ -74,5 +82,81 @@ def test_with_no_landmark_the_pose_is_that_of_the_telemetry():
 
 def test_landmarks_that_no_camera_up_there_can_see_have_no_pose():
     seen = look(8, n=3)
-    up = replace(seen.flight, pitch_rad=-1.5)
-    assert solved(seen, up) is None
+    assert solved(seen, replace(seen.flight, pitch_rad=-1.5)) is None
+
+
+# The test of landmarks.
+
+
+def checked(seen, marks, telemetry=True, camera=CAMERA):
+    bare = independent_expectation(focal_prior(camera, PARAMETERS), marks.sigma_m)
+    prior = pose_prior(seen.flight, camera, PARAMETERS) if telemetry else None
+    expected = bare if prior is None else independent_expectation(prior, marks.sigma_m)
+    alone = bare if telemetry else None
+    return check_landmarks(marks, camera, expected, PARAMETERS.gate_probability, NAMES[: len(marks)], alone)
+
+
+def with_pixels_of(marks, order):
+    return replace(marks, image_px=marks.image_px[order])
+
+
+def moved_away(marks, row, by_m):
+    return replace(marks, east_north_m=marks.east_north_m + np.eye(len(marks))[:, row : row + 1] * by_m)
+
+
+@pytest.mark.parametrize("altitude_m", [50.0, 200.0])
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2)])
+def test_two_swapped_identities_are_found_and_swapped_back(pair, altitude_m):
+    order = np.arange(4)
+    order[list(pair)] = pair[::-1]
+    for seed in range(15):
+        seen = look(seed, altitude_m=altitude_m)
+        right, repaired = checked(seen, seen.marks), checked(seen, with_pixels_of(seen.marks, order))
+        assert repaired.order.tolist() == order.tolist()
+        assert np.allclose(right.solution.pose.place_m, repaired.solution.pose.place_m, atol=1e-2)
+    assert repaired.changes[0].startswith(f"identities of {NAMES[pair[0]]} and {NAMES[pair[1]]} swapped back (chi-sq")
+    assert [repaired.state[row] for row in pair] == ["reassigned", "reassigned"]
+
+
+def test_identities_that_went_round_are_put_back():
+    for seed in range(15):
+        seen = look(seed, n=6)
+        repaired = checked(seen, with_pixels_of(seen.marks, np.roll(np.arange(6), 1)))
+        assert repaired.order.tolist() == np.roll(np.arange(6), -1).tolist()
+    assert repaired.changes[0].startswith("identities reassigned")
+
+
+@pytest.mark.parametrize("n", [4, 6])
+def test_a_place_far_off_is_left_out_and_said_so(n):
+    for seed in range(15):
+        seen = look(seed, n=n)
+        check = checked(seen, moved_away(seen.marks, 2, [15.0, -12.0]))
+        assert check.state == tuple("excluded" if row == 2 else "used" for row in range(n))
+    assert check.changes[0].startswith("blue left out: not where it is expected (chi-square")
+
+
+def test_without_telemetry_six_landmarks_tell_which_is_off():
+    seen = look(2, n=6)
+    check = checked(seen, moved_away(seen.marks, 4, [60.0, 40.0]), telemetry=False)
+    assert check.used.tolist() == [True, True, True, True, False, True]
+
+
+def test_landmarks_that_agree_overrule_a_telemetry_that_does_not():
+    seen = look(3, n=6, sigma_m=0.05)
+    astray = replace(seen, flight=replace(seen.flight, place=(500.0, -400.0), altitude_m=20.0))
+    check = checked(astray, seen.marks)
+    assert check.alone and check.passed and check.used.all()
+    assert np.allclose(check.solution.pose.place_m, seen.pose.place_m, atol=0.5)
+    assert "telemetry left out: the 6 landmarks agree with one another, not with it" in check.changes[0]
+
+
+@pytest.mark.parametrize("turn", [1, 3, 5])
+def test_without_telemetry_four_of_six_landmarks_whose_names_are_all_wrong_are_not_believed(turn):
+    places = np.array([[10.3, -5.1], [9.5, 11.7], [1.9, 13.4], [-12.9, 5.4], [-9.5, -6.8], [4.7, -12.2]])
+    pixels = np.array([[1179, 500], [966, 221], [850, 284], [636, 619], [843, 790], [1173, 703.0]])
+    camera, rows = Camera("above", (1920, 1080), (1371.0, 1371.0), (959.5, 539.5)), np.arange(6)
+    marks = LandmarkObservations(
+        rows, np.roll(pixels, turn, axis=0), places, np.full(6, GPS_M), np.ones(6), np.zeros(6)
+    )
+    check = checked(None, marks, telemetry=False, camera=camera)
+    assert not check.passed and "no change explains it" in check.cause

@@ -1,4 +1,4 @@
-"""Ranging from one look: exact on exact boxes, honest about its errors, careful with what a box does not show."""
+"""Ranging by a camera on the ground and its calibration: exact on exact boxes, with errors as large as stated."""
 
 from dataclasses import replace
 
@@ -8,6 +8,7 @@ import pytest
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.camera_calibration import calibrate_focal_length, calibrate_pose
 from torchvision_dddas.geo.ranging import range_people, touches_border
 
 PEOPLE = np.array([[0.0, 8.0], [2.5, 12.0], [-3.0, 20.0], [1.0, 30.0]])
@@ -69,6 +70,15 @@ def test_paper_mode_is_eq_13_to_15_as_printed():
     assert np.isnan(found.covariance_m2).all()
 
 
+def with_noise(box, rng, parameters):
+    """Boxes with errors of their edges as the parameters have them."""
+    n, tall = len(box), box[:, 3].copy()
+    row, top = (np.hypot(sigma * tall, 0.5) for sigma in (parameters.feet_sigma, parameters.height_sigma))
+    feet, height = box[:, 1] + tall + rng.normal(0, 1, n) * row, tall + rng.normal(0, 1, n) * top
+    left = box[:, 0] + rng.normal(0, 1, n) * row
+    return np.stack([left, feet - height, box[:, 2], height], axis=1)
+
+
 COLUMNS = {
     "heading": (2, lambda cam, s: replace(cam, heading_rad=cam.heading_rad + s * cam.heading_sigma_rad)),
     "pitch": (3, lambda cam, s: replace(cam, pitch_rad=cam.pitch_rad + s * cam.pitch_sigma_rad)),
@@ -94,28 +104,19 @@ def test_95_percent_ellipses_hold_93_to_97_percent(use, distance, pitch):
     rng, n = np.random.default_rng(4), 1500
     cam, parameters = camera(pitch_rad=pitch, heading_rad=0.7), GroundParameters(use=use)
     person = distance * np.array([[np.sin(0.9), np.cos(0.9)]])
-    box = np.concatenate(
-        [
-            boxes(
-                person,
-                parameters.body_height_m + rng.normal(0, parameters.body_height_sigma_m),
-                replace(
-                    cam,
-                    heading_rad=0.7 + rng.normal(0, cam.heading_sigma_rad),
-                    pitch_rad=pitch + rng.normal(0, cam.pitch_sigma_rad),
-                    height_m=1.2 + rng.normal(0, cam.height_sigma_m),
-                    focal_px=(1000 * (1 + rng.normal(0, cam.focal_sigma)),) * 2,
-                ),
-                rng.normal(0, cam.position_sigma_m, 2),
-            )
-            for _ in range(n)
-        ]
-    )
-    tall = box[:, 3].copy()
-    feet = box[:, 1] + tall + rng.normal(0, 1, n) * np.hypot(parameters.feet_sigma * tall, 0.5)
-    box[:, 0] += rng.normal(0, 1, n) * np.hypot(parameters.feet_sigma * tall, 0.5)
-    box[:, 3] += rng.normal(0, 1, n) * np.hypot(parameters.height_sigma * tall, 0.5)
-    box[:, 1] = feet - box[:, 3]
+
+    def one_box():
+        true = replace(
+            cam,
+            heading_rad=0.7 + rng.normal(0, cam.heading_sigma_rad),
+            pitch_rad=pitch + rng.normal(0, cam.pitch_sigma_rad),
+            height_m=1.2 + rng.normal(0, cam.height_sigma_m),
+            focal_px=(1000 * (1 + rng.normal(0, cam.focal_sigma)),) * 2,
+        )
+        tall = parameters.body_height_m + rng.normal(0, parameters.body_height_sigma_m)
+        return boxes(person, tall, true, rng.normal(0, cam.position_sigma_m, 2))
+
+    box = with_noise(np.concatenate([one_box() for _ in range(n)]), rng, parameters)
     found = seen(box, cam, use=use)
     off = found.east_north_m - person
     inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance_m2), off) < 5.991
@@ -137,3 +138,58 @@ def test_without_a_camera_height_there_is_the_body_height_alone():
     assert np.allclose(found.east_north_m, PEOPLE) and np.isfinite(found.covariance_m2).all()
     with pytest.raises(InputError, match=r"has no height_m; ground\.use = feet needs"):
         seen(boxes(PEOPLE, 1.75, camera()), cam, use="feet")
+
+
+# Calibration.
+
+
+def crowd(cam, rng, n=300, noise=0.03, scatter=0.08):
+    people = np.stack([rng.uniform(-4, 4, n), rng.uniform(8, 30, n)], axis=1)
+    box = boxes(people, rng.normal(1.75, scatter, n), cam)
+    grown = box[:, 3] * rng.normal(1, noise, n)
+    box[:, 1] += box[:, 3] - grown
+    box[:, 3] = grown
+    return box
+
+
+def test_exact_people_tell_it_exactly():
+    box = crowd(camera(height_m=3.0, pitch_rad=0.1), np.random.default_rng(0), n=40, noise=0, scatter=0)
+    found = calibrate_pose(box, camera(), 1.75, 0.05)
+    assert found.height_m == pytest.approx(3.0, abs=1e-4)
+    assert found.pitch_rad == pytest.approx(0.1, abs=1e-5)
+
+
+def test_people_in_one_row_do_not_tell():
+    rng = np.random.default_rng(0)
+    box = np.stack([rng.uniform(0, 1000, 100), np.zeros(100), np.full(100, 40.0), rng.normal(100, 8, 100)], axis=1)
+    box[:, 1] = rng.normal(500, 3, 100) - box[:, 3]
+    with pytest.raises(InputError, match="which does not tell how the camera stands"):
+        calibrate_pose(box, camera(), 1.75, 0.05)
+
+
+def test_boxes_where_the_lens_shows_nothing_are_left_out_and_said():
+    box = crowd(camera(height_m=3.0, pitch_rad=0.1), np.random.default_rng(0), n=40)
+    with pytest.raises(InputError, match="where the lens shows nothing: check k1 and k2"):
+        calibrate_pose(box, replace(camera(), k1=-10.0), 1.75, 0.05)
+
+
+def test_an_outlier_is_said_and_not_used():
+    height = np.array([180.0, 181.0, 179.0, 120.0, 180.0])
+    found = calibrate_focal_length(np.full(5, 10.0), height, 1.8)
+    assert found.outlier.tolist() == [False, False, False, True, False]
+    assert found.focal_px == pytest.approx(1000)
+    assert found.spread_px == pytest.approx(1000 * np.std([180, 181, 179, 180], ddof=1) / 180)
+
+
+@pytest.mark.parametrize(
+    ("distance", "height", "body", "words"),
+    [
+        ([], [], 1.8, "no measurement to calibrate by"),
+        ([0.0], [100.0], 1.8, "a distance of 0 will not do"),
+        ([5.0], [np.nan], 1.8, "a height in pixels of nan will not do"),
+        ([5.0], [100.0], -1.8, r"a body height of -1\.8 will not do"),
+    ],
+)
+def test_what_cannot_calibrate_is_named(distance, height, body, words):
+    with pytest.raises(InputError, match=words):
+        calibrate_focal_length(np.array(distance), np.array(height), body)
