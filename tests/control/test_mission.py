@@ -21,14 +21,14 @@ LOST = {"what": "ugv_lost", "time_s": 0.5, "seconds": 9.0, "vehicle": 2}
 
 @dataclass
 class Flight:
-    """What came of a run."""
+    """What came of a run: results, commands, notices by frame, true places of the ground vehicles by frame."""
 
     source: SimulatorSource
     mission: Mission
-    surveyed: list[FrameResult] = field(default_factory=list)
+    results: list[FrameResult] = field(default_factory=list)
     steered: list[Command] = field(default_factory=list)
     noticed: list[tuple[int, str]] = field(default_factory=list)
-    places: dict[int, np.ndarray] = field(default_factory=dict)  # true ones of the ground vehicles, by frame
+    places: dict[int, np.ndarray] = field(default_factory=dict)
 
 
 OFTEN = ("steering.picture_s=0.5", "steering.sampling=false")
@@ -44,26 +44,24 @@ def world(seconds=6.0, **tables):
 def fly(overrides=(), seconds=6.0, **tables) -> Flight:
     """Fly a small scenario in the closed loop."""
     scenario = world(seconds, **tables)
-    simulated = SimulatorSource(scenario)
-    steered, steer = [], simulated.steer
-
-    def told(command):
-        steered.append(command)
-        steer(command)
-
-    simulated.steer = told  # type: ignore[method-assign]
-    settings = load_config("patrol", [*overrides])
+    simulated, steered = SimulatorSource(scenario), []
+    steer = simulated.steer
+    simulated.steer = lambda command: (steered.append(command), steer(command))  # type: ignore[method-assign]
     source = StartedSource(simulated)
-    mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
+    mission = build_mission(
+        source, load_config("patrol", [*overrides]), "onboard", scenario.clip.located_by == "landmarks"
+    )
     flown = Flight(simulated, mission, steered=steered)
     engine = load_engine("onboard", mission.settings)
-    pipeline = Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)
-    for surveyed in pipeline(source):
-        flown.surveyed.append(surveyed)
+    for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(source):
+        flown.results.append(result)
         flown.noticed += [(notice.frame, notice.text) for notice in mission.notices()]
-        for truth in simulated.truths():
-            flown.places[truth.frame] = truth.bodies.place_m[truth.bodies.kind == "ugv"]
+        flown.places |= own_places(simulated)
     return flown
+
+
+def own_places(source):
+    return {truth.frame: truth.bodies.place_m[truth.bodies.kind == "ugv"] for truth in source.truths()}
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +70,10 @@ def flown():
 
 
 def test_what_is_found_reaches_the_source_as_commands(flown):
-    commands = [s.command for s in flown.surveyed]
+    commands = [result.command for result in flown.results]
     # One comes before there is anything to be found: how often to look.
     assert all(one is other for one, other in zip(flown.steered[1:], commands, strict=True))
     last = commands[-1]
-    assert last is not None
-    assert last.look_at is not None
     assert {order.vehicle for order in last.orders} <= {"ugv1", "ugv2", "ugv3", "ugv4"}
     # Degrees near the world's origin, not metres.
     assert np.abs(np.asarray(last.look_at) - flown.source.origin_deg).max() < 0.001
@@ -88,36 +84,26 @@ def test_commands_move_the_ground_vehicles(flown):
     alone = SimulatorSource(world(fault=(FROZEN, DROPPED, LOST)))
     planned: dict[int, np.ndarray] = {}
     for _ in alone:
-        planned |= {truth.frame: truth.bodies.place_m[truth.bodies.kind == "ugv"] for truth in alone.truths()}
+        planned |= own_places(alone)
     assert np.abs(planned[2] - flown.places[2]).max() < 1e-9
     assert np.abs(planned[30] - flown.places[30]).max() > 0.3
 
 
-def test_reports_are_taken_as_they_come(flown):
-    landmarks = flown.mission.watch.locator.site.landmarks
-    told = landmarks.frame[~landmarks.planned]
-    assert told.max() == 30
-    assert not landmarks.geographic
-    telemetry = flown.mission.watch.locator.site.telemetry
-    assert telemetry is not None
-    assert telemetry.time_s[-1] == pytest.approx(5.8)
-
-
-def test_targets_are_judged_by_what_ground_vehicles_saw(flown):
-    judged = [s.confirmed for s in flown.surveyed]
-    assert all(c is not None for c in judged)
-    assert any(by for c in judged if c is not None for by in c.seen_by)
+def test_reports_are_taken_as_they_come_and_targets_are_judged_by_what_ground_vehicles_saw(flown):
+    site = flown.mission.watch.locator.site
+    assert site.landmarks.frame[~site.landmarks.planned].max() == 30 and not site.landmarks.geographic
+    assert site.telemetry.time_s[-1] == pytest.approx(5.8)
+    assert any(by for result in flown.results for by in result.confirmed.seen_by)
 
 
 def test_places_are_those_of_the_world(flown):
     """The crowd walks eastward about the middle: what is found of it is near."""
-    places = np.concatenate([s.locations.positions.east_north_m for s in flown.surveyed if s.locations is not None])
+    places = np.concatenate([r.locations.positions.east_north_m for r in flown.results if r.locations is not None])
     assert len(places) > 20
-    origin = flown.mission.watch.locator.site.origin_deg
-    assert origin is not None
-    here = geometry.east_north(geometry.lonlat(places, origin), flown.source.origin_deg)
-    away = np.linalg.norm(here - (-1.0, 0.0), axis=1)
-    assert np.median(away) < 3.0
+    here = geometry.east_north(
+        geometry.lonlat(places, flown.mission.watch.locator.site.origin_deg), flown.source.origin_deg
+    )
+    assert np.median(np.linalg.norm(here - (-1.0, 0.0), axis=1)) < 3.0
 
 
 def test_what_goes_wrong_is_noticed(flown):
@@ -130,23 +116,21 @@ def test_what_goes_wrong_is_noticed(flown):
 
 
 def test_dropped_frames_are_scenes_without_targets(flown):
-    lost = [s.tracked for s in flown.surveyed if "could not be read" in s.tracked.cause]
+    lost = [r.tracked for r in flown.results if "could not be read" in r.tracked.cause]
     assert [f.number for f in lost] == [17, 18]
 
 
 @pytest.mark.slow
 def test_frames_left_out_on_purpose_leave_no_empty_scenes():
     flown = fly(("steering.sampling=true", "steering.sampling_share=2.0"), 3.0, clip={"rate_hz": 10.0})
-    numbers = [s.tracked.number for s in flown.surveyed]
-    assert numbers[0] == 1
-    assert max(np.diff(numbers)) > 1
-    assert len(numbers) < 25
-    assert not [s.tracked.cause for s in flown.surveyed if "could not be read" in s.tracked.cause]
+    numbers = [r.tracked.number for r in flown.results]
+    assert numbers[0] == 1 and max(np.diff(numbers)) > 1 and len(numbers) < 25
+    assert not [r.tracked.cause for r in flown.results if "could not be read" in r.tracked.cause]
     assert numbers == sorted(flown.places)
 
 
 @pytest.mark.slow
 def test_without_ground_vehicles_telemetry_lays_the_pictures_on_the_ground():
     flown = fly((), 1.0, team={"ugvs": 0}, clip={"located_by": "telemetry"})
-    assert {s.locations.fix.by for s in flown.surveyed if s.locations is not None} == {"telemetry"}
+    assert {r.locations.fix.by for r in flown.results if r.locations is not None} == {"telemetry"}
     assert flown.mission.watch.locator.site.origin_deg == flown.source.origin_deg

@@ -31,11 +31,8 @@ def test_between_two_looks_no_target_moves_by_more_than_half_its_size():
 
 @pytest.mark.parametrize(("wanted", "every"), [(0.0, 1), (3.2, 3), (1e30, 6)])
 def test_the_sampling_is_rounded_and_bounded_and_its_change_recorded(wanted, every):
-    new, made = sampled(5, 1, wanted, "altitude 50 m", EVERY)
-    assert new == every
-    assert [(a.frame, a.parameter, a.old, a.new, a.cause) for a in made] == (
-        [] if every == 1 else [(5, "sampling.every", 1, every, "altitude 50 m")]
-    )
+    record = (Adjustment(5, SAMPLING, 1, every, "altitude 50 m"),)
+    assert sampled(5, 1, wanted, "altitude 50 m", EVERY) == (every, record if every > 1 else ())
 
 
 # -- a run that must keep up with a camera -----------------------------------------------------------------------------
@@ -82,16 +79,13 @@ def test_keypoints_are_halved_to_the_least_then_the_search_narrows_then_pictures
 def test_too_long_a_look_is_shed_until_it_fits_and_no_further():
     now, moved, _ = driven(36, 200)
     assert [(a.parameter, a.old, a.new) for a in moved] == [("registration.keypoints", 400, 200)]
-    assert "36 ms" in moved[0].cause
-    assert "90%" in moved[0].cause
-    assert now.rung == 1
+    assert "36 ms" in moved[0].cause and "90%" in moved[0].cause and now.rung == 1
 
 
 def test_more_is_looked_at_again_after_calm_s_with_time_to_spare_and_not_before():
     busy, _, end_s = driven(36, 20)
     early, moved, _ = driven(15, 124, busy, end_s)
-    assert early.rung == busy.rung
-    assert not moved
+    assert early.rung == busy.rung and not moved
     calm, moved, _ = driven(15, 130, busy, end_s)
     assert calm.rung == 0
     assert [(a.parameter, a.old, a.new) for a in moved] == [("registration.keypoints", 200, 400)]

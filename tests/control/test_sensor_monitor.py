@@ -9,27 +9,19 @@ from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 RATE_HZ = 10.0
 
 
-def reports(rows, names=("ugv1", "ugv2")):
+def reports(rows):
     """rows: (frame, which, east, north) or with planned."""
     table = np.array([(*row, 0)[:5] for row in rows], float).reshape(-1, 5)
-    count = len(table)
+    n = len(table)
+    which, nowhere, sigma = table[:, 1].astype(np.int64), np.full((n, 2), np.nan), np.full(n, 0.1)
     return Landmarks(
-        names,
-        table[:, 0],
-        table[:, 1].astype(np.int64),
-        np.full((count, 2), np.nan),
-        table[:, 2:4],
-        np.full(count, 0.1),
-        table[:, 4] == 1,
-        np.arange(count),
-        False,
+        ("ugv1", "ugv2"), table[:, 0], which, nowhere, table[:, 2:4], sigma, table[:, 4] == 1, np.arange(n), False
     )
 
 
 def telemetry(times):
-    times = np.asarray(times, float)
     nothing = np.full(len(times), np.nan)
-    return Telemetry(times, nothing, nothing, np.zeros((len(times), 2)))
+    return Telemetry(np.asarray(times, float), nothing, nothing, np.zeros((len(times), 2)))
 
 
 def standing(until, which=(0, 1)):
@@ -99,6 +91,5 @@ def test_pictures_that_repeat_are_told_at_the_first_and_counted_at_the_end():
 def test_a_sudden_motion_of_the_picture_is_told_and_a_steady_one_is_not(sign):
     assert film([3.0 * sign] * 20) == []
     assert film([k * 0.2 * sign for k in range(40)]) == []
-    (jerk,) = film([0.5] * 12 + [sign * 6.5] * 8)
-    assert jerk[0] == 13
-    assert "jerks" in jerk[1]
+    ((frame, text),) = film([0.5] * 12 + [sign * 6.5] * 8)
+    assert frame == 13 and "jerks" in text

@@ -17,7 +17,7 @@ from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.types import Detections, Elevation, Flight, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Detections, Elevation, Frame, Registration, Scene, Telemetry
 
 
 def hill(east_north):
@@ -55,12 +55,8 @@ def prepared(tmp_path):
 
 def errors(flight, found):
     """(N,) metres from the truth, of all frames."""
-    return np.concatenate(
-        [
-            np.linalg.norm(g.positions.east_north_m - flight.targets(g.frame)[g.positions.target - 1], axis=1)
-            for g in found
-        ]
-    )
+    off = [g.positions.east_north_m - flight.targets(g.frame)[g.positions.target - 1] for g in found]
+    return np.linalg.norm(np.concatenate(off), axis=1)
 
 
 def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(prepared):
@@ -77,26 +73,19 @@ def test_heights_above_sea_will_do_where_the_ground_is_known(prepared):
     flight = Overflight(ground=hill, geographic=False)
     locator, _ = prepared(flight, raster(hill, base=1300.0))
     flown = locator.site.telemetry
-    assert flown is not None
     height = np.array([flight.vehicle(frame)[2] for frame in flight.numbers()]) + 1300.0
     unknown = np.full(len(flown), np.nan)
     locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=unknown, above_sea_m=height))
-    at = locator.telemetry_at(0.0)
-    assert at is not None
-    assert at.altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
+    assert locator.telemetry_at(0.0).altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
 
 
 def test_an_altitude_below_the_ground_counts_as_unknown(prepared):
     locator, _ = prepared(Overflight(geographic=False))
     flown = locator.site.telemetry
-    assert flown is not None
     sunk = np.where(flown.time_s < 0.35, -2.0, flown.altitude_m)
     locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=sunk))
-    before, after = locator.telemetry_at(0.0), locator.telemetry_at(0.8)
-    assert isinstance(before, Flight)
-    assert isinstance(after, Flight)
-    assert np.isnan(before.altitude_m)
-    assert after.altitude_m == pytest.approx(50.0)
+    assert np.isnan(locator.telemetry_at(0.0).altitude_m)
+    assert locator.telemetry_at(0.8).altitude_m == pytest.approx(50.0)
 
 
 def test_a_landmark_where_the_raster_has_no_height_is_not_used(prepared):
@@ -134,34 +123,6 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert camera.centre_px == (499.5, 299.5)
 
 
-@pytest.mark.slow
-def test_colours_lead_to_the_same_places_as_the_tables_pixels(prepared, tmp_path):
-    flight = Overflight(frames=3, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
-    (tmp_path / "colours.toml").write_text(COLOURS_TOML)
-    colours = read_colours(tmp_path / "colours.toml")
-    locator, _ = prepared(flight, pictured=False)
-    watch = LandmarkWatch(locator, colours, load_colours("onboard"))
-    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
-        found = watch.update(scene(frame, picture, flight.shown(frame, flight.marks(frame))[:1]))
-        assert found.sighted_by[0] == "motion" or found.sighted_by[0] == "colour"
-        np.testing.assert_allclose(found.fixed.marks.image_px, flight.shown(frame, flight.marks(frame)), atol=1.0)
-        # The landmark's blob is gone from the targets, and the mask counts on.
-        assert len(found.scene.detections) == 1
-        assert found.scene.mask.max() == 1
-
-
-def scene(frame, picture, landmark_px):
-    """With a blob at a landmark and one elsewhere."""
-    height, width = picture.shape[:2]
-    mask = np.zeros((height, width), np.uint16)
-    boxes = [[*np.rint(landmark_px[0] - 13), 27, 27], [300, 30, 20, 20]]
-    for value, (x, y, w, h) in enumerate(np.array(boxes, int), 1):
-        mask[y : y + h, x : x + w] = value
-    unknown = np.full(2, np.nan)
-    found = Detections(np.array(boxes, float), np.ones(2), np.array([729.0, 400]), unknown, unknown)
-    return Scene(Frame(frame, (frame - 1) / 10, picture), mask, found, 1)
-
-
 def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prepared):
     locator, table = prepared(Overflight(landmarks=3, geographic=False), telemetry=False)
     with pytest.raises(InputError, match="frame 1 has 3, none more: 1 missing"):
@@ -192,15 +153,55 @@ def test_places_over_the_date_line_are_near_each_other(prepared):
     assert np.abs(moved.landmarks.place).max() < 100
 
 
-def test_a_blob_off_its_landmark_gives_way_to_the_colour_where_the_frame_before_tells(prepared, tmp_path):
+def scene(frame, picture, landmark_px):
+    """With a blob at a landmark and one elsewhere."""
+    mask = np.zeros(picture.shape[:2], np.uint16)
+    boxes = np.array([[*np.rint(landmark_px - 13), 27, 27], [300, 30, 20, 20]])
+    for value, (x, y, w, h) in enumerate(boxes.astype(int), 1):
+        mask[y : y + h, x : x + w] = value
+    found = Detections(boxes, np.ones(2), np.array([729.0, 400]), *np.full((2, 2), np.nan))
+    return Scene(
+        Frame(frame, (frame - 1) / 10, picture), mask, found, 1, step=Registration(np.eye(3), 100, 100, 0.1, 0.0)
+    )
+
+
+def test_colours_lead_to_the_tables_pixels_and_a_blob_off_its_landmark_gives_way_to_the_colour(prepared, tmp_path):
     flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
     locator, _ = prepared(flight, pictured=False)
     watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
-    still = Registration(np.eye(3), 100, 100, 0.1, 0.0)
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
         truth = flight.shown(frame, flight.marks(frame))
-        beside = truth[:1] + np.array([[9.0 if frame == 4 else 0.0, 0.0]])
-        found = watch.update(replace(scene(frame, picture, beside), step=still))
-        np.testing.assert_allclose(found.fixed.marks.image_px[0], truth[0], atol=1.0)
+        found = watch.update(scene(frame, picture, truth[0] + (9.0 * (frame == 4), 0.0)))
+        np.testing.assert_allclose(found.fixed.marks.image_px, truth, atol=1.0)
+        if frame < 4:
+            # The landmark's blob is gone from the targets, and the mask counts on.
+            assert len(found.scene.detections) == found.scene.mask.max() == 1
     assert found.sighted_by[0] == "colour"
+
+
+def test_a_tables_pixels_remove_the_smallest_box_about_each_landmark_from_the_targets(prepared):
+    flight = Overflight(frames=1, geographic=False)
+    locator, _ = prepared(flight)
+    truth = flight.shown(1, flight.marks(1))
+    found = LandmarkWatch(locator, None, None).update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
+    assert found.sighted_by == ("table",) * len(truth)
+    assert found.scene.detections.box_px.tolist() == [[300, 30, 20, 20]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"telemetry": None, "landmarks": None}, "got neither"),
+        ({"altitude_m": np.full(9, -1.0)}, "at or below ground throughout"),
+        ({"pitch_rad": np.full(9, -1.0)}, "looks into the sky"),
+        ({"geographic": True}, "the landmarks are in local metres, the telemetry in longitude and latitude"),
+        ({"place": np.full((9, 2), 3e5)}, "km or more from the landmarks"),
+    ],
+)
+def test_a_site_whose_parts_contradict_each_other_is_refused(prepared, change, words):
+    locator, _ = prepared(Overflight(frames=9, geographic=False))
+    site = locator.site
+    telemetry = None if "telemetry" in change else replace(site.telemetry, **change)
+    with pytest.raises(InputError, match=words):
+        build_site(change.get("landmarks", site.landmarks), telemetry)

@@ -1,19 +1,21 @@
 """Graphs are opened where they are what their manifest lists, and refused in one line where they are not."""
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import torchvision_dddas
-from torchvision_dddas import runtime as graphs
+from torchvision_dddas import runtime
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import plane_homography
-from torchvision_dddas.people import onnx_scorer as onboard_people
+from torchvision_dddas.people.onnx_scorer import OnnxScorer
 from torchvision_dddas.runtime import MANIFEST, SHIPPED, manifest, opened, seal, verified
 from torchvision_dddas.types import LinearSvm
 
@@ -41,25 +43,17 @@ def refusal(folder: Path, name: str = NAME) -> str:
     return str(caught.value)
 
 
-def test_the_manifest_lists_every_shipped_graph_and_nothing_else():
-    listed = manifest(SHIPPED)["graphs"]
-    assert set(listed) == {path.name for path in SHIPPED.glob("*.onnx")}
-    assert all(verified(SHIPPED, name) == (SHIPPED / name).read_bytes() for name in listed)
-
-
-def test_the_manifest_says_what_a_graph_takes_and_gives_as_the_runtime_sees_it():
-    for name, held in manifest(SHIPPED)["graphs"].items():
+def test_the_manifest_lists_every_shipped_graph_as_the_runtime_sees_it_and_as_it_was_compared_with_torch():
+    held = manifest(SHIPPED)
+    assert held["package"] == torchvision_dddas.__version__
+    assert set(held["graphs"]) == {path.name for path in SHIPPED.glob("*.onnx")}
+    for name, entry in held["graphs"].items():
+        assert verified(SHIPPED, name) == (SHIPPED / name).read_bytes()
         session = opened(SHIPPED, name)
         for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
             assert [(v.name, v.type, v.shape) for v in found] == [
-                (value, f"tensor({entry['type']})", entry["shape"]) for value, entry in held[side].items()
+                (value, f"tensor({listed['type']})", listed["shape"]) for value, listed in entry[side].items()
             ]
-
-
-def test_every_shipped_graph_was_compared_with_torch_and_is_of_this_version():
-    held = manifest(SHIPPED)
-    assert held["package"] == torchvision_dddas.__version__
-    for entry in held["graphs"].values():
         assert entry["checks"] and all(check["off"] <= check["limit"] for check in entry["checks"])
         assert {"torch", "onnx", "onnxruntime"} == set(entry["versions"])
 
@@ -118,8 +112,6 @@ def test_graphs_of_another_version_and_absent_files_are_named_in_one_line(folder
 
 def test_a_graph_that_the_runtime_refuses_is_one_line(folder: Path):
     """Listed and whole, but of no use to this runtime."""
-    import hashlib
-
     content = b"no graph at all"
     (folder / NAME).write_bytes(content)
     digest = hashlib.sha256(content).hexdigest()
@@ -130,20 +122,15 @@ def test_a_graph_that_the_runtime_refuses_is_one_line(folder: Path):
 def test_both_onboard_back_ends_refuse_tampered_graphs(folder: Path, monkeypatch):
     for name in (NAME, "people_scores.onnx"):
         (folder / name).write_bytes((folder / name).read_bytes() + b"\0")
+    nothing = LinearSvm(np.zeros(PeopleParameters().features, np.float32), 0.0, "none")
     with pytest.raises(InputError, match=r"people_scores.onnx is not the graph"):
-        onboard_people.OnnxScorer(PeopleParameters(graphs=str(folder)), LinearSvm(_nothing(), 0.0, "none"))
+        OnnxScorer(PeopleParameters(graphs=str(folder)), nothing)
     monkeypatch.setattr(plane_homography, "SHIPPED", folder)
     with pytest.raises(InputError, match=r"homography.onnx is not the graph"):
         plane_homography.open_graph.__wrapped__("homography")
 
 
 def test_shipped_graphs_that_are_damaged_ask_for_a_new_installation(folder: Path, monkeypatch):
-    monkeypatch.setattr(graphs, "SHIPPED", folder)
+    monkeypatch.setattr(runtime, "SHIPPED", folder)
     (folder / NAME).write_bytes(b"")
     assert "install torchvision-dddas anew" in refusal(folder)
-
-
-def _nothing() -> Any:
-    import numpy as np
-
-    return np.zeros(PeopleParameters().features, np.float32)
