@@ -44,9 +44,14 @@ def world(seconds=6.0, **tables):
 def fly(overrides=(), seconds=6.0, **tables) -> Flight:
     """Fly a small scenario in the closed loop."""
     scenario = world(seconds, **tables)
-    simulated, steered = SimulatorSource(scenario), []
-    steer = simulated.steer
-    simulated.steer = lambda command: (steered.append(command), steer(command))  # type: ignore[method-assign]
+    simulated = SimulatorSource(scenario)
+    steered, steer = [], simulated.steer
+
+    def record(command):
+        steered.append(command)
+        steer(command)
+
+    simulated.steer = record  # type: ignore[method-assign]
     source = StartedSource(simulated)
     mission = build_mission(
         source, load_config("patrol", [*overrides]), "onboard", scenario.clip.located_by == "landmarks"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,8 +90,8 @@ def step_to(place: np.ndarray, goal: np.ndarray, speed_m_s: float) -> np.ndarray
 class World:
     """A toy: targets walk, the aerial vehicle and the ground vehicles go where they are asked, frames settle late."""
 
-    targets: np.ndarray
-    velocity: np.ndarray | float = 0.0
+    start: Any
+    pace: Any = 0.0
     kinds: tuple[str | float, ...] = ()
     team: np.ndarray = field(default_factory=SQUARE.copy)
     altitude_m: float = 50.0
@@ -98,12 +99,12 @@ class World:
     hidden: Callable[[float], bool] = lambda now_s: False
     reporting: slice | list[int] = field(default_factory=lambda: slice(None))
     silent: bool = False
-    steering: Steering | None = None
+    parameters: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.targets = np.array(self.targets, float)
-        self.velocity = np.broadcast_to(np.array(self.velocity, float), self.targets.shape)
-        self.steering = self.steering or steering(len(self.team))
+        self.targets = np.array(self.start, float)
+        self.velocity = np.broadcast_to(np.array(self.pace, float), self.targets.shape)
+        self.steering = steering(len(self.team), **self.parameters)
         self.now_s, self.looked, self.rng = 0.0, np.zeros(2), np.random.default_rng(7)
         self.commands: list[Command] = []
         self.made: list[Adjustment] = []
@@ -288,7 +289,7 @@ def sampled_by(targets, velocity=0.0, speed_m_s=0.5, misses=(), step=None):
     """`every` after each frame, and the adjustments, for a flight over targets that stand or walk."""
     one, every, made = steering(rate_hz=SAMPLED_HZ, sampling=True), [], []
     for frame in range(1, 110):
-        here = [] if frame in misses else np.array(targets, float) + np.array(velocity) * frame / SAMPLED_HZ
+        here = np.array(targets, float)[: 0 if frame in misses else None] + np.array(velocity) * frame / SAMPLED_HZ
         seen, flight = located(frame, here, velocity, rate_hz=SAMPLED_HZ), flown(pose_at((0, 0)), speed_m_s)
         command, new = one.update(seen, None, frame / SAMPLED_HZ + 1, team_at(SQUARE), flight, step)
         every.append(command.every)
@@ -312,7 +313,7 @@ def test_while_a_target_is_lost_or_the_registration_weak_every_frame_is_processe
 
 def test_each_part_can_be_left_as_planned():
     def after(**parameters):
-        return World([[0, 5]], (1.4, 0), ("unseen",), steering=steering(**parameters)).run(8).commands[-1]
+        return World([[0, 5]], (1.4, 0), ("unseen",), parameters=parameters).run(8).commands[-1]
 
     command = after(sampling=False)
     assert command.every == 1 and command.look_at is not None and command.orders

@@ -32,6 +32,7 @@ def test_the_first_frame_is_that_of_a_single_picture():
     assert np.allclose(alone.pose.place_m, first.pose.place_m, atol=1e-6)
     assert np.allclose(alone.covariance, first.covariance, rtol=1e-6)
     prior = pose_prior(seen.flight, CAMERA, Settings().aerial)
+    assert prior is not None
     remembered = BiasFilter().at(0.0, prior, seen.marks, 20.0).expected(prior, seen.marks)
     assert np.allclose(remembered.information, independent_expectation(prior, seen.marks.sigma_m).information)
 
@@ -48,7 +49,7 @@ def test_few_landmarks_leave_the_rest_to_the_telemetry_and_none_leave_all():
 def test_a_gap_is_named_and_no_place_invented():
     seen, one = look(8), georeferencer()
     assert one.update(16, 0.0, seen.flight, seen.marks).by == "pose"
-    gap = one.update(17, 0.1, None, seen.marks[[0, 1, 3]])
+    gap = one.update(17, 0.1, None, seen.marks[np.array([0, 1, 3])])
     assert gap.by == "" and gap.pose is None
     assert gap.cause == "frame 17 has 3 landmarks and no telemetry, 1 missing of the 4 that are needed"
     assert one.update(18, 0.2, seen.flight, seen.marks).by == "pose"
