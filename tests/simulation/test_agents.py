@@ -320,7 +320,7 @@ def test_any_rate_of_frames_is_possible(rate_hz):
 
 def faulty(what, **more):
     fault = {"what": what, "time_s": 2.0, "seconds": 1.5, "vehicle": 2} | more
-    quiet = {"crowd": (), "car": (), "happening": (), "gps": {}}
+    quiet: dict = {"crowd": (), "car": (), "happening": (), "gps": {}}
     return moments(busy(fault=(fault,), team={"patrol": "along"}, **quiet), 60)
 
 

@@ -43,6 +43,7 @@ def look(world, now):
 
 def test_a_picture_comes_with_the_camera_that_the_vehicle_reports(bare):
     picture = GroundCamera(bare, SMALL).take(moment((0, 8)), 0)
+    assert picture is not None
     camera = picture.camera
     assert (picture.vehicle, picture.frame, picture.image.shape) == ("ugv1", 1, (240, 320, 3))
     assert (camera.size_px, camera.geographic, camera.place) == ((320, 240), True, (-110.95, 31.6))

@@ -1,4 +1,4 @@
-"""The team of UGVs, its receivers and colours, the UAV and the camera's sensor: motion within limits, errors as asked."""
+"""The team of UGVs, its receivers and colours, the UAV, and the camera's sensor: within their limits and errors."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -141,7 +141,7 @@ def test_plates_keep_their_colours_in_shade_noise_and_compression(light):
         picture[16:32, 16:32] = bgr[k] * light
         noisy = (picture + rng.normal(0, 5, picture.shape)).clip(0, 255).astype(np.uint8)
         coded = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-        hsv = cv2.cvtColor(cv2.imdecode(coded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2HSV).reshape(-1, 3)
+        hsv = cv2.cvtColor(np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)), cv2.COLOR_BGR2HSV).reshape(-1, 3)
         found = in_ranges(hsv, colours).reshape(48, 48, 12)
         assert found[17:31, 17:31, k].mean() > 0.9
         assert np.delete(found[16:32, 16:32], k, axis=2).any(axis=2).mean() < 0.1

@@ -9,27 +9,21 @@ from torchvision_dddas.simulation import WorldParameters, build_world
 from torchvision_dddas.simulation.world import shadow_above_ground, sun_direction
 from torchvision_dddas.types import Elevation, Ortho
 
-KNOBS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
+PARAMETERS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
 BARE = WorldParameters(side_m=60, bushes_per_ha=0, trees_per_ha=0, buildings=0, relief_m=0)
 
 
 @pytest.fixture(scope="module")
 def world():
-    return build_world(KNOBS, seed=3)
+    return build_world(PARAMETERS, seed=3)
 
 
-def texel_of(world, east_north_m):
-    """(row, column) of places in the texture."""
-    half = world.side_m / 2
-    places = np.asarray(east_north_m)
-    return (
-        np.clip((half - places[..., 1]) / world.texel_m, 0, len(world.albedo) - 1).astype(int),
-        np.clip((places[..., 0] + half) / world.texel_m, 0, len(world.albedo) - 1).astype(int),
-    )
+def bare(**changed):
+    return BARE.model_copy(update=changed)
 
 
 def test_same_seed_gives_the_same_world_and_another_seed_another(world):
-    again, other = build_world(KNOBS, seed=3), build_world(KNOBS, seed=4)
+    again, other = build_world(PARAMETERS, seed=3), build_world(PARAMETERS, seed=4)
     assert np.array_equal(world.albedo, again.albedo)
     assert np.array_equal(world.surface, again.surface)
     assert np.array_equal(world.relief.up_m, again.relief.up_m)
@@ -37,7 +31,7 @@ def test_same_seed_gives_the_same_world_and_another_seed_another(world):
     assert not np.array_equal(world.relief.up_m, other.relief.up_m)
 
 
-@pytest.mark.parametrize("parameters", [KNOBS, BARE])
+@pytest.mark.parametrize("parameters", [PARAMETERS, BARE])
 def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, parameters):
     whole = build_world(parameters, seed=3).albedo.astype(int)
     monkeypatch.setattr("torchvision_dddas.simulation.world._AT_ONCE", 72 * 600)
@@ -48,7 +42,7 @@ def test_the_texture_does_not_depend_on_the_bands_it_is_made_in(monkeypatch, par
 
 
 def test_height_is_bilinear_and_mirrored_at_the_edges():
-    hilly = build_world(BARE.model_copy(update={"relief_m": 5.0}), seed=1)
+    hilly = build_world(bare(relief_m=5.0), seed=1)
     relief = hilly.relief
     nodes = np.array(relief.corner_m) + relief.step_m * np.array([[3, 5], [4, 5], [3, 6], [4, 6]])
     heights = relief.up_m[[5, 5, 6, 6], [3, 4, 3, 4]]
@@ -69,43 +63,38 @@ def test_a_given_elevation_replaces_the_hills():
     assert made.relief.base_m == pytest.approx(1207, abs=1e-3)
 
 
-@pytest.mark.parametrize("hole", [False, True])
-def test_an_elevation_that_does_not_cover_the_world_is_refused(hole):
+@pytest.mark.parametrize(("west_m", "hole", "share"), [(0.0, slice(0), "5[01]"), (-60.0, slice(20, 24), "9[0-9]")])
+def test_an_elevation_that_does_not_cover_the_world_is_refused(west_m, hole, share):
     up_m = np.zeros((41, 41))
-    if hole:
-        up_m[20:24, 20:24] = np.nan
-    given = Elevation(up_m, (-60.0, -60.0) if hole else (0.0, -60.0), 3.0)
-    share = "9[0-9]" if hole else "5[01]"
+    up_m[hole, hole] = np.nan
     with pytest.raises(InputError, match=rf"covers {share} % of the world: it has heights from .* m east"):
-        build_world(BARE, seed=0, elevation=given)
+        build_world(BARE, seed=0, elevation=Elevation(up_m, (west_m, -60.0), 3.0))
 
 
-def test_a_world_of_too_many_pixels_is_refused_with_the_texel_that_would_do():
-    parameters = BARE.model_copy(update={"side_m": 4000.0})
+def test_a_world_of_too_many_pixels_is_refused_with_the_texel_that_is_possible():
     with pytest.raises(InputError, match=r"40000 of them .* set world.texel_m to 0.334 or more"):
-        build_world(parameters, seed=0)
+        build_world(bare(side_m=4000.0), seed=0)
 
 
 def test_things_stand_where_the_list_says_and_nowhere_else(world):
-    assert set(world.things.kind) == {"bush", "tree", "building"}
-    texel = world.surface_texel_m
+    things, texel = world.things, world.surface_texel_m
+    assert set(things.kind) == {"bush", "tree", "building"}
     middle = (np.arange(world.surface.shape[0]) + 0.5) * texel - world.side_m / 2
-    apart = [np.hypot(middle[None] - east, -middle[:, None] - north) for east, north in world.things.east_north_m]
-    reach = np.min([d - r for d, r in zip(apart, world.things.radius_m, strict=True)], axis=0)
+    apart = [np.hypot(middle[None] - east, -middle[:, None] - north) for east, north in things.east_north_m]
+    reach = np.min([d - r for d, r in zip(apart, things.radius_m, strict=True)], axis=0)
     assert not world.surface[reach > 2 * texel].any()
-    for distance, radius, height in zip(apart, world.things.radius_m, world.things.height_m, strict=True):
+    for distance, radius, height in zip(apart, things.radius_m, things.height_m, strict=True):
         # The smallest bushes are but a few pixels, which level their tops.
         assert world.surface[distance < radius].max() > (0.55 if radius > 0.8 else 0.25) * height
-    assert world.surface.max() <= world.things.height_m.max()
-    assert np.abs(world.things.east_north_m).max() < world.side_m / 2
+    assert world.surface.max() <= things.height_m.max()
+    assert np.abs(things.east_north_m).max() < world.side_m / 2
 
 
 def test_nothing_stands_near_the_places_kept_clear():
-    dense = KNOBS.model_copy(update={"bushes_per_ha": 800.0})
     places = np.array([[0.0, 0.0], [12.0, -9.0], [-20, 15]])
     for keep_clear, near in ((None, True), ((places, 4.0), False)):
-        made = build_world(dense, seed=2, keep_clear=keep_clear)
-        apart = np.hypot(*(made.things.east_north_m[:, None] - places).T) - made.things.radius_m
+        things = build_world(bare(bushes_per_ha=800.0), seed=2, keep_clear=keep_clear).things
+        apart = np.hypot(*(things.east_north_m[:, None] - places).T) - things.radius_m
         assert (apart.min() < 4) == near
 
 
@@ -116,35 +105,34 @@ def test_shadows_fall_away_from_the_sun_as_long_as_it_is_low(azimuth_deg):
     heights[79:82, 79:82] = 5  # a pole in pixels of 0.25 m
     over = shadow_above_ground(heights, 0.25, to_sun)
     way = -to_sun[:2] / np.hypot(*to_sun[:2])
-    length = 5 / np.tan(np.radians(40))
+    metres = np.array([0.5, 0.85, 1.15, -0.5]) * 5 / np.tan(np.radians(40))
+    half, most, beyond, before = over[
+        np.round(80 - metres * way[1] / 0.25).astype(int), np.round(80 + metres * way[0] / 0.25).astype(int)
+    ]
+    assert half == pytest.approx(2.5, abs=0.4)
+    assert most > 0
+    assert max(beyond, before) < 0
 
-    def at(metres):
-        return over[round(80 - metres * way[1] / 0.25), round(80 + metres * way[0] / 0.25)]
 
-    assert at(0.5 * length) == pytest.approx(2.5, abs=0.4)
-    assert at(0.85 * length) > 0
-    assert at(1.15 * length) < 0
-    assert at(-0.5 * length) < 0
+def test_no_shadow_falls_below_a_sun_overhead():
+    assert (shadow_above_ground(np.eye(4, dtype=np.float32), 0.25, np.array([0.0, 0, 1])) < 0).all()
 
 
 def test_ground_in_shadow_is_darker_and_bluer():
-    parameters = BARE.model_copy(update={"buildings": 1, "sun_height_deg": 30.0})
-    lit, shaded = build_world(BARE.model_copy(update={"sun_height_deg": 30.0}), seed=5), build_world(parameters, seed=5)
+    lit, shaded = (build_world(bare(sun_height_deg=30.0, buildings=count), seed=5) for count in (0, 1))
     (place,), (radius,), (height,) = shaded.things.east_north_m, shaded.things.radius_m, shaded.things.height_m
     assert height > 2
-    way = -lit.to_sun[:2] / np.hypot(*lit.to_sun[:2])
-    behind = place + (radius + np.arange(0.2, 0.6, 0.1))[:, None] * way
-    rows, columns = texel_of(lit, behind)
-    ratio = shaded.albedo[rows, columns] / np.maximum(lit.albedo[rows, columns], 1.0)
-    blue, _, red = ratio.mean(0)
+    behind = place - (radius + np.arange(0.2, 0.6, 0.1))[:, None] * lit.to_sun[:2] / np.hypot(*lit.to_sun[:2])
+    rows, columns = ((30 + sign * behind[:, axis]) / lit.texel_m for sign, axis in ((-1, 1), (1, 0)))
+    at = rows.astype(int), columns.astype(int)
+    blue, _, red = (shaded.albedo[at] / np.maximum(lit.albedo[at], 1.0)).mean(0)
     assert red < 0.6
     assert blue > red
 
 
 @pytest.mark.parametrize("width_m", [0.1, 0.35])
 def test_keypoints_are_found_everywhere(width_m):
-    made = build_world(BARE.model_copy(update={"side_m": 120.0}), seed=6)
-    grey = cv2.cvtColor(made.albedo, cv2.COLOR_BGR2GRAY)
+    grey = cv2.cvtColor(build_world(bare(side_m=120.0), seed=6).albedo, cv2.COLOR_BGR2GRAY)
     seen = cv2.resize(grey, None, fx=0.1 / width_m, fy=0.1 / width_m, interpolation=cv2.INTER_AREA)
     cell = 48
     for top in range(0, seen.shape[0] - cell, cell):
@@ -154,40 +142,36 @@ def test_keypoints_are_found_everywhere(width_m):
             assert (strength == cv2.dilate(strength, np.ones((11, 11))))[strength > 1e-3].sum() >= 3
 
 
-def photo_of(side_px, pixel_m, image=None):
-    """A photo about the origin, north up."""
-    if image is None:
-        image = np.random.default_rng(1).integers(60, 180, (side_px, side_px, 3), np.uint8)
-    first = pixel_m * (side_px - 1) / 2
-    return Ortho(image, np.array([[pixel_m, 0, -first], [0, -pixel_m, first]]))
+def photo_of(image):
+    """A photo in pixels of 0.1 m about the origin, north up."""
+    return Ortho(image, np.array([[0.1, 0, -29.95], [0, -0.1, 29.95]]))
 
 
-def test_a_photo_on_the_same_grid_is_the_texture():
-    photo = photo_of(600, 0.1)
-    assert np.array_equal(build_world(BARE, seed=0, photo=photo).albedo, photo.image)
+def test_a_photo_on_the_same_grid_is_the_texture_and_its_holes_are_filled_with_soil_of_its_colour():
+    image = np.random.default_rng(1).integers(60, 120, (600, 600, 3), np.uint8)
+    assert np.array_equal(build_world(BARE, seed=0, photo=photo_of(image)).albedo, image)
+    for empty in (255, 0):
+        image[:200] = empty
+        made = build_world(BARE, seed=0, photo=photo_of(image)).albedo
+        assert np.array_equal(made[220:], image[220:])
+        assert made[:190].mean() == pytest.approx(90, rel=0.25)
+        assert 20 < np.percentile(made[:190], 0.5) < np.percentile(made[:190], 99.5) < 200
+        assert made[:190].std() > 5
 
 
-def test_a_photo_turned_and_finer_lies_where_its_matrix_says():
-    image = np.full((1500, 1500, 3), 90, np.uint8)
-    cv2.circle(image, (950, 550), 20, (40, 60, 210), -1)
-    turn, pixel_m = np.radians(30), 0.08
+@pytest.mark.parametrize("pixel_m", [0.08, 0.4])
+def test_a_photo_turned_and_finer_or_coarser_lies_where_its_matrix_says(pixel_m):
+    side = round(120 / pixel_m)
+    image = np.full((side, side, 3), 90, np.uint8)
+    spot = round(0.63 * side), round(0.37 * side)
+    cv2.circle(image, spot, round(1.6 / pixel_m), (40, 60, 210), -1)
+    turn = np.radians(30)
     turned = pixel_m * np.array([[np.cos(turn), np.sin(turn)], [np.sin(turn), -np.cos(turn)]])
-    matrix = np.c_[turned, -turned @ [750, 750]]
+    matrix = np.c_[turned, -turned @ [side / 2, side / 2]]
     made = build_world(BARE, seed=0, photo=Ortho(image, matrix))
     rows, columns = np.nonzero(made.albedo[..., 2] > 150)
     east, north = (columns.mean() + 0.5) * 0.1 - 30, 30 - (rows.mean() + 0.5) * 0.1
-    assert (east, north) == pytest.approx(matrix @ [950, 550, 1], abs=0.05)
-
-
-@pytest.mark.parametrize("empty", [255, 0])
-def test_holes_of_a_photo_are_filled_with_soil_of_its_colour(empty):
-    image = np.random.default_rng(1).integers(60, 120, (600, 600, 3), np.uint8)
-    image[:200] = empty
-    made = build_world(BARE, seed=0, photo=photo_of(600, 0.1, image)).albedo
-    assert np.array_equal(made[220:], image[220:])
-    assert made[:190].mean() == pytest.approx(90, rel=0.25)
-    assert 20 < np.percentile(made[:190], 0.5) < np.percentile(made[:190], 99.5) < 200
-    assert made[:190].std() > 5
+    assert (east, north) == pytest.approx(matrix @ [*spot, 1], abs=0.05 if pixel_m < 0.1 else 0.2)
 
 
 def test_a_photo_of_elsewhere_is_refused():
