@@ -75,9 +75,6 @@ def pan(ground: np.ndarray, frames: int, size=SIZE, car: float | None = None) ->
     return images
 
 
-# -- what comes out --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("config", CONFIGS)
 def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(config, film):
     found = detect(frames_of(film.images), load_config(config))
@@ -136,9 +133,6 @@ def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
                 assert same(a, b), f"frame {t + 1} of {kept} kept"
 
 
-# -- light, cuts, bad frames -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("config", CONFIGS)
 def test_a_cut_gives_no_full_mask_and_is_not_looked_across(config, noise):
     one, two = pan(noise, 8, car=5.0), pan(255 - noise[::-1, ::-1], 8, car=5.0)
@@ -176,9 +170,6 @@ def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film
         scene = found[number - 1]
         assert (scene.reliable, scene.cause) == (False, "the frame could not be read")
         assert not scene.mask.any() and len(scene.detections) == 0
-
-
-# -- clips too short, telemetry --------------------------------------------------------------------------------------
 
 
 def flight(time_s, altitude_m=60.0, speed_m_s=5.0) -> Telemetry:
@@ -280,11 +271,3 @@ def test_three_frames_are_enough_and_fewer_are_refused_with_the_number_that_is_m
     for count, says in enumerate(("no frame", "1 frame ", "2 frames")):
         with pytest.raises(InputError, match=f"{says}.* {3 - count} missing"):
             detect(images[:count], load_config(config))
-
-
-@pytest.mark.parametrize("config", CONFIGS)
-def test_a_clip_of_blank_frames_is_unreliable_from_end_to_end(config):
-    found = detect(frames_of([np.zeros((67, 101, 3), np.uint8)] * 5), load_config(config))
-    assert [s.reliable for s in found] == [False] * 5
-    assert not any(s.mask.any() for s in found)
-    assert all(s.cause == "the picture is blank" for s in found)

@@ -96,16 +96,13 @@ def test_the_longer_side_and_the_speed_decide(box, velocity, passes):
     assert Gates(10.0, 200.0, 60.0).admit(box[0], box[1], np.array(velocity)) is passes
 
 
-@pytest.mark.parametrize(("altitude", "area"), [(50.0, 160), (10.0, 300), (500.0, 12)])
-def test_the_expected_size_sets_the_smallest_area_between_its_bounds(altitude, area):
-    """2 m at 1000 px focal length are 2000 / altitude px; a tenth of its square at 50 m is 160 px."""
-    assert settings_at(altitude, 10, BASE).settings.gates.min_area_px == area
-
-
-def test_the_small_path_is_on_while_targets_are_expected_to_fit_its_boxes():
-    assert settings_at(50.5, 10, BASE).settings.small.on
-    assert not settings_at(49.5, 10, BASE).settings.small.on
-    assert not settings_at(200.0, 10, with_parameters(BASE, {"small.on": False})).settings.small.on
+@pytest.mark.parametrize(
+    ("altitude", "area", "small"), [(50.5, 157, True), (49.5, 163, False), (10.0, 300, False), (500.0, 12, True)]
+)
+def test_the_expected_size_sets_the_smallest_area_between_its_bounds_and_switches_the_small_path(altitude, area, small):
+    """2 m at 1000 px focal length are 2000 / altitude px; the smallest area is a tenth of its square."""
+    settings = settings_at(altitude, 10, BASE).settings
+    assert (settings.gates.min_area_px, settings.small.on) == (area, small)
 
 
 def test_gaps_are_closed_in_metres_where_that_is_wanted_and_never_wider_than_in_pixels():

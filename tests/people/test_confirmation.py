@@ -57,14 +57,10 @@ def test_a_blob_behind_another_is_hidden_and_one_beside_it_is_not():
     assert seen([[0, 10]], [[0, 5]]).looked.tolist() == [False]
 
 
-def test_a_crowd_is_counted():
+def test_a_person_between_two_blobs_is_at_one_and_leaves_the_other_in_doubt_and_crowds_are_counted():
     people = [[0.2, 10], [-0.3, 10.1], [0.1, 9.8], [5, 12]]
     found = seen([[0, 10], [5, 12]], people, score=[0.6, 0.9, 0.7, 0.8])
-    assert found.people.tolist() == [3, 1]
-    assert found.best.tolist() == [0.9, 0.8]
-
-
-def test_a_person_between_two_blobs_is_at_one_and_leaves_the_other_in_doubt():
+    assert (found.people.tolist(), found.best.tolist()) == ([3, 1], [0.9, 0.8])
     found = seen([[0, 10], [0.8, 10]], [0.2, 10])
     assert (found.people.tolist(), found.looked.tolist()) == ([1, 0], [True, False])
 
@@ -109,6 +105,8 @@ def test_a_look_weighs_as_bayes_says():
     assert beliefs.probability("blob") == pytest.approx(0.25 * 0.8 / (0.25 * 0.8 + 0.75 * 0.1))
     assert evidence(one(True), parameters)[0] == pytest.approx(math.log(0.2 / 0.9))
     assert evidence(one(False), parameters)[0] == 0
+    beliefs.add(["other"], [("ugv", one(False))])
+    assert beliefs.kind("other") == "unseen" and beliefs.probability("other") == pytest.approx(0.25)
 
 
 def test_one_chance_hit_makes_no_crowd_of_a_car():
@@ -142,10 +140,3 @@ def test_nothing_to_compare_is_fine(which):
     assert len(seen(blobs, people).looked) == len(blobs)
     boxes = observe_picture(np.zeros((len(blobs), 4)), np.zeros((len(people), 4)), np.ones(len(people)), KNOBS)
     assert len(boxes.people) == len(blobs)
-
-
-def test_what_was_never_seen_keeps_the_prior_and_is_unseen():
-    beliefs = Beliefs(ConfirmParameters(prior=0.3))
-    beliefs.add(["blob"], [("ugv", one(False))])
-    assert beliefs.kind("blob") == "unseen"
-    assert beliefs.probability("blob") == pytest.approx(0.3)

@@ -1,4 +1,4 @@
-"""People in pictures and clips."""
+"""People in pictures and clips, and beside what moves in the scenes of a run."""
 
 from dataclasses import dataclass, field
 
@@ -8,8 +8,9 @@ import pytest
 
 from torchvision_dddas.config import PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.people.detector import UNREAD, PersonDetector, detect_in_clip, detect_people
-from torchvision_dddas.types import DetectionTable, Frame
+from torchvision_dddas.people.detector import UNREAD, PersonDetector, PersonTracker, detect_in_clip
+from torchvision_dddas.tracking import FrameTracker, track_scenes
+from torchvision_dddas.types import Detections, DetectionTable, Frame, Registration, Scene
 
 SIZE = (320, 240)
 
@@ -148,12 +149,6 @@ def test_what_is_no_picture_is_one_line(image, says):
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_of_pictures_at_hand_the_one_that_is_too_small_is_named():
-    images = [np.zeros((200, 100), np.uint8), np.zeros((20, 10), np.uint8)]
-    with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
-        detect_people(images, Brightest(), PeopleParameters())
-
-
 def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypatch):
     monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", lambda parameters, backend: Brightest())
     detector = PersonDetector()
@@ -162,10 +157,94 @@ def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypa
     assert len(both) == 2 and len(alone) == len(both[0]) == len(both[1])
     with pytest.raises(InputError, match="float64 pixels"):
         detector(np.zeros((160, 120)))
-    with pytest.raises(InputError, match="picture 1"):
-        detector(np.zeros((16, 12), np.uint8))
-
-
-def test_the_public_detector_refuses_an_unknown_backend():
+    with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
+        detector([picture, np.zeros((20, 10), np.uint8)])
+    monkeypatch.undo()
     with pytest.raises(InputError, match="no back end is named"):
         PersonDetector(backend="quantum")
+
+
+SETTINGS = Settings.model_validate({"people": {"search": "regions"}})
+STILL = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+
+
+def person_tracker(scorer, settings, interval, size):
+    return PersonTracker(scorer, settings, interval, size, FrameTracker(settings, interval, size, pictures=False))
+
+
+class Sure(Brightest):
+    """Certain enough for an identity."""
+
+    def _map(self, image, part):
+        return 5 * super()._map(image, part)
+
+
+def scenes(clip=None, interval=1):
+    for frame in clip or Clip():
+        yield Scene(frame, np.zeros(SIZE[::-1], np.uint16), Detections(), interval, step=STILL)
+
+
+def tracked(scenes, interval=1, settings=SETTINGS):
+    tracker = person_tracker(Sure(), settings, interval, SIZE)
+    for scene in scenes:
+        tracker.update(scene)
+    return tracker
+
+
+def test_one_who_walks_keeps_an_identity_and_each_frame_is_told_once():
+    tracker = tracked(scenes())
+    found = [tracker.people_of(number, True) for number in range(1, 13)]
+    assert [frame.number for frame in found] == list(range(1, 13))
+    assert all(frame.detections.kind == "person" for frame in found)
+    (identity,) = {name for frame in found for name in frame.tracks.identity.tolist()}
+    assert identity == 1
+    at = [frame.tracks.box_px[0, 0] for frame in found if len(frame.tracks)]
+    assert len(at) >= 10
+    assert at[-1] - at[0] > 20  # it went along
+    assert tracker.people_of(12, True) is None
+    assert tracked(scenes()).people_of(12, False) is None
+    of_third = tracked(scenes(), interval=3)
+    assert [number for number in range(1, 13) if of_third.people_of(number, True) is not None] == [1, 4, 7, 10]
+    with pytest.raises(InputError):
+        person_tracker(Brightest(), SETTINGS, 1, (40, 60))
+
+
+def test_people_settle_with_the_frames_of_what_moves():
+    tracker = person_tracker(Sure(), SETTINGS, 1, SIZE)
+
+    def seen():
+        for scene in scenes():
+            tracker.update(scene)
+            yield scene
+
+    settled = []
+    for frame in track_scenes(seen(), SETTINGS, 1, SIZE):
+        people = tracker.people_of(frame.number, False)
+        settled.append(people is not None)
+    # Only the frames that the end itself settles wait for it.
+    assert sum(settled) >= 6
+    assert settled == sorted(settled, reverse=True)
+
+
+def test_a_frame_that_could_not_be_read_has_nobody():
+    (scene,) = scenes(Clip(numbers=(1,)))
+    unread = Scene(scene.frame, scene.mask, scene.detections, 1, False, UNREAD)
+    tracker = person_tracker(Brightest(), SETTINGS, 1, SIZE)
+    tracker.update(unread)
+    people = tracker.people_of(1, True)
+    assert people is not None
+    assert len(people.detections) == 0
+
+
+def test_a_narrower_search_looks_at_less():
+    def windows(settings):
+        scorer = Brightest()
+        tracker = person_tracker(scorer, SETTINGS, 1, SIZE)
+        for scene in scenes():
+            if scene.frame.number == 3:
+                tracker.retune(settings)
+            tracker.update(scene)
+        return scorer.windows
+
+    narrow = Settings.model_validate({"people": {"search": "regions", "look_share": 0.05}})
+    assert windows(narrow) < windows(SETTINGS)

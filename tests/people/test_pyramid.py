@@ -10,7 +10,6 @@ from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.suppression import body_boxes
-from torchvision_dddas.types import Part
 
 SIZE = (180, 220)
 
@@ -114,15 +113,6 @@ def test_parts_hold_every_window_whose_body_lies_in_its_region_where_a_search_ev
     assert len(wanted) > 20
     assert wanted <= within
     assert len(within) < 0.5 * len(everywhere)
-
-
-def test_a_window_in_two_parts_is_found_once():
-    k = parameters()
-    parts = [Part(SIZE, 0, 0, 80, 136), Part(SIZE, 8, 0, 80, 136)]  # 3 x 2 windows each, 2 x 2 of them the same
-    maps = [np.arange(6, dtype=np.float32).reshape(2, 3) + 1, np.array([[2, 3, 9], [5, 6, 9]], np.float32)]
-    box, margin = pyramid.windows(parts, maps, SIZE, k)
-    assert margin.tolist() == [1, 2, 3, 4, 5, 6, 9, 9]
-    assert box[:3].tolist() == [[0, 0, 64, 128], [8, 0, 64, 128], [16, 0, 64, 128]]
 
 
 def test_no_part_is_made_for_bodies_that_the_pyramid_does_not_reach_or_regions_off_the_picture():

@@ -116,6 +116,8 @@ def test_people_come_best_first_with_a_probability_that_rises_with_the_score():
         )
         assert people.margin.tolist() == [2.0, 1.0, 0.5]
         assert (np.diff(people.score) < 0).all()
+        nobody = people_from_windows(window[:0], np.zeros(0), SIZE, parameters(suppression=suppression))
+        assert len(nobody) == 0 and nobody.box_px.shape == nobody.window_px.shape == (0, 4)
 
 
 @pytest.mark.parametrize(
@@ -134,11 +136,3 @@ def test_a_body_that_meets_the_border_is_flagged(box, cut):
     k = parameters()
     people = people_from_windows(around(np.array([box], float), k), np.array([1.0]), SIZE, k)
     assert people.cut.tolist() == [cut]
-
-
-def test_no_windows_show_nobody():
-    for suppression in ("nms", "opencv", "none"):
-        people = people_from_windows(np.zeros((0, 4)), np.zeros(0), SIZE, parameters(suppression=suppression))
-        assert len(people) == 0
-        assert people.box_px.shape == people.window_px.shape == (0, 4)
-        assert people.cut.dtype == bool

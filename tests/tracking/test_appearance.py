@@ -1,4 +1,4 @@
-"""Histograms of boxes, their similarity and score; association scores, the speed prior and the memory of tracks."""
+"""Association scores: histograms of boxes and their similarity; motion and size; the speed prior."""
 
 from dataclasses import replace
 
@@ -42,10 +42,6 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (200, 300, 3), np.uint8)
 
 
-def score_of(signature, other, visible, parameters):
-    return appearance_scores(similarity(signature, other), visible, parameters)
-
-
 def likeness(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.sqrt(one) @ np.sqrt(other))
 
@@ -54,41 +50,25 @@ BOX = (100, 40, 40, 120)
 BOXES = np.array([BOX, (10, 10, 20, 50), (200.4, 100.7, 30.2, 80.9), (150, 150, 3, 2)], float)
 
 
-def test_all_histograms_of_a_box_sum_to_one_together_and_none_is_negative():
-    found = strip_histograms(noise(), BOXES)
-    assert found.shape == (4, SIGNATURE) and found.dtype == np.float32
-    np.testing.assert_allclose(found.sum(axis=1), 1, rtol=1e-5)
-    assert (found >= 0).all()
-
-
-def test_the_likeness_of_a_target_to_itself_is_one_and_to_another_colour_less():
-    image = picture((BOX, RED, BLUE), ((200, 40, 40, 120), GREEN, BLUE), ((20, 40, 40, 120), RED, BLUE))
-    same, other, again = strip_histograms(image, np.array([BOX, (200, 40, 40, 120), (20, 40, 40, 120)], float))
-    assert likeness(same, same) == pytest.approx(1, abs=1e-5)
-    assert likeness(same, again) == pytest.approx(1, abs=1e-5)
-    assert likeness(same, other) < 0.8
-
-
 def test_a_box_outside_has_zeros_and_one_half_outside_has_its_inside():
     image = noise()
     outside = [(-50, 10, 40, 80), (300, 10, 40, 80), (10, -90, 40, 80), (10, 200, 40, 80)]
     found = strip_histograms(
         image, np.array([*outside, (-20, 40, 40, 120), (0, 150, 40, 120), (-100, -100, 600, 600)], float)
     )
-    assert not found[:4].any()
+    assert found.dtype == np.float32 and not found[:4].any() and (found >= 0).all()
     np.testing.assert_allclose(found[4:].sum(axis=1), 1, rtol=1e-5)
 
 
 def test_a_target_cut_off_by_the_border_still_looks_like_itself():
     """What is left of it is compared in its place in the whole box, not stretched to one."""
-    image = picture((BOX, RED, BLUE))
-    whole, cut = (
-        strip_histograms(image, np.array([BOX], float))[0],
-        strip_histograms(image[:, 115:], np.array([(-15, *BOX[1:])], float))[0],
-    )
+    image = picture((BOX, RED, BLUE), ((200, 40, 40, 120), GREEN, BLUE))
+    whole, other = strip_histograms(image, np.array([BOX, (200, 40, 40, 120)], float))
+    cut = strip_histograms(image[:, 115:], np.array([(-15, *BOX[1:])], float))[0]
     low = strip_histograms(image[:130], np.array([BOX], float))[0]
-    assert likeness(whole, cut) > 0.98
-    assert likeness(whole, low) > 0.98
+    assert likeness(whole, whole) == pytest.approx(1, abs=1e-5)
+    assert likeness(whole, cut) > 0.98 and likeness(whole, low) > 0.98
+    assert likeness(whole, other) < 0.8
 
 
 def test_a_grey_picture_is_one_without_colour():
@@ -110,24 +90,14 @@ def looks(count: int, seed: int = 0) -> np.ndarray:
     return some / some.sum(axis=1, keepdims=True)
 
 
-def test_the_same_look_scores_best_and_a_mixture_of_two_between_them():
+def test_a_similar_histogram_scores_more_the_more_of_the_target_is_seen_and_an_unknown_one_nothing():
     one, two = looks(2)
-    score = score_of(one[None], np.stack([one, (one + two) / 2, two]), np.ones(3), KNOBS)[0]
-    assert score[0] > score[1] > score[2]
-    assert score[0] == pytest.approx(KNOBS.appearance_weight * (1 - KNOBS.appearance_offset))
-
-
-def test_what_is_unknown_scores_nothing():
-    known = looks(2)
-    score = score_of(np.stack([known[0], UNKNOWN]), np.stack([UNKNOWN, known[1]]), np.ones(2), KNOBS)
-    assert score[0, 0] == score[1, 0] == score[1, 1] == 0
-    assert score[0, 1] != 0
-
-
-def test_the_less_of_a_target_is_seen_the_less_its_look_says():
-    one, two = looks(2)
-    score = score_of(one[None], np.tile(two, (3, 1)), np.array([1.0, 0.4, 0.0]), KNOBS)[0]
-    assert abs(score[0]) > abs(score[1]) > abs(score[2]) == 0
+    alike = similarity(np.stack([one, UNKNOWN]), np.stack([one, (one + two) / 2, two, two, two, UNKNOWN]))
+    score = appearance_scores(alike, np.array([1, 1, 1, 0.4, 0, 1]), KNOBS)
+    assert score[0, 0] == pytest.approx(KNOBS.appearance_weight * (1 - KNOBS.appearance_offset))
+    assert score[0, 0] > score[0, 1] > score[0, 2]
+    assert abs(score[0, 2]) > abs(score[0, 3]) > abs(score[0, 4]) == 0
+    assert score[0, 5] == 0 and not score[1].any()
 
 
 CLEAR, RIVALS = [[9.0, -90], [-90, 9.0]], [[9.0, 8.5], [-90, -90]]
@@ -138,10 +108,7 @@ def test_there_is_a_doubt_where_a_track_or_a_detection_has_two_likely_links():
     assert not is_ambiguous(np.array(CLEAR), known)
     assert is_ambiguous(np.array(RIVALS), known)
     assert is_ambiguous(np.array(RIVALS).T, known)
-
-
-def test_there_is_a_doubt_until_a_track_that_may_go_on_has_been_looked_at():
-    known = looks(2)
+    # Until a track that may go on has a histogram.
     assert is_ambiguous(np.array(CLEAR), known[:, :0])
     known[1] = 0
     assert is_ambiguous(np.array(CLEAR), known)
@@ -246,14 +213,6 @@ def learned(speed: float, interval: int = 5, looks: int = 40, start: float = 0.0
     for look in range(looks):
         pace.add(walkers(interval * look, speed), walkers(interval * (look + 1), speed), interval)
     return pace.speed
-
-
-def test_it_starts_as_told_and_learns_nothing_from_nothing():
-    pace = SpeedPrior(0.2)
-    for before, now in ((np.zeros((0, 4)), walkers(0, 0.1)), (walkers(0, 0.1), np.zeros((0, 4)))):
-        pace.add(before, now, 5)
-    pace.add(walkers(0, 0.1, 2), walkers(1, 0.1, 2), 1)
-    assert pace.speed == 0.2
 
 
 @pytest.mark.parametrize("speed", [0.02, 0.1, 0.3])

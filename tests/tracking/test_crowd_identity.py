@@ -43,12 +43,6 @@ def test_crowds_that_cross_keep_their_identities_whichever_track_goes_on(swapped
     assert shared and len({of_frame[0] for of_frame in shared}) == 1
 
 
-def test_crowds_that_join_for_good_have_one_identity():
-    apart = [[(1, -6 + 0.2 * k, 0, 2.0), (2, 6 - 0.2 * k, 0, 1.5)] for k in range(20)]
-    joined = [[(1 if k < 40 else 3, 0.05 * k, 0, 3.0)] for k in range(150)]
-    assert {of_frame[0] for of_frame in identities([*apart, *joined])[20:]} == {1}
-
-
 def test_a_crowd_that_was_missed_for_some_seconds_comes_back_under_its_identity_though_its_track_is_new():
     frames = [[(1 if k < 30 else 5, 0.2 * k, 0, 2.0)] for k in range(60)]
     frames[28:40] = [[]] * 12

@@ -121,14 +121,6 @@ def test_people_whose_ways_cross_keep_their_identities_at_a_low_frame_rate(seed,
     assert all(len(page) == 6 for page in found)
 
 
-def test_only_a_good_detection_begins_a_track_but_a_fair_one_may_go_on_with_it():
-    parameters = with_parameters(Settings(), {}).track
-    fair = (parameters.min_score + parameters.birth_score) / 2
-    assert not any(names(tracked([seen((300, 300), score=fair)] * 9)))
-    good_then_fair = [seen((300, 300), score=parameters.birth_score)] + [seen((300, 300), score=fair)] * 8
-    assert names(tracked(good_then_fair)) == [{0: 1}] * 9
-
-
 def test_who_left_the_picture_is_remembered_for_less_long_than_who_was_lost_inside():
     """One walks out at the side; one walks there too, but is lost so early that it may as well have turned."""
     for start, size, remembered in ((1060, SIZE, 0), (700, SIZE, 1), (1060, None, 1)):

@@ -1,4 +1,4 @@
-"""The source's three-frame tracker, what fails in it included."""
+"""The source's affinities, gate, dispersion and tracker, what fails in it included."""
 
 from collections.abc import Callable, Sequence
 from itertools import combinations, permutations
@@ -10,7 +10,18 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.config import PaperParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.tracking.source_tracker import Features, SourceTracker, assign, associate, gate
+from torchvision_dddas.tracking import source_tracker
+from torchvision_dddas.tracking.dual_ascent import assign_triplets
+from torchvision_dddas.tracking.source_tracker import (
+    Features,
+    SourceTracker,
+    assign,
+    associate,
+    frames_considered,
+    gate,
+    location_weight,
+    normalized_entropy,
+)
 from torchvision_dddas.types import Detections
 
 SIZE = (20.0, 40.0)
@@ -139,3 +150,72 @@ def test_gating_features_or_their_sum_by_hand():
         assert assign(three, None, 1.0, parameters(exact_targets=most, gate="off")).tolist() == [
             [k] * 3 for k in (1, 2, 3)
         ]
+
+
+def test_the_dummy_by_words_and_by_formula():
+    a, b, c = (np.array([row], float) for row in ([4, 1], [2, 3], [1, 5]))
+    words, formula = (
+        source_tracker.affinity([a, b, c], PaperParameters.model_validate({"dummy": d})) for d in ("zero", "formula")
+    )
+    assert words[1, 1, 1] == formula[1, 1, 1] == pytest.approx(7 / 14)
+    assert words.sum() == words[1, 1, 1]
+    # A vector of zeros adds nothing above and the other vector below the line: (2 + 1 + 0) / (4 + 3 + 5) and so on.
+    assert formula[1, 1, 0] == pytest.approx((2 + 1) / (4 + 3 + 5))
+    assert formula[0, 1, 1] == pytest.approx((1 + 3) / (5 + 2 + 5))
+    assert formula[1, 0, 1] == formula[0, 0, 0] == formula[0, 0, 1] == formula[0, 1, 0] == 0
+    assert not source_tracker.affinity([a, b], PaperParameters())[0].any()
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (3, 4, 2)])
+def test_off_raises_nothing_and_no_reading_touches_real_entries_or_the_dummies_own(shape):
+    score = np.pad(np.random.default_rng(0).random(shape) * 0.5, [(1, 0)] * len(shape))
+    np.testing.assert_array_equal(gate(score, 0.4, "off"), score)
+    for reading in ("one_dummy", "every_dummy"):
+        gated = gate(score, 0.4, reading)
+        inside = (slice(1, None),) * len(shape)
+        np.testing.assert_array_equal(gated[inside], score[inside])
+        assert gated[(0,) * len(shape)] == 0
+
+
+def test_to_the_letter_the_best_assignment_leaves_everybody_alone():
+    """Five targets that no one could mistake: each alone earns 0.6, three of them 1.8, their triplet at most 1."""
+    real = np.full((5, 5, 5), 0.1)
+    real[np.arange(5), np.arange(5), np.arange(5)] = 0.99
+    score = np.pad(real, 1)[:-1, :-1, :-1]
+    found = assign_triplets(gate(score, 0.4, "every_dummy"), gap=0.0, most_exact=None).triplets
+    assert (found > 0).sum(axis=1).tolist() == [1] * 15
+    right = assign_triplets(score, gap=0.0, most_exact=None).triplets
+    np.testing.assert_array_equal(right, np.repeat(np.arange(1, 6), 3).reshape(5, 3))
+
+
+@pytest.mark.parametrize(
+    ("cluster", "wanted"),
+    [
+        ([1, 2, 3, 4], 1.0),
+        ([1, 1, 1, 1], 0.0),
+        ([1, 1, 2, 2], 0.5),
+        ([1, 1, 1, 2], (0.75 * np.log2(4 / 3) + 0.25 * 2) / 2),
+        ([1], 1.0),
+        ([], 1.0),
+    ],
+)
+def test_normalized_entropy_by_hand(cluster, wanted):
+    assert normalized_entropy(np.array(cluster, int)) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(
+    ("location", "appearance", "weight"), [(0.9, None, 1.0), (0.65, 0.9, 0.0), (0.3, 0.65, 0.5), (0.0, 0.0, 0.5)]
+)
+def test_the_weight_rule(location, appearance, weight):
+    assert location_weight(location, never if appearance is None else lambda: appearance, 0.65) == (weight, appearance)
+
+
+def test_each_reading_of_the_window_is_its_own():
+    values, same, differ = [0.9, 0.4], [3, 3], [3, 4]
+    for reading, wanted in (
+        ("smallest", (0.4, 0.4)),
+        ("newest", (0.9, 0.9)),
+        ("smallest_if_counts_differ", (0.9, 0.4)),
+    ):
+        parameters = PaperParameters.model_validate({"dispersion_of": reading})
+        assert tuple(min(values[: frames_considered(counts, parameters)]) for counts in (same, differ)) == wanted

@@ -77,10 +77,8 @@ def test_only_the_frames_of_the_interval_are_looked_at(interval):
     wanted = list(range(1, 41, interval))
     table = table_of(walkers(range(1, 41)))
     clip = Clip()
-    for followed in (
-        list(track_table(table, SETTINGS, interval)),
-        list(track_clip(clip, table, load_engine("onboard", SETTINGS), SETTINGS, interval)),
-    ):
+    in_clip = track_clip(clip, table, load_engine("onboard", SETTINGS), SETTINGS, interval)
+    for followed in (list(track_table(table, SETTINGS, interval)), list(in_clip)):
         assert [f.number for f in followed if len(f.detections)] == wanted
         assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
     assert clip.given == len(wanted)
@@ -141,10 +139,6 @@ def test_steps_times_and_adjustments_between_the_frames_looked_at_are_kept():
     assert moves == [None, [-8, 2], [-6, 1.5], [-8, 2]]  # the step that is not known counts as none
     assert [len(f.adjustments) for f in followed] == [1, 4, 4, 4]
     assert [f.seconds["foreground"] for f in followed] == [0.5, 2, 2, 2]
-
-
-SETTINGS = load_config()
-SIZE = (320, 240)
 
 
 def crowd_table(frames, seed=0, score=1.0, people=4):
@@ -250,15 +244,6 @@ def test_the_public_tracker_gives_boxes_and_scores_the_identities_of_the_same_ta
     assert all(np.array_equal(one.box_px, other.box_px) for one, other in zip(found, wanted, strict=True))
 
 
-def test_detections_of_the_motion_detector_count_as_certain_and_keep_their_scores():
-    one = np.ones(1)
-    faint = [Detections(np.array([[10.0 + k, 20, 12, 40]]), 0.01 * one, one, one, one) for k in range(5)]
-    tracker = Tracker()
-    found = [tracks for detections in faint for tracks in tracker.update(detections)] + tracker.flush()
-    assert [t.identity.tolist() for t in found] == [[1]] * 5 and {float(t.score[0]) for t in found} == {0.01}
-    assert not any(len(t) for t in Tracker(motion=False).update(faint[0]) + Tracker(motion=False).flush())
-
-
 @pytest.mark.parametrize("mode", ["default", "paper"])
 def test_both_modes_follow_a_walker_with_pictures_and_settle_every_frame_once(mode):
     settings = load_config(overrides=[f"track.mode={mode}"])
@@ -289,14 +274,9 @@ def test_bad_input_of_the_public_tracker_is_refused_in_one_line(given, message):
     tracker.update(np.zeros((0, 4)), frame=3)
     with pytest.raises(InputError, match=message):
         tracker.update(**given)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"), [({"interval": 0}, "interval must be"), ({"size": (3, -1)}, "size must")]
-)
-def test_a_tracker_of_bad_settings_is_refused(given, message):
-    with pytest.raises(InputError, match=message):
-        Tracker(**given)
+    for name, bad in (("interval", 0), ("size", (3, -1))):
+        with pytest.raises(InputError, match=f"{name} must"):
+            Tracker(**{name: bad})
 
 
 def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
