@@ -144,9 +144,9 @@ def test_pairs_and_windows_at_once_give_what_one_at_a_time_gives() -> None:
     odd = Window(views[0], tuple(views[1:4]), np.stack(still[:3]), (1, 2, 3), ((0, 1),), (1, 2), (0, 2))
     asked = [window(views, still, at, [(at - 1, at + 1)], False) for at in (1, 2, 4)]
     asked.insert(1, odd)
-    for whole, one in zip(engine.foreground(asked), asked, strict=True):
-        (alone,) = engine.foreground([one])
+    for found, one in zip(engine.foreground(asked), asked, strict=True):
+        (single,) = engine.foreground([one])
         for name in ("core", "evidence", "wide", "texture"):
-            np.testing.assert_array_equal(getattr(whole, name), getattr(alone, name))
-        assert (whole.small is None) == (alone.small is None) == (one.small is None)
-        assert whole.offsets == alone.offsets
+            np.testing.assert_array_equal(getattr(found, name), getattr(single, name))
+        assert (found.small is None) == (single.small is None) == (one.small is None)
+        assert found.offsets == single.offsets

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,8 +40,8 @@ def coloured(*levels: int) -> Callable[[], np.ndarray]:
     return lambda: counts.reshape(-1, 768)
 
 
-def never() -> np.ndarray:
-    raise AssertionError("histograms were made")
+def never() -> Any:
+    raise AssertionError("appearance was computed")
 
 
 def parameters(**values: object) -> PaperParameters:

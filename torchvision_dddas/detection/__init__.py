@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from torchvision_dddas.detection.blobs import fill_hull
-from torchvision_dddas.detection.detector import Clip, MotionDetector, Retune, check_length, detect_motion, load_engine
+from torchvision_dddas.detection.detector import MotionDetector, Retune, check_length, detect_motion, load_engine
 from torchvision_dddas.detection.engine import (
     EVIDENCE_CAP,
     EVIDENCE_SCALE,
@@ -24,7 +24,6 @@ __all__ = [
     "EVIDENCE_CAP",
     "EVIDENCE_SCALE",
     "LAST_TOLERANCE",
-    "Clip",
     "Engine",
     "Foreground",
     "MotionDetector",

@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 
@@ -42,19 +41,8 @@ _JUDGED_FRAMES = 5  # that persistence uses: two before and two after the frame
 _TORCH_BATCH = 8
 
 
-class Clip(Protocol):
-    """A source of frames."""
-
-    @property
-    def rate_hz(self) -> float:
-        """Frames a second."""
-        ...
-
-    def __iter__(self) -> Iterator[Frame]: ...
-
-
 def detect_motion(
-    source: Clip | Iterable[Frame | np.ndarray],
+    source: Iterable[Frame | np.ndarray],
     settings: Settings | None = None,
     backend: str | Engine = "auto",
     telemetry: Telemetry | None = None,

@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -99,13 +100,5 @@ class TorchScorer:
 
 def layout(parameters: PeopleParameters) -> hog.Layout:
     """The descriptor of the settings. Raises InputError where they do not fit one another."""
-    return hog.Layout(
-        (parameters.window_width_px, parameters.window_height_px),
-        parameters.cell_px,
-        parameters.block_px,
-        parameters.block_stride_px,
-        parameters.bins,
-        parameters.signed,
-        parameters.clip,
-        parameters.gamma,
-    )
+    values: dict[str, Any] = parameters.descriptor
+    return hog.Layout(**values)
