@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from torchvision_dddas import detection, geometry
+from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import Engine, MotionDetector, Retune, detect_motion, load_engine
 from torchvision_dddas.errors import InputError
@@ -32,8 +32,15 @@ if TYPE_CHECKING:
     from torchvision_dddas.control import Mission
 
 
-class Clip(detection.Clip, Protocol):
+class Clip(Protocol):
     """A source of frames with a known size and rate."""
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second."""
+        ...
 
     @property
     def size(self) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """Moving targets from a moving camera: frames to targets. `MotionDetector` is the way in."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torchvision_dddas.detection.blobs import fill_hull
 from torchvision_dddas.detection.detector import MotionDetector, Retune, check_length, detect_motion, load_engine
@@ -46,10 +46,12 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    """The names of the torch engine, which is loaded when one of them is first used."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from torchvision_dddas.detection import torch_engine
+if not TYPE_CHECKING:  # it would hide wrong names from the type checker
 
-    return getattr(torch_engine, name)
+    def __getattr__(name):
+        """The names of the torch engine, which is loaded when one of them is first used."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from torchvision_dddas.detection import torch_engine
+
+        return getattr(torch_engine, name)
