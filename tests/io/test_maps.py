@@ -35,6 +35,9 @@ def test_no_positions_are_a_valid_map_and_local_metres_are_refused(make):
     assert make(tracks([]))
     with pytest.raises(ValueError, match="no longitude"):
         make(tracks(walk(origin=None)))
+    for unclocked in (tracks(walk(), **UNCLOCKED), tracks(walk(), timed=False)):
+        with pytest.raises(ValueError, match="no clock"):
+            cot(unclocked)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -66,7 +69,7 @@ def test_without_a_clock_times_are_seconds_and_without_any_there_are_none():
     assert not {"seconds", "times"} & one["properties"].keys()
 
 
-def test_ellipses_are_right_handed_polygons_of_95_percent_where_the_error_is_known():
+def test_ellipses_are_polygons_of_95_percent_where_the_error_is_known_and_landmarks_are_named():
     found = [f for f in features(tracks(walk()), ellipses=True) if "ellipse_of" in f["properties"]]
     assert [f["properties"]["frame"] for f in found if f["properties"]["ellipse_of"] == 2] == [1, 11, 21, 30]
     properties = found[-1]["properties"]
@@ -76,9 +79,6 @@ def test_ellipses_are_right_handed_polygons_of_95_percent_where_the_error_is_kno
     assert ring[0] == ring[-1] and signed_area(ring) > 0
     unknown = features(tracks(walk(covariance=np.full((2, 2), np.nan))), ellipses=True)
     assert len(unknown) == 2 and unknown[0]["properties"]["sigma_m"][0] is None
-
-
-def test_landmarks_are_named_points():
     mark = features(tracks(walk()), landmarks=tracks([positions(1, [[5, 5]], target=[3])]), names=NAMES)[-1]
     assert mark["properties"]["landmark"] == "delta & <co>" and mark["geometry"]["type"] == "Point"
 
@@ -94,12 +94,6 @@ def test_the_box_holds_all_places_also_over_180_degrees(origin):
             assert west <= longitude <= east if west <= east else longitude >= west or longitude <= east
     kinds = {feature["geometry"]["type"] for feature in found["features"]}
     assert any(kind.startswith("Multi") for kind in kinds) == (origin != ORIGIN)
-
-
-def test_at_a_pole_there_are_places_and_no_ellipses():
-    found = features(tracks(walk(origin=(0.0, 90.0))), ellipses=True)
-    assert all("target" in f["properties"] for f in found)
-    assert all(abs(v) <= 180 for f in found for p in places(f["geometry"]["coordinates"]) for v in p)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -214,12 +208,6 @@ def test_events_are_at_least_a_second_apart_and_valid_until_after_the_next():
         assert at == start and stale > at + 1
         times.setdefault(event.get("uid"), []).append(at)
     assert len(times) == 2 and all(np.diff(own).min() >= 0.999 and len(own) == 4 for own in times.values())
-
-
-@pytest.mark.parametrize("how", [UNCLOCKED, {"timed": False}])
-def test_events_need_a_clock(how):
-    with pytest.raises(ValueError, match="no clock"):
-        cot(tracks(walk(), **how))
 
 
 # --------------------------------------------------------------------------------------------------------------------

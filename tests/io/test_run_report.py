@@ -194,14 +194,10 @@ def test_gaps_are_shaded_and_unknown_values_are_not_drawn():
     svg = timeline.chart()
     assert svg.count('class="gap"') == 2 and "chi-squared" not in svg  # nothing was expected of the landmarks
     assert timeline["used"].tolist() == [4, 4, 4, 0, 0, 4]
-    assert np.isnan(timeline["sigma_m"]).tolist() == [False, False, False, True, True, False]
+    np.testing.assert_allclose(timeline["sigma_m"], np.sqrt(2) * np.array([1, 1, 1, np.nan, np.nan, 1]))
+    np.testing.assert_allclose(timeline["relative_m"], timeline["sigma_m"] / 2)
     dark = run(seconds=lambda number: {"a": 0.01}, causes=(4, 5, 6)).chart()
     assert dark.count('class="gap"') == 2  # of targets, and of the time spent
-
-
-def test_the_median_errors_are_those_of_the_targets():
-    timeline = located([grounded(1, covariance=[[9, 0], [0, 16]])])
-    assert timeline["sigma_m"][0] == 5 and timeline["relative_m"][0] == 2.5
 
 
 @pytest.mark.parametrize(("freedom", "limit"), [(1, 3.841), (2, 5.991), (12, 21.026)])
@@ -214,6 +210,8 @@ def test_a_parameter_holds_its_first_value_until_it_is_moved_and_each_new_one_fr
     timeline = run([(1, "a.b", np.inf, np.inf), (3, "a.b", np.inf, 7), (6, "a.b", 7, 5)])
     np.testing.assert_array_equal(timeline.parameter("a.b"), [np.nan, np.nan, 7, 7, 7, 5, 5, 5, 5, 5])
     points_inside(timeline.chart())
+    moves = [(k, "interval.frames", k % 5, (k + 1) % 5) for k in range(2, 600)]
+    assert len(run(moves, range(1, 601), events=[(k, f"event {k}") for k in range(600)]).chart()) < 300_000
 
 
 def test_only_the_parameters_moved_most_have_panels_and_vehicles_share_theirs():
@@ -242,10 +240,3 @@ def test_events_are_ticked_at_their_time_and_stay_inside_the_plot():
     assert tick_places(svg) == [pytest.approx(TIME_LEFT + 5 / 9 * TIME_WIDTH, abs=1.5)]
     places = tick_places(run(frames=range(20, 41), events=[(1, "early"), (99, "late")]).chart())
     assert min(places) >= TIME_LEFT and max(places) <= TIME_LEFT + TIME_WIDTH
-
-
-def test_a_long_run_with_thousands_of_adjustments_stays_a_light_chart():
-    moves = {k: (k, "interval.frames", k % 5, (k + 1) % 5) for k in range(2, 1000)}
-    events = [(k, f"event {k}") for k in range(1, 1001)]
-    timeline = run(moves.values(), range(1, 1001), lambda number: {"a": 0.001 * (number % 7), "b": 0.01}, (), events)
-    assert len(timeline.chart()) < 300_000
