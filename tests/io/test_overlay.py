@@ -15,13 +15,13 @@ from torchvision_dddas.io.overlay import (
     SEARCHED,
     UNLIKELY,
     UNTRACKED,
-    TrackPictures,
+    RunPictures,
     draw_people,
     draw_scene,
     identity_colour,
 )
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo, ThreadedWriter
-from torchvision_dddas.types import Detections, Frame, People, PeopleFrame, Scene, TrackedFrame, Tracks
+from torchvision_dddas.types import Detections, Frame, FrameResult, People, PeopleFrame, Scene, TrackedFrame, Tracks
 
 SIZE = (120, 90)
 
@@ -44,7 +44,7 @@ def tracked(boxes=((5, 20, 20, 30),), identities=(1,), grey=False, number=1, rea
     n = len(identities)
     tracks = Tracks(number, np.array(identities, int), boxes[:n], np.ones(n), np.arange(n))
     frame = Frame(number, 0.1 * number, image(grey, size)) if read else None
-    return TrackedFrame(number, frame, given, tracks, cause=cause)
+    return FrameResult(TrackedFrame(number, frame, given, tracks, cause=cause))
 
 
 def people(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause="", score=0.9, size=(320, 240)):
@@ -57,7 +57,7 @@ def people(boxes=((60, 60, 40, 100),), cut=(), regions=None, grey=False, cause="
 
 DRAWERS: dict[str, Any] = {
     "scene": (scene_of, draw_scene),
-    "tracks": (tracked, lambda item: TrackPictures(item.frame.image.shape[1::-1])(item)),
+    "tracks": (tracked, lambda item: RunPictures(item.frame.image.shape[1::-1])(item)),
     "people": (people, draw_people),
 }
 
@@ -94,7 +94,7 @@ def test_a_cause_is_a_caption_that_fits_pictures_of_any_size(kind):
 
 
 def test_each_identity_has_its_colour_in_every_frame_and_a_trail():
-    pictures = TrackPictures(SIZE)
+    pictures = RunPictures(SIZE)
     for number in (1, 2):
         drawn = pictures(tracked([[5, 20, 20, 30], [60, 20, 20, 30]], [3, 11], number=number))
         assert [shows(drawn, identity_colour(identity)) for identity in (3, 11, 4)] == [True, True, False]
@@ -106,7 +106,7 @@ def test_each_identity_has_its_colour_in_every_frame_and_a_trail():
 
 
 def test_detections_without_identity_and_frames_without_picture_are_drawn():
-    drawn = TrackPictures(SIZE)(tracked(identities=[], read=False, cause="the frame could not be read"))
+    drawn = RunPictures(SIZE)(tracked(identities=[], read=False, cause="the frame could not be read"))
     assert drawn.shape == (90, 120, 3) and (drawn[20, 5:25] == UNTRACKED).all()
 
 

@@ -1,7 +1,7 @@
 """What overlays show: targets with tint and heading, tracks with trails, people, landmarks and orders."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -166,34 +166,46 @@ class Trails:
             del self.places[identity]
 
 
-class TrackPictures:
-    """Draws frames with tracks and trails, given in order."""
+class RunPictures:
+    """Draws frames of a run with tracks, landmarks, what ground vehicles say, and what they were asked to do.
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        """size: (width, height) of the pictures, for frames that could not be read."""
-        self._size = size
+    Frames are shown in order; each is drawn once however many callers want it, and not at all if none does.
+    """
+
+    def __init__(self, size: tuple[int, int], names: Sequence[str] = ()) -> None:
+        """size: (width, height) of the pictures, for frames that could not be read. names: of the landmarks."""
+        self._size, self._names = size, tuple(names)
         self._trails = Trails(_TRAIL_LENGTH)
+        self._shown: FrameResult | None = None
+        self._picture: np.ndarray | None = None
 
-    def skip(self, tracked: TrackedFrame) -> None:
-        """Add a frame to the trails without drawing it."""
-        self._trails.add(tracked)
+    def show(self, result: FrameResult) -> None:
+        """Go on to the next frame, if it is not the same."""
+        if result is not self._shown:
+            self._trails.add(result.tracked)
+            self._shown, self._picture = result, None
 
-    def __call__(
-        self,
-        tracked: TrackedFrame,
-        remarks: Sequence[tuple[str, Colour]] = (),
-        kinds: Mapping[int, str] | None = None,
-    ) -> np.ndarray:
-        """The frame with boxes, numbers and trails, (H, W, 3) uint8 BGR; black where it could not be read.
+    def __call__(self, result: FrameResult) -> np.ndarray:
+        """The picture of a frame, (H, W, 3) uint8 BGR; black where it could not be read.
 
-        remarks: further lines of the caption with their colours. kinds: text behind the number of an identity.
+        The caller must not draw on it.
         """
-        self._trails.add(tracked)
+        self.show(result)
+        if self._picture is None:
+            self._picture = self._draw(result)
+        return self._picture
+
+    def _draw(self, result: FrameResult) -> np.ndarray:
+        tracked, located, confirmed = result.tracked, result.locations, result.confirmed
         width, height = self._size
         black = np.zeros((height, width, 3), np.uint8)
         picture = black if tracked.frame is None else colour_picture(tracked.frame.image)
         thick = line_width(picture)
         tracks, given = tracked.tracks, tracked.detections
+        letters = {}
+        if confirmed is not None and located is not None:
+            targets = located.positions.target[confirmed.row].tolist()
+            letters = {t: f" {LETTERS.get(kind, '?')}" for t, kind in zip(targets, confirmed.kind, strict=True)}
         for row in tracked.untracked:
             rectangle(picture, given.box_px[row], UNTRACKED, 1)
         for identity, box, row in zip(tracks.identity.tolist(), tracks.box_px, tracks.row, strict=True):
@@ -201,49 +213,17 @@ class TrackPictures:
             way = drawable(np.array([place[1:] for place in self._trails.places[identity]]))
             cv2.polylines(picture, [way], False, colour, thick, cv2.LINE_AA)
             rectangle(picture, box, colour, thick + 1 if row >= 0 else 1)
-            label(picture, box, f"{identity} {(kinds or {}).get(identity, '')}".rstrip(), colour)
+            label(picture, box, f"{identity}{letters.get(identity, '')}", colour)
         text = f"frame {tracked.number}  identities {len(tracks)}  detections {len(given)}"
-        _caption(picture, (text, TEXT), (tracked.cause, WARNING), *remarks)
+        place = ("", TEXT) if located is None else _summarize_location(located)
+        command = "" if result.command is None else _summarize_command(result.command)
+        _caption(picture, (text, TEXT), (tracked.cause, WARNING), place, (command, TEXT))
+        if located is not None:
+            self._draw_landmarks(picture, located)
+            self._draw_orders(picture, result, located)
         return picture
 
-
-class RunPictures:
-    """Draws frames of a run with tracks, landmarks, what ground vehicles say, and what they were asked to do.
-
-    Frames are shown in order; each is drawn once however many callers want it, and not at all if none does.
-    """
-
-    def __init__(self, size: tuple[int, int], names: Sequence[str]) -> None:
-        """size: (width, height) of the pictures. names: of the landmarks."""
-        self._tracks, self._names = TrackPictures(size), tuple(names)
-        self._shown: FrameResult | None = None
-        self._picture: np.ndarray | None = None
-
-    def show(self, result: FrameResult) -> None:
-        """Go on to the next frame, if it is not the same."""
-        if result is self._shown:
-            return
-        if self._shown is not None and self._picture is None:
-            self._tracks.skip(self._shown.tracked)
-        self._shown, self._picture = result, None
-
-    def __call__(self, result: FrameResult) -> np.ndarray:
-        """The picture of a frame, (H, W, 3) uint8 BGR. The caller must not draw on it."""
-        self.show(result)
-        if self._picture is None:
-            self._picture = self._draw(result)
-        return self._picture
-
-    def _draw(self, result: FrameResult) -> np.ndarray:
-        located, confirmed = result.locations, result.confirmed
-        command = ("" if result.command is None else _summarize_command(result.command), TEXT)
-        if located is None:
-            return self._tracks(result.tracked, [command])
-        letters = {}
-        if confirmed is not None:
-            targets = located.positions.target[confirmed.row].tolist()
-            letters = {t: LETTERS.get(kind, "?") for t, kind in zip(targets, confirmed.kind, strict=True)}
-        picture = self._tracks(result.tracked, [_summarize_location(located), command], letters)
+    def _draw_landmarks(self, picture: np.ndarray, located: AerialLocations) -> None:
         states = dict(zip(located.fix.landmark.tolist(), located.fix.state, strict=True))
         thick = line_width(picture)
         arm = 6 * thick
@@ -256,8 +236,6 @@ class RunPictures:
             cv2.drawMarker(picture, middle, colour, cv2.MARKER_CROSS, arm, thick)
             name = self._names[which] + ("" if state == "used" else f" {state}")
             label(picture, np.array([place[0] + 2 * arm, place[1] - arm, 0, 0]), name, colour)
-        self._draw_orders(picture, result, located)
-        return picture
 
     def _draw_orders(self, picture: np.ndarray, result: FrameResult, located: AerialLocations) -> None:
         """Draw an arrow from each vehicle towards its goal, at most a tenth of the picture long."""

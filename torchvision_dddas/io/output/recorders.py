@@ -20,7 +20,7 @@ from torchvision_dddas.io.output.run_record import (
     count_tracks,
 )
 from torchvision_dddas.io.output.run_report import REPORT
-from torchvision_dddas.io.overlay import LIKELY, RunPictures, TrackPictures, draw_people, draw_scene
+from torchvision_dddas.io.overlay import LIKELY, RunPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
 from torchvision_dddas.io.tables import detection_tables
 from torchvision_dddas.types import (
@@ -62,8 +62,11 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> RunRecord:
         """Start the run. rate_hz, size: of the overlay, (width, height)."""
-        overlay = OverlayVideo(self.folder, rate_hz, TrackPictures(size))
-        parts: dict[str, Part[TrackedFrame]] = {"tables": tables.track_tables(self.folder), "overlay": overlay}
+        pictures = RunPictures(size)
+        parts: dict[str, Part[TrackedFrame]] = {
+            "tables": tables.track_tables(self.folder),
+            "overlay": OverlayVideo(self.folder, rate_hz, lambda tracked: pictures(FrameResult(tracked))),
+        }
         return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
 
     def _count(self, item: TrackedFrame) -> None:
