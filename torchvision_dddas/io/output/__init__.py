@@ -1,6 +1,5 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
-from torchvision_dddas.io.output.live_session import RESULTS, Event, SessionLog, make_session_folder
 from torchvision_dddas.io.output.map_files import Site
 from torchvision_dddas.io.output.recorder import Part, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
@@ -12,9 +11,18 @@ from torchvision_dddas.io.output.recorders import (
     PipelineRecorder,
     TrackRecorder,
 )
-from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, clip_facts, finite, versions
+from torchvision_dddas.io.output.run_record import (
+    RESULTS,
+    RUN_JSON,
+    Event,
+    RunRecord,
+    SessionLog,
+    clip_facts,
+    finite,
+    make_session_folder,
+)
 from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
-from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM, WORLD
+from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM
 
 __all__ = [
     "CONFIRMATION_NAMES",
@@ -22,7 +30,6 @@ __all__ = [
     "PROBLEM",
     "RESULTS",
     "RUN_JSON",
-    "WORLD",
     "AerialRecorder",
     "ConfirmationRecorder",
     "DetectionRecorder",
@@ -40,5 +47,4 @@ __all__ = [
     "finite",
     "make_session_folder",
     "parse_save",
-    "versions",
 ]

@@ -11,14 +11,7 @@ from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
 from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder
 from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
-from torchvision_dddas.io.output.run_record import (
-    RUN_JSON,
-    LocationCounts,
-    RunRecord,
-    Spans,
-    count_identities,
-    count_tracks,
-)
+from torchvision_dddas.io.output.run_record import NO_POSE, RUN_JSON, RunRecord, Spans
 from torchvision_dddas.io.output.run_report import REPORT
 from torchvision_dddas.io.overlay import LIKELY, RunPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
@@ -70,7 +63,7 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
         return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
 
     def _count(self, item: TrackedFrame) -> None:
-        count_tracks(self.record, item)
+        _count_tracks(self.record, item)
 
 
 class PeopleRecorder(RunRecorder[PeopleFrame]):
@@ -169,7 +162,7 @@ class AerialRecorder(RunRecorder[AerialLocations]):
         parts: dict[str, Part[AerialLocations]] = {"maps": maps, "tables": places}
         record = maps.record = self.start({**site.facts, **facts}, parts)
         record.notes += _missing_maps(site, self.save)
-        self._counts = LocationCounts(record, site.names)
+        self._counts = _LocationCounts(record, site.names)
         return record
 
     def _count(self, item: AerialLocations) -> None:
@@ -218,17 +211,17 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         if site is not None:
             maps.record = record
             record.notes += _missing_maps(site, save)
-            self._locations, self._not_found = LocationCounts(record, names), Spans(is_exact=True)
+            self._locations, self._not_found = _LocationCounts(record, names), Spans(is_exact=True)
             record.counts["nothing_found"] = self._not_found.rows
         return record
 
     def _count(self, item: FrameResult) -> None:
         tracked = item.tracked
         if self._locations is None:
-            count_tracks(self.record, tracked)
+            _count_tracks(self.record, tracked)
             return
         self._locations.add(_locations(item))
-        count_identities(self.record.counts, tracked)
+        _count_identities(self.record.counts, tracked)
         if tracked.cause:
             self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
 
@@ -238,6 +231,69 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         if self._locations is None:
             for name in set(PipelineRecorder.files) - set(self.found_files):
                 remove(self.folder / name)
+
+
+def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
+    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity."""
+    counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
+    counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
+    counts["untracked"] = counts.get("untracked", 0) + len(tracked.untracked)
+
+
+def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
+    """Add a frame of a run that gives identities and locates nothing."""
+    counts, targets = record.counts, len(tracked.detections)
+    counts.setdefault("first_frame", tracked.number)
+    counts["last_frame"] = tracked.number
+    _count_identities(counts, tracked)
+    counts["tracked"] = record.targets + targets - counts["untracked"]
+    record.note(tracked.number, targets, tracked.seconds, tracked.adjustments, tracked.cause or None)
+
+
+class _LocationCounts:
+    """Counts what is located from the air in a record.
+
+    positions: rows of positions.csv. by: frames by what gave the camera's pose, `nothing` for those not located.
+    weak: spans of frames that were located with something amiss. repairs: what was changed and why.
+    landmarks: of each, in how many frames it was seen, used, and left out of those located; and the spans of frames in
+    which it was reassigned or excluded.
+    """
+
+    def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
+        """names: of the landmarks."""
+        self._record, self._names = record, tuple(names)
+        self._weak, self._repairs = Spans(), Spans()
+        record.counts |= {
+            "positions": 0,
+            "by": dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0),
+            "landmarks": {n: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for n in names},
+            "weak": self._weak.rows,
+            "repairs": self._repairs.rows,
+        }
+
+    def add(self, located: AerialLocations) -> None:
+        """Count a frame."""
+        record, frame, fix = self._record, located.frame, located.fix
+        counts, before = record.counts, record.last_frame
+        counts["positions"] += len(located.positions)
+        counts["by"][fix.by or "nothing"] += 1
+        for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
+            landmark = counts["landmarks"][self._names[which]]
+            landmark["seen"] += 1
+            landmark["used"] += is_used
+            landmark["left_out"] += bool(fix.by) and not is_used
+            if state in ("reassigned", "excluded"):
+                spans = landmark[state]
+                if spans and spans[-1][1] == before:
+                    spans[-1][1] = frame
+                else:
+                    spans.append([frame, frame])
+        if fix.by and fix.cause:
+            self._weak.add(frame, before, fix.cause, by=fix.by)
+        for change in fix.changes:
+            self._repairs.add(frame, before, change)
+        cause = None if fix.by else fix.cause or NO_POSE
+        record.note(frame, len(located.box_px), located.seconds, located.adjustments, cause)
 
 
 def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:

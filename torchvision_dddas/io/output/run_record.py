@@ -1,7 +1,8 @@
-"""run.json: what was run, with which settings and versions, what happened, how long it took, what moved and why."""
+"""run.json: what was run, with which settings and versions, what happened, how long it took; the log of a session."""
 
 import json
 import math
+import os
 import platform
 import re
 import sys
@@ -9,14 +10,18 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import write_whole
+from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.runtime import VERSION
-from torchvision_dddas.types import Adjustment, AerialLocations, Source, TrackedFrame
+from torchvision_dddas.types import Adjustment, Source
 
 RUN_JSON = "run.json"
 NO_POSE = "nothing told where the camera was"
@@ -193,67 +198,69 @@ def versions() -> dict[str, str]:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# What several commands count.
+# The folder of one live session. Earlier sessions stay as they are, and its files are valid at every moment:
+# results.jsonl grows by a line per frame, events.log by a line per event; run.json is replaced whole.
+
+RESULTS, EVENTS = "results.jsonl", "events.log"
 
 
-def count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
-    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity."""
-    counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
-    counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
-    counts["untracked"] = counts.get("untracked", 0) + len(tracked.untracked)
+@dataclass(frozen=True)
+class Event:
+    """Something that happened. utc_s: seconds since 1970. frame: 0 if it belongs to none. kind: one word."""
+
+    utc_s: float
+    frame: int
+    kind: str
+    text: str
 
 
-def count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
-    """Add a frame of a run that gives identities and locates nothing."""
-    counts, targets = record.counts, len(tracked.detections)
-    counts.setdefault("first_frame", tracked.number)
-    counts["last_frame"] = tracked.number
-    count_identities(counts, tracked)
-    counts["tracked"] = record.targets + targets - counts["untracked"]
-    record.note(tracked.number, targets, tracked.seconds, tracked.adjustments, tracked.cause or None)
+def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
+    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError if none can be made."""
+    name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for k in range(1, 1000):
+            folder = out / (name if k == 1 else f"{name}-{k}")
+            try:
+                folder.mkdir()
+            except FileExistsError:  # a supervisor may start it twice within a second
+                continue
+            return folder
+    except OSError as error:
+        raise InputError(
+            f"cannot write into {out}: {error.strerror or error}. Choose another folder with --out"
+        ) from None
+    raise InputError(f"{out} holds a thousand sessions that began at {name}; choose another folder with --out")
 
 
-class LocationCounts:
-    """Counts what is located from the air in a record.
+class SessionLog:
+    """events.log and run.json of a session. A method that raises OSError, as on a full disk, may be called again."""
 
-    positions: rows of positions.csv. by: frames by what gave the camera's pose, `nothing` for those not located.
-    weak: spans of frames that were located with something amiss. repairs: what was changed and why.
-    landmarks: of each, in how many frames it was seen, used, and left out of those located; and the spans of frames in
-    which it was reassigned or excluded.
-    """
+    def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
+        """facts: what run.json says of the run from its start."""
+        self.folder, self.facts = folder, facts
+        self._events = os.open(folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
 
-    def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
-        """names: of the landmarks."""
-        self._record, self._names = record, tuple(names)
-        self._weak, self._repairs = Spans(), Spans()
-        record.counts |= {
-            "positions": 0,
-            "by": dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0),
-            "landmarks": {n: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for n in names},
-            "weak": self._weak.rows,
-            "repairs": self._repairs.rows,
-        }
+    def append(self, events: Sequence[Event]) -> None:
+        """Append events, a line each: UTC time, frame or -, kind, text."""
+        stamps = iso_utc(np.array([event.utc_s for event in events]))
+        lines = "".join(
+            f"{stamp} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n"
+            for stamp, e in zip(stamps, events, strict=True)
+        )
+        size, rest = os.fstat(self._events).st_size, lines.encode()
+        try:
+            while rest:
+                rest = rest[os.write(self._events, rest) :]
+        except OSError:
+            with suppress(OSError):  # a line that a full disk broke off is written again whole
+                os.ftruncate(self._events, size)
+            raise
 
-    def add(self, located: AerialLocations) -> None:
-        """Count a frame."""
-        record, frame, fix = self._record, located.frame, located.fix
-        counts, before = record.counts, record.last_frame
-        counts["positions"] += len(located.positions)
-        counts["by"][fix.by or "nothing"] += 1
-        for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
-            landmark = counts["landmarks"][self._names[which]]
-            landmark["seen"] += 1
-            landmark["used"] += is_used
-            landmark["left_out"] += bool(fix.by) and not is_used
-            if state in ("reassigned", "excluded"):
-                spans = landmark[state]
-                if spans and spans[-1][1] == before:
-                    spans[-1][1] = frame
-                else:
-                    spans.append([frame, frame])
-        if fix.by and fix.cause:
-            self._weak.add(frame, before, fix.cause, by=fix.by)
-        for change in fix.changes:
-            self._repairs.add(frame, before, change)
-        cause = None if fix.by else fix.cause or NO_POSE
-        record.note(frame, len(located.box_px), located.seconds, located.adjustments, cause)
+    def write_state(self, state: str, now: dict[str, Any]) -> None:
+        """Replace run.json. state: running, complete, stopped or failed."""
+        write_run_record(self.folder / RUN_JSON, state, {**self.facts, **now})
+
+    def close(self) -> None:
+        """Close events.log."""
+        os.close(self._events)
