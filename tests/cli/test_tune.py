@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.cli.conftest import bad
+from tests.cli.conftest import bad, record
 from tests.evaluation.studies.world import filmed, study
 from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
@@ -56,15 +56,19 @@ def test_the_tuned_settings_are_written_for_config_and_keep_what_was_not_tuned(t
 
 
 def test_before_and_after_are_measured_on_clips_tuned_on_and_held_out_apart(tuned) -> None:
-    told = json.loads((tuned[0] / "run.json").read_text())
-    assert told["state"] == "complete" and told["family"] == "motion"
+    kept = record(tuned[0])
+    assert kept["state"] == "complete" and kept["family"] == "motion"
     for side, names in (("tuned", ["one", "two"]), ("held_out", ["held"])):
-        found = told["verdict"][side]
+        found = kept["verdict"][side]
         assert found["clips"] == names
         entry = found["changes"]["tasks"]["motion"]["pooled"]["pixels"]["f"]
         assert found["pooled"] == {"before": entry["first"], "after": entry["second"]}
         assert 0 <= entry["first"] <= 1 and entry["first"] != entry["second"]
     assert "Tuned on (2 clips): f" in tuned[1] and "Held out (1 clip): f" in tuned[1]
+    assert [step["step"] for step in kept["history"]] == list(range(11))
+    assert "step 10 of 10: loss" in tuned[1] and "watched" in tuned[1]
+    page = (tuned[0] / "report.html").read_text()
+    assert THRESHOLD in page and "Clips tuned on" in page and "Clips held out" in page and "http" not in page
 
 
 def test_the_figures_are_those_of_the_study_with_the_tuned_settings(clips, tuned) -> None:
@@ -73,27 +77,16 @@ def test_the_figures_are_those_of_the_study_with_the_tuned_settings(clips, tuned
     result = CliRunner().invoke(app, [*words, "--out", str(out), "--cache", str(clips.parent / "cache"), "--jobs", "1"])
     assert result.exit_code == 0, result.output
     measured = json.loads((out / "metrics.json").read_text())["tasks"]["motion"]["pooled"]["pixels"]["f"]
-    told = json.loads((tuned[0] / "run.json").read_text())
-    assert told["verdict"]["held_out"]["pooled"]["after"] == measured
-
-
-def test_every_step_is_recorded_and_its_losses_are_told_on_the_way(tuned) -> None:
-    told = json.loads((tuned[0] / "run.json").read_text())
-    assert [step["step"] for step in told["history"]] == list(range(11))
-    assert "step 10 of 10: loss" in tuned[1] and "watched" in tuned[1]
-
-
-def test_the_page_shows_the_parameter_and_both_sets_of_clips(tuned) -> None:
-    page = (tuned[0] / "report.html").read_text()
-    assert THRESHOLD in page and "Clips tuned on" in page and "Clips held out" in page and "http" not in page
+    kept = record(tuned[0])
+    assert kept["verdict"]["held_out"]["pooled"]["after"] == measured
 
 
 def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tuned, tmp_path) -> None:
     bowl = Bowl(place=math.log(6))
     out = clips.parent / "first"
-    before = json.loads((out / "run.json").read_text())
+    before = record(out)
     result = asked(clips, *ASKED, "--holdout", "h*", "--out", str(out), "--resume", bowl=bowl)
-    after = json.loads((out / "run.json").read_text())
+    after = record(out)
     assert result.exit_code == 0 and bowl.calls == []
     assert (before["taken"], after["taken"]) == (10, 0) and "s a step" not in (out / "report.html").read_text()
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
@@ -102,7 +95,7 @@ def test_a_run_that_is_taken_up_does_no_step_twice_and_says_the_same(clips, tune
 def test_a_pull_holds_the_parameter_where_it_began(clips, tuned, tmp_path) -> None:
     result = asked(clips, *ASKED, "--clips", "one", "--pull", "100", "--out", str(tmp_path))
     assert result.exit_code == 0, result.output
-    held, free = (json.loads((out / "run.json").read_text())["history"] for out in (tmp_path, tuned[0]))
+    held, free = (record(out)["history"] for out in (tmp_path, tuned[0]))
     moved = [abs(steps[-1]["knobs"][THRESHOLD] - steps[0]["knobs"][THRESHOLD]) for steps in (held, free)]
     assert moved[0] < moved[1] / 2
     wrong = asked(clips, *ASKED, "--pull", "-1", "--out", str(tmp_path / "wrong"))
@@ -120,27 +113,20 @@ def test_a_cost_is_measured_once_and_kept_for_a_run_that_is_taken_up(clips, tmp_
     words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
     assert asked(clips, *words).exit_code == 0
     count = len(calls)
-    told = json.loads((tmp_path / "run.json").read_text())["cost"]
-    assert told["weight"] == 0.5 and [curve["knob"] for curve in told["curves"]] == [THRESHOLD]
+    kept = record(tmp_path)["cost"]
+    assert kept["weight"] == 0.5 and [curve["knob"] for curve in kept["curves"]] == [THRESHOLD]
     assert asked(clips, *words, "--resume").exit_code == 0
     assert len(calls) == count > 0
     assert "What time costs" in (tmp_path / "report.html").read_text()
-
-
-def test_another_weight_of_the_cost_is_not_taken_for_the_one_before(clips, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: settings.difference.threshold)
-    words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
-    assert asked(clips, *words, "--cost", "0.5").exit_code == 0
-    result = asked(clips, *words, "--cost", "2", "--resume", "--quiet")
-    assert "with other cost" in bad(result)
 
 
 def test_what_is_refused_leaves_the_record_of_the_run_before(clips, tmp_path) -> None:
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     assert asked(clips, *words).exit_code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    result = asked(clips, *words, "--patience", "3", "--resume", "--quiet")
-    assert "with other patience" in bad(result)
+    for option, value in (("patience", "3"), ("cost", "2")):
+        result = asked(clips, *words, f"--{option}", value, "--resume", "--quiet")
+        assert f"with other {option}" in bad(result)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -156,7 +142,7 @@ def test_the_loss_that_was_chosen_is_recorded_and_no_checkpoint_of_another_is_ta
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     bowl = Choosy(place=math.log(6))
     assert asked(clips, *words, "--loss", "square", bowl=bowl).exit_code == 0
-    assert json.loads((tmp_path / "run.json").read_text())["loss"] == "square"
+    assert record(tmp_path)["loss"] == "square"
     assert "motion, loss square, on" in (tmp_path / "report.html").read_text()
     result = asked(clips, *words, "--resume", "--quiet", bowl=bowl)
     assert "with other loss, square and not round" in bad(result)
@@ -173,27 +159,33 @@ def test_settings_that_tuning_would_overwrite_are_refused(clips, tmp_path) -> No
     assert load_config(config).difference.threshold == 12
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_anything_is_computed(clips, tmp_path) -> None:
+def test_a_folder_that_cannot_be_written_is_refused_before_anything_is_computed(clips, tmp_path) -> None:
     (tmp_path / "file").touch()
     bowl = Bowl()
     bowl.examples = lambda *_: pytest.fail("examples were prepared")  # type: ignore[method-assign]
     assert "cannot write" in bad(asked(clips, *ASKED, "--out", str(tmp_path / "file"), bowl=bowl))
 
 
-def test_a_run_that_is_stopped_says_so_and_can_be_taken_up(clips, tmp_path) -> None:
+def stopped(after: int) -> Bowl:
+    """A bowl that Ctrl-C ends after so many losses."""
+
     class Stopped(Bowl):
         def loss(self, parameters, batch, softness):
-            if len(self.calls) > 9:
+            if len(self.calls) > after:
                 raise KeyboardInterrupt
             return super().loss(parameters, batch, softness)
 
+    return Stopped(place=math.log(6))
+
+
+def test_a_run_that_is_stopped_says_so_and_can_be_resumed(clips, tmp_path) -> None:
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
-    assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
-    assert json.loads((tmp_path / "run.json").read_text())["state"] == "interrupted"
+    assert asked(clips, *words, bowl=stopped(9)).exit_code == 130
+    assert record(tmp_path)["state"] == "interrupted"
     assert asked(clips, *words, "--resume").exit_code == 0
     whole = asked(clips, *words[:-1], str(tmp_path / "whole"))
     assert whole.exit_code == 0
-    histories = [json.loads((place / "run.json").read_text())["history"] for place in (tmp_path, tmp_path / "whole")]
+    histories = [record(place)["history"] for place in (tmp_path, tmp_path / "whole")]
     assert histories[0] == histories[1]
 
 
@@ -206,15 +198,6 @@ def test_without_a_checkpoint_to_go_on_from_it_is_said_that_it_begins_anew(clips
 
 
 def test_an_unfinished_descent_is_kept_beside_the_new_one(clips, tmp_path) -> None:
-    def stopped(after: int):
-        class Stopped(Bowl):
-            def loss(self, parameters, batch, softness):
-                if len(self.calls) > after:
-                    raise KeyboardInterrupt
-                return super().loss(parameters, batch, softness)
-
-        return Stopped(place=math.log(6))
-
     words = (*ASKED, "--clips", "one", "--out", str(tmp_path))
     old, now = tmp_path / "checkpoint.old.pt", tmp_path / "checkpoint.pt"
     assert asked(clips, *words, bowl=stopped(8)).exit_code == 130
@@ -228,29 +211,7 @@ def test_an_unfinished_descent_is_kept_beside_the_new_one(clips, tmp_path) -> No
     assert old.read_bytes() == begun, "a descent that came to its end was kept as unfinished"
     old.replace(now)
     assert asked(clips, *words, "--resume").exit_code == 0
-    assert json.loads((tmp_path / "run.json").read_text())["taken"] == 5
-
-
-def test_an_unfinished_descent_that_was_set_aside_can_be_gone_on_with_at_its_own_cost(
-    clips, tmp_path, monkeypatch
-) -> None:
-    class Stopped(Bowl):
-        def loss(self, parameters, batch, softness):
-            if len(self.calls) > 8:
-                raise KeyboardInterrupt
-            return super().loss(parameters, batch, softness)
-
-    words = (*ASKED, "--clips", "one", "--cost", "0.5", "--out", str(tmp_path))
-    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: settings.difference.threshold)
-    assert asked(clips, *words, bowl=Stopped(place=math.log(6))).exit_code == 130
-    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: lambda settings: 2 * settings.difference.threshold)
-    assert asked(clips, *words).exit_code == 0
-    for name in ("checkpoint", "cost"):
-        end = "pt" if name == "checkpoint" else "json"
-        (tmp_path / f"{name}.old.{end}").replace(tmp_path / f"{name}.{end}")
-    result = asked(clips, *words, "--resume")
-    assert result.exit_code == 0, result.output
-    assert json.loads((tmp_path / "run.json").read_text())["taken"] == 5
+    assert record(tmp_path)["taken"] == 5
 
 
 def test_without_torch_one_line_says_what_to_install(clips, monkeypatch) -> None:
@@ -267,7 +228,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
     last = result.output.strip().splitlines()[-1]
     assert last.startswith("dddas: ") and "one, frame 2" in last and THRESHOLD in last
     assert load_config(tmp_path / "tuned.toml").difference.threshold <= 12
-    assert json.loads((tmp_path / "run.json").read_text())["state"] == "failed"
+    assert record(tmp_path)["state"] == "failed"
     assert "Stopped" in (tmp_path / "report.html").read_text()
 
 
