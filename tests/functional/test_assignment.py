@@ -113,7 +113,7 @@ def test_a_wider_cut_tells_fewer_targets_apart_and_the_slope_says_so():
     assert torch.autograd.gradcheck(lambda c: dispersion(apart, everybody(apart), c, 0.05), cut)
 
 
-def test_who_is_not_there_has_no_say_and_one_or_none_count_as_apart():
+def test_who_is_not_there_does_not_count_and_one_or_none_count_as_apart():
     apart, there = grouped(3, 2), torch.tensor([True, True, False, True, False])
     kept = apart[there][:, there]
     wanted = dispersion(kept, everybody(kept), 0.25, 0.1).item()

@@ -161,16 +161,6 @@ def test_a_blank_picture_of_any_size_has_none(shape):
     assert torch.isfinite(points).all() and (score == 0).all()
 
 
-def test_only_allowed_pixels_are_chosen_and_set_the_maximum(texture, tensor):
-    picture = texture(0, 120, 160)
-    picture[:, 100:] = 0
-    picture[40:60, 120:140] = 255
-    allowed = torch.zeros(1, 1, 120, 160, dtype=torch.bool)
-    allowed[..., :90] = True
-    points, _, valid = keypoints.grid_features(tensor(picture), 16, allowed=allowed)
-    assert valid.any() and (points[valid][:, 0] < 90).all()
-
-
 def test_grid_features_are_the_best_pixel_of_every_whole_cell(texture, tensor):
     picture = tensor(texture(2, 37, 53))
     eigen = keypoints.min_eigenvalue(picture)[0, 0]

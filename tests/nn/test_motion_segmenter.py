@@ -49,7 +49,7 @@ def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> 
 
 
 @pytest.mark.parametrize("kind", ["normalized", "to_reference"])
-def test_knobs_as_tensors_give_what_the_settings_give(kind: str) -> None:
+def test_parameters_as_tensors_give_what_the_settings_give(kind: str) -> None:
     settings = with_parameters(SETTINGS, {"difference.kind": kind})
     motion, windows = MotionSegmenter(settings), differences()
     given, tuned = motion(windows, {}, 0.1), motion(windows, values(), 0.1)

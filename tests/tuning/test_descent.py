@@ -71,13 +71,6 @@ def test_a_descent_that_was_broken_off_goes_on_as_if_it_had_not_been(tmp_path: P
     assert told == list(range(13))
 
 
-def test_a_descent_that_is_over_is_not_begun_again(tmp_path: Path) -> None:
-    place = tmp_path / "checkpoint.pt"
-    first, bowl = descend(Bowl(), parameters(), pieces(), QUICK, place=place), Bowl()
-    assert same(first, descend(bowl, parameters(), pieces(), QUICK, place=place, resume=True))
-    assert bowl.calls == []
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -98,7 +91,7 @@ def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", b"PK\x03\x04 and then nothing"])
-def test_a_damaged_checkpoint_is_told_in_a_line(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     place = tmp_path / "checkpoint.pt"
     place.write_bytes(content)
     with pytest.raises(InputError, match="is no checkpoint, or is damaged"):
@@ -160,14 +153,7 @@ def test_a_loss_that_is_no_number_from_the_start_is_bad_input() -> None:
         descend(bowl, parameters(), pieces(), QUICK)
 
 
-def test_a_failed_descent_is_told_again_when_it_is_taken_up(tmp_path: Path) -> None:
-    bowl, place = Bowl(place=4.0, wrong=("two", 3), wrong_above=14.0), tmp_path / "checkpoint.pt"
-    first = descend(bowl, parameters(), pieces(spread=0.0), QUICK, place=place)
-    again = descend(bowl, parameters(), pieces(spread=0.0), QUICK, place=place, resume=True)
-    assert first.failed == again.failed != "" and same(first, again)
-
-
-def test_knobs_without_a_slope_are_named() -> None:
+def test_parameters_without_a_gradient_are_named() -> None:
     asked = Parameters(Settings(), [THRESHOLD, "gates.min_area_px"])
     found = descend(Bowl(), asked, pieces(), QUICK)
     assert found.idle == ("gates.min_area_px",)
@@ -180,7 +166,7 @@ def test_it_ends_when_its_time_is_over() -> None:
 
 
 @pytest.mark.slow
-def test_a_pull_keeps_knobs_near_where_they_began_and_the_stronger_the_nearer() -> None:
+def test_a_pull_keeps_parameters_near_their_start_and_the_stronger_the_nearer() -> None:
     plan = Plan(steps=80, rate=0.1)
     ends = [
         descend(Bowl(), parameters(), pieces(spread=0.0), replace(plan, pull=pull)).settings.difference.threshold
@@ -248,7 +234,7 @@ class _Idle(Bowl):
         return (parameters["morphology.erode_px"].log() - 2).square().expand(len(batch))
 
 
-def test_sizes_go_on_where_nothing_else_has_a_say() -> None:
+def test_sizes_go_on_where_nothing_else_has_an_effect() -> None:
     found = descend(
         _Idle(), Parameters(Settings(), ["morphology.erode_px", NOISE]), pieces(), Plan(steps=20, watched=0)
     )
@@ -257,7 +243,7 @@ def test_sizes_go_on_where_nothing_else_has_a_say() -> None:
 
 
 @pytest.mark.parametrize("pull", [0.0, 0.1])
-def test_a_parameter_without_a_say_is_told_and_not_pulled_about(pull: float) -> None:
+def test_a_parameter_without_effect_is_refused_and_not_pulled(pull: float) -> None:
     class Deaf(Bowl):
         def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
             return torch.ones(len(batch), dtype=torch.float64)
@@ -266,7 +252,7 @@ def test_a_parameter_without_a_say_is_told_and_not_pulled_about(pull: float) -> 
         descend(Deaf(), Parameters(Settings(), [NOISE]), pieces(), replace(QUICK, pull=pull))
 
 
-def test_examples_on_which_no_parameter_has_a_say_stop_nothing() -> None:
+def test_examples_on_which_no_parameter_has_an_effect_stop_nothing() -> None:
     class Hush(Bowl):
         def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
             lost = super().loss(parameters, batch, softness)
@@ -331,7 +317,7 @@ def test_every_example_has_its_turn_before_any_has_another() -> None:
     assert taken[:10] != taken[10:]
 
 
-def test_a_clip_with_few_labelled_frames_has_the_say_of_one_with_many() -> None:
+def test_a_clip_with_few_labelled_frames_has_the_weight_of_one_with_many() -> None:
     clips = ["long"] * 9 + ["short"] * 2
     taken = [i for step in range(9) for i in draw_batch(step, clips, 2, seed=0)]
     assert sorted(taken[:18]) == [*range(9), *[9] * 4, *[10] * 5] or sorted(taken[:18]) == [

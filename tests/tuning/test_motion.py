@@ -12,7 +12,6 @@ from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, measures
-from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.nn import Core
 from torchvision_dddas.tuning.family import Example
@@ -57,7 +56,7 @@ def test_a_step_down_the_slope_of_a_threshold_that_is_too_high_lowers_it(clip: C
     assert float(parameters.free[0].grad) > 0
 
 
-def test_a_clip_without_masks_is_told_in_one_line(clip: Clip) -> None:
+def test_a_clip_without_masks_is_refused_in_one_line(clip: Clip) -> None:
     assert clip.truth is not None
     for truth in (None, replace(clip.truth, masks={})):
         bare = replace(clip, name="bare", truth=truth)
@@ -77,13 +76,6 @@ def test_of_a_clip_in_which_nothing_moves_whatever_is_found_is_false(clip: Clip)
         family.loss({"difference.threshold": torch.tensor(at)}, examples, 0.02).mean() for at in (60.0, 4.0)
     )
     assert float(calm) < 0.01 and float(alarmed) > 0.9
-
-
-def test_unlabelled_pixels_are_known_to_be_so(clip: Clip, examples: list[Example]) -> None:
-    assert clip.truth is not None
-    labels = labels_of(clip.truth, examples[0].frame)
-    assert torch.equal(examples[0].content.truth[0, 0], torch.from_numpy(labels > 0))
-    assert bool(examples[0].content.known.all())
 
 
 def test_a_loss_of_another_name_is_another_loss_of_the_same_masks(examples: list[Example]) -> None:

@@ -12,7 +12,7 @@ from torchvision_dddas.tuning.parameters import TUNABLE, Parameters, expand_name
 
 @pytest.mark.parametrize("name", TUNABLE)
 @pytest.mark.parametrize("free", [-1e6, -40.0, -1.0, 0.0, 2.0, 40.0, 1e6])
-def test_no_parameter_leads_out_of_a_knobs_range(name: str, free: float) -> None:
+def test_no_free_number_leads_out_of_a_range(name: str, free: float) -> None:
     parameter = TUNABLE[name]
     value = float(parameter.value(torch.tensor(free, dtype=torch.float64)))
     assert parameter.low - 1e-6 <= value <= parameter.high * (1 + 1e-6)
@@ -33,7 +33,7 @@ def _share(name: str, value: float) -> float:
     return (scale(value) - scale(parameter.low)) / (scale(parameter.high) - scale(parameter.low))
 
 
-def test_knobs_that_have_not_moved_are_the_settings_they_came_from() -> None:
+def test_parameters_that_have_not_moved_are_the_settings_they_came_from() -> None:
     settings = with_parameters(Settings(), {"difference.threshold": 3.14159265, "landmarks.common_sigma_m": 0.0})
     assert Parameters(settings, TUNABLE).settings() == settings
 
@@ -76,7 +76,7 @@ def test_a_group_stands_for_its_tunable_parameters() -> None:
 
 
 @pytest.mark.parametrize("name", ["difference.kind", "difference.treshold", "nonsense", "registration.levels"])
-def test_a_parameter_that_cannot_be_tuned_is_told_with_those_that_can(name: str) -> None:
+def test_a_parameter_that_cannot_be_tuned_is_refused_with_those_that_can(name: str) -> None:
     with pytest.raises(InputError, match=r"difference\.threshold \(0\.1 to 255\)") as caught:
         Parameters(Settings(), [name])
     assert "\n" not in str(caught.value) and f"'{name}'" in str(caught.value)

@@ -35,7 +35,7 @@ def picture(seed: int, true: PeopleParameters) -> ScoredPicture:
 
 
 @pytest.mark.slow
-def test_knobs_that_drew_the_truth_are_found_again():
+def test_parameters_that_drew_the_truth_are_found_again():
     true = PeopleParameters(
         height_share=0.8, width_share=0.42, feet_share=0.9, probability_slope=4.0, probability_even=0.5
     )

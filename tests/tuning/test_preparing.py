@@ -35,6 +35,6 @@ def test_a_clip_without_the_truth_that_is_needed_is_named(clips) -> None:
         prepare(read_spec(clips), clips.parent, ["difference.threshold"], (), ["boxes"])
 
 
-def test_knobs_of_several_families_are_told_apart(clips) -> None:
+def test_parameters_of_several_families_are_refused(clips) -> None:
     with pytest.raises(InputError, match=r"motion: difference\.threshold; tracking: track\.speed"):
         prepare(read_spec(clips), clips.parent, ["difference.threshold", "track.speed"])

@@ -84,7 +84,7 @@ def test_what_is_no_registration_to_be_believed_costs(examples: list[Example]) -
     assert float(lost([wild], 2.0, 1.0)) > 2
 
 
-def test_what_cannot_be_tuned_is_told_in_a_line(clip: Clip, examples: list[Example]) -> None:
+def test_what_cannot_be_tuned_is_refused_in_one_line(clip: Clip, examples: list[Example]) -> None:
     assert clip.truth is not None
     bare, told = replace(clip, name="bare", truth=replace(clip.truth, masks={})), list[int]()
     with pytest.raises(InputError, match="bare has no masks of what moves"):

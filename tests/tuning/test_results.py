@@ -81,7 +81,7 @@ def test_the_goal_is_judged_by_itself_and_less_may_be_better() -> None:
     assert _say_change(GOAL, None) == ""
 
 
-def test_knobs_that_did_not_move_change_nothing(clips) -> None:
+def test_parameters_that_did_not_move_change_nothing(clips) -> None:
     same = {"difference.threshold": load_config("fast").difference.threshold}
     assert with_parameters(load_config("fast"), same) == load_config("fast")
     spec = read_spec(clips)
@@ -164,7 +164,7 @@ def test_it_says_first_what_tuning_was_worth_on_clips_tuned_on_and_held_out():
     assert "4.00 s a step" in said(tuning_report(record(taken=2)))
 
 
-def test_each_parameter_has_its_plot_and_its_row_and_one_without_a_slope_is_told():
+def test_each_parameter_has_its_plot_and_row_and_one_without_effect_is_marked():
     text = tuning_report(record())
     assert text.count("<svg") >= 4
     for name in NAMES:
@@ -182,7 +182,7 @@ def test_a_descent_that_was_stopped_says_so_at_once():
     assert f"Stopped: {failed}. The parameters are the last good ones." in said(tuning_report(record(failed=failed)))
 
 
-def test_what_time_costs_is_told_parameter_by_parameter():
+def test_the_time_of_each_parameter_is_shown():
     curves = [{"knob": NAMES[0], "values": [2.0, 4.0], "times": [1.3, 1.0]}]
     text = said(tuning_report(record(cost={"weight": 0.1, "seconds": 0.02, "expected": 0.015, "curves": curves})))
     assert "a loss of 0.1. Expected: 20.0 → 15.0 ms a frame." in text and "1.3, 1" in text
@@ -241,7 +241,7 @@ def test_as_the_settings_are_the_term_is_nothing_and_twice_the_time_costs_the_we
     assert float(cost.expected({THRESHOLD: scalar(2.0), CLOSE: scalar(10.0)}).detach()) == pytest.approx(0.06)
 
 
-def test_the_points_are_allowed_values_on_either_side_of_the_knobs_own() -> None:
+def test_the_points_are_allowed_values_on_either_side_of_the_parameters_own() -> None:
     settings = with_parameters(Settings(), {THRESHOLD: 200.0, BLUR: 5})
     assert list(timed_points(settings, [THRESHOLD, BLUR])) == [
         ("", 0.0),
@@ -276,7 +276,7 @@ def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() 
         '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.absent", "values": [1], "times": [1]}]}',
     ],
 )
-def test_a_damaged_file_is_told_in_a_line(tmp_path: Path, content: str) -> None:
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
     (tmp_path / "cost.json").write_text(content)
     with pytest.raises(InputError, match="does not hold the cost"):
         read_cost(tmp_path / "cost.json")

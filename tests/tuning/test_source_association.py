@@ -124,21 +124,6 @@ def test_nobody_and_targets_that_fill_up_change_nothing_and_all_is_finite():
     assert torch.isfinite(slope)
 
 
-def test_the_order_of_targets_does_not_matter():
-    looks, identities = looks_of(6, 1)
-    plain = stack_padded(Windows, [build_window(looks, identities, paper())])
-    order = np.array([2, 0, 1, 5, 4, 3])
-    rows = np.append(0, order + 1)
-    mixed = replace(
-        plain,
-        similarity=plain.similarity[:, :, rows],
-        alternative=plain.alternative[:, :, rows],
-        true=plain.true[:, order],
-    )
-    for loss in (wrong_links, links_nll):
-        torch.testing.assert_close(loss(paper(), mixed, 0.05), loss(paper(), plain, 0.05))
-
-
 def test_a_link_that_no_parameter_can_save_counts_no_more_than_once():
     many = windows(paper(), count=4, many=2, pictured=False)
     exchanged = replace(many, true=many.true.flip(2))

@@ -7,6 +7,7 @@ Source: N. Dalal and B. Triggs, Histograms of oriented gradients for human detec
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 
 import torch
 from torch import Tensor
@@ -127,22 +128,11 @@ def ramps(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
 
 def hats(bins: int) -> Tensor:
     """(bins, K) float64: the hats of the bins as sums of ramps."""
-    at = knots(bins)
-    last = len(at) - 1
-    rows = torch.zeros(bins, last + 1, dtype=torch.float64)
-    for place, knot in enumerate(at):
-        row = rows[knot % bins]
-        if place == 0:
-            row[0] += 1  # left of the next knot the hat is 1 - (t - k), plus what bends it to zero
-            row[1] -= 1
-            row[2] += 1
-        else:
-            row[place] += 1
-            if place < last:
-                row[place + 1] -= 2
-            if place + 2 <= last:
-                row[place + 2] += 1
-    return rows
+    rows = torch.zeros(bins, bins + 4, dtype=torch.float64)
+    for place, knot in enumerate(knots(bins)):
+        # Left of its knot the first hat is 1 - (t - k), plus what bends it to zero.
+        rows[knot % bins, place : place + 3] += torch.tensor([1.0, -2.0 if place else -1.0, 1.0])
+    return rows[:, : bins + 2]
 
 
 def cell_weights(layout: Layout) -> Tensor:
@@ -167,12 +157,8 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
     cut = maps[..., : strips * step, :].unflatten(-2, (strips, step))
     weights = cell_weights(layout).to(maps).view(layout.cells, parts, step)
     rows = torch.matmul(weights.flatten(0, 1), cut).unflatten(-2, (layout.cells, parts))  # (..., strips, c, parts, N)
-    total = None
-    for part in range(parts):
-        here = rows[..., part : part + (blocks - 1) * hop + 1 : hop, :, part, :]
-        total = here if total is None else total + here
-    assert total is not None
-    return total.transpose(-3, -2)
+    shifted = [rows[..., part : part + (blocks - 1) * hop + 1 : hop, :, part, :] for part in range(parts)]
+    return reduce(torch.add, shifted).transpose(-3, -2)
 
 
 def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tensor:

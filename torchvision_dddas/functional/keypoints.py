@@ -32,7 +32,6 @@ def grid_features(
     cell_px: int,
     quality: float | Float[Tensor, "B"] = 0.01,
     block: int = 3,
-    allowed: Bool[Tensor, "B 1 H W"] | None = None,
     least: float = 1e-7,
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
     """The best pixel of every whole cell_px x cell_px cell, row by row: spread over the frame, and faster.
@@ -41,14 +40,13 @@ def grid_features(
     above quality times the frame's maximum, and above `least`: the rounding that a blank picture shows.
     """
     eigen = min_eigenvalue(gray, block)
-    admitted = eigen if allowed is None else eigen * allowed
     (height, width), batch = gray.shape[-2:], len(gray)
     rows, columns = height // cell_px, width // cell_px
     if not rows or not columns:
         return gray.new_zeros(batch, 0, 2), gray.new_zeros(batch, 0), gray.new_zeros(batch, 0, dtype=torch.bool)
-    best, index = functional.max_pool2d(admitted, cell_px, cell_px, return_indices=True)
+    best, index = functional.max_pool2d(eigen, cell_px, cell_px, return_indices=True)
     best, index = best.flatten(1), index.flatten(1)
     points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
     share = torch.as_tensor(quality, dtype=eigen.dtype, device=eigen.device).reshape(-1, 1)
-    valid = best > (share * admitted.flatten(1).amax(1, keepdim=True)).clamp(min=least)
+    valid = best > (share * eigen.flatten(1).amax(1, keepdim=True)).clamp(min=least)
     return points, best * valid, valid
