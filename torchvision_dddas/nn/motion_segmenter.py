@@ -88,16 +88,11 @@ class MotionSegmenter(nn.Module):
 
     def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
         """The core mask. values: the tuned parameters by name. softness: a share of the settings' threshold."""
-        threshold = self._parameter("difference.threshold", values)
         evidence = self.evidence(differences, values)
-        margin = evidence - threshold
-        margin = blend_sizes(
-            self._parameter("morphology.erode_px", values), lambda side: morphology.erode(margin, side, "ellipse")
-        )
-        eroded = margin
-        margin = blend_sizes(
-            self._parameter("morphology.close_px", values), lambda side: morphology.closing(eroded, side, "ellipse")
-        )
+        above = evidence - self._parameter("difference.threshold", values)
+        erode_px, close_px = (self._parameter(f"morphology.{name}_px", values) for name in ("erode", "close"))
+        eroded = blend_sizes(erode_px, lambda side: morphology.erode(above, side, "ellipse"))
+        margin = blend_sizes(close_px, lambda side: morphology.closing(eroded, side, "ellipse"))
         return Core(step(margin, softness * self.settings.difference.threshold), margin, evidence)
 
     def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
@@ -144,8 +139,6 @@ class MotionSegmenter(nn.Module):
 
     def _blurred(self, levels: Tensor, values: Values) -> Tensor:
         def of_size(side: int) -> Tensor:
-            if side == 1:
-                return levels
             smooth = filters.gaussian(levels, side)
             return straight_through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
 
