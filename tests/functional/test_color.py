@@ -160,3 +160,7 @@ def test_soft_counts_tend_to_hard_as_softness_vanishes():
     ]
     assert apart[0] > apart[1] > apart[2]
     assert apart[2] < 5  # of 1,200
+
+
+def test_no_ranges_give_no_masks():
+    assert color.within_ranges(torch.zeros(2, 3, 4, 5), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (2, 0, 4, 5)

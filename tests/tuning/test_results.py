@@ -13,6 +13,7 @@ from tests.browser import evaluate, needs_browser
 from tests.evaluation.studies.test_comparison import CLIPS, comparison
 from tests.evaluation.studies.world import filmed, study
 from tests.pages import Page
+from tests.tuning.worlds import filmed_clip
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import bootstrap
@@ -20,7 +21,7 @@ from torchvision_dddas.evaluation.studies.runner import read_spec, run_study
 from torchvision_dddas.evaluation.studies.summary import goal_value, parse_goal
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.tuning.report import tuning_report
-from torchvision_dddas.tuning.time_cost import Curve, TimeCost, measure_cost, read_cost, timed_points
+from torchvision_dddas.tuning.time_cost import Curve, TimeCost, frame_timer, measure_cost, read_cost, timed_points
 from torchvision_dddas.tuning.verdict import Verdict, _say_change, judge
 
 THRESHOLD, CLOSE, BLUR = "difference.threshold", "morphology.close_px", "difference.blur_px"
@@ -286,3 +287,8 @@ def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     cost = TimeCost(0.1, 1 / 3, (Curve(THRESHOLD, (2.0, 4.0), (1.1, 1.0)),))
     (tmp_path / "cost.json").write_text(json.dumps(cost.as_json()))
     assert read_cost(tmp_path / "cost.json") == cost
+
+
+def test_a_frame_is_timed_by_the_hard_pipeline(tmp_path: Path) -> None:
+    timed = frame_timer(filmed_clip(tmp_path, 5), "motion", load_config("fast"), "onboard")
+    assert 0 < timed(load_config("fast")) < 10
