@@ -18,7 +18,6 @@ from torchvision_dddas.live.status import StatusWriter, snapshot_facts
 from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"
-LINKS = ("/metrics", "/health.json")
 
 Page = Callable[[], tuple[int, str, str]]
 """Returns (status, type, text); called in a thread of the server."""
@@ -76,11 +75,12 @@ def health_pages(
 
     def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
-        return now, find_trouble(now, patience_s, watchdog.hung)
+        late = f"no result for {_span(now.idle_s)}" if now.idle_s > patience_s else ""
+        return now, watchdog.hung or late
 
     def page() -> tuple[int, str, str]:
         now, trouble = state()
-        return 200, "text/html", html_page(now, name, run.state, trouble, LINKS)
+        return 200, "text/html", html_page(now, name, run.state, trouble)
 
     def prometheus() -> tuple[int, str, str]:
         text = metrics(*state(), version, {stream.name: stream.lost for stream in streams})
@@ -88,8 +88,9 @@ def health_pages(
 
     def program() -> tuple[int, str, str]:
         now, trouble = state()
-        facts = {"state": run.state, "input": name, "version": version, **snapshot_facts(now)}
-        return (503 if trouble else 200), "application/json", health_json(facts, trouble)
+        facts = {"ok": not trouble, "trouble": trouble, "state": run.state, "input": name, "version": version}
+        text = json.dumps(finite(facts | snapshot_facts(now)), indent=2) + "\n"
+        return (503 if trouble else 200), "application/json", text
 
     return {"/": page, "/metrics": prometheus, "/health.json": program}
 
@@ -144,80 +145,62 @@ class _Handler(BaseHTTPRequestHandler):
         """Requests are not logged."""
 
 
-# --------------------------------------------------------------------------------------------------------------------
-# What the pages say.
-
-_TILES = {
-    "rate_hz": ("results a second", ""),
-    "targets": ("targets now", ""),
-    "people": ("people now", ""),
-    "every": ("looks at one picture of", ""),
-    "keypoints": ("keypoints", ""),
-    "queue": ("pictures waiting", ""),
-    "resident_bytes": ("memory", " MB"),
+# What is known of the health: by name, the title of its tile on the page, "" for none, and the help for Prometheus.
+_COUNTS = {
+    "captured": ("pictures captured", "Pictures that the source gave."),
+    "dropped": ("dropped", "Pictures that were too late to be looked at."),
+    "late": ("late", "Results later than the deadline."),
+    "undecoded": ("not decoded", "Pictures that could not be decoded."),
+    "unreliable": ("without a conclusion", "Frames from which nothing could be concluded."),
+    "reconnects": ("reconnected", "Times that the stream was opened again."),
+    "begun_anew": ("begun anew", "Times that the work failed and was begun anew."),
+    "looked_at": ("", "Pictures that were looked at."),
+    "results": ("", "Frames whose results were handed on."),
 }
-_TIME_TILES = {"latency": "latency, median · 99 %", "age": "age of a result", "step": "work on a picture"}
-_COUNT_TILES = {
-    "captured": "pictures captured",
-    "dropped": "dropped",
-    "late": "late",
-    "undecoded": "not decoded",
-    "unreliable": "without a conclusion",
-    "reconnects": "reconnected",
-    "begun_anew": "begun anew",
+_GAUGES = {
+    "rate_hz": ("results a second", "Results a second."),
+    "targets": ("targets now", "Targets in the latest frame."),
+    "people": ("people now", "People in the latest frame."),
+    "every": ("looks at one picture of", "One of so many pictures is looked at."),
+    "keypoints": ("keypoints", "Keypoints that a registration may take."),
+    "queue": ("pictures waiting", "Pictures that wait."),
+    "resident_bytes": ("memory", "Memory of the process."),
 }
-_HELP = {
-    "captured": "Pictures that the source gave.",
-    "dropped": "Pictures that were too late to be looked at.",
-    "looked_at": "Pictures that were looked at.",
-    "undecoded": "Pictures that could not be decoded.",
-    "reconnects": "Times that the stream was opened again.",
-    "results": "Frames whose results were handed on.",
-    "late": "Results later than the deadline.",
-    "unreliable": "Frames from which nothing could be concluded.",
-    "begun_anew": "Times that the work failed and was begun anew.",
-    "every": "One of so many pictures is looked at.",
-    "keypoints": "Keypoints that a registration may take.",
-    "queue": "Pictures that wait.",
-    "rate_hz": "Results a second.",
-    "targets": "Targets in the latest frame.",
-    "people": "People in the latest frame.",
-    "resident_bytes": "Memory of the process.",
-    "latency": "From the capture of the newest picture to the results that it settles.",
-    "age": "From the capture of a picture to its own results.",
-    "step": "Work on a picture.",
+_SECONDS = {
+    "latency": ("latency", "From the capture of the newest picture to the results that it settles."),
+    "age": ("age of a result", "From the capture of a picture to its own results."),
+    "step": ("work on a picture", "Work on a picture."),
 }
+_HELP = {name: words for table in (_COUNTS, _GAUGES, _SECONDS) for name, (_, words) in table.items()}
 
 
-def html_page(now: Snapshot, name: str, state: str, trouble: str, links: tuple[str, ...], refresh_s: int = 2) -> str:
+def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int = 2) -> str:
     """The page for people: no scripts, nothing fetched from elsewhere, reloaded every refresh_s."""
-    latest = list(reversed(now.events))[:_SHOWN_EVENTS]
+
+    def count(name: str) -> str:
+        return f"{now.counts.get(name, 0):,}".replace(",", " ")
+
+    figures = [("running for", _span(now.since_s)), ("results", count("results"))]
+    for key, (title, _) in _GAUGES.items():
+        if key in now.gauges:
+            is_bytes = key == "resident_bytes"
+            figures.append((title, f"{now.gauges[key] / (1e6 if is_bytes else 1):.3g}{' MB' if is_bytes else ''}"))
+    for key, (title, _) in _SECONDS.items():
+        if key in now.seconds:
+            median, _, most = now.seconds[key]
+            figures += [(f"{title}, median", f"{1000 * median:.0f} ms"), (f"{title}, 99 %", f"{1000 * most:.0f} ms")]
+    figures += [(title, count(key)) for key, (title, _) in _COUNTS.items() if title and key in now.counts]
     return render_page(
         "live.html",
         title=f"{state} · {name}",
         name=name,
         trouble=trouble,
-        figures=_figures(now),
-        events=[(_clock(event.utc_s), event.frame, event.text) for event in latest],
+        figures=figures,
+        events=[(_clock(e.utc_s), e.frame, e.text) for e in list(reversed(now.events))[:_SHOWN_EVENTS]],
         now=_clock(datetime.now(UTC).timestamp()),
-        links=links,
+        links=("/metrics", "/health.json"),
         refresh_s=refresh_s,
     )
-
-
-def _figures(now: Snapshot) -> list[tuple[str, str]]:
-    def count(name: str) -> str:
-        return f"{now.counts.get(name, 0):,}".replace(",", " ")
-
-    figures = [("running for", _span(now.since_s)), ("results", count("results"))]
-    for name, (title, unit) in _TILES.items():
-        if name in now.gauges:
-            figures.append((title, f"{now.gauges[name] / (1e6 if unit else 1):.3g}{unit}"))
-    for name, title in _TIME_TILES.items():
-        if name in now.seconds:
-            median, _, most = now.seconds[name]
-            figures += [(f"{title}, median", f"{1000 * median:.0f} ms"), (f"{title}, 99 %", f"{1000 * most:.0f} ms")]
-    return [*figures, *((title, count(name)) for name, title in _COUNT_TILES.items() if name in now.counts)]
 
 
 def _span(seconds: float) -> str:
@@ -271,15 +254,3 @@ def _value(value: float) -> str:
     if math.isnan(value):
         return "NaN"
     return ("+Inf" if value > 0 else "-Inf") if math.isinf(value) else f"{value:.12g}"
-
-
-def find_trouble(now: Snapshot, patience_s: float, hung: str = "") -> str:
-    """What is wrong, in words; empty if nothing is. patience_s: a longer time without a result is wrong."""
-    if hung:
-        return hung
-    return f"no result for {_span(now.idle_s)}" if now.idle_s > patience_s else ""
-
-
-def health_json(state: Mapping[str, Any], trouble: str) -> str:
-    """The state of the run, and whether anything is wrong."""
-    return json.dumps(finite({"ok": not trouble, "trouble": trouble, **state}), indent=2) + "\n"
