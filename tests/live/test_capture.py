@@ -146,12 +146,14 @@ def test_how_many_pictures_are_looked_at_can_be_set_while_it_runs(camera, later)
     assert "dropped" not in some.counts
 
 
-def test_a_picture_that_cannot_be_decoded_is_counted_and_told(camera, later) -> None:
-    some = camera([grey(1), later(), None, later(), None, later(), grey(1)])
-    frames = taken(some.frames, 2)
-    assert [(f.number, f.skipped) for f in frames] == [(1, 0), (4, 2)]
-    assert some.counts["undecoded"] == 2
-    assert some.told == ["frame 2 could not be decoded and was left out"]  # and not again at once
+def test_single_bad_pictures_are_left_out_counted_and_reported_once(camera, later) -> None:
+    some = camera([grey(1), later(), None, later(), None, later(), grey(1), later(), grey(1, 32, 24), later(), grey(1)])
+    assert [(f.number, f.skipped) for f in taken(some.frames, 3)] == [(1, 0), (4, 2), (6, 1)]
+    assert (some.counts["undecoded"], some.counts["wrong_size"]) == (2, 1)
+    assert some.told == [
+        "frame 2 could not be decoded and was left out",
+        "pictures are 32x24 in place of 64x48: they are left out",
+    ]
 
 
 def test_a_stream_that_can_no_longer_be_decoded_is_opened_again(camera, later) -> None:
@@ -160,24 +162,14 @@ def test_a_stream_that_can_no_longer_be_decoded_is_opened_again(camera, later) -
     assert any("could be decoded for 6.0 s" in what for what in some.told)
 
 
-def test_one_picture_of_another_size_is_left_out_and_told(camera, later) -> None:
-    some = camera([grey(1), later(), grey(1, 32, 24), later(), grey(1)])
-    assert [(f.number, f.skipped) for f in taken(some.frames, 2)] == [(1, 0), (3, 1)]
-    assert some.counts["wrong_size"] == 1
-    assert some.told == ["pictures are 32x24 in place of 64x48: they are left out"]
-
-
 def test_a_camera_that_comes_back_with_another_size_is_scaled_where_it_shows_the_same(camera, later) -> None:
+    other = camera([grey(1), *[later(1.0), grey(7, 64, 64)] * 20, later(1.0), grey(9)])
+    assert [int(f.image[0, 0, 0]) for f in taken(other.frames, 2)] == [1, 9]  # another shape is never bent
     some = camera([grey(1), *[later(1.0), grey(7, 128, 96)] * 8])
     frames = taken(some.frames, 3)
     assert [f.image.shape for f in frames] == [(48, 64, 3)] * 3
     assert [f.time_s for f in frames] == pytest.approx([0, 6, 7])
     assert any("for 5.0 s: they are scaled" in what for what in some.told)
-
-
-def test_pictures_of_another_shape_are_never_bent(camera, later) -> None:
-    some = camera([grey(1), *[later(1.0), grey(7, 64, 64)] * 20, later(1.0), grey(9)])
-    assert [int(f.image[0, 0, 0]) for f in taken(some.frames, 2)] == [1, 9]
 
 
 def test_a_lost_stream_is_opened_again_with_ever_longer_pauses(camera, later) -> None:
@@ -372,7 +364,7 @@ def test_a_recording_without_pace_waits_for_the_run(tmp_path: Path) -> None:
     source.close()
 
 
-def test_a_damaged_recording_is_played_on(tmp_path: Path) -> None:
+def test_what_is_damaged_in_a_recording_is_left_out(tmp_path: Path) -> None:
     path = write_video(tmp_path / "clip.avi", "MJPG", frames=20)
     spoil_avi_frame(path, 12)
     health = Health()
@@ -380,9 +372,6 @@ def test_a_damaged_recording_is_played_on(tmp_path: Path) -> None:
     assert [f.number for f in frames] == [n for n in range(1, 21) if n != 12]
     assert health.snapshot().counts["undecoded"] == 1
     assert [(e.kind, e.frame) for e in health.snapshot().events] == [("stream", 12)]
-
-
-def test_an_image_of_another_size_among_others_is_left_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "frames", range(1, 6))
     cv2.imwrite(str(folder / "frame3.png"), picture(3, 32, 24))
     source = LiveSource(str(folder), LiveParameters(pace=0))

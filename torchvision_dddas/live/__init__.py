@@ -2,6 +2,6 @@
 
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot
-from torchvision_dddas.live.load_shedding import LoadShedding
+from torchvision_dddas.live.runner import LoadShedding
 
 __all__ = ["Health", "LiveSource", "LoadShedding", "Snapshot"]

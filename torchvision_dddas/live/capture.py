@@ -94,7 +94,8 @@ class LiveSource:
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames, the newest if the run is late; a further iteration goes on where the one before ended."""
-        if self._queue.begin():
+        if not self._queue.begun:
+            self._queue.note(begun=True)
             self._feed.begin()
         while not self._queue.over:
             frame = self._queue.take(self._feed.check())
@@ -110,7 +111,7 @@ class LiveSource:
 
     def stop(self) -> None:
         """End the iteration. May be called from any thread, and from a signal handler."""
-        self._queue.close()
+        self._queue.note(closed=True)
 
     def close(self) -> None:
         """Stop and release the camera; a thread that hangs in its driver is left behind."""
@@ -130,21 +131,12 @@ class Player:
         self._health, self._clock = health, clock
         if isinstance(recording, (VideoSource, ImageSource)):
             recording.tolerant = True  # leave out pictures of another size
-        self._thread = threading.Thread(target=self._play, name="playing", daemon=True)
-
-    @property
-    def apart_s(self) -> float:
-        """As in LiveSource."""
-        return 1 / (self._recording.rate_hz * self._pace) if self._pace else 0.0
-
-    @property
-    def threads(self) -> list[threading.Thread]:
-        """Threads that may be alive."""
-        return [self._thread]
+        self.apart_s = 1 / (recording.rate_hz * pace) if pace else 0.0
+        self.threads = [threading.Thread(target=self._play, name="playing", daemon=True)]
 
     def begin(self) -> None:
         """Start playing."""
-        self._thread.start()
+        self.threads[0].start()
 
     def check(self) -> float | None:
         """As in Receiver: a player never hangs."""
@@ -176,7 +168,7 @@ class Player:
             self._log.report(f"the recording cannot be read further: {error}")
         finally:
             self._report()
-            queue.end()
+            queue.note(ended=True)
 
     def _report(self) -> None:
         for problem in self._recording.problems:

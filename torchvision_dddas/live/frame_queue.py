@@ -39,7 +39,7 @@ class FrameQueue:
     """A queue with one thread on each side; a full one drops its oldest frame.
 
     changed: the condition that guards it and all that the two threads share. begun: frames are being taken. ended: the
-    source gives no more. closed: the run takes no more. every: one of so many frames is wanted.
+    source gives no more. closed: the run takes no more, and no thread waits. every: one of so many frames is wanted.
     """
 
     def __init__(self, room: int, health: Health, clock: Clock) -> None:
@@ -95,23 +95,10 @@ class FrameQueue:
             while not self.closed and (left := until_s - self._clock.now()) > 0:
                 self._clock.wait(self.changed, left)
 
-    def begin(self) -> bool:
-        """Note that frames are being taken; return whether this is the first time."""
+    def note(self, begun: bool = False, ended: bool = False, closed: bool = False) -> None:
+        """Note that frames are being taken, or are no more; who waits looks again."""
         with self.changed:
-            first, self.begun = not self.begun, True
-            self.changed.notify_all()
-            return first
-
-    def end(self) -> None:
-        """Note that the source gives no more frames."""
-        with self.changed:
-            self.ended = True
-            self.changed.notify_all()
-
-    def close(self) -> None:
-        """Note that the run takes no more frames; both threads stop waiting."""
-        with self.changed:
-            self.closed = True
+            self.begun, self.ended, self.closed = self.begun or begun, self.ended or ended, self.closed or closed
             self.changed.notify_all()
 
     def _notify(self) -> None:

@@ -65,7 +65,7 @@ class Receiver:
         try:
             self._await_first()
         except BaseException:
-            queue.close()
+            queue.note(closed=True)
             raise
 
     @property
@@ -113,17 +113,6 @@ class Receiver:
         if self._failure is not None:
             raise self._failure
 
-    def _first(self, stream: Stream) -> None:
-        """Learn the size and the rate. Raises InputError."""
-        image = first_picture(stream, self.name)
-        self.size = (image.shape[1], image.shape[0])
-        self.rate_hz = self.rate_hz or stream.rate_hz or self._measured(stream)
-
-    def _measured(self, stream: Stream) -> float:
-        times_s = [self._clock.now() for _ in range(_MEASURED) if stream.grab()]
-        apart_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
-        return 1 / apart_s if 0.001 < apart_s < 10 else _FALLBACK_HZ
-
     def _work(self, turn: int) -> None:
         try:
             while not self._queue.closed and turn == self._turn:
@@ -146,7 +135,9 @@ class Receiver:
                 stream = self._opener()
             if not self._ready:
                 # Here the driver's own limits apply; _await_first has one for all of it.
-                self._first(stream)
+                image = first_picture(stream, self.name)
+                self.size = (image.shape[1], image.shape[0])
+                self.rate_hz = self.rate_hz or stream.rate_hz or self._measured(stream)
                 with self._queue.changed:
                     self._ready = turn == self._turn
                     self._queue.changed.notify_all()
@@ -170,6 +161,11 @@ class Receiver:
             self._pause_s = self._parameters.retry_s  # the connection held
         if not self._queue.closed:
             self._lost(why)
+
+    def _measured(self, stream: Stream) -> float:
+        times_s = [self._clock.now() for _ in range(_MEASURED) if stream.grab()]
+        apart_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
+        return 1 / apart_s if 0.001 < apart_s < 10 else _FALLBACK_HZ
 
     @contextmanager
     def _driver(self, turn: int, times: float = 1.0) -> Iterator[None]:
@@ -229,7 +225,12 @@ class Receiver:
             log.report(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
             return False
         if (fitted := self._fitted(image, taken_s)) is not None:
-            self._found()
+            self._health.gauge("connected", 1)
+            if self._lost_s is not None:
+                gone_s, self._lost_s = self._clock.now() - self._lost_s, None
+                self._health.count("reconnects")
+                tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
+                log.report(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
             self._queue.put(Frame(log.number, taken_s - self._start_s, fitted, 0, taken_s))
         return True
 
@@ -257,15 +258,6 @@ class Receiver:
             self._lost_s, self._tries = self._clock.now(), 0
             self._health.gauge("connected", 0)
             self._log.report(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
-
-    def _found(self) -> None:
-        self._health.gauge("connected", 1)
-        if self._lost_s is None:
-            return
-        gone_s, self._lost_s = self._clock.now() - self._lost_s, None
-        self._health.count("reconnects")
-        tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
-        self._log.report(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
 
     def _compare(self, sent_hz: float) -> None:
         if not self._off and abs(sent_hz / self.rate_hz - 1) > _OFF:

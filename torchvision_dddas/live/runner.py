@@ -1,17 +1,23 @@
-"""The loop of a live run: frames in, results out, and a restart after an error."""
+"""The loop of a live run: frames in, results out, cheaper settings under load, and a restart after an error."""
 
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from math import isfinite
 
+import numpy as np
+
+from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.control import rules as control
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
+from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import Watchdog
-from torchvision_dddas.types import Frame, FrameResult, Telemetry, TrackedFrame
+from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
 
 _MOST_FAILURES = 25
 """Restarts in a row without a result, after which the run gives up."""
@@ -66,24 +72,20 @@ class Feed:
             if self._first:
                 # Earlier frames are not missing: the pipeline that failed has seen them.
                 frame, self._first = replace(frame, skipped=frame.number - 1), False
-            self._check_telemetry(frame)
             self.newest = frame
+            if self._log is not None:
+                flight = self._log.at(frame.time_s)
+                silent = flight is None or not isfinite(flight.altitude_m)
+                if silent != self._silent:
+                    self._silent = silent
+                    words = "silent: the altitude is not known any more" if silent else "there again"
+                    self._health.event("telemetry", f"telemetry is {words}", frame.number)
             self._watchdog.begin(frame.number)
             yield frame
 
     def stop(self) -> None:
         """Take no further frame; results of those taken still come."""
         self.ended = True
-
-    def _check_telemetry(self, frame: Frame) -> None:
-        if self._log is None:
-            return
-        flight = self._log.at(frame.time_s)
-        silent = flight is None or not isfinite(flight.altitude_m)
-        if silent != self._silent:
-            self._silent = silent
-            words = "silent: the altitude is not known any more" if silent else "there again"
-            self._health.event("telemetry", f"telemetry is {words}", frame.number)
 
 
 Result = tuple[FrameResult, TrackedFrame | None]
@@ -98,20 +100,20 @@ class _Renumbering:
 
     def __call__(self, result: Result) -> Result:
         located, people = result
-        followed, grounded = self._shifted(0, located.tracked), located.locations
-        if grounded is not None and self._before[0]:
-            places = grounded.positions
-            grounded = replace(grounded, positions=replace(places, target=places.target + self._before[0]))
-        located = replace(located, tracked=followed, locations=grounded)
-        return located, None if people is None else self._shifted(1, people)
+        locations, before = located.locations, self._before[0]
+        if locations is not None and before:
+            places = locations.positions
+            locations = replace(locations, positions=replace(places, target=places.target + before))
+        located = replace(located, tracked=self._shift(0, located.tracked), locations=locations)
+        return located, None if people is None else self._shift(1, people)
 
     def restart(self) -> None:
         self._before = list(self._highest)
 
-    def _shifted(self, kind: int, followed: TrackedFrame) -> TrackedFrame:
-        before, tracks = self._before[kind], followed.tracks
+    def _shift(self, kind: int, tracked: TrackedFrame) -> TrackedFrame:
+        before, tracks = self._before[kind], tracked.tracks
         self._highest[kind] = max(self._highest[kind], before + int(tracks.identity.max(initial=0)))
-        return replace(followed, tracks=replace(tracks, identity=tracks.identity + before)) if before else followed
+        return replace(tracked, tracks=replace(tracks, identity=tracks.identity + before)) if before else tracked
 
 
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
@@ -176,3 +178,57 @@ def _where(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if "torchvision_dddas" in f.filename] or frames
     return f"{ours[-1].filename.rpartition('torchvision_dddas/')[2]}:{ours[-1].lineno}" if ours else "nowhere"
+
+
+# The cost of a frame is the mean of the latest, without the longest of them: that one may wait for something else.
+_MOST_FRAMES = 10
+_FEWEST_FRAMES = 5
+
+
+class LoadShedding:
+    """Applies the rule `control.shed`. Call it before each frame; it returns the settings that keep up with the source.
+
+    settings: those in force. people: whether people are searched for, so that their search can be narrowed.
+    """
+
+    def __init__(
+        self,
+        source: LiveSource,
+        settings: Settings,
+        health: Health | None = None,
+        people: bool = False,
+        clock: Clock | None = None,
+    ) -> None:
+        self.settings, self.load = settings, control.Load()
+        self._source, self._base, self._people = source, settings, people
+        self._health, self._clock = health or Health(), clock or Clock()
+        self._costs: deque[float] = deque(maxlen=_MOST_FRAMES)
+        self._has_begun = False
+        self._show(control.rungs(settings, people)[0])
+
+    def __call__(self, frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:
+        """The settings from this frame on, and the record of what changed."""
+        if not self._has_begun:  # no frame was processed before the first
+            self._has_begun = True
+            return self.settings, ()
+        self._costs.append(self._source.busy_s)
+        if len(self._costs) < _FEWEST_FRAMES:
+            return self.settings, ()
+        cost_s, rung = float(np.mean(sorted(self._costs)[:-1])), self.load.rung
+        self.load, moved = control.shed(
+            frame.number, self.load, cost_s, self._source.apart_s, self._clock.now(), self._base, self._people
+        )
+        if self.load.rung != rung:
+            values = control.rungs(self._base, self._people)[self.load.rung]
+            in_settings = {name: value for name, value in values.items() if name != control.SAMPLING}
+            self.settings = with_parameters(self._base, in_settings)
+            self._source.look_at(int(values[control.SAMPLING]))
+            self._costs.clear()  # measured with the settings before
+            self._show(values)
+            words = ", ".join(f"{a.parameter} {a.old:g} -> {a.new:g}" for a in moved)
+            self._health.event("load", f"{words}: {moved[0].cause}", frame.number)
+        return self.settings, moved
+
+    def _show(self, values: dict[str, float]) -> None:
+        self._health.gauge("every", values[control.SAMPLING])
+        self._health.gauge("keypoints", values["registration.keypoints"])

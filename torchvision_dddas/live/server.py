@@ -13,8 +13,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output import finite
 from torchvision_dddas.io.report import render_page
 from torchvision_dddas.io.streams import Stream
-from torchvision_dddas.live.health import Health, Snapshot
-from torchvision_dddas.live.status import StatusWriter, snapshot_facts
+from torchvision_dddas.live.health import Health, Snapshot, StatusWriter, snapshot_facts
 from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"

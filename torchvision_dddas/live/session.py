@@ -15,11 +15,17 @@ from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_fa
 from torchvision_dddas.io.sources import without_secrets
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
-from torchvision_dddas.live.health import Health, Snapshot
-from torchvision_dddas.live.load_shedding import LoadShedding
-from torchvision_dddas.live.runner import Feed, RepeatedFailure, Result, record_result, results, send_result
+from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
+from torchvision_dddas.live.runner import (
+    Feed,
+    LoadShedding,
+    RepeatedFailure,
+    Result,
+    record_result,
+    results,
+    send_result,
+)
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
-from torchvision_dddas.live.status import StatusWriter
 from torchvision_dddas.live.watchdog import HUNG, StopSignals, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
 from torchvision_dddas.pipeline import Pipeline
