@@ -8,8 +8,7 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.sweep import (
     AHEAD,
-    Choice,
-    Range,
+    Axis,
     Trial,
     best,
     count_points,
@@ -47,18 +46,18 @@ def test_axes_have_the_types_of_the_settings_and_no_value_twice() -> None:
     grid = ["difference.threshold=10, 9,9.0", "refine.on=true,false", "difference.near_frames=[1],[1,2]"]
     axes = parse_grid([*grid, "difference.kind=normalized,to_reference"], NOW)
     assert axes == [
-        Choice("difference.threshold", (10.0, 9.0)),
-        Choice("refine.on", (True, False)),
-        Choice("difference.near_frames", ((1,), (1, 2))),
-        Choice("difference.kind", ("normalized", "to_reference")),
+        Axis("difference.threshold", (10.0, 9.0)),
+        Axis("refine.on", (True, False)),
+        Axis("difference.near_frames", ((1,), (1, 2))),
+        Axis("difference.kind", ("normalized", "to_reference")),
     ]
     assert count_points(axes) == 16
     ranges = ["difference.threshold=8:30", "difference.blur_px=3:9", "small.gap_frames=2:20:log"]
     assert parse_ranges([*ranges, "refine.on=true,false"], NOW) == [
-        Range("difference.threshold", 8.0, 30.0),
-        Range("difference.blur_px", 3, 9, step=2),
-        Range("small.gap_frames", 2, 20, step=1, log=True),
-        Choice("refine.on", (True, False)),
+        Axis("difference.threshold", (), 8.0, 30.0),
+        Axis("difference.blur_px", (), 3, 9, step=2),
+        Axis("small.gap_frames", (), 2, 20, step=1, log=True),
+        Axis("refine.on", (True, False)),
     ]
 
 

@@ -282,42 +282,34 @@ def write_study(
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        try:
-            results = run_study(spec, base, workers, place, clips, on_event, begin)
-            measures = summarize(results)
-            _write_json(folder / "metrics.json", measures)
-            write_csv(folder / "metrics.csv", measures)
-            write_parquet(folder, measures, results)
-            scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
-            write_scores(folder, spec.name, scored)
-            write_whole(folder / "report.html", study_report(finite(measures), results).encode())
-            record = {
-                "state": "complete",
-                "versions": versions(),
-                "study": {
-                    "name": spec.name,
-                    "tasks": spec.tasks,
-                    "config": spec.config,
-                    "set": spec.overrides,
-                    "backend": spec.backend,
-                    "interval": spec.interval,
-                },
-                **results.facts,
-                "left_out": results.left_out,
-                "cache": place,
-                "settings": results.settings.model_dump(),
-                "seconds": {"wall": round(time.perf_counter() - start_s, 3)},
-                "costs": summarize_costs(results),
-            }
-            _write_json(folder / "run.json", record)
-        except BaseException:
-            if has_begun:
-                with suppress(OSError):
-                    record = {"state": "interrupted", "study": spec.name, "cache": place}
-                    _write_json(folder / "run.json", record)
-            raise
-    except OSError as error:
-        raise cannot_write(folder / "run.json", error) from error
+        results = run_study(spec, base, workers, place, clips, on_event, begin)
+        measures = summarize(results)
+        _write_json(folder / "metrics.json", measures)
+        write_csv(folder / "metrics.csv", measures)
+        write_parquet(folder, measures, results)
+        scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
+        write_scores(folder, spec.name, scored)
+        write_whole(folder / "report.html", study_report(finite(measures), results).encode())
+        study = {name: value for name, value in vars(spec).items() if name not in ("sources", "overrides")}
+        record = {
+            "state": "complete",
+            "versions": versions(),
+            "study": {**study, "set": spec.overrides},
+            **results.facts,
+            "left_out": results.left_out,
+            "cache": place,
+            "settings": results.settings.model_dump(),
+            "seconds": {"wall": round(time.perf_counter() - start_s, 3)},
+            "costs": summarize_costs(results),
+        }
+        _write_json(folder / "run.json", record)
+    except BaseException as error:
+        if has_begun:
+            with suppress(OSError):
+                _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
+        if isinstance(error, OSError):
+            raise cannot_write(folder / "run.json", error) from error
+        raise
     return results, measures
 
 

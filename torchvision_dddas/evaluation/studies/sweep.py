@@ -39,33 +39,26 @@ Measure = Callable[[Mapping[str, object]], Measured]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """Some values of a parameter."""
+class Axis:
+    """A parameter and its values; without values the range from low to high, both included.
+
+    step: 0 for real numbers. log: even in the logarithm.
+    """
 
     parameter: str
-    values: tuple[object, ...]
-
-
-@dataclass(frozen=True)
-class Range:
-    """Values of a parameter from low to high, both included. step: 0 for real numbers. log: even in the logarithm."""
-
-    parameter: str
-    low: float
-    high: float
+    values: tuple[object, ...] = ()
+    low: float = 0
+    high: float = 0
     step: int = 0
     log: bool = False
 
 
-Axis = Choice | Range
-
-
-def parse_grid(texts: Sequence[str], settings: Settings) -> list[Choice]:
+def parse_grid(texts: Sequence[str], settings: Settings) -> list[Axis]:
     """Axes from texts such as `difference.threshold=10,20,30`.
 
     Raises InputError for an unknown parameter, one that is named twice, no values, a bad value, or too many points.
     """
-    axes: list[Choice] = []
+    axes: list[Axis] = []
     for text in texts:
         parameter, values = _split(text, "group.parameter=value,value", axes)
         axes.append(_choice(parameter, values, text, settings))
@@ -87,7 +80,7 @@ def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
     return axes
 
 
-def count_points(axes: Sequence[Choice]) -> int:
+def count_points(axes: Sequence[Axis]) -> int:
     """The number of points of a grid."""
     return math.prod(len(axis.values) for axis in axes)
 
@@ -104,7 +97,7 @@ def _split(text: str, wanted: str, axes: Sequence[Axis]) -> tuple[str, str]:
     return parameter, values
 
 
-def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Choice:
+def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Axis:
     """Values between commas, as TOML has them; words need no quotes."""
     try:
         values = list(tomllib.loads(f"values = [{listed}]")["values"])
@@ -122,10 +115,10 @@ def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Choic
         _check(parameter, value, settings)
     if isinstance(_current(settings, parameter), float):
         values = [float(value) if isinstance(value, int) else value for value in values]
-    return Choice(parameter, tuple(dict.fromkeys(values)))
+    return Axis(parameter, tuple(dict.fromkeys(values)))
 
 
-def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Range:
+def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Axis:
     current = _current(settings, parameter)
     if isinstance(current, bool) or not isinstance(current, int | float):
         raise InputError(f"{parameter} is no number and has no range; give its values, as {parameter}=first,second")
@@ -149,7 +142,7 @@ def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) 
         _check(parameter, end, settings)
     if log and odd:
         raise InputError(f"{parameter} takes odd numbers, which have no logarithmic range; leave out :log")
-    return Range(parameter, low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
+    return Axis(parameter, (), low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
 
 
 def _check(parameter: str, value: object, settings: Settings) -> None:
@@ -184,7 +177,7 @@ class Trial:
 
 
 def search_grid(
-    axes: Sequence[Choice],
+    axes: Sequence[Axis],
     settings: Settings,
     measure: Measure,
     prepare: Callable[[Sequence[Mapping[str, object]]], None] = lambda points: None,
@@ -224,7 +217,7 @@ def search_ranges(
     import optuna
 
     def suggest(axis: Axis) -> object:
-        if isinstance(axis, Choice):  # by their places, as Optuna takes no lists as values
+        if axis.values:  # by their places, as Optuna takes no lists as values
             return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
         if axis.step:
             return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
