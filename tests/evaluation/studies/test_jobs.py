@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import signal
 import socket
 import subprocess
@@ -134,36 +133,26 @@ def test_bad_input_and_faults_are_the_causes_of_the_tasks_that_meet_them(folder,
     assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
 
 
-linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds workers by /proc")
-
-SCHEDULER = """
-    import asyncio
-    from distributed import Scheduler
-    async def main():
-        async with Scheduler(host="127.0.0.1", port=0, dashboard=False, dashboard_address=None) as scheduler:
-            print(scheduler.address, flush=True)
-            await scheduler.finished()
-    asyncio.run(main())
-"""
-
-WORKER = """
+NODE = """
     import asyncio, sys
     {before}
-    from distributed import Worker
+    from distributed import Scheduler, Worker
     async def main():
-        async with Worker(sys.argv[1], nthreads=1, dashboard=False) as worker:
-            print(worker.address, flush=True)
-            await worker.finished()
+        async with {node} as node:
+            print(node.address, flush=True)
+            await node.finished()
     asyncio.run(main())
 """
+SCHEDULER = 'Scheduler(host="127.0.0.1", port=0, dashboard=False, dashboard_address=None)'
+WORKER = "Worker(sys.argv[1], nthreads=1, dashboard=False)"
 
 OTHER_CODE = "import torchvision_dddas.evaluation.studies.jobs as jobs; jobs.code_identity = lambda backend: 'other'"
 
 
 @contextmanager
-def process(script: str, *words: str, before: str = ""):
-    """A process that prints its address in its first line; it ends with the block."""
-    command = [sys.executable, "-c", textwrap.dedent(script).replace("{before}", before), *words]
+def process(node: str, *words: str, before: str = ""):
+    """A node of a cluster, which prints its address in its first line; it ends with the block."""
+    command = [sys.executable, "-c", textwrap.dedent(NODE.format(node=node, before=before)), *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as run:
         try:
             assert run.stdout is not None
@@ -213,37 +202,21 @@ def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(by_name,
         assert outcome.cause == ("" if deaths == 1 else lost)
 
 
-def children(parent: int) -> list[int]:
-    """The worker processes of a process: those that Python's multiprocessing has spawned."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            ppid = int(stat.read_text().rpartition(")")[2].split()[1])
-            command = (stat.parent / "cmdline").read_bytes()
-        except OSError:
-            continue
-        if ppid == parent and b"spawn_main" in command:
-            found.append(int(stat.parent.name))
-    return found
-
-
 def stopped_after(line: str, words: list[str], by: signal.Signals) -> int:
     """Run a command and stop it once a line of stderr holds some words; its exit code. Its workers end with it."""
+    psutil = pytest.importorskip("psutil")
     with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
         assert run.stderr is not None
         assert any(line in text for text in run.stderr)
-        ends = [os.pidfd_open(pid) for pid in children(run.pid)]
-        assert ends
+        workers = [child for child in psutil.Process(run.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        assert workers
         run.send_signal(by)
         run.wait(60)
-    for end in ends:
-        assert select.select([end], [], [], 60.0)[0]
-        os.close(end)
+    assert not psutil.wait_procs(workers, 60)[1]
     return run.returncode
 
 
 @pytest.mark.slow
-@linux
 def test_a_study_killed_interrupted_and_resumed_gives_the_same_bytes_as_one_process(tmp_path) -> None:
     pytest.importorskip("distributed")
     study, whole, out = world.three(tmp_path / "clips"), tmp_path / "whole", tmp_path / "out"

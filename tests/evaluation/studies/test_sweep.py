@@ -62,7 +62,7 @@ def test_axes_have_the_types_of_the_settings_and_no_value_twice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("parse", "text", "said"),
+    ("parse", "text", "message"),
     [
         (parse_grid, "difference.threshold", "is no axis of a sweep"),
         (parse_grid, "difference.threshold=,", "has no values"),
@@ -78,8 +78,8 @@ def test_axes_have_the_types_of_the_settings_and_no_value_twice() -> None:
         (parse_ranges, "difference.kind=1:2", "no number"),
     ],
 )
-def test_a_bad_axis_is_refused_in_one_line(parse, text, said) -> None:
-    with pytest.raises(InputError, match=said) as caught:
+def test_a_bad_axis_is_refused_in_one_line(parse, text, message) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         parse([text], NOW)
     assert "\n" not in str(caught.value)
 
