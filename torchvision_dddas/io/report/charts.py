@@ -55,7 +55,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Dots:
-    """(N,) points, each with a text that is shown under the pointer. sign: disc or ring."""
+    """(N,) points, each with a text that is shown under the pointer. sign: disc, cross or ring."""
 
     name: str
     x: np.ndarray
@@ -349,6 +349,8 @@ def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float
 
 
 def _sign(dots: Dots, x: float, y: float, hint: str = "") -> str:
+    if dots.sign == "cross":
+        return f'<path d="M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6" class="line c{dots.colour}">{_hint(hint)}</path>'
     style = f"line c{dots.colour}" if dots.sign == "ring" else f"f{dots.colour}"
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="{style}">{_hint(hint)}</circle>'
 
