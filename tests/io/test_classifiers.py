@@ -65,11 +65,8 @@ def test_a_classifier_is_the_same_in_every_format(tmp_path, name, content):
     np.testing.assert_array_equal(svm.weights, WEIGHTS)
     assert svm.weights.dtype == np.float32
     assert (svm.bias, svm.origin) == (BIAS, str(tmp_path / name))
-
-
-def test_without_a_bias_it_is_zero(tmp_path):
-    svm = read_classifier(write(tmp_path, "w.txt", "1 2 3"), 3)
-    assert (svm.weights.tolist(), svm.bias) == ([1, 2, 3], 0)
+    bare = read_classifier(write(tmp_path, "w.txt", "1 2 3"), 3)
+    assert (bare.weights.tolist(), bare.bias) == ([1, 2, 3], 0)
 
 
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])

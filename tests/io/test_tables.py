@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.tables import (
     DETECTIONS,
     Column,
@@ -34,10 +33,7 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     read = read_table(tmp_path / "places.csv", PLACES)
     assert read["frame"].tolist() == [7] * 4 and read.columns["name"] == names
     np.testing.assert_array_equal(read["east_m"], [1.23, math.nan, math.nan, -0.5])
-
-
-def test_a_row_of_single_values_is_one_line_and_no_rows_are_none():
-    assert PLACES.format_rows({"frame": 1, "name": None, "east_m": 0.126}) == "1,,0.13\n"
+    assert PLACES.format_rows({"frame": 1, "name": None, "east_m": 0.126}) == "1,,0.13\n"  # single values are one line
     assert PLACES.format_rows({"frame": 1, "name": "a", "east_m": np.zeros(0)}) == ""
 
 
@@ -64,21 +60,16 @@ def test_columns_in_any_order_with_others_between_and_a_byte_order_mark(tmp_path
         ("frame,east_m\n1,inf\n", "east_m is 'inf'"),
     ],
 )
-def test_each_mistake_is_one_line_with_file_and_line(tmp_path, text, message):
-    path = tmp_path / "places.csv"
-    path.write_text(text)
-    with pytest.raises(InputError) as caught:
-        read_table(path, PLACES, ("frame", "east_m"))
-    assert message in str(caught.value) and "places.csv" in str(caught.value) and "\n" not in str(caught.value)
+def test_each_mistake_is_one_line_with_file_and_line(refused, text, message):
+    assert message in refused(lambda path: read_table(path, PLACES, ("frame", "east_m")), text)
 
 
-def test_ragged_lines_are_read_as_far_as_the_wanted_columns_go(tmp_path):
+def test_ragged_lines_are_read_as_far_as_the_wanted_columns_go(tmp_path, refused):
     path = tmp_path / "t.csv"
     path.write_text("frame,east_m,note\n1,2\n3,4,a,b\n")
     assert read_table(path, PLACES, is_ragged=True)["east_m"].tolist() == [2, 4]
-    path.write_text("frame,east_m\n1,2\n3\n")
-    with pytest.raises(InputError, match="line 3: east_m is missing: the line ends before it"):
-        read_table(path, PLACES, is_ragged=True)
+    line = refused(lambda path: read_table(path, PLACES, is_ragged=True), "frame,east_m\n1,2\n3\n")
+    assert "line 3: east_m is missing: the line ends before it" in line
 
 
 def test_numbers_are_told_from_what_is_none():
