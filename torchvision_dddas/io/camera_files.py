@@ -23,27 +23,12 @@ from torchvision_dddas.io.tables import PLACES, Column, Schema, read_csv, read_t
 from torchvision_dddas.types import Camera, PoseTable
 
 LIMITS: dict[str, tuple[float, float]] = {
-    "focal_px": (1, 1e6),
-    "focal_v_px": (1, 1e6),
-    "hfov_deg": (0.1, 170),
-    "width_px": (1, 1e5),
-    "height_px": (1, 1e5),
-    "height_m": (0.01, 1000),
-    "pitch_deg": (-89, 89),
-    "roll_deg": (-180, 180),
-    "heading_deg": (-360, 360),
-    "east_m": (-1e7, 1e7),
-    "north_m": (-1e7, 1e7),
-    "longitude_deg": (-180, 180),
-    "latitude_deg": (-90, 90),
-    "k1": (-10, 10),
-    "k2": (-100, 100),
-    "focal_sigma": (0, 1),
-    "height_sigma_m": (0, 100),
-    "pitch_sigma_deg": (0, 45),
-    "heading_sigma_deg": (0, 180),
-    "position_sigma_m": (0, 1000),
-}
+    "focal_px": (1, 1e6), "focal_v_px": (1, 1e6), "hfov_deg": (0.1, 170), "width_px": (1, 1e5), "height_px": (1, 1e5),
+    "height_m": (0.01, 1000), "pitch_deg": (-89, 89), "roll_deg": (-180, 180), "heading_deg": (-360, 360),
+    "east_m": (-1e7, 1e7), "north_m": (-1e7, 1e7), "longitude_deg": (-180, 180), "latitude_deg": (-90, 90),
+    "k1": (-10, 10), "k2": (-100, 100), "focal_sigma": (0, 1), "height_sigma_m": (0, 100), "pitch_sigma_deg": (0, 45),
+    "heading_sigma_deg": (0, 180), "position_sigma_m": (0, 1000),
+}  # fmt: skip
 """Range of every key that is a number. `centre_px` is a pair; `name` is text.
 
 focal_v_px: along the columns, where pixels are not square. centre_px: u, v of the optical axis. pitch_deg: positive

@@ -99,7 +99,7 @@ def _check_header(header: list[str], path: str | Path, rate_hz: float | None) ->
 
 
 def _check_degrees(table: CsvTable) -> None:
-    """A latitude tells more of a mistake than a longitude, so that it comes first."""
+    """Check latitudes first: they reveal swapped columns more often than longitudes."""
     for name, most in (("latitude_deg", 90), ("longitude_deg", 180)):
         is_wrong = np.abs(table[name]) > most
         if is_wrong.any():

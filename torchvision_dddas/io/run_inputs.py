@@ -50,7 +50,7 @@ class AerialInput:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What run.json says of them."""
+        """The files as run.json records them."""
         facts = dict(vars(self))
         return {"landmarks_file": facts.pop("landmarks"), **facts}
 
@@ -145,7 +145,7 @@ def read_locator(
 
 
 def locator_facts(locator: AerialLocator) -> dict[str, Any]:
-    """What run.json says of an aerial locator."""
+    """An aerial locator as run.json records it."""
     camera = locator.camera
     return {
         "origin_deg": locator.site.origin_deg,

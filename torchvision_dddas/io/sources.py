@@ -361,7 +361,7 @@ class OpenedStream:
 
     def __init__(self, target: str | int, name: str, limits_s: tuple[float, float]) -> None:
         self._capture = open_capture(target, name, limits_s)
-        # What goes wrong from now on is told by who reads; OpenCV would write a line for each time.
+        # The reader reports failures from now on; OpenCV would write a line for each.
         cv2.utils.logging.setLogLevel(0)
         self.rate_hz = _announced_hz(self._capture)
 
@@ -390,7 +390,7 @@ def stream_target(spec: str) -> str | int | None:
 
 
 def without_secrets(spec: str) -> str:
-    """An address as it may be told to anyone: without a user's name and password."""
+    """An address without a user's name and password."""
     return _SECRETS.sub("", spec)
 
 

@@ -1,4 +1,4 @@
-"""How a camera looks, from how its mount is turned in a vehicle that is turned itself.
+"""Attitudes: rotations of vehicles and of the cameras on them.
 
 A turned body has axes forward, right and down, given in north, east and down. Its angles are heading (clockwise from
 north), pitch (positive below the horizon, as in the record) and roll (clockwise, seen from behind), in this order.

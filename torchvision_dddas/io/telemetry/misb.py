@@ -173,7 +173,7 @@ def _is_checksum(packet: bytes, checksum: bytes | None) -> bool:
 
 
 def mapped(value: bytes | None, low: float, high: float, signed: bool = False) -> float:
-    """An integer spread over a range; a signed one's lowest value says out of range. NaN where there is none."""
+    """An integer spread over a range; a signed one's lowest value means out of range. NaN where there is none."""
     if not value or len(value) > 8:
         return math.nan
     number, most = int.from_bytes(value, "big", signed=signed), 2 ** (8 * len(value) - signed) - 1
@@ -187,7 +187,7 @@ def imap(value: bytes | None, low: float, high: float) -> float:
     if not value or len(value) > 8:
         return math.nan
     number, bits = int.from_bytes(value, "big"), 8 * len(value) - 1
-    if number > 1 << bits:  # the highest bit alone is the upper end; with others it tells infinities and the like
+    if number > 1 << bits:  # the highest bit alone is the upper end; with others it means infinity and the like
         return math.nan
     scale = 2.0 ** (bits - math.ceil(math.log2(high - low)))
     offset = scale * low - math.floor(scale * low) if low < 0 < high else 0.0

@@ -100,7 +100,7 @@ _KEYS = {
     "hfov_rad": "hfov horizontalfov",
 }
 QUANTITY = {key: quantity for quantity, keys in _KEYS.items() for key in keys.split()}
-"""Quantity by key, without capitals, blanks, dashes and underscores; of several, what stands first tells it best."""
+"""Quantity by key, without capitals, blanks, dashes and underscores; of several, the first is the best."""
 
 _UNITS = {
     "ft": 0.3048, "feet": 0.3048, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600,
@@ -110,18 +110,18 @@ _DATE = re.compile(
     r"(\d{4})[./-](\d{1,2})[./-](\d{1,2})[ T]+(\d{1,2}):(\d{1,2}):(\d{1,2})"
     r"(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*(Z|[+-]\d{2}:?\d{2})?"
 )
-# Half the width of the picture whose focal length is said as that of a 36 mm wide one.
+# Half the width of the picture whose focal length is given for one 36 mm wide.
 _HALF_WIDTH_MM = 18.0
 
 
 @cache
 def quantity_of(key: str) -> str | None:
-    """What a key tells, however it is written; None for one that tells nothing of the flight."""
+    """The quantity of a key, however it is written; None for any other key."""
     return QUANTITY.get(re.sub(r"[\s_-]", "", key.lower()))
 
 
 def convert(key: str, value: float, unit: str = "") -> tuple[str, float] | None:
-    """The quantity and its value in the record's units and signs; None for a key that tells none."""
+    """The quantity of a key and its value in the record's units and signs; None for any other key."""
     quantity = quantity_of(key)
     if quantity is None:
         return None
@@ -134,7 +134,7 @@ def convert(key: str, value: float, unit: str = "") -> tuple[str, float] | None:
 
 
 def parse_date(text: str) -> tuple[float, bool] | None:
-    """Seconds since 1970 of the first date with a time in a text, and whether its zone is told; else it is as if UTC.
+    """Seconds since 1970 of the first date with a time in a text, and whether it has a zone; else UTC is assumed.
 
     None without a date. Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`.
     """
@@ -246,7 +246,7 @@ def _moment(text: str, unit: str) -> tuple[float, bool]:
         return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]), False
     value = _to_float(text)
     is_since_1970 = value > 1e9
-    # Without a unit the size tells: of times since 1970, 10 digits are seconds, 13 milli- and 16 microseconds.
+    # Without a unit the size decides: of times since 1970, 10 digits are seconds, 13 milli- and 16 microseconds.
     per_second = _PER_SECOND.get(unit, 1e6 if value > 1e14 else 1e3 if value > 1e11 else 1.0)
     value /= per_second
     return value, is_since_1970 and (unit not in _PER_SECOND or value > 1e9)
