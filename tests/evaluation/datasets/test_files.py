@@ -40,6 +40,8 @@ def test_both_ways_read_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_an_error_names_the_line(tmp_path: Path, content: str, line: str) -> None:
     with pytest.raises(InputError, match=line.replace("+", r"\+")):
         read_rows(text(tmp_path / "a.txt", content), COLUMNS, "kind")
+    with pytest.raises(InputError, match=r"none\.txt cannot be read: No such file"):
+        read_rows(tmp_path / "none.txt", COLUMNS)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".ppm", ".pgm", ".webp", ".tif"])

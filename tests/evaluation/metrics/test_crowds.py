@@ -121,6 +121,13 @@ def test_what_is_found_where_it_is_scores_full():
     assert (score.recall, score.detected, score.false_blobs, score.idf1) == (1, 1, 0, 1)
     assert score.crowd_error_m.mean == score.target_error_m.mean == score.knowledge_m == pytest.approx(0)
     assert score.inside == 1
+    assert score.lines() == [
+        "crowds: 100.0 % of 2 seen and located, 0.00 false blobs a frame",
+        "error of a crowd's place: mean 0.00 m, median 0.00, 95 % 0.00",
+        "error of a target from its people: mean 0.00 m, median 0.00",
+        "95 % ellipses hold the truth in 100.0 %",
+        "what is known of all crowds at all times: 0.00 m off, 10 where nothing is",
+    ]
 
 
 def test_nothing_found_is_recall_0_and_costs_the_cap():

@@ -193,6 +193,7 @@ def test_the_accuracy_ratio_of_windows_counts_wrong_links():
 
 def test_windows_are_of_looks_an_interval_apart():
     truth = table({"a": 1}, {}, {"a": 1}, {}, {"a": 1})
+    assert table(*[{"a": 1}] * 11).every(5).frame.tolist() == [1, 6, 11]
     found = table({"a": 1}, {}, {"a": 2}, {}, {"a": 2})
     assert tracking.count(truth, found, interval=2)[0].links_2 == (2, 1.0)
     assert tracking.count(truth, found, interval=2)[0].links_3 == (1, 0.5)
