@@ -26,12 +26,14 @@ def landmarks(rows, names=("a",)):
     return Landmarks(names, frame, landmark, table[:, 6:], place, table[:, 5], table[:, 4] == 1, np.arange(n), False)
 
 
-def once_a_second(seconds, places):
-    return [(1 + RATE * t, 0, *place) for t, place in zip(seconds, places, strict=True)]
+def reported(seconds, places, names=("a",)):
+    """The trajectories of a landmark that reports at these times."""
+    rows = [(1 + RATE * t, 0, *place) for t, place in zip(seconds, places, strict=True)]
+    return LandmarkTrajectories(landmarks(rows, names), KNOBS, RATE)
 
 
 def test_reports_once_a_second_give_a_straight_way_in_every_frame_and_no_jump_at_a_report():
-    course = LandmarkTrajectories(landmarks(once_a_second(range(4), [(0, 0), (5, 0), (10, 5), (10, 15)])), KNOBS, RATE)
+    course = reported(range(4), [(0, 0), (5, 0), (10, 5), (10, 15)])
     places = np.array([course.at(frame).east_north_m[0] for frame in range(1, 77)])
     assert places[[0, 25, 50, 75]].tolist() == [[0, 0], [5, 0], [10, 5], [10, 15]]
     assert places[10] == pytest.approx([2, 0])
@@ -40,9 +42,7 @@ def test_reports_once_a_second_give_a_straight_way_in_every_frame_and_no_jump_at
 
 
 def test_a_short_dropout_is_bridged_straight_and_less_sure_in_its_middle():
-    course = LandmarkTrajectories(
-        landmarks(once_a_second([0, 1, 2, 5, 6, 7], [(t, 0) for t in (0, 1, 2, 5, 6, 7)])), KNOBS, RATE
-    )
+    course = reported([0, 1, 2, 5, 6, 7], [(t, 0) for t in (0, 1, 2, 5, 6, 7)])
     middle = course.at(1 + round(3.5 * RATE))
     assert middle.east_north_m[0] == pytest.approx([3.5, 0], abs=0.03)
     assert middle.sigma_m[0] == pytest.approx(np.hypot(1.0, 0.5 * 1.5), rel=0.02)
@@ -51,7 +51,7 @@ def test_a_short_dropout_is_bridged_straight_and_less_sure_in_its_middle():
 
 def test_a_long_dropout_goes_straight_on_for_gap_s_and_then_the_landmark_is_absent_until_it_reports_again():
     seconds = [0, 1, 2, 12, 13]
-    course = LandmarkTrajectories(landmarks(once_a_second(seconds, [(2.0 * t, 0) for t in seconds])), KNOBS, RATE)
+    course = reported(seconds, [(2.0 * t, 0) for t in seconds])
     after = course.at(1 + 25 * 5)
     assert after.east_north_m[0] == pytest.approx([10, 0])
     assert after.sigma_m[0] == pytest.approx(np.hypot(1.0, 0.5 * 3))
@@ -73,10 +73,7 @@ def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_la
 
 
 def test_speeds_are_those_over_the_ground():
-    course = LandmarkTrajectories(
-        landmarks(once_a_second(range(5), [(3 * t, 4 * t) for t in range(5)]), ("a", "b")), KNOBS, RATE
-    )
-    speed = course.speed_m_s(51)
+    speed = reported(range(5), [(3 * t, 4 * t) for t in range(5)], ("a", "b")).speed_m_s(51)
     assert speed[0] == pytest.approx(5.0) and np.isnan(speed[1])
 
 

@@ -282,7 +282,7 @@ class Steering:
             mount = replace(mount, altitude_m=altitude_m)
         orders: tuple[Order, ...] = ()
         if parameters.look:
-            orders = self._team.orders(prediction, self._uav.followed(prediction), mount, now_s)
+            orders = self._team.orders(prediction, self._uav.followed(prediction), mount)
         fly_to = None
         if look_at is not None and mount is not None:
             fly_to = mount.pose(look_at, mount.altitude_m).place_m[:2]

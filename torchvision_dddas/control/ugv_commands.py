@@ -83,9 +83,11 @@ class UgvTeam:
         self._on_ring: list[int] = []
         self._place_of: np.ndarray | None = None
         self._let_be: dict[int, float] = {}
+        self._now_s = 0.0
 
     def hear(self, marks: LandmarkObservations, now_s: float) -> np.ndarray:
         """Take over the places that the team reports; returns those (V, 2) of the present vehicles."""
+        self._now_s = now_s
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
                 vehicle = self._known.setdefault(row, _Vehicle(place, now_s))
@@ -100,23 +102,21 @@ class UgvTeam:
         self._known = dict(sorted(self._known.items()))
         return np.array([vehicle.place_m for vehicle in self._known.values()]).reshape(-1, 2)
 
-    def orders(
-        self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None, now_s: float
-    ) -> tuple[Order, ...]:
-        """Orders for each vehicle; none without targets. rows: the targets that are followed."""
+    def orders(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None) -> tuple[Order, ...]:
+        """Orders for each vehicle that was heard; none without targets. rows: the targets that are followed."""
         if not len(rows) or not self._known:
             self._ring = None
             return ()
         # Around the followed targets, a little later.
         later = prediction.east_north_m[rows] + _LEAD_S * prediction.velocity_m_s[rows]
         middle = later.mean(axis=0) if mount is None else mount.centre(later, mount.altitude_m)[0]
-        self._send(prediction, now_s)
+        self._send(prediction)
         team_m = np.array([vehicle.place_m for vehicle in self._known.values()])
         stations = _keep_off(self._stations(prediction, middle, rows, team_m, mount), prediction, team_m)
         goals = _pass_by(stations, team_m, prediction)
         drift_m_s = float(np.linalg.norm(prediction.velocity_m_s[rows].mean(axis=0)))
         return tuple(
-            self._order(v, station, goal, prediction, drift_m_s, now_s)
+            self._order(v, station, goal, prediction, drift_m_s)
             for v, station, goal in zip(self._known, stations, goals, strict=True)
         )
 
@@ -164,9 +164,10 @@ class UgvTeam:
         goals[tied] = drawn
         return goals
 
-    def _send(self, prediction: Prediction, now_s: float) -> None:
+    def _send(self, prediction: Prediction) -> None:
         """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
-        row_of, needs = {target: row for row, target in enumerate(prediction.target.tolist())}, _need(prediction)
+        now_s, needs = self._now_s, _need(prediction)
+        row_of = {target: row for row, target in enumerate(prediction.target.tolist())}
         for v, vehicle in self._known.items():
             if vehicle.sent_to < 0:
                 continue
@@ -207,9 +208,7 @@ class UgvTeam:
             self._log.set(f"{self.names[v]}.sent_to", target, why)
             free -= 1
 
-    def _order(
-        self, v: int, station: np.ndarray, goal: np.ndarray, prediction: Prediction, drift_m_s: float, now_s: float
-    ) -> Order:
+    def _order(self, v: int, station: np.ndarray, goal: np.ndarray, prediction: Prediction, drift_m_s: float) -> Order:
         vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
         away = float(np.linalg.norm(station - vehicle.place_m))
         vehicle.near = away < parameters.near_m * (_FAR if vehicle.near else 1.0)
@@ -218,10 +217,10 @@ class UgvTeam:
         speed = slow if vehicle.near else parameters.fast_m_s
         why = f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s"
         self._log.set(f"{name}.speed_m_s", speed, why, least=1.0)
-        row = self._watch(v, prediction, now_s)
-        return Order(name, goal, speed, prediction.east_north_m[row], self._is_pictured(v, prediction, row, now_s))
+        row = self._watch(v, prediction)
+        return Order(name, goal, speed, prediction.east_north_m[row], self._is_pictured(v, prediction, row))
 
-    def _watch(self, v: int, prediction: Prediction, now_s: float) -> int:
+    def _watch(self, v: int, prediction: Prediction) -> int:
         """The row of the target that a vehicle looks at.
 
         Those in reach before others; of these the one most in need, and of equals the nearest.
@@ -233,13 +232,13 @@ class UgvTeam:
         # A vehicle that changed its mind at each step would see nothing.
         in_reach = beyond <= self.parameters.look_m * np.where(held, 1.1, 1.0)
         row = int(np.argmax(2.0 * in_reach + doubt + 0.2 * held - 1e-3 * np.maximum(beyond, 0)))
-        if held.any() and now_s - vehicle.watched_s < _LOOK_S:
+        if held.any() and self._now_s - vehicle.watched_s < _LOOK_S:
             row = int(held.argmax())
         if vehicle.sent_to >= 0:
             row = int(np.flatnonzero(prediction.target == vehicle.sent_to)[0])
         target = int(prediction.target[row])
         if target != vehicle.watches:
-            vehicle.watches, vehicle.watched_s, vehicle.sure = target, now_s, _is_sure(prediction, row, False)
+            vehicle.watches, vehicle.watched_s, vehicle.sure = target, self._now_s, _is_sure(prediction, row, False)
             period = self._period_s(vehicle)
             what = f"target {target}, {distance[row]:.0f} m off: {_describe(prediction, row)}"
             self._log.set(f"{name}.looks_at", target, f"{what}; a picture every {period:g} s")
@@ -249,7 +248,7 @@ class UgvTeam:
     def _period_s(self, vehicle: _Vehicle) -> float:
         return self.parameters.picture_s * (_SELDOM if vehicle.sure else 1)
 
-    def _is_pictured(self, v: int, prediction: Prediction, row: int, now_s: float) -> bool:
+    def _is_pictured(self, v: int, prediction: Prediction, row: int) -> bool:
         """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
         vehicle = self._known[v]
         vehicle.sure = _is_sure(prediction, row, vehicle.sure)
@@ -259,10 +258,10 @@ class UgvTeam:
         beyond = float(np.linalg.norm(prediction.east_north_m[row] - vehicle.place_m)) - float(prediction.radius_m[row])
         # One vehicle after the other, each in its part of the period.
         shift_s = 1e-6 - v * period / len(self.names)
-        turn, last = (int((when_s + shift_s) // period) for when_s in (now_s, vehicle.pictured_s))
+        turn, last = (int((when_s + shift_s) // period) for when_s in (self._now_s, vehicle.pictured_s))
         if beyond > self.parameters.look_m or turn == last:
             return False
-        vehicle.pictured_s = now_s
+        vehicle.pictured_s = self._now_s
         return True
 
 
