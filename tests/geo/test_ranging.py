@@ -52,22 +52,14 @@ def test_a_pixel_that_the_lens_cannot_fill_has_no_ray():
     assert np.isfinite(found.bearing_rad).tolist() == [True, False]
 
 
-def test_a_level_camera_ranges_by_eq_13_as_depth_and_not_as_the_way_over_the_ground():
-    box = np.array([[939.5 - 0.2 * 200, 380.0, 80.0, 200.0]])
-    found = seen(box, camera(), use="height")
-    depth = 1000 * 1.75 / 200
-    angle = np.arctan((939.5 - 0.5 - 639.5) / 1000)
-    assert found.distance_m[0] == pytest.approx(depth / np.cos(angle))
-    assert found.bearing_rad[0] == pytest.approx(angle)
-
-
-def test_paper_mode_is_eq_13_to_15_as_printed():
-    box = np.array([[939.5 - 0.2 * 200, 380.0, 80.0, 200.0]])
-    found = seen(box, camera(pitch_rad=0.2, heading_rad=1.0), mode="paper")
-    distance, bearing = 1000 * 1.75 / 200, 1.0 + np.arctan(299.5 / 1000)
-    assert found.distance_m[0] == pytest.approx(distance)
-    assert np.allclose(found.east_north_m, [[distance * np.sin(bearing), distance * np.cos(bearing)]])
-    assert np.isnan(found.covariance_m2).all()
+def test_a_level_camera_ranges_by_eq_13_as_depth_and_paper_mode_as_the_way_over_the_ground():
+    box, depth, angle = np.array([[939.5 - 0.2 * 200, 380.0, 80.0, 200.0]]), 1000 * 1.75 / 200, np.arctan(299.5 / 1000)
+    level = seen(box, camera(), use="height")
+    assert (level.distance_m[0], level.bearing_rad[0]) == pytest.approx((depth / np.cos(angle), angle))
+    printed = seen(box, camera(pitch_rad=0.2, heading_rad=1.0), mode="paper")
+    assert printed.distance_m[0] == pytest.approx(depth)
+    assert np.allclose(printed.east_north_m, [[depth * np.sin(1.0 + angle), depth * np.cos(1.0 + angle)]])
+    assert np.isnan(printed.covariance_m2).all()
 
 
 def with_noise(box, rng, parameters):
