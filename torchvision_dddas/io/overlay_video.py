@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import remove, temporary
+from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
 
 Item = TypeVar("Item")
 
@@ -64,22 +64,20 @@ class OverlayPicture(Generic[Item]):
     """overlay.png: the picture of the last item."""
 
     def __init__(self, folder: Path, draw: Callable[[Item], np.ndarray]) -> None:
-        self._draw = draw
-        self._path = folder / "overlay.png"
-        self._part = temporary(self._path)
+        self._path, self._draw = folder / "overlay.png", draw
+        self._content = b""
 
     def write(self, item: Item) -> None:
-        """Draw it. Raises OSError if the disk refuses."""
-        self._part.write_bytes(cv2.imencode(".png", self._draw(item))[1].tobytes())
+        """Draw it."""
+        self._content = cv2.imencode(".png", self._draw(item))[1].tobytes()
 
     def close(self, complete: bool) -> None:
-        """Put it in its place, if there is one."""
-        if self._part.exists():
-            self._part.replace(self._path)
+        """Write it, if there is one. Raises OSError if the disk refuses."""
+        if self._content:
+            write_whole(self._path, self._content)
 
     def discard(self) -> None:
-        """Remove what was begun."""
-        remove(self._part)
+        """Nothing is begun before the end."""
 
 
 class ThreadedWriter:
