@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from tests.simulation.small import bodies_at, moment_of
-from torchvision_dddas.simulation import CameraParameters, Scenario, WorldParameters, build_world
+from torchvision_dddas.simulation import Scenario
 from torchvision_dddas.simulation.aerial_camera import AerialCamera
 from torchvision_dddas.simulation.cameras import camera_axes, motion_blur, view_from_pose
+from torchvision_dddas.simulation.scenario import CameraParameters, WorldParameters
+from torchvision_dddas.simulation.world import build_world
 from torchvision_dddas.types import CameraPose, Elevation
 
 SIDE_M = 120.0

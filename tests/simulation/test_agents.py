@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from torchvision_dddas import geometry
-from torchvision_dddas.simulation import CarPlan, CrowdPlan, Happening, Scenario
+from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario
 from torchvision_dddas.simulation.agents import Agents
 from torchvision_dddas.simulation.crowds import FASTEST_M, SLOWEST_M, UNIT_S, Crowds
 from torchvision_dddas.simulation.ground_vehicles import RADIUS_M, Cars
 from torchvision_dddas.simulation.movement import Obstacles, near_pairs
+from torchvision_dddas.simulation.scenario import Happening
 from torchvision_dddas.types import Command, Order
 
 NOTHING = np.zeros((0, 5))

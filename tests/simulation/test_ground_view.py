@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from tests.simulation.small import bodies_at, moment_of
-from torchvision_dddas.simulation import GpsParameters, Scenario, TeamParameters, WorldParameters, build_world
+from torchvision_dddas.simulation import Scenario
 from torchvision_dddas.simulation.ground_camera import GroundCamera
+from torchvision_dddas.simulation.scenario import GpsParameters, TeamParameters, WorldParameters
+from torchvision_dddas.simulation.world import build_world
 
 BARE = WorldParameters(side_m=80, texel_m=0.1, relief_m=0, bushes_per_ha=0, trees_per_ha=0, buildings=0)
 SMALL = Scenario(seed=3, world=BARE, team=TeamParameters(width_px=320, height_px=240), gps=GpsParameters(error95_m=3.5))

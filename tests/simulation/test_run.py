@@ -18,15 +18,10 @@ from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics import truth as read
 from torchvision_dddas.io.ground_tables import read_positions
-from torchvision_dddas.simulation import (
-    Simulator,
-    SimulatorSource,
-    TruthOutput,
-    build_world,
-    film,
-    film_clip,
-    load_scenario,
-)
+from torchvision_dddas.simulation import SimulatorSource, film, film_clip, load_scenario
+from torchvision_dddas.simulation.simulator import Simulator
+from torchvision_dddas.simulation.truth import TruthOutput
+from torchvision_dddas.simulation.world import build_world
 from torchvision_dddas.types import CameraPose, Command, Elevation, Order, Truth
 
 

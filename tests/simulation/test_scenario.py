@@ -7,14 +7,8 @@ import pytest
 from tests.simulation.small import as_file, small
 from torchvision_dddas.config import Settings, config_names, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation import (
-    Scenario,
-    check_scenario,
-    load_scenario,
-    scenario_names,
-    scenario_settings,
-    scenario_toml,
-)
+from torchvision_dddas.simulation import Scenario, load_scenario, scenario_names, scenario_settings, scenario_toml
+from torchvision_dddas.simulation.scenario import check_scenario
 
 SURVEYS = [name for name in scenario_names() if name != "demo"]
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.simulation import AircraftParameters, CameraParameters, TeamParameters
 from torchvision_dddas.simulation.cameras import view_from_pose
 from torchvision_dddas.simulation.ground_vehicles import ACCELERATION_M_S2, TURN_RAD_S, Team, marker_plates
 from torchvision_dddas.simulation.movement import Obstacles, Waypoints
+from torchvision_dddas.simulation.scenario import AircraftParameters, CameraParameters, TeamParameters
 from torchvision_dddas.simulation.sensors import Receivers, Sensor
 from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, Swaying
 from torchvision_dddas.types import Camera

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.simulation import WorldParameters, build_world
-from torchvision_dddas.simulation.world import shadow_above_ground, sun_direction
+from torchvision_dddas.simulation.scenario import WorldParameters
+from torchvision_dddas.simulation.world import build_world, shadow_above_ground, sun_direction
 from torchvision_dddas.types import Elevation, Ortho
 
 PARAMETERS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)

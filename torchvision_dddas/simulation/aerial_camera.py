@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.simulation.aerial_ground import PixelPlaces, Terrain
+from torchvision_dddas.simulation.aerial_ground import Terrain
 from torchvision_dddas.simulation.agents import Moment
 from torchvision_dddas.simulation.body_shapes import Wardrobe, limb_capsules, vehicle_faces
 from torchvision_dddas.simulation.cameras import LEAST_PX, Shutter, motion_blur, streak_kernel
@@ -64,16 +64,13 @@ class AerialCamera:
             air[:] = HAZE.astype(np.uint8)
             picture = np.asarray(cv2.blendLinear(picture, air, 1 - places.haze, places.haze))
         if self._exposure_s > 0:
-            picture = motion_blur(picture, self._ways(moment, places))
+            # The way of the ground in the picture while it is exposed, at points from corner to corner.
+            height, width = places.east_m.shape
+            at = np.ix_([0, height // 2, height - 1], [0, width // 2, width - 1])
+            place = np.stack([places.east_m[at], places.north_m[at]], axis=-1).reshape(-1, 2).astype(float)
+            way = self._shutter.ways(moment, np.c_[place, self._world.up_m(place)], self._exposure_s)
+            picture = motion_blur(picture, way.reshape(3, 3, 2).astype(np.float32))
         return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies
-
-    def _ways(self, moment: Moment, places: PixelPlaces) -> np.ndarray:
-        """(3, 3, 2) pixels that the ground moves in the picture while it is exposed, from corner to corner."""
-        height, width = places.east_m.shape
-        at = np.ix_([0, height // 2, height - 1], [0, width // 2, width - 1])
-        place = np.stack([places.east_m[at], places.north_m[at]], axis=-1).reshape(-1, 2).astype(float)
-        ground = np.c_[place, self._world.up_m(place)]
-        return self._shutter.ways(moment, ground, self._exposure_s).reshape(3, 3, 2).astype(np.float32)
 
 
 class _Outlines(NamedTuple):
@@ -136,13 +133,19 @@ class _Painter:
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
         kept = in_sun[shade_body]
+        # Each body has a canvas of its own, enlarged: the smaller the body the more so.
+        low, high = _boxes(solids.body, solids.points_px, shape)
+        steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
+        code = np.clip(1 + solids.up_m * _CODES, 1, 255)
+        colours = np.c_[np.clip(solids.colour, 0, 255), code].tolist()
+        sheets = _fill(solids.body, solids.points_px, low, high, steps, colours)
         shades = _draw_shades(shade_body[kept], shade_px[kept], bodies.target, shape)
         step = np.c_[bodies.velocity_m_s[rows], np.zeros(len(rows))] * self._exposure_s / 2
         places = np.concatenate([bodies.place_m[rows] - step, bodies.place_m[rows] + step])
         ends, _ = self._shutter.project(moment, places)
         way = ends[len(rows) :] - ends[: len(rows)]
         visible = np.hypot(way[:, 0], way[:, 1]) > LEAST_PX
-        return _draw_sheets(solids, shape), shades, dict(zip(rows[visible].tolist(), way[visible], strict=True))
+        return sheets, shades, dict(zip(rows[visible].tolist(), way[visible], strict=True))
 
     def paint(
         self, moment: Moment, drawn: _Drawn, picture: np.ndarray, rise_m: np.ndarray | None
@@ -195,15 +198,6 @@ class _Painter:
         for at in np.array_split(np.arange(len(place)), -(-len(place) // 30_000)):
             above[at] = cv2.remap(self._shade_m, u[at], v[at], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)[:, 0]
         return np.clip(above / 1.6, 0, 1)
-
-
-def _draw_sheets(outlines: _Outlines, shape: tuple[int, ...]) -> list[_Sheet]:
-    """The outlines of each body on a canvas of its own, enlarged: the smaller the body the more so."""
-    low, high = _boxes(outlines.body, outlines.points_px, shape)
-    steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1, initial=0))]
-    code = np.clip(1 + outlines.up_m * _CODES, 1, 255)
-    colours = np.c_[np.clip(outlines.colour, 0, 255), code].tolist()
-    return _fill(outlines.body, outlines.points_px, low, high, steps, colours)
 
 
 def _draw_shades(body: np.ndarray, points_px: np.ndarray, target: np.ndarray, shape: tuple[int, ...]) -> list[_Sheet]:

@@ -113,7 +113,11 @@ class Team:
         # A vehicle that is lost stands at once: its place is what the team knew last.
         self.speed = np.where(stopped, 0.0, speed)
         place = self.place + (seconds * self.speed)[:, None] * heading_vector(self.course + turn * seconds / 2)
-        place = self._obstacles.outside(_keep_apart(place), 1.0)
+        # Those that are nearer than two vehicles can be are moved half the distance apart each.
+        away = place[:, None] - place
+        distance = np.hypot(away[..., 0], away[..., 1]) + 1e9 * np.eye(len(place))
+        short = 0.5 * np.maximum(_APART_M - distance, 0) / np.maximum(distance, 1e-6)
+        place = self._obstacles.outside(place + (short[..., None] * away).sum(axis=1), 1.0)
         self.place = np.where(stopped[:, None], self.place, self._inside(place))
         self.course = (self.course + turn * seconds) % (2 * np.pi)
         to = self._look_at - self.place
@@ -192,14 +196,6 @@ class Team:
     def _inside(self, place: np.ndarray) -> np.ndarray:
         edge = self._half - min(3.0, self._half / 4)
         return place.clip(-edge, edge)
-
-
-def _keep_apart(place: np.ndarray) -> np.ndarray:
-    """(K, 2) places, those that are nearer than two vehicles can be moved half the distance apart each."""
-    away = place[:, None] - place
-    distance = np.hypot(away[..., 0], away[..., 1]) + 1e9 * np.eye(len(place))
-    short = 0.5 * np.maximum(_APART_M - distance, 0) / np.maximum(distance, 1e-6)
-    return place + (short[..., None] * away).sum(axis=1) if short.any() else place
 
 
 class Cars:

@@ -20,7 +20,6 @@ from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.output.recorder import PartOf
 from torchvision_dddas.io.overlay_video import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
-from torchvision_dddas.simulation.agents import Report
 from torchvision_dddas.simulation.scenario import Scenario, load_scenario, scenario_settings, scenario_toml
 from torchvision_dddas.simulation.simulator import Shot, Simulator, name_scenario_in_errors, open_simulator
 from torchvision_dddas.simulation.truth import TruthOutput, moving_mask
@@ -200,10 +199,11 @@ class _Tables:
         for moment in item.shot.moments:
             if moment.flight is not None:
                 flights.append(_flight_line(moment.time_s, moment.flight))
-            for report in moment.reports:
-                line = _report_line(self._names[report.vehicle], report)
-                if report.planned:
-                    self._plans[report.vehicle, round(report.frame, 6)] = line
+            for r in moment.reports:
+                name, (lon, lat) = self._names[r.vehicle], r.lonlat_deg
+                line = f"{_short(r.frame, 6)},{name},{lon:.9f},{lat:.9f},{r.sigma_m:.6g},{r.planned:d}\n"
+                if r.planned:
+                    self._plans[r.vehicle, round(r.frame, 6)] = line
                 else:
                     reports.append(line)
         self._files.write("".join(flights), "".join(reports))
@@ -352,12 +352,6 @@ def _camera_toml(camera: Camera, is_standing: bool = False) -> str:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.6g}")
-
-
-def _report_line(name: str, report: Report) -> str:
-    """A line of landmarks.csv."""
-    lon, lat = report.lonlat_deg
-    return f"{_short(report.frame, 6)},{name},{lon:.9f},{lat:.9f},{report.sigma_m:.6g},{report.planned:d}\n"
 
 
 def _flight_line(time_s: float, flight: Flight) -> str:

@@ -46,7 +46,12 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.n
     east, north = np.meshgrid(middle.astype(np.float32), -middle.astype(np.float32))
 
     def patches(widest_m: float, fall: float = 0.6) -> np.ndarray:
-        return _fractal_noise(rng, shape, max(widest_m / cell, 1), fall)
+        """Noise of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
+        total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, max(widest_m / cell, 1)
+        while width >= 1:
+            total += np.float32(height) * _noise_bumps(rng, shape, width)
+            power, height, width = power + height**2, height * fall, width / 2
+        return total / np.float32(np.sqrt(power))
 
     tone = np.empty((3, *shape), np.float32)
     tone[:] = _TAN[:, None, None]
@@ -210,15 +215,6 @@ def _noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: flo
     # A cell is left out at the edges, where the enlargement repeats the outermost value.
     first = int(width_px)
     return large[first : first + shape[0], first : first + shape[1]] * np.float32(_SPREAD)
-
-
-def _fractal_noise(rng: np.random.Generator, shape: tuple[int, int], widest_px: float, fall: float) -> np.ndarray:
-    """(H, W) float32 of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
-    total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, widest_px
-    while width >= 1:
-        total += np.float32(height) * _noise_bumps(rng, shape, width)
-        power, height, width = power + height**2, height * fall, width / 2
-    return total / np.float32(np.sqrt(power))
 
 
 def _noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
