@@ -172,9 +172,9 @@ def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film
         assert not scene.mask.any() and len(scene.detections) == 0
 
 
-def flight(time_s, altitude_m=60.0, speed_m_s=5.0) -> Telemetry:
+def flight(time_s, altitude_m=60.0) -> Telemetry:
     time = np.asarray(time_s, float)
-    return Telemetry(time, np.broadcast_to(altitude_m, time.shape), np.broadcast_to(speed_m_s, time.shape))
+    return Telemetry(time, np.broadcast_to(altitude_m, time.shape), np.full(time.shape, 5.0))
 
 
 @pytest.mark.parametrize("count", [16, None])

@@ -16,8 +16,7 @@ class Counted:
 
     def __init__(self) -> None:
         self.engine, self.count = load_engine("onboard", Settings()), 0
-        self.name, self.parameters = self.engine.name, self.engine.parameters
-        self.prepare, self.foreground = self.engine.prepare, self.engine.foreground
+        self.prepare = self.engine.prepare
 
     def register(self, pairs):
         self.count += len(pairs)

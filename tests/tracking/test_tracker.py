@@ -1,7 +1,8 @@
 """Identities along a clip, a clip with a table, a table alone, and through the public class."""
 
 from dataclasses import replace
-from typing import cast
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.tracking import Tracker, track_clip, track_scenes, track_table
 from torchvision_dddas.tracking.score_tracker import ScoreTracker
 from torchvision_dddas.tracking.source_tracker import SourceTracker
-from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene, Source
+from torchvision_dddas.types import Adjustment, Detections, DetectionTable, Frame, Registration, Scene
 
 SETTINGS = load_config()
 SIZE = (320, 240)
@@ -95,21 +96,6 @@ def test_rows_on_frames_that_cannot_be_read_or_lie_after_the_end_are_tracked_all
     assert blind == [n for n in range(1, 36, interval) if n in lost or n > 30]
     assert all((f.cause == "the frame could not be read") == (f.frame is None) for f in followed)
     assert len(identities(followed, 60)) == len(identities(followed, 140)) == 1
-
-
-def test_what_is_settled_while_a_clip_runs_is_what_the_whole_run_gives():
-    table = table_of(walkers(range(1, 41), lanes=(60, 64, 140)))
-    engine = load_engine("onboard", SETTINGS)
-    whole = all_of(track_clip(Clip(40), table, engine, SETTINGS, 1))
-    for end in (3, 11, 25):
-        clip = Clip(40)
-        early: dict[int, dict] = {}
-        for followed in track_clip(clip, table, engine, SETTINGS, 1):
-            if clip.given > end:
-                break
-            early |= all_of([followed])
-        assert len(early) >= end - 8  # a handful of frames wait for the next ones
-        assert early == {number: whole[number] for number in early}
 
 
 def scenes_of(count, step=None, adjustments=None, bad=()):
@@ -204,27 +190,17 @@ def own(frames=40):
     )
 
 
-class Blank:
-    """A clip without anything in it."""
-
-    size, count, exact, rate_hz, problems, name = SIZE, 40, True, 10.0, (), "blank"
-    last = 40
-
-    def every(self, interval):
-        for n in range(1, 41, interval):
-            yield Frame(n, n / 10, np.full((240, 320, 3), 90, np.uint8))
-
-
 def test_the_table_of_a_clip_s_own_detections_is_followed_as_these_are_with_and_without_the_clip():
     table = own()
-    scenes = []
-    for frame in Blank().every(1):
+    scenes, blank = [], [Frame(n, n / 10, np.full((240, 320, 3), 90, np.uint8)) for n in range(1, 41)]
+    for frame in blank:
         here = table.at(frame.number)
         detections = Detections(here.box_px, here.score, here.area_px, here.heading_rad, here.speed_px)
         scenes.append(Scene(frame, np.zeros((240, 320), np.uint16), detections, 3))
     wanted = found(f.tracks for f in track_scenes(scenes, SETTINGS, 1, SIZE))
     engine = load_engine("onboard", SETTINGS)
-    assert found(f.tracks for f in track_clip(cast(Source, Blank()), table, engine, SETTINGS, 1)) == wanted
+    clip: Any = SimpleNamespace(size=SIZE, last=40, every=lambda interval: iter(blank))
+    assert found(f.tracks for f in track_clip(clip, table, engine, SETTINGS, 1)) == wanted
     alone = list(track_table(table, SETTINGS, 1))
     assert all(sorted(f.tracks.identity.tolist()) == [1, 2] for f in alone)
     assert all(f.tracks.score.tolist() == [0.55, 0.55] for f in alone)

@@ -242,8 +242,6 @@ class MotionDetector:
     def _this_from_last(self, index: int) -> np.ndarray | None:
         return self._at(index - 1).next_from_this if index > self._first else None
 
-    # -- registration ------------------------------------------------------------------------------------------------
-
     def _register(self) -> None:
         """Register all successive frames that are here."""
         slots = [self._at(i) for i in range(self._registered, self._total)]
@@ -261,8 +259,6 @@ class MotionDetector:
             slot.step = replace(step, reliable=False, cause="the picture is blank") if is_blank else step
             slot.seconds["register"] = seconds
         self._registered += len(steps)
-
-    # -- observation -------------------------------------------------------------------------------------------------
 
     def _find_ready(self) -> list[int]:
         """Up to `batch` frames whose windows are complete."""
@@ -365,8 +361,6 @@ class MotionDetector:
             observation.foreground = replace(observation.foreground, small=None)  # not needed again
         self._small_tracks.step(index, self._this_from_last(index), boxes)
         self._at(index).seconds["small"] = time.perf_counter() - start
-
-    # -- targets -----------------------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
         """Draw the targets of the frames whose following frames, as far as persistence needs them, are observed."""

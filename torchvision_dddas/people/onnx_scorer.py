@@ -104,14 +104,13 @@ class OnnxScorer:
             for column in range(min(phases, width)):
                 x, y = column * stride, row * stride
                 inner = replace(part, x=part.x + x, y=part.y + y, width=part.width - x, height=part.height - y)
-                found = self._score_at_block_stride(level, inner)[::every, ::every]
+                found = self._score_blocks(self._compute_histograms(level, inner))[::every, ::every]
                 here = scores[row::phases, column::phases]
                 here[:] = found[: here.shape[0], : here.shape[1]]
         return scores
 
-    def _score_at_block_stride(self, level: np.ndarray, part: Part) -> np.ndarray:
+    def _score_blocks(self, histograms: np.ndarray) -> np.ndarray:
         """Scores of the windows at every block stride."""
-        histograms = self._compute_histograms(level, part)
         _, ny, nx = histograms.shape
         down, across, _ = self.svm_feed["weights"].shape
         found = np.empty((ny - down + 1, nx - across + 1), np.float32)
