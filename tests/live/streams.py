@@ -1,7 +1,7 @@
-"""Cameras that do what a test says, and time that passes as it says."""
+"""Cameras that follow a test's script, and a clock that a test moves."""
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ PATIENCE_S = 30.0
 
 
 class FakeClock(Clock):
-    """Time that stands still but for the camera's thread, whose sleeps are over at once; `pass_s` moves it on."""
+    """A clock that only `pass_s` moves, and the sleeps of the camera's thread, which end at once."""
 
     def __init__(self) -> None:
         self.now_s, self.utc_ahead_s = 100.0, 1.7e9
@@ -36,7 +36,7 @@ class FakeClock(Clock):
         self.now_s += seconds
 
     def pass_s(self, seconds: float) -> None:
-        """Move on, and wake who waits."""
+        """Move on, and wake all threads that wait."""
         self.now_s += seconds
         for changed in self._waited:
             with changed:
@@ -48,24 +48,27 @@ def grey(level: int, width: int = 64, height: int = 48) -> np.ndarray:
 
 
 class FakeStream:
-    """Plays a script: a picture, None (cannot be decoded), False (no picture came), or something to call first.
+    """Plays a script of pictures: an array or a grey level, None (cannot be decoded), False (no picture came).
 
-    What is called may wait, move the clock, or raise; it is no read of its own.
+    Between them, a float lets seconds pass on the clock, and a function is called: it may wait or raise.
     """
 
-    def __init__(self, script: Iterable[Any], rate_hz: float | None = 25.0) -> None:
-        self.rate_hz = rate_hz
+    def __init__(self, script: Iterable[Any], rate_hz: float | None = 25.0, clock: FakeClock | None = None) -> None:
+        self.rate_hz, self.clock = rate_hz, clock
         self.released = threading.Event()
-        self._script: Iterator[Any] = iter(script)
+        self._script = iter(script)
         self._image: np.ndarray | None = None
 
     def grab(self) -> bool:
         for step in self._script:
             if callable(step):
                 step()
-                continue
-            self._image = None if step is False else step
-            return step is not False
+            elif isinstance(step, float):
+                assert self.clock is not None
+                self.clock.now_s += step
+            else:
+                self._image = None if step is None or step is False else grey(step) if np.ndim(step) == 0 else step
+                return step is not False
         return False
 
     def retrieve(self) -> np.ndarray | None:
@@ -90,27 +93,23 @@ class Streams:
 
 
 class Gate:
-    """Somewhere a camera's thread waits until the test lets it go on. reached: it is there."""
+    """A step where a camera's thread waits until the test lets it go on. reached: it is there."""
 
     def __init__(self) -> None:
         self.reached, self.open = threading.Event(), threading.Event()
 
     def __call__(self) -> None:
         self.reached.set()
-        assert self.open.wait(PATIENCE_S), "nobody opened the gate"
+        assert self.open.wait(PATIENCE_S), "the test never opened the gate"
 
 
-def taken(frames: Iterator[Any], count: int) -> list[Any]:
-    return [next(frames) for _ in range(count)]
+def after(event: threading.Event, act: Callable[[], object]) -> threading.Thread:
+    """Do something after an event, in a thread of its own."""
 
+    def run() -> None:
+        assert event.wait(PATIENCE_S)
+        act()
 
-def after(gate: Gate, what: Callable[[], object]) -> threading.Thread:
-    """Do something once the gate is reached, in a thread of its own."""
-
-    def act() -> None:
-        assert gate.reached.wait(PATIENCE_S)
-        what()
-
-    thread = threading.Thread(target=act)
+    thread = threading.Thread(target=run)
     thread.start()
     return thread

@@ -1,50 +1,48 @@
-"""Steps that hang, what a supervisor hears, and signals as requests."""
+"""Steps that hang, notices to a supervisor, and signals as requests."""
 
 import os
 import signal
 import socket
 import threading
-from contextlib import suppress
 
 import pytest
 
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.watchdog import StopSignals, Supervisor, Watchdog
 
+PATIENCE_S = 60.0
+
 
 class Case:
-    """A watchdog with a clock of its own. ended: with what words the process would have been."""
+    """A watchdog whose clock the test sets. ended: the last words of a process that was ended."""
 
     def __init__(self, hung_s=10.0, supervisor=None):
         self.ended: list[str] = []
         self.now_s, self.health = 0.0, Health()
         self.dog = Watchdog(self.health, hung_s, supervisor, self.ended.append, lambda: self.now_s)
 
-    def at(self, now_s):
-        self.now_s = now_s
-        self.dog.check()
+    def at(self, *times_s):
+        for self.now_s in times_s:
+            self.dog.check()
 
     @property
-    def told(self):
+    def reported(self):
         return [(event.kind, event.frame) for event in self.health.snapshot().events]
 
 
-def test_a_step_that_hangs_is_told_once_and_ended_after_twice_as_long():
+def test_a_step_that_hangs_is_reported_once_and_ended_after_twice_as_long():
     case = Case()
     case.dog.begin(7)
     case.at(10.0)
-    assert case.told == []
-    case.at(11.0)
-    case.at(19.0)
-    assert case.told == [("watchdog", 7)]
-    assert "frame 7" in case.dog.hung
-    assert not case.ended
+    assert case.reported == []
+    case.at(11.0, 19.0)
+    assert case.reported == [("watchdog", 7)]
+    assert "frame 7" in case.dog.hung and not case.ended
     case.at(20.5)
-    assert len(case.ended) == 1
-    assert "frame 7 has taken 20 s" in case.ended[0]
+    assert ["frame 7 has taken 20 s" in words for words in case.ended] == [True]
 
 
-def test_a_step_that_ends_late_is_forgiven_and_the_next_one_told_again():
+def test_a_late_step_is_forgiven_and_the_next_one_is_reported_again():
     case = Case()
     for frame, now_s in ((1, 11.0), (2, 41.0)):
         case.dog.begin(frame)
@@ -52,57 +50,51 @@ def test_a_step_that_ends_late_is_forgiven_and_the_next_one_told_again():
         case.dog.done()
         case.at(now_s + 19.0)  # waiting for pictures never counts as hung
         assert case.dog.hung == ""
-    assert case.told == [("watchdog", 1), ("watchdog", 2)] and not case.ended
+    assert case.reported == [("watchdog", 1), ("watchdog", 2)] and not case.ended
     unlimited = Case(hung_s=0.0)
     unlimited.dog.begin(1)
     unlimited.at(1e6)
-    assert unlimited.told == [] and not unlimited.ended
-
-
-class Heard:
-    """A supervisor's socket: called, it gives what was said to it."""
-
-    def __init__(self, way: socket.socket, path: str) -> None:
-        self.way, self.path = way, path
-        way.bind(path)
-        way.setblocking(False)
-
-    def __call__(self) -> list[str]:
-        said: list[str] = []
-        with suppress(BlockingIOError):
-            while True:
-                said.append(self.way.recv(4096).decode())
-        return said
+    assert unlimited.reported == [] and not unlimited.ended
 
 
 @pytest.fixture
-def heard(tmp_path):
+def notified(tmp_path):
+    """The path of a supervisor's socket, and a function that gives what was sent to it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
-        yield Heard(way, str(tmp_path / "notify"))
+        way.bind(str(tmp_path / "notify"))
+        way.setblocking(False)
+
+        def received():
+            try:
+                return [way.recv(4096).decode(), *received()]
+            except BlockingIOError:
+                return []
+
+        yield str(tmp_path / "notify"), received
 
 
-def test_a_supervisor_hears_that_all_is_well_while_it_is(heard):
-    case = Case(supervisor=Supervisor({"NOTIFY_SOCKET": heard.path, "WATCHDOG_USEC": "8000000"}))
+def test_a_supervisor_is_notified_while_no_step_hangs(notified):
+    path, received = notified
+    case = Case(supervisor=Supervisor({"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "8000000"}))
     case.dog.begin(1)
-    for now_s in (0.0, 1.0, 2.0, 3.0, 4.0):
-        case.at(now_s)
-    assert heard() == ["WATCHDOG=1"] * 3
-    case.at(11.0)
-    case.at(15.0)
-    assert heard() == []
+    case.at(0.0, 1.0, 2.0, 3.0, 4.0)
+    assert received() == ["WATCHDOG=1"] * 3
+    case.at(11.0, 15.0)
+    assert received() == []
     case.dog.done()
     case.at(16.0)
-    assert heard() == ["WATCHDOG=1"]
+    assert received() == ["WATCHDOG=1"]
 
 
 @pytest.mark.parametrize(
     "environ",
     [{}, {"NOTIFY_SOCKET": "/nowhere/at/all"}, {"NOTIFY_SOCKET": "@nobody-is-there"}, {"WATCHDOG_USEC": "1000"}],
 )
-def test_a_supervisor_hears_words_and_where_nobody_listens_nothing_is_raised(heard, environ):
-    Supervisor({"NOTIFY_SOCKET": heard.path}).say("READY=1", "STATUS=well")
+def test_a_notice_is_sent_where_a_supervisor_listens_and_never_raises(notified, environ):
+    path, received = notified
+    Supervisor({"NOTIFY_SOCKET": path}).say("READY=1", "STATUS=well")
     Supervisor(environ).say("READY=1")
-    assert heard() == ["READY=1\nSTATUS=well"]
+    assert received() == ["READY=1\nSTATUS=well"]
 
 
 @pytest.mark.parametrize(
@@ -113,11 +105,9 @@ def test_only_the_process_that_is_meant_answers_the_watchdog(more, every_s):
     assert Supervisor(environ).every_s == every_s
 
 
-PATIENCE_S = 60.0
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_asks_and_the_second_ends_at_once(number):
+def test_the_first_signal_asks_the_second_ends_at_once_and_handlers_are_restored(number):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     asked, ended, codes = threading.Event(), threading.Event(), []
 
     def at_once(code):
@@ -125,25 +115,18 @@ def test_the_first_signal_asks_and_the_second_ends_at_once(number):
         ended.set()
 
     with StopSignals(lambda number: asked.set(), at_once) as stopping:
+        assert stopping.signal is None and not asked.is_set()
         os.kill(os.getpid(), number)
         assert asked.wait(PATIENCE_S)
-        assert stopping.signal == number
-        assert not codes
+        assert stopping.signal == number and not codes
         os.kill(os.getpid(), signal.SIGTERM)
         assert ended.wait(PATIENCE_S)
     assert codes == [128 + signal.SIGTERM]
-
-
-def test_nothing_is_asked_without_a_signal_and_handlers_are_given_back():
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with StopSignals(lambda number: pytest.fail("nobody asked")) as stopping:
-        assert signal.getsignal(signal.SIGINT) is not before[0]
-    assert stopping.signal is None
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
     assert signal.set_wakeup_fd(-1) == -1
 
 
-def test_in_another_thread_signals_stay_as_they_are():
+def test_another_thread_leaves_the_handlers_as_they_are():
     before, seen = signal.getsignal(signal.SIGTERM), []
 
     def inside():
