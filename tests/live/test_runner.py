@@ -179,7 +179,7 @@ class Loaded:
         self.every = every
 
     def feed(self, *costs_s):
-        moved = []
+        moved = list[Adjustment]()
         for number, cost_s in enumerate(costs_s, start=1):
             moved += self.shedding(Frame(number, 0.0, PICTURE))[1]
             self.busy_s = cost_s
