@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 
 from tests.simulation.small import small
-from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control import Mission, StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
+from torchvision_dddas.geometry import east_north, lonlat
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import SimulatorSource
 from torchvision_dddas.types import Command, FrameResult
 
-FROZEN = {"what": "frozen", "time_s": 2.0, "seconds": 0.5}
-DROPPED = {"what": "dropped", "time_s": 3.2, "seconds": 0.3}
-LOST = {"what": "ugv_lost", "time_s": 0.5, "seconds": 9.0, "vehicle": 2}
+FAULTS = (
+    {"what": "frozen", "time_s": 2.0, "seconds": 0.5},
+    {"what": "dropped", "time_s": 3.2, "seconds": 0.3},
+    {"what": "ugv_lost", "time_s": 0.5, "seconds": 9.0, "vehicle": 2},
+)
 
 
 @dataclass
@@ -52,10 +54,8 @@ def fly(overrides=(), seconds=6.0, **tables) -> Flight:
         steer(command)
 
     simulated.steer = record  # type: ignore[method-assign]
-    source = StartedSource(simulated)
-    mission = build_mission(
-        source, load_config("patrol", [*overrides]), "onboard", scenario.clip.located_by == "landmarks"
-    )
+    source, settings = StartedSource(simulated), load_config("patrol", [*overrides])
+    mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
     flown = Flight(simulated, mission, steered=steered)
     engine = load_engine("onboard", mission.settings)
     for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(source):
@@ -71,25 +71,22 @@ def own_places(source):
 
 @pytest.fixture(scope="module")
 def flown():
-    return fly(OFTEN, fault=(FROZEN, DROPPED, LOST))
+    return fly(OFTEN, fault=FAULTS)
 
 
 def test_what_is_found_reaches_the_source_as_commands(flown):
     commands = [result.command for result in flown.results]
     # One comes before there is anything to be found: how often to look.
     assert all(one is other for one, other in zip(flown.steered[1:], commands, strict=True))
-    last = commands[-1]
-    assert {order.vehicle for order in last.orders} <= {"ugv1", "ugv2", "ugv3", "ugv4"}
+    assert {order.vehicle for order in commands[-1].orders} <= {"ugv1", "ugv2", "ugv3", "ugv4"}
     # Degrees near the world's origin, not metres.
-    assert np.abs(np.asarray(last.look_at) - flown.source.origin_deg).max() < 0.001
+    assert np.abs(np.asarray(commands[-1].look_at) - flown.source.origin_deg).max() < 0.001
 
 
 @pytest.mark.slow
 def test_commands_move_the_ground_vehicles(flown):
-    alone = SimulatorSource(world(fault=(FROZEN, DROPPED, LOST)))
-    planned: dict[int, np.ndarray] = {}
-    for _ in alone:
-        planned |= own_places(alone)
+    alone = SimulatorSource(world(fault=FAULTS))
+    planned = {frame: place for _ in alone for frame, place in own_places(alone).items()}
     assert np.abs(planned[2] - flown.places[2]).max() < 1e-9
     assert np.abs(planned[30] - flown.places[30]).max() > 0.3
 
@@ -99,28 +96,19 @@ def test_reports_are_taken_as_they_come_and_targets_are_judged_by_what_ground_ve
     assert site.landmarks.frame[~site.landmarks.planned].max() == 30 and not site.landmarks.geographic
     assert site.telemetry.time_s[-1] == pytest.approx(5.8)
     assert any(by for result in flown.results for by in result.confirmed.seen_by)
-
-
-def test_places_are_those_of_the_world(flown):
-    """The crowd walks eastward about the middle: what is found of it is near."""
+    # The crowd walks eastward about the middle: what is found of it is near.
     places = np.concatenate([r.locations.positions.east_north_m for r in flown.results if r.locations is not None])
-    assert len(places) > 20
-    here = geometry.east_north(
-        geometry.lonlat(places, flown.mission.watch.locator.site.origin_deg), flown.source.origin_deg
-    )
-    assert np.median(np.linalg.norm(here - (-1.0, 0.0), axis=1)) < 3.0
+    here = east_north(lonlat(places, site.origin_deg), flown.source.origin_deg)
+    assert len(places) > 20 and np.median(np.linalg.norm(here - (-1.0, 0.0), axis=1)) < 3.0
 
 
-def test_what_goes_wrong_is_noticed(flown):
+def test_what_goes_wrong_is_noticed_and_dropped_frames_are_scenes_without_targets(flown):
     said = {frame: text for frame, text in flown.noticed if "camera" in text}
     # Frames 11 to 13 show frame 10 again; reports of the lost vehicle end at frame 3.
     assert "frozen" in said[11]
     assert said[14] == "the camera sees again: 3 pictures repeated the one before"
     (silent,) = [text for _, text in flown.noticed if "ugv2" in text]
     assert silent.startswith("ugv2 reports no place for 2.")
-
-
-def test_dropped_frames_are_scenes_without_targets(flown):
     lost = [r.tracked for r in flown.results if "could not be read" in r.tracked.cause]
     assert [f.number for f in lost] == [17, 18]
 
@@ -135,7 +123,7 @@ def test_frames_left_out_on_purpose_leave_no_empty_scenes():
 
 
 @pytest.mark.slow
-def test_without_ground_vehicles_telemetry_lays_the_pictures_on_the_ground():
+def test_without_ground_vehicles_telemetry_places_the_pictures_on_the_ground():
     flown = fly((), 1.0, team={"ugvs": 0}, clip={"located_by": "telemetry"})
     assert {r.locations.fix.by for r in flown.results if r.locations is not None} == {"telemetry"}
     assert flown.mission.watch.locator.site.origin_deg == flown.source.origin_deg

@@ -1,4 +1,4 @@
-"""What a run notices of its own instruments: silence, leaps, frozen and jerking pictures, told once each."""
+"""What a run notices of its own instruments: silence, leaps, frozen and jerking pictures."""
 
 import numpy as np
 import pytest
@@ -10,60 +10,62 @@ RATE_HZ = 10.0
 
 
 def reports(rows):
-    """rows: (frame, which, east, north) or with planned."""
-    table = np.array([(*row, 0)[:5] for row in rows], float).reshape(-1, 5)
+    """rows: (frame, which, east) or with planned."""
+    table = np.array([(*row, 0)[:4] for row in rows], float).reshape(-1, 4)
     n = len(table)
-    which, nowhere, sigma = table[:, 1].astype(np.int64), np.full((n, 2), np.nan), np.full(n, 0.1)
-    return Landmarks(
-        ("ugv1", "ugv2"), table[:, 0], which, nowhere, table[:, 2:4], sigma, table[:, 4] == 1, np.arange(n), False
-    )
+    which, nowhere, place = table[:, 1].astype(np.int64), np.full((n, 2), np.nan), np.c_[table[:, 2], np.zeros(n)]
+    sigma, planned = np.full(n, 0.1), table[:, 3] == 1
+    return Landmarks(("ugv1", "ugv2"), table[:, 0], which, nowhere, place, sigma, planned, np.arange(n), False)
 
 
-def telemetry(times):
-    nothing = np.full(len(times), np.nan)
-    return Telemetry(np.asarray(times, float), nothing, nothing, np.zeros((len(times), 2)))
+def standing(frames, which=1):
+    return [(frame, which, 5.0 * which) for frame in frames]
 
 
-def standing(until, which=(0, 1)):
-    return [(frame, k, 5.0 * k, 0.0) for frame in range(1, until + 1) for k in which]
-
-
-def watched(until, rows, times=None):
-    """All that is noticed from frame to frame, as (frame, text)."""
-    watch = SensorMonitor(("ugv1", "ugv2"), RATE_HZ)
-    times = np.arange(until) / RATE_HZ if times is None else np.asarray(times)
-    said = []
+def watched(until, rows, flown=1000):
+    """All that is noticed from frame to frame, as (frame, text), where the first vehicle stands and reports."""
+    watch, said = SensorMonitor(("ugv1", "ugv2"), RATE_HZ), []
+    rows = standing(range(1, until + 1), 0) + rows
     for now in range(1, until + 1):
-        there = reports([row for row in rows if row[0] <= now or len(row) == 5])
-        watch.check_reports(now, there, telemetry(times[times <= (now - 1) / RATE_HZ + 1e-9]))
+        heard = np.arange(min(now, flown)) / RATE_HZ
+        nothing = np.full(len(heard), np.nan)
+        there = reports([row for row in rows if row[0] <= now or len(row) == 4])
+        watch.check_reports(now, there, Telemetry(heard, nothing, nothing, np.zeros((len(heard), 2))))
         said += [(notice.frame, notice.text) for notice in watch.notices()]
     return said
 
 
-def test_a_vehicle_that_falls_silent_is_told_once_and_again_when_it_is_back():
-    rows = standing(60, (0,)) + [row for row in standing(60, (1,)) if not 20 < row[0] < 50]
-    assert watched(60, rows) == [
-        (41, "ugv2 reports no place for 2.1 s: nothing stands in for it"),
-        (50, "ugv2 reports its place again, after 3.0 s"),
-    ]
+PLANNED = [(frame, 1, 5.0, 1) for frame in range(30, 100, 10)]
+LEAP = "ugv2's reports leap by 10.0 m within 0.1 s"
 
 
-def test_a_plan_that_goes_on_stands_in_for_a_silent_vehicle():
-    rows = [*standing(60, (0,)), *standing(20, (1,)), *((frame, 1, 5.0, 0.0, 1) for frame in range(30, 100, 10))]
-    assert watched(60, rows) == [(41, "ugv2 reports no place for 2.1 s: its plan stands in for it")]
-
-
-def test_telemetry_that_stops_is_told():
-    (said,) = watched(40, standing(40), np.arange(10) / RATE_HZ)
-    assert said == (31, "the UAV says nothing of itself for 2.1 s: landmarks alone tell its place")
-
-
-def test_a_leap_is_told_with_its_length_there_and_back():
-    rows = standing(30, (0,)) + [(f, 1, 5.0 + (10.0 if 10 <= f < 20 else 0.0), 0.0) for f in range(1, 31)]
-    assert watched(30, rows) == [
-        (10, "ugv2's reports leap by 10.0 m within 0.1 s"),
-        (20, "ugv2's reports leap by 10.0 m within 0.1 s"),
-    ]
+@pytest.mark.parametrize(
+    ("rows", "flown", "said"),
+    [
+        (
+            standing([*range(1, 21), *range(50, 61)]),
+            60,
+            [
+                (41, "ugv2 reports no place for 2.1 s: nothing stands in for it"),
+                (50, "ugv2 reports its place again, after 3.0 s"),
+            ],
+        ),
+        (
+            standing(range(1, 21)) + PLANNED,
+            60,
+            [(41, "ugv2 reports no place for 2.1 s: its plan stands in for it")],
+        ),
+        (
+            standing(range(1, 61)),
+            10,
+            [(31, "the UAV says nothing of itself for 2.1 s: landmarks alone tell its place")],
+        ),
+        ([(f, 1, 15.0 if 10 <= f < 20 else 5.0) for f in range(1, 61)], 60, [(10, LEAP), (20, LEAP)]),
+    ],
+    ids=["silent", "planned", "no telemetry", "leap"],
+)
+def test_silence_and_leaps_are_noticed_once_each(rows, flown, said):
+    assert watched(60, rows, flown) == said
 
 
 def film(moves_px, frozen=()):
@@ -80,7 +82,7 @@ def film(moves_px, frozen=()):
     return said
 
 
-def test_pictures_that_repeat_are_told_at_the_first_and_counted_at_the_end():
+def test_pictures_that_repeat_are_noticed_at_the_first_and_counted_at_the_end():
     assert film([0.0] * 20, frozen=(8, 9, 10)) == [
         (9, "the picture repeats the one before: the camera is frozen"),
         (12, "the camera sees again: 3 pictures repeated the one before"),
@@ -88,7 +90,7 @@ def test_pictures_that_repeat_are_told_at_the_first_and_counted_at_the_end():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_sudden_motion_of_the_picture_is_told_and_a_steady_one_is_not(sign):
+def test_a_sudden_motion_of_the_picture_is_noticed_and_a_steady_one_is_not(sign):
     assert film([3.0 * sign] * 20) == []
     assert film([k * 0.2 * sign for k in range(40)]) == []
     ((frame, text),) = film([0.5] * 12 + [sign * 6.5] * 8)

@@ -1,8 +1,6 @@
 """Results steer the instruments: synthetic located frames in, commands and their causes out."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from torchvision_dddas.control import Steering
 from torchvision_dddas.geo.landmark_trajectories import best_spread, spread_m2
 from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.types import (
-    Adjustment,
     AerialLocations,
     Camera,
     CameraPose,
@@ -63,80 +60,69 @@ def located(frame, places, velocity=0.0, targets=None, pose=None, rate_hz=RATE_H
 def judged(frame, kinds) -> Confirmation:
     """What ground vehicles say of targets in order: human, not_human or unseen, or a probability."""
     chance, n = {"human": 0.99, "not_human": 0.01, "unseen": 0.5}, len(kinds)
-    probability = np.array([chance.get(kind, kind) for kind in kinds], float)
-    words = tuple(k if isinstance(k, str) else ("human" if k >= 0.5 else "not_human") for k in kinds)
+    words = tuple(k if isinstance(k, str) else "human" for k in kinds)
     nothing = [np.full(n, np.nan)] * 3
+    probability = np.array([chance.get(kind, kind) for kind in kinds], float)
     return Confirmation(frame, np.arange(n), words, probability, ((),) * n, np.zeros(n, np.int64), *nothing)
 
 
 def team_at(places, rows=slice(None)) -> LandmarkObservations:
-    n = len(places)
-    return LandmarkObservations(np.arange(n), np.full((n, 2), np.nan), places, np.ones(n), np.ones(n), np.zeros(n))[
-        rows
-    ]
+    n, unseen = len(places), np.full((len(places), 2), np.nan)
+    return LandmarkObservations(np.arange(n), unseen, places, np.ones(n), np.ones(n), np.zeros(n))[rows]
 
 
-def flown(pose: CameraPose, speed_m_s: float = 2.0) -> Flight:
+def flown(pose, speed_m_s=2.0) -> Flight:
     return Flight(float(pose.place_m[2]), speed_m_s, tuple(pose.place_m[:2]), float("nan"), *pose.angles_rad)
 
 
-def step_to(place: np.ndarray, goal: np.ndarray, speed_m_s: float) -> np.ndarray:
+def step_to(place, goal, speed_m_s):
     """The place one frame later."""
     way = goal - place
     return place + way * min(1.0, speed_m_s / RATE_HZ / max(float(np.linalg.norm(way)), 1e-9))
 
 
-@dataclass
 class World:
     """A toy: targets walk, the aerial vehicle and the ground vehicles go where they are asked, frames settle late."""
 
-    start: Any
-    pace: Any = 0.0
-    kinds: tuple[str | float, ...] = ()
-    team: np.ndarray = field(default_factory=SQUARE.copy)
-    altitude_m: float = 50.0
-    pitch_deg: float = 90.0
-    hidden: Callable[[float], bool] = lambda now_s: False
-    reporting: slice | list[int] = field(default_factory=lambda: slice(None))
-    silent: bool = False
-    parameters: dict[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.targets = np.array(self.start, float)
-        self.velocity = np.broadcast_to(np.array(self.pace, float), self.targets.shape)
-        self.steering = steering(len(self.team), **self.parameters)
+    def __init__(self, start, pace=0.0, kinds=(), team=SQUARE, altitude_m=50.0, pitch_deg=90.0, **parameters):
+        self.targets, self.team = np.array(start, float), team.copy()
+        self.velocity = np.broadcast_to(np.array(pace, float), self.targets.shape)
+        self.kinds, self.altitude_m, self.pitch_deg = kinds, altitude_m, pitch_deg
+        self.reporting: slice | list[int] = slice(None)
+        self.hidden = self.silent = False
+        self.steering = steering(len(team), **parameters)
         self.now_s, self.looked, self.rng = 0.0, np.zeros(2), np.random.default_rng(7)
-        self.commands: list[Command] = []
-        self.made: list[Adjustment] = []
-        self.poses: list[CameraPose] = []
-        self.frames: list[AerialLocations] = []
+        self.commands, self.made, self.frames = [], [], []
 
-    def run(self, seconds: float, check: Callable[["World"], None] = lambda world: None) -> "World":
+    def run(self, seconds, check=lambda world: None) -> "World":
         for _ in range(round(seconds * RATE_HZ)):
             self._frame()
             check(self)
         return self
 
-    def inside(self, places: np.ndarray) -> np.ndarray:
-        """Whether the picture shows them now."""
-        pixels = project(np.c_[places, np.zeros(len(places))], self.poses[-1], CAMERA)
+    def inside(self, places) -> np.ndarray:
+        """Whether the last picture shows them."""
+        pixels = project(np.c_[places, np.zeros(len(places))], self.pose, CAMERA)
         return np.all((pixels > 0) & (pixels < np.array(CAMERA.size_px) - 1), axis=1)
 
-    def changes(self, parameter: str) -> list[Adjustment]:
+    def changes(self, parameter):
         return [change for change in self.made if change.parameter.endswith(parameter)]
 
+    def ordered(self) -> set[str]:
+        return {order.vehicle for order in self.commands[-1].orders}
+
     def _frame(self) -> None:
-        pose = pose_at(self.looked, self.altitude_m, self.pitch_deg)
-        self.poses.append(pose)
-        shown = np.flatnonzero(self.inside(self.targets) & (not self.hidden(self.now_s)))
+        self.pose = pose_at(self.looked, self.altitude_m, self.pitch_deg)
+        shown = np.flatnonzero(self.inside(self.targets) & (not self.hidden))
         noisy = self.targets + self.rng.normal(0, 0.3, self.targets.shape)
-        self.frames.append(located(len(self.poses), noisy[shown], self.velocity[shown], shown + 1, pose))
-        late = len(self.poses) - 1 - round(RATE_HZ)
+        self.frames.append(located(len(self.frames) + 1, noisy[shown], self.velocity[shown], shown + 1, self.pose))
+        late = len(self.frames) - 1 - round(RATE_HZ)
         if late >= 0:
             settled = self.frames[late]
             kinds = [self.kinds[k - 1] for k in settled.positions.target] if self.kinds else []
             marks = team_at(self.team + self.rng.normal(0, 0.5, self.team.shape), self.reporting)
-            confirmed, flight = judged(settled.frame, kinds) if kinds else None, None if self.silent else flown(pose)
+            confirmed = judged(settled.frame, kinds) if kinds else None
+            flight = None if self.silent else flown(self.pose)
             command, made = self.steering.update(settled, confirmed, self.now_s, marks, flight)
             self.commands.append(command)
             self.made.extend(made)
@@ -154,11 +140,14 @@ class World:
             self.team[k] = step_to(self.team[k], order.goal, order.speed_m_s)
 
 
-def test_nothing_known_changes_nothing():
+def test_nothing_known_changes_nothing_and_without_a_place_on_the_ground_there_is_nothing_to_look_at():
     one = steering()
-    for frame in range(1, 30):
-        command, made = one.update(located(frame, []), None, frame / RATE_HZ, team_at(SQUARE), None)
-        assert command == Command() and made == ()
+    for frame in range(1, 10):
+        assert one.update(located(frame, []), None, frame / RATE_HZ, team_at(SQUARE), None) == (Command(), ())
+    for frame in range(10, 30):
+        blind = replace(located(frame, [[1, 2]]), fix=Fix(frame, "", cause="nothing"))
+        command, _ = one.update(blind, None, frame / RATE_HZ + 1, team_at(SQUARE), None)
+    assert command.look_at is None and len(command.orders) == 4
 
 
 # The aerial vehicle.
@@ -184,13 +173,14 @@ def test_it_climbs_where_crowds_part_and_comes_down_when_they_meet_again():
 
 
 def test_where_nothing_is_found_any_more_it_sees_more_from_higher_and_goes_back_at_last():
-    lost = World([[0, 0]], (0.5, 0.0), ("human",), hidden=lambda now_s: now_s > 15).run(30)
-    climbs = lost.changes("uav.altitude_m")
+    lost = World([[0, 0]], (0.5, 0.0), ("human",)).run(15)
+    lost.hidden = True
+    climbs = lost.run(15).changes("uav.altitude_m")
     assert climbs and all("no target for" in change.cause and change.new > change.old for change in climbs)
     assert lost.run(40).commands[-1].altitude_m == 50.0
-    lost.hidden, lost.looked = lambda now_s: False, lost.targets[0].copy()
+    lost.hidden, lost.looked = False, lost.targets[0].copy()
     lost.run(10)
-    assert lost.inside(lost.targets).all() and len(lost.commands[-1].orders) == 4
+    assert lost.inside(lost.targets).all() and len(lost.ordered()) == 4
 
 
 def test_silent_telemetry_is_survived_by_what_the_pictures_tell():
@@ -198,11 +188,6 @@ def test_silent_telemetry_is_survived_by_what_the_pictures_tell():
     walk.silent = True
     walk.run(20)
     assert walk.inside(walk.targets).all()
-    one = steering()
-    for frame in range(1, 30):
-        blind = replace(located(frame, [[1, 2]]), fix=Fix(frame, "", cause="nothing"))
-        command, _ = one.update(blind, None, frame / RATE_HZ + 1, team_at(SQUARE), None)
-    assert command.look_at is None and len(command.orders) == 4
 
 
 def test_a_target_that_is_not_human_is_given_up_and_followed_until_then():
@@ -210,7 +195,7 @@ def test_a_target_that_is_not_human_is_given_up_and_followed_until_then():
     assert car.looked[0] > 5
     car.kinds = ("not_human",)
     car.run(15)
-    assert np.linalg.norm(car.looked - car.targets[0]) > 10 and car.commands[-1].orders == ()
+    assert np.linalg.norm(car.looked - car.targets[0]) > 10 and not car.ordered()
 
 
 # The ground vehicles.
@@ -232,17 +217,13 @@ def test_ground_vehicles_surround_a_crowd_that_walks_and_are_never_on_one_line(c
 
 def test_what_nobody_has_seen_is_looked_at_first_then_what_is_least_sure():
     w = World([[0, 6], [0, -6], [5, 0]], 0.0, ("human", "unseen", 0.6)).run(10)
-
-    def all_look_at(row: int) -> bool:
-        """Whether the vehicles that have a target in reach, two or more, look at it."""
+    for row, kinds, seconds in ((1, ("human", "human", 0.6), 6), (2, w.kinds, 0)):
+        # Two or more vehicles have it in reach, and all that have look at it.
         near = np.linalg.norm(w.team - w.targets[row], axis=1) < 13
         at = np.array([order.look_at for order in w.commands[-1].orders])
-        return near.sum() >= 2 and (np.linalg.norm(at - w.targets[row], axis=1) < 2)[near].all()
-
-    assert all_look_at(1)
-    w.kinds = ("human", "human", 0.6)
-    w.run(6)
-    assert all_look_at(2)
+        assert near.sum() >= 2 and (np.linalg.norm(at - w.targets[row], axis=1) < 2)[near].all()
+        w.kinds = kinds
+        w.run(seconds)
 
 
 def test_a_vehicle_is_sent_to_what_nobody_can_see_from_the_ring_and_called_back_when_it_has_been_seen():
@@ -261,20 +242,13 @@ def test_a_vehicle_is_sent_to_what_nobody_can_see_from_the_ring_and_called_back_
 
 def test_a_vehicle_that_falls_silent_is_counted_on_for_a_while_and_then_the_others_close_the_ring():
     w = World([[0, 0]], (0.5, 0), ("human",)).run(10)
-
-    def ordered() -> set[str]:
-        return {order.vehicle for order in w.commands[-1].orders}
-
     w.reporting = [0, 1, 3]
-    w.run(5)
-    assert ordered() == set(NAMES[:4])
-    w.run(30)
+    assert w.run(5).ordered() == set(NAMES[:4])
+    assert w.run(30).ordered() == {"ugv1", "ugv2", "ugv4"} and w.inside(w.targets).all()
     (change,) = w.changes("team.vehicles")
-    assert ordered() == {"ugv1", "ugv2", "ugv4"} and w.inside(w.targets).all()
     assert (change.old, change.new, change.cause) == (4, 3, "ugv3 silent for 10 s")
     w.reporting = slice(None)
-    w.run(1)
-    assert len(ordered()) == 4 and len(w.changes("team.vehicles")) == 2
+    assert len(w.run(1).ordered()) == 4 and len(w.changes("team.vehicles")) == 2
 
 
 def test_no_picture_is_wanted_of_what_is_out_of_reach():
@@ -288,9 +262,10 @@ def test_no_picture_is_wanted_of_what_is_out_of_reach():
 def sampled_by(targets, velocity=0.0, speed_m_s=0.5, misses=(), step=None):
     """`every` after each frame, and the adjustments, for a flight over targets that stand or walk."""
     one, every, made = steering(rate_hz=SAMPLED_HZ, sampling=True), [], []
+    flight = flown(pose_at((0, 0)), speed_m_s)
     for frame in range(1, 110):
         here = np.array(targets, float)[: 0 if frame in misses else None] + np.array(velocity) * frame / SAMPLED_HZ
-        seen, flight = located(frame, here, velocity, rate_hz=SAMPLED_HZ), flown(pose_at((0, 0)), speed_m_s)
+        seen = located(frame, here, velocity, rate_hz=SAMPLED_HZ)
         command, new = one.update(seen, None, frame / SAMPLED_HZ + 1, team_at(SQUARE), flight, step)
         every.append(command.every)
         made += [change for change in new if change.parameter == "sampling.every"]
@@ -313,7 +288,7 @@ def test_while_a_target_is_lost_or_the_registration_weak_every_frame_is_processe
 
 def test_each_part_can_be_left_as_planned():
     def after(**parameters):
-        return World([[0, 5]], (1.4, 0), ("unseen",), parameters=parameters).run(8).commands[-1]
+        return World([[0, 5]], (1.4, 0), ("unseen",), **parameters).run(8).commands[-1]
 
     command = after(sampling=False)
     assert command.every == 1 and command.look_at is not None and command.orders
