@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.geo.test_ranging import with_noise
+from tests.airborne import within_95
+from tests.geo.test_ranging import erring, with_noise
 from tests.upright import boxes, camera, poses
 from torchvision_dddas.config import GroundParameters, load_config
 from torchvision_dddas.errors import InputError
@@ -15,38 +16,29 @@ from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import DetectionTable, Sightings
 
-SETTINGS = load_config()
 WALKERS = np.array([[-1.0, 10.0], [2.0, 14.0]])
 NEAR = {"position_sigma_m": 0.1, "heading_sigma_rad": 0.005}
 ORIGIN = (-110.95, 32.23)
 
 
 def walked(frame):
-    """Where the walkers are."""
     return WALKERS + np.array([0, 0.1 * frame])
 
 
 def table(cam, place=(0.0, 0.0), frames=(1, 2, 3), identity=(5, 9)):
     """Two walkers who go north by 0.1 m a frame."""
-    parts = [boxes(walked(frame), 1.75, cam, place) for frame in frames]
     n = len(WALKERS) * len(frames)
-    return DetectionTable(
-        "tracks.csv",
-        np.repeat(frames, len(WALKERS)),
-        np.concatenate(parts) if parts else np.zeros((0, 4)),
-        np.linspace(0.5, 1, n),
-        np.arange(n) + 1,
-        identity=np.tile(identity, len(frames)),
-    )
+    box = np.concatenate([boxes(walked(frame), 1.75, cam, place) for frame in frames])
+    score, line, identities = np.linspace(0.5, 1, n), np.arange(n) + 1, np.tile(identity, len(frames))
+    return DetectionTable("tracks.csv", np.repeat(frames, len(WALKERS)), box, score, line, identity=identities)
 
 
-def found(tables, cameras, poses=None, settings=SETTINGS, rate=None):
-    return list(GroundLocator(cameras, settings, poses=poses or (), rate_hz=rate).locate_tables(tables))
+def found(tables, cameras, *overrides):
+    return list(GroundLocator(cameras, load_config(overrides=overrides)).locate_tables(tables))
 
 
 def test_one_camera_keeps_the_identities_of_its_table():
-    cam = camera()
-    looks = found([table(cam)], [cam])
+    looks = found([table(camera())], [camera()])
     assert [look.frame for look in looks] == [1, 2, 3]
     for look in looks:
         assert look.positions.target.tolist() == [5, 9]
@@ -54,10 +46,10 @@ def test_one_camera_keeps_the_identities_of_its_table():
         assert look.positions.origin_deg is None and look.positions.lonlat_deg is None
 
 
-def test_an_identity_twice_in_a_frame_is_said_with_its_line():
+def test_an_identity_twice_in_a_frame_is_refused_with_its_line():
     twice = replace(table(camera()), identity=np.array([5, 9, 5, 5, 5, 9]))
     with pytest.raises(InputError, match=r"line 4: identity 5 is there already in frame 2; wanted each once"):
-        GroundLocator(camera(), SETTINGS).locate_tables([twice])
+        found([twice], [camera()])
 
 
 def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
@@ -80,53 +72,45 @@ def test_frames_that_lie_near_are_one_look_where_asked_for():
     south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
     tables = [table(south, frames=(1, 11)), table(west, west.place, frames=(3, 13))]
     assert [look.frame for look in found(tables, [south, west])] == [1, 3, 11, 13]
-    near = load_config(overrides=["ground.within_frames=2"])
-    looks = found(tables, [south, west], settings=near)
+    looks = found(tables, [south, west], "ground.within_frames=2")
     assert [look.frame for look in looks] == [1, 11]
     assert all((look.members >= 0).all() for look in looks)
 
 
 def test_paper_mode_converts_by_111320_metres_a_degree():
-    paper = load_config(overrides=["ground.mode=paper"])
     cam = camera(place=ORIGIN, geographic=True)
-    (look, *_) = found([table(cam)], [cam], settings=paper)
+    (look, *_) = found([table(cam)], [cam], "ground.mode=paper")
     box = table(cam).box_px[0]
     depth = 1000 * 1.75 / box[3]
     angle = np.arctan((box[0] + box[2] / 2 - 0.5 - 639.5) / 1000)
     north = ORIGIN[1] + depth * np.cos(angle) / 111_320
     east = ORIGIN[0] + depth * np.sin(angle) / (111_320 * np.cos(np.radians(ORIGIN[1])))
-    assert look.positions.lonlat_deg is not None
     assert np.allclose(look.positions.lonlat_deg[0], (east, north), atol=1e-12)
     with pytest.raises(InputError, match="no covariances to fuse 2 cameras by"):
-        found([table(cam), table(cam)], [cam, cam], settings=paper)
+        found([table(cam), table(cam)], [cam, cam], "ground.mode=paper")
 
 
-def test_cameras_in_degrees_and_in_metres_do_not_mix():
-    cam = camera()
-    with pytest.raises(InputError, match="give all in one kind"):
-        found([table(cam), table(cam)], [cam, replace(cam, geographic=True, place=ORIGIN)])
-
-
-def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first():
+def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first_and_one_in_metres_is_refused():
     there = tuple(lonlat(np.array([[-15.0, 12.0]]), ORIGIN)[0].tolist())
     south = camera(place=ORIGIN, geographic=True, **NEAR)
     west = camera(heading_rad=np.pi / 2, place=there, geographic=True, **NEAR)
     looks = found([table(south), table(west, (-15.0, 12.0))], [south, west])
     assert np.allclose(looks[0].positions.east_north_m, walked(1), atol=1e-3)
+    with pytest.raises(InputError, match="give all in one kind"):
+        found([table(south), table(south)], [camera(), south])
 
 
 # Fusion.
 
 
-def sightings(east_north_m, own=0.01, common=None, body=None):
-    """Sightings of a vehicle whose errors are those given: own variance, position sigma, sigma by the body's height."""
+def sightings(east_north_m, own=0.01, common=0.0):
+    """Sightings of a vehicle whose errors are those given: own variance or covariance, position sigma."""
     places = np.asarray(east_north_m, float).reshape(-1, 2)
     n = len(places)
     camera_m = np.zeros((n, 2, 6))
-    camera_m[:, [0, 1], [0, 1]] = common or 0.0
-    own_m2 = np.broadcast_to(np.asarray(own) * np.eye(2) if np.ndim(own) == 0 else own, (n, 2, 2))
-    body_m = np.zeros((n, 2)) if body is None else np.broadcast_to(np.asarray(body, float), (n, 2))
-    return Sightings(places, np.ones(n), np.zeros(n), np.full(n, "both"), own_m2, body_m, camera_m)
+    camera_m[:, [0, 1], [0, 1]] = common
+    own_m2 = np.broadcast_to(own * np.eye(2) if np.ndim(own) == 0 else own, (n, 2, 2))
+    return Sightings(places, np.ones(n), np.zeros(n), np.full(n, "both"), own_m2, np.zeros((n, 2)), camera_m)
 
 
 def test_independent_sightings_are_averaged_by_the_inverse_of_their_covariances():
@@ -163,32 +147,22 @@ def test_each_sighting_is_of_exactly_one_person_whatever_the_order_of_the_vehicl
 
 def test_four_vehicles_halve_the_error_of_one_and_say_how_large_it_is():
     rng, alone, fused, inside, wrong = np.random.default_rng(1), [], [], [], 0
+    parameters, everybody = GroundParameters(), np.arange(3)
     for scene in range(120):
         people, tall = rng.normal(0, 4, (3, 2)), 1.75 + rng.normal(0, 0.1, 3)
         team = []
         for turn in np.arange(4) * np.pi / 2:
-            place = 18 * np.array([np.sin(turn), np.cos(turn)])
-            known = camera(heading_rad=turn + np.pi)
-            true = camera(
-                heading_rad=known.heading_rad + rng.normal(0, known.heading_sigma_rad),
-                pitch_rad=rng.normal(0, known.pitch_sigma_rad),
-                height_m=1.2 + rng.normal(0, known.height_sigma_m),
-                focal_px=(1000 * (1 + rng.normal(0, known.focal_sigma)),) * 2,
-            )
-            box = boxes(people, tall, true, place + rng.normal(0, known.position_sigma_m, 2))
-            box = with_noise(box, rng, GroundParameters())
+            place, known = 18 * np.array([np.sin(turn), np.cos(turn)]), camera(heading_rad=turn + np.pi)
+            box = boxes(people, tall, erring(known, rng), place + rng.normal(0, known.position_sigma_m, 2))
             where = poses(known, 3, place)
-            team.append(range_people(box, np.zeros(3, bool), known, where, where.place, GroundParameters()))
+            box = with_noise(box, rng, parameters)
+            team.append(range_people(box, np.zeros(3, bool), known, where, where.place, parameters))
         alone += [np.linalg.norm(seen.east_north_m - people, axis=1) for seen in team]
-        same = np.tile(np.arange(3)[:, None], 4)
-        found, joint = estimate_places(team, same)
-        off = found - people
-        own = joint[np.arange(3), :, np.arange(3)]
-        inside.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(own), off) < 5.991)
-        fused.append(np.linalg.norm(off, axis=1))
+        place, joint = estimate_places(team, np.tile(everybody[:, None], 4))
+        inside.append(within_95(place - people, joint[everybody, :, everybody]))
+        fused.append(np.linalg.norm(place - people, axis=1))
         if scene < 30:
             wrong += {tuple(row) for row in associate(team).tolist()} != {(n,) * 4 for n in range(3)}
-    assert np.mean(alone) > 2.0
-    assert np.mean(fused) < 0.5 * np.mean(alone)
+    assert np.mean(alone) > 2.0 and np.mean(fused) < 0.5 * np.mean(alone)
     assert 0.92 < np.mean(inside) < 0.98
     assert wrong < 0.15 * 30
