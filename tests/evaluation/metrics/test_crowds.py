@@ -8,10 +8,6 @@ from torchvision_dddas.evaluation.metrics.crowds import (
     CAP_M,
     HOLD_S,
     CrowdScorer,
-    FoundTargets,
-    TrueFrame,
-    covering,
-    crowds,
 )
 from torchvision_dddas.types import (
     AerialLocations,
@@ -42,26 +38,16 @@ def world(*things, frame=1, moving=1.0):
     """The truth of a frame. things: (target, kind, [places]); a body shows as 5 x 5 pixels where in the picture."""
     rows = [(target, kind, place) for target, kind, places in things for place in places]
     n = len(rows)
-    place = np.array([row[2] for row in rows], float).reshape(n, 2)
-    bodies = Bodies(
-        np.arange(1, n + 1) + 10,
-        np.array([row[1] for row in rows]),
-        np.array([row[0] for row in rows], np.int64),
-        np.c_[place, np.zeros(n)],
-        np.tile([moving, 0.0], (n, 1)),
-        np.zeros(n),
-        np.full(n, 1.7),
-        np.zeros(n),
-        np.zeros((n, 3)),
-        np.full((n, 3), np.nan),
-        np.zeros(n, bool),
-    )
+    number, zero = np.arange(1, n + 1) + 10, np.zeros(n)
+    kind, target = np.array([row[1] for row in rows]), np.array([row[0] for row in rows], np.int64)
+    place, velocity = np.array([row[2] for row in rows], float).reshape(n, 2), np.tile([moving, 0.0], (n, 1))
+    looks = np.full(n, 1.7), zero, np.zeros((n, 3)), np.full((n, 3), np.nan), zero.astype(bool)
+    bodies = Bodies(number, kind, target, np.c_[place, zero], velocity, zero, *looks)
     mask, people = np.zeros(SIZE, np.uint16), np.zeros(SIZE, np.uint16)
     for k, (u, v) in enumerate(np.round(pixel(place)).astype(int)):
         here = slice(max(v - 2, 0), max(v + 3, 0)), slice(max(u - 2, 0), max(u + 3, 0))
         mask[here], people[here] = bodies.target[k], bodies.number[k]
-    pose = CameraPose(np.array([0, 0, 50.0]), np.eye(3))
-    return Truth(frame, (frame - 1) / 10, mask, people, bodies, pose)
+    return Truth(frame, (frame - 1) / 10, mask, people, bodies, CameraPose(np.array([0, 0, 50.0]), np.eye(3)))
 
 
 def box(*places_m, grown=3):
@@ -78,28 +64,18 @@ def found(*targets, frame=1, blobs=None, kinds=None, sigma_m=0.1):
     identity = np.array([t[0] for t in targets], np.int64)
     rows = np.array([k for k, t in enumerate(targets) if t[2] is not None], np.int64)
     place = np.array([targets[k][2] for k in rows], float).reshape(-1, 2)
+    covariance = np.tile(np.eye(2) * sigma_m**2, (len(rows), 1, 1))
     blobs = boxes if blobs is None else np.array(blobs, float).reshape(-1, 4)
     followed = TrackedFrame(frame, None, Detections(blobs), Tracks(frame, identity, boxes, np.ones(n), np.arange(n)))
-    positions = Positions(
-        np.full(len(rows), frame), identity[rows], place, np.tile(np.eye(2) * sigma_m**2, (len(rows), 1, 1))
-    )
-    none = np.zeros((len(rows), 2))
+    positions = Positions(np.full(len(rows), frame), identity[rows], place, covariance)
+    zero, at_s, fix = np.zeros(len(rows)), (frame - 1) / 10, Fix(frame, "pose")
     grounded = AerialLocations(
-        frame,
-        (frame - 1) / 10,
-        positions,
-        rows,
-        positions.covariance_m2,
-        none,
-        boxes,
-        Fix(frame, "pose"),
-        LandmarkObservations(),
+        frame, at_s, positions, rows, covariance, np.zeros((len(rows), 2)), boxes, fix, LandmarkObservations()
     )
     confirmed = None
     if kinds is not None:
-        zero = np.zeros(len(rows))
-        whole = np.zeros(len(rows), np.int64)
-        confirmed = Confirmation(frame, np.arange(len(rows)), kinds, zero, ((),) * len(rows), whole, zero, zero, zero)
+        each = np.arange(len(rows))
+        confirmed = Confirmation(frame, each, kinds, zero, ((),) * len(rows), each * 0, zero, zero, zero)
     return FrameResult(followed, grounded, confirmed=confirmed)
 
 
@@ -111,16 +87,15 @@ def scored(*pairs):
     return scorer.score()
 
 
-WEST, EAST = [(-5, 0), (-4.5, 0.5), (-5, 1)], [(5, 0), (5.5, 0.5), (5, 1)]
+WEST, EAST = [(-5, 0), (-4.5, 0.5), (-5, 1), (-5.5, 0.5)], [(5, 0), (5.5, 0.5), (5, 1)]
 MIDDLE, OTHER = np.mean(WEST, axis=0), np.mean(EAST, axis=0)
 TWO = (1, "person", WEST), (2, "person", EAST)
 
 
-def test_what_is_found_where_it_is_scores_full():
+def test_targets_found_in_their_places_score_full():
     score = scored((world(*TWO), found((7, box(*WEST), MIDDLE), (8, box(*EAST), OTHER))))
-    assert (score.recall, score.detected, score.false_blobs, score.idf1) == (1, 1, 0, 1)
+    assert (score.recall, score.detected, score.false_blobs, score.idf1, score.inside) == (1, 1, 0, 1, 1)
     assert score.crowd_error_m.mean == score.target_error_m.mean == score.knowledge_m == pytest.approx(0)
-    assert score.inside == 1
     assert score.lines() == [
         "crowds: 100.0 % of 2 seen and located, 0.00 false blobs a frame",
         "error of a crowd's place: mean 0.00 m, median 0.00, 95 % 0.00",
@@ -136,34 +111,29 @@ def test_nothing_found_is_recall_0_and_costs_the_cap():
     assert math.isnan(score.crowd_error_m.mean)
 
 
-def test_one_blob_over_two_crowds_that_cross_stands_for_both():
-    there = [(0, 0), (0.5, 0)], [(0, 0.8), (0.5, 0.8)]
-    truth = world((1, "person", there[0]), (2, "person", there[1]))
-    assert scored((truth, found((7, box(*there[0], *there[1]), (0.25, 0.4))))).recall == 1
-
-
 def test_one_crowd_in_two_blobs_counts_once_and_lies_between_them():
-    truth = world((1, "person", WEST))
     parts = [(7, box(WEST[0]), WEST[0]), (8, box(WEST[2]), WEST[2])]
-    score = scored((truth, found(*parts)))
+    score = scored((world((1, "person", WEST)), found(*parts)))
     assert (score.crowd_frames, score.recall) == (1, 1)
     assert score.crowd_error_m.mean == pytest.approx(np.linalg.norm(np.mean([WEST[0], WEST[2]], axis=0) - MIDDLE))
 
 
-def test_a_box_that_is_not_located_is_detected_and_not_recalled():
-    score = scored((world((1, "person", WEST)), found((7, box(*WEST), None))))
-    assert (score.recall, score.detected) == (0, 1)
+CROSSING = [(0, 0), (0.5, 0)], [(0, 0.8), (0.5, 0.8)]
 
 
-def test_a_box_over_everything_stands_for_no_crowd():
-    score = scored((world(*TWO), found((7, [0, 0, SIZE[1], SIZE[0]], (0, 8)))))
-    assert score.detected == 0
-
-
-def test_a_place_in_the_middle_of_a_crowd_is_it_wherever_its_box_lies():
-    away = box((0, -6))
-    assert scored((world((1, "person", WEST)), found((7, away, MIDDLE + 1.2)))).recall == 1
-    assert scored((world((1, "person", WEST)), found((7, away, MIDDLE + 2.5)))).recall == 0
+@pytest.mark.parametrize(
+    ("things", "target", "recall", "detected"),
+    [
+        ((TWO[0],), (box(*WEST), None), 0, 1),  # not located
+        (TWO, ([0, 0, SIZE[1], SIZE[0]], (0, 8)), 0, 0),  # over everything
+        ([(k, "person", CROSSING[k - 1]) for k in (1, 2)], (box(*CROSSING[0], *CROSSING[1]), (0.25, 0.4)), 1, 1),
+        ((TWO[0],), (box((0, -6)), MIDDLE + 1.2), 1, 1),  # in the middle of the crowd, wherever its box lies
+        ((TWO[0],), (box((0, -6)), MIDDLE + 2.5), 0, 0),
+    ],
+)
+def test_a_box_or_a_place_in_its_middle_finds_a_crowd(things, target, recall, detected):
+    score = scored((world(*things), found((7, *target))))
+    assert (score.recall, score.detected) == (recall, detected)
 
 
 @pytest.mark.parametrize(("outside", "counts"), [(1, 1), (2, 1), (3, 0)])
@@ -180,33 +150,18 @@ def test_only_blobs_that_touch_nothing_are_false():
     assert (score.false_blobs, score.landmark_blobs, score.false_targets) == (1, 1, 0)
 
 
-def test_a_body_lies_in_the_box_that_has_half_of_its_pixels():
-    truth = TrueFrame(world((1, "person", [(0, 0)])))
-    u, v = truth.u.min(), truth.v.min()
-    boxes = np.array([[u, v, 3, 5], [u, v, 2, 5]], float)
-    assert truth.bodies_in(truth.pixels_in(boxes)).tolist() == [[True], [False]]
-
-
-def test_pixels_of_what_is_no_body_touch_and_belong_to_nobody():
-    truth = world((1, "person", [(0, 0)]))
-    truth.mask[:4, :4] = 3
-    frame = TrueFrame(truth)
-    assert frame.pixels.sum() == 25
-    assert frame.untouched(np.array([[0, 0, 9, 9.0]])) == 0
-
-
 def test_the_error_of_a_target_is_that_from_the_people_in_its_box():
     score = scored((world((1, "person", WEST)), found((7, box(*WEST[:2], grown=1), np.add(WEST[0], (0.25, 3.25))))))
     assert score.target_error_m.mean == pytest.approx(3.0)
     assert score.inside == 0
 
 
-def walk(frames, identities, people=lambda k: WEST):
+def walk(identities, people=lambda k: WEST):
     """A crowd that stays where it is, under the identities given; 0: not found."""
     pairs = []
-    for k in range(frames):
-        told = [(identities[k], box(*people(k)), np.mean(people(k), axis=0))] if identities[k] else []
-        pairs.append((world((1, "person", people(k)), frame=k + 1), found(*told, frame=k + 1)))
+    for k, identity in enumerate(identities):
+        targets = [(identity, box(*people(k)), np.mean(people(k), axis=0))] if identity else []
+        pairs.append((world((1, "person", people(k)), frame=k + 1), found(*targets, frame=k + 1)))
     return pairs
 
 
@@ -215,26 +170,23 @@ def walk(frames, identities, people=lambda k: WEST):
     [([7] * 6, 0), ([7, 7, 7, 8, 8, 8], 1), ([7, 7, 0, 0, 7, 7], 0), ([7, 0, 8, 8, 7, 7], 2)],
 )
 def test_a_switch_is_a_change_of_a_crowds_identity_however_long_it_was_lost(identities, switches):
-    score = scored(*walk(6, identities))
+    score = scored(*walk(identities))
     assert score.switches == switches
     assert score.crowd_minutes == pytest.approx(0.5 / 60)
     assert score.switches_a_minute == pytest.approx(switches / (0.5 / 60))
 
 
 def test_a_crowd_whose_people_change_may_change_its_identity():
-    grown = [*WEST, (-5.5, 0.5)]
-    assert scored(*walk(4, [7, 7, 8, 8], lambda k: WEST if k < 2 else grown)).switches == 0
+    assert scored(*walk([7, 7, 8, 8], lambda k: WEST[: 3 if k < 2 else 4])).switches == 0
 
 
 def test_two_parts_that_take_turns_at_being_the_larger_one_are_no_switch():
-    truth = [world((1, "person", WEST), frame=k) for k in (1, 2, 3)]
     larger, smaller = box(*WEST[:2]), box(WEST[2])
-    told = [
-        found((7, larger, MIDDLE), (8, smaller, MIDDLE)),
-        found((7, smaller, MIDDLE), (8, box(WEST[1]), MIDDLE), frame=2),
-        found((7, larger, MIDDLE), (8, smaller, MIDDLE), frame=3),
+    pairs = [
+        (world(TWO[0], frame=k), found((7, first, MIDDLE), (8, second, MIDDLE), frame=k))
+        for k, first, second in ((1, larger, smaller), (2, smaller, box(WEST[1])), (3, larger, smaller))
     ]
-    assert scored(*zip(truth, told, strict=True)).switches == 0
+    assert scored(*pairs).switches == 0
 
 
 def test_a_blob_over_two_crowds_carries_one_identity_and_the_others_returns():
@@ -258,45 +210,26 @@ def test_kinds_are_judged_by_what_most_boxes_of_a_target_hold():
     assert (score.kinds, score.kind_right, score.blob_kind_right) == (2, 0.5, 0.5)
 
 
-def test_between_looks_the_last_known_place_moves_on_and_then_is_forgotten():
-    late = 1 + round((HOLD_S + 1) * 10)
-    pairs = [
-        (world((1, "person", WEST), frame=1), found((7, box(*WEST), np.add(MIDDLE, (0, 3))))),
-        (world((1, "person", WEST), frame=late), found(frame=late)),
-    ]
-    score = scored(*pairs)
-    known = 1 + round(HOLD_S * 10)
+def test_the_last_known_place_of_a_crowd_is_kept_for_a_while_and_then_forgotten():
+    late, known = 1 + round((HOLD_S + 1) * 10), 1 + round(HOLD_S * 10)
+    first = world((1, "person", WEST), frame=1), found((7, box(*WEST), np.add(MIDDLE, (0, 3))))
+    score = scored(first, (world((1, "person", WEST), frame=late), found(frame=late)))
     assert score.known == pytest.approx(known / late)
     assert score.knowledge_m == pytest.approx((3 * known + CAP_M * (late - known)) / late)
 
 
-def test_people_who_stand_count_apart():
+def test_frames_without_truth_or_crowds_have_no_figures_and_people_who_stand_count_apart():
+    score = scored((world(*TWO), found(frame=2)))
+    assert (score.frames, score.by_name()["recall"], score.lines()) == (0, None, [])
+    assert math.isnan(scored((world(), found((1, box((0, 0)), (0, 0))))).recall)
     score = scored((world(*TWO, moving=0.0), found((7, box(*WEST), MIDDLE))), (world(*TWO, frame=2), found(frame=2)))
     assert (score.recall, score.recall_moving) == (0.25, 0)
 
 
-def test_frames_without_truth_are_left_out_and_a_run_without_any_has_no_figures():
-    score = scored((world(*TWO), found(frame=2)))
-    assert score.frames == 0
-    assert math.isnan(score.recall)
-    assert score.by_name()["recall"] is None
-    assert score.lines() == []
-
-
-def test_places_told_in_degrees_are_taken_to_the_truths_metres():
-    told = found((7, box(*WEST), (0, 0)))
-    positions = replace(told.locations.positions, lonlat_deg=np.array([[1.0, 2.0]]))
+def test_places_in_degrees_are_converted_to_the_truths_metres():
+    result = found((7, box(*WEST), (0, 0)))
+    positions = replace(result.locations.positions, lonlat_deg=np.array([[1.0, 2.0]]))
     scorer = CrowdScorer(local=lambda degrees: degrees + MIDDLE - (1.0, 2.0))
     scorer.feed(world((1, "person", WEST)))
-    scorer.feed(replace(told, locations=replace(told.locations, positions=positions)))
+    scorer.feed(replace(result, locations=replace(result.locations, positions=positions)))
     assert scorer.score().crowd_error_m.mean == pytest.approx(0)
-
-
-def test_an_empty_world_has_no_crowds():
-    truth = TrueFrame(world())
-    told = FoundTargets(
-        np.zeros((1, 4)), np.ones(1, int), np.zeros((1, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2)), ("human",)
-    )
-    held = truth.bodies_in(truth.pixels_in(told.box_px))
-    assert crowds(truth) == []
-    assert covering(truth, [], told, held).shape == (0, 1)
