@@ -35,6 +35,10 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         self.words.append(data)
 
+    def shown(self) -> str:
+        """All words, with single blanks between them."""
+        return " ".join(" ".join(self.words).split())
+
     def values(self, tag: str, name: str) -> list[str]:
         """The values of an attribute of all elements of a kind."""
         return [value or "" for element, attribute, value in self.attributes if (element, attribute) == (tag, name)]

@@ -58,7 +58,7 @@ def clip(tmp_path):
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def dddas():
     """Call the command line: dddas("detect", path, ...) gives the result with exit_code, stdout and stderr."""
     from torchvision_dddas.cli import app

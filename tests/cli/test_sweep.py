@@ -3,17 +3,14 @@
 import json
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from tests.cli.conftest import bad
-from tests.synthetic_clip import render
-from torchvision_dddas.cli import app
+from tests.evaluation.studies import world
 from torchvision_dddas.config import load_config
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
+HOLD = ("--holdout", "h*")
 
 
 @pytest.fixture(scope="module")
@@ -21,30 +18,27 @@ def study(tmp_path_factory) -> Path:
     """A study of three small clips and the cache beside it."""
     place = tmp_path_factory.mktemp("sweep")
     for seed, name in enumerate(("one", "two", "held")):
-        film = render(seed=seed, frames=7, size=(200, 150))
-        for part, pictures in (("frames", film.images), ("masks", film.masks)):
-            folder = place / "clips" / name / part
-            folder.mkdir(parents=True)
-            for i, picture in enumerate(pictures, 1):
-                cv2.imwrite(str(folder / f"{i:06d}.png"), np.asarray(picture).astype(np.uint8))
-    (place / "study.toml").write_text('config = "fast"\n[[dataset]]\nkind = "folder"\nfolder = "clips"\n')
-    return place / "study.toml"
-
-
-def run(study: Path, *words: str, command: str = "sweep"):
-    files = ["--dataset", str(study), "--cache", str(study.parent / "cache")]
-    one = [] if "--jobs" in words or "--scheduler" in words else ["--jobs", "1"]  # others take seconds to start
-    measure = ["--measure", "motion.pixels.f"] if command == "sweep" and "--measure" not in words else []
-    return CliRunner().invoke(app, [command, *files, *measure, *one, *words])
+        world.filmed(place / "clips", name, seed, frames=7)
+    return world.study(place / "clips", 'config = "fast"')
 
 
 @pytest.fixture(scope="module")
-def swept(study) -> tuple[Path, str]:
+def run(study, dddas):
+    def call(*words, command="sweep"):
+        files = ("--dataset", study, "--cache", study.parent / "cache")
+        jobs = () if "--jobs" in words else ("--jobs", 1)  # others take seconds to start
+        measure = ("--measure", "motion.pixels.f") if command == "sweep" and "--measure" not in words else ()
+        return dddas(command, *files, *measure, *jobs, *words)
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def swept(study, run) -> tuple[Path, str]:
     """The folder of a sweep, and what it printed."""
-    out = study.parent / "first"
-    result = run(study, *GRID, "--holdout", "h*", "--out", str(out))
+    result = run(*GRID, *HOLD, "--out", study.parent / "first")
     assert result.exit_code == 0, result.output
-    return out, result.output
+    return study.parent / "first", result.output
 
 
 def test_the_best_of_a_grid_is_written_for_config_and_measured_on_clips_held_out(swept) -> None:
@@ -59,13 +53,13 @@ def test_the_best_of_a_grid_is_written_for_config_and_measured_on_clips_held_out
     assert set(record["on_held_out"]) == {"before", "best"} and "Held out (held)" in swept[1]
 
 
-def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(study, swept, tmp_path, monkeypatch) -> None:
+def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(run, swept, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", lambda *_: pytest.fail("computed again"))
-    assert run(study, *GRID, "--holdout", "h*", "--out", str(tmp_path), "--quiet").exit_code == 0
+    assert run(*GRID, *HOLD, "--out", tmp_path, "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):
         assert (tmp_path / name).read_bytes() == (swept[0] / name).read_bytes()
-    words = ("--clips", "one,two", "--out", str(tmp_path), "--config", str(swept[0] / "best.toml"), "--quiet")
-    result = run(study, *words, command="evaluate")
+    words = ("--clips", "one,two", "--out", tmp_path, "--config", swept[0] / "best.toml", "--quiet")
+    result = run(*words, command="evaluate")
     assert result.exit_code == 0, result.output
     assert json.loads((tmp_path / "run.json").read_text())["computed"] == 0
     f = json.loads((tmp_path / "metrics.json").read_text())["tasks"]["motion"]["pooled"]["pixels"]["f"]
@@ -88,12 +82,12 @@ def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(study, swept, 
         ((*GRID, "--measure", "motion.tracks.idf1"), "no group of measures of motion; wanted pixels"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(study, swept, tmp_path, words, message) -> None:
-    assert message in bad(run(study, *words, "--out", str(tmp_path / "out")))
+def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, words, message) -> None:
+    assert message in bad(run(*words, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
-def test_without_optuna_the_line_says_how_to_get_it(study, tmp_path, monkeypatch) -> None:
+def test_without_optuna_the_line_says_how_to_get_it(run, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torchvision_dddas.evaluation.studies.sweep.find_spec", lambda name: None)
-    words = ("--optuna", "2", "--range", "difference.threshold=5:40", "--out", str(tmp_path / "out"))
-    assert "torchvision-dddas[tune]" in bad(run(study, *words))
+    words = ("--optuna", 2, "--range", "difference.threshold=5:40", "--out", tmp_path / "out")
+    assert "torchvision-dddas[tune]" in bad(run(*words))

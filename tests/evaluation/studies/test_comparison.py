@@ -22,53 +22,56 @@ def _few(monkeypatch):
     monkeypatch.setattr(bootstrap.effects, "__defaults__", (100, 300))
 
 
-def of_tracks(folder, name, miss, clips=range(8)) -> ScoredStudy:
-    """Clips of which a share of the boxes is missed."""
-    cases = []
-    for seed in clips:
-        place = folder / f"clip-{seed}"
-        clip, _ = tracked(place if not place.exists() else folder / name / f"clip-{seed}", seed)
-        found = found_of(walk(seed, 30, miss=miss)[1], 33)
-        cases.append(ScoredCase("tracking", f"clip-{seed}", score(clip, "tracking", found)))
-    return ScoredStudy(name, tuple(cases))
+@pytest.fixture
+def missing(tmp_path):
+    """missing(name, share, clips) makes a study of which a share of the boxes is missed."""
+
+    def make(name, share, clips=range(8)) -> ScoredStudy:
+        cases = []
+        for seed in clips:
+            clip, _ = tracked(tmp_path / name / f"clip-{seed}", seed)
+            found = found_of(walk(seed, 30, miss=share)[1], 33)
+            cases.append(ScoredCase("tracking", clip.name, score(clip, "tracking", found)))
+        return ScoredStudy(name, tuple(cases))
+
+    return make
 
 
-def test_a_study_beside_itself_is_the_same(tmp_path):
-    one = of_tracks(tmp_path, "one", 0.2, range(3))
-    found = compare_studies(one, one)["tasks"]["tracking"]
+def of_tracks(one, two):
+    return compare_studies(one, two)["tasks"]["tracking"]
+
+
+def test_a_study_beside_itself_is_the_same(missing):
+    one = missing("one", 0.2, range(3))
+    found = of_tracks(one, one)
     assert (found["same"], found["clips"]) == (["clip-0", "clip-1", "clip-2"], {})
     assert {entry["says"] for entry in found["pooled"]["tracks"].values()} == {"the same"}
 
 
-def test_a_loss_everywhere_is_worse_beyond_noise_and_other_noise_is_not(tmp_path):
-    one = of_tracks(tmp_path, "one", 0.05)
-    found = compare_studies(one, of_tracks(tmp_path, "two", 0.6))["tasks"]["tracking"]
+def test_a_loss_everywhere_is_worse_beyond_noise_and_other_noise_is_not(missing):
+    one, two = missing("one", 0.05), missing("two", 0.6)
+    found = of_tracks(one, two)
     mota = found["pooled"]["tracks"]["mota"]
     assert mota["says"] == "worse" and mota["change"] == mota["second"] - mota["first"] < 0
     assert mota["over_clips"]["p"] == pytest.approx(2 / 2**8)
     assert mota["over_clips"]["p"] < mota["over_clips"]["p_holm"] < 0.05
     assert mota["over_clips"]["interval"][0] < mota["change"] < mota["over_clips"]["interval"][1] < 0
     assert len(found["clips"]) == 8
-    found = compare_studies(one, of_tracks(tmp_path, "three", 0.06))["tasks"]["tracking"]
-    assert {entry["says"] for entry in found["pooled"]["tracks"].values()} <= {"within noise", "the same"}
-    assert found["pooled"]["tracks"]["mota"]["over_clips"]["enough"]
+    turned = [ScoredStudy(study.name, study.cases[::-1]) for study in (one, two)]
+    assert json.dumps(found) == json.dumps(of_tracks(*turned))
+    pooled = of_tracks(one, missing("three", 0.06))["pooled"]["tracks"]
+    assert {entry["says"] for entry in pooled.values()} <= {"within noise", "the same"}
+    assert pooled["mota"]["over_clips"]["enough"]
 
 
-def test_few_clips_tell_too_little_or_only_of_themselves(tmp_path):
-    one, two = of_tracks(tmp_path, "one", 0.05, range(2)), of_tracks(tmp_path, "two", 0.7, range(2))
-    pooled = compare_studies(one, two)["tasks"]["tracking"]["pooled"]["tracks"]
+def test_few_clips_allow_no_verdict_or_one_on_themselves(missing):
+    pooled = of_tracks(missing("one", 0.05, range(2)), missing("two", 0.7, range(2)))["pooled"]["tracks"]
     assert pooled["mota"]["over_clips"] is None and pooled["mota"]["says"] == "worse on these clips"
     assert pooled["hota"]["says"] == "too little to tell"  # of whole tracks, about which frames say nothing
 
 
-def test_the_order_of_cases_changes_nothing(tmp_path):
-    one, two = of_tracks(tmp_path, "one", 0.1, range(6)), of_tracks(tmp_path, "two", 0.3, range(6))
-    turned = [ScoredStudy(study.name, study.cases[::-1]) for study in (one, two)]
-    assert json.dumps(compare_studies(one, two)) == json.dumps(compare_studies(*turned))
-
-
-def test_clips_of_one_study_alone_are_named_and_studies_without_a_common_clip_refused(tmp_path):
-    one, two = of_tracks(tmp_path, "one", 0.1, (0, 1)), of_tracks(tmp_path, "two", 0.2, (1, 2))
+def test_clips_of_one_study_alone_are_named_and_studies_without_a_common_clip_refused(missing):
+    one, two = missing("one", 0.1, (0, 1)), missing("two", 0.2, (1, 2))
     assert compare_studies(one, two)["notes"] == [
         "clip-0, tracking: only in the first study, one",
         "clip-2, tracking: only in the second study, two",
@@ -79,8 +82,8 @@ def test_clips_of_one_study_alone_are_named_and_studies_without_a_common_clip_re
         compare_studies(one, ScoredStudy("two", ()))
 
 
-def test_another_truth_or_other_frames_are_not_compared(tmp_path):
-    one, two = of_tracks(tmp_path, "one", 0.1, (0, 1)), of_tracks(tmp_path, "two", 0.2, (0, 1))
+def test_another_truth_or_other_frames_are_not_compared(missing, tmp_path):
+    one, two = missing("one", 0.1, (0, 1)), missing("two", 0.2, (0, 1))
     clip, found = tracked(tmp_path / "more" / "clip", 0)
     tracks = clip.truth.tracks
     fewer = replace(clip, truth=replace(clip.truth, tracks=tracks.at(np.arange(1, len(tracks.frame)))))
@@ -99,20 +102,16 @@ def test_less_is_better_where_it_is():
 
 
 def test_masks_are_compared_by_pixels_boxes_and_ranks(tmp_path):
-    cases = []
-    for seed in (1, 2):
-        clip, found = masked(tmp_path / f"{seed}" / "clip", 0)
-        if seed == 2:
-            blank = dict.fromkeys(found.masks, found.masks[1])
-            found = found_of(walk(0, 12)[1][::2], 12, blank, False)
-        cases.append(ScoredStudy(f"{seed}", (ScoredCase("motion", "clip", score(clip, "motion", found)),)))
-    found = compare_studies(*cases)["tasks"]["motion"]
+    clip, found = masked(tmp_path / "clip")
+    worse = found_of(walk(0, 12)[1][::2], 12, dict.fromkeys(found.masks, found.masks[1]), False)
+    one, two = (ScoredStudy("", (ScoredCase("motion", "clip", score(clip, "motion", f)),)) for f in (found, worse))
+    found = compare_studies(one, two)["tasks"]["motion"]
     assert list(found["pooled"]) == ["pixels", "boxes", "ranking"]
     assert list(found["clips"]["clip"]["pixels"]) == ["f"]
 
 
-def test_scores_are_read_back_as_they_were_written(tmp_path):
-    study = of_tracks(tmp_path, "one", 0.2, (1, 0))
+def test_scores_are_read_back_as_they_were_written(missing, tmp_path):
+    study = missing("one", 0.2, (1, 0))
     write_scores(tmp_path, "one", study.cases)
     again = read_scores(tmp_path)
     assert [case.clip for case in again.cases] == ["clip-0", "clip-1"]
@@ -123,17 +122,15 @@ def test_scores_are_read_back_as_they_were_written(tmp_path):
 
 
 def entry(first, second, says, interval=None, p=0.01):
-    change = None if first is None or second is None else second - first
     over_frames = {"interval": interval, "p": p, "p_holm": 2 * p, "enough": True}
-    return {"first": first, "second": second, "change": change, "over_frames": over_frames, "says": says}
+    return {"first": first, "second": second, "change": second - first, "over_frames": over_frames, "says": says}
 
 
 def comparison(clips):
-    pooled = {
-        "pixels": {"f": entry(0.5, 0.6, "better on these clips", [0.05, 0.15]), "precision": entry(0.5, None, "x")}
-    }
-    pooled["pixels"]["f"]["over_clips"] = {"interval": [0.01, 0.2], "p": 0.2, "p_holm": 0.4, "enough": True}
-    mine = {"same": ["untouched"], "pooled": pooled, "clips": clips}
+    f = entry(0.5, 0.6, "better on these clips", [0.05, 0.15])
+    f["over_clips"] = {"interval": [0.01, 0.2], "p": 0.2, "p_holm": 0.4, "enough": True}
+    precision = entry(0.5, 0.0, "x") | {"second": None, "change": None}
+    mine = {"same": ["untouched"], "pooled": {"pixels": {"f": f, "precision": precision}}, "clips": clips}
     return {"first": "a <b>", "second": "b", "tasks": {"motion": mine}, "notes": ["lost, motion: only in the first"]}
 
 
@@ -144,22 +141,18 @@ CLIPS = {
 }
 
 
-def words(text):
-    return " ".join(" ".join(Page(text).words).split())
-
-
 def test_the_page_begins_with_what_changed_by_how_much_and_whether_that_is_beyond_noise():
     text = comparison_report(comparison(CLIPS))
-    shown = words(text)
-    assert "+0.100 F, pixels 0.500 → 0.600: better on these clips" in shown
-    assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 not, 1 the same" in shown
-    assert "only in the first" in shown and "untouched" in shown
-    assert not {"i", "b>"} & set(Page(text).found)
+    page = Page(text)
+    assert "+0.100 F, pixels 0.500 → 0.600: better on these clips" in page.shown()
+    assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 not, 1 the same" in page.shown()
+    assert "only in the first" in page.shown() and "untouched" in page.shown()
+    assert not {"i", "b>"} & set(page.found)
     # The interval over clips stands before that over frames, and p is the corrected one.
     assert "0.010 to 0.200" in text and "0.050 to 0.150" not in text
-    values = [value for tag, name, value in Page(text).attributes if (tag, name) == ("td", "data-v")]
+    values = page.values("td", "data-v")
     assert "0.4" in values and "0.2" not in values[:6]
     # The largest loss stands first in the plot.
     rows = [text.index(f">{name}</text>") for name in ("down", "quiet", "up &lt;i&gt;")]
     assert rows == sorted(rows)
-    assert "1 the same" in words(comparison_report(comparison({})))
+    assert "1 the same" in Page(comparison_report(comparison({}))).shown()

@@ -17,24 +17,12 @@ import pytest
 from tests.evaluation.studies import world
 from torchvision_dddas.config import load_config
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.cache import Cache
-from torchvision_dddas.evaluation.studies.jobs import (
-    CONNECT_S,
-    MAX_DEATHS,
-    Job,
-    Workers,
-    do_job,
-    find_cached,
-    make_keys,
-)
-from torchvision_dddas.evaluation.studies.records import Task
+from torchvision_dddas.evaluation.studies.jobs import Job, Workers, do_job, find_cached, make_keys
 from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
 from torchvision_dddas.evaluation.studies.summary import summarize
 
-TASKS: tuple[Task, ...] = ("motion", "tracking", "association")
 ALL = ["motion", "motion: score", "tracking", "tracking: score", "association", "association: score"]
 
 
@@ -48,8 +36,12 @@ def folder(tmp_path_factory):
 
 
 def job_of(place, *overrides, interval=1):
-    (clip,) = read(Source("folder", place / "clips"), Path()).clips
-    return Job(0, clip, TASKS, load_config(None, overrides), "onboard", interval)
+    (clip,) = world.clips_in(place / "clips")
+    return Job(0, clip, ("motion", "tracking", "association"), load_config(None, overrides), "onboard", interval)
+
+
+def with_truth(job, **changes):
+    return replace(job, clip=replace(job.clip, truth=replace(job.clip.truth, **changes)))
 
 
 def do(place, job, cache=None):
@@ -58,20 +50,13 @@ def do(place, job, cache=None):
 
 def computed(place, job):
     done = do(place, job)
-    assert [d.cause for d in done] == [""] * len(done)
+    assert not any(d.cause for d in done)
     return [stage for d in done for stage in d.computed]
 
 
 @pytest.mark.parametrize(
     ("change", "again"),
-    [
-        ("difference.threshold=4.5", ALL[:4]),
-        ("track.memory_frames=9", ALL[2:]),
-        pytest.param("registration.keypoints=400", ALL, marks=pytest.mark.slow),
-        pytest.param("paper.window=2", ALL[2:], marks=pytest.mark.slow),
-        ("people.search=regions", []),
-        ("live.calm_s=9.0", []),
-    ],
+    [("difference.threshold=4.5", ALL[:4]), ("track.memory_frames=9", ALL[2:]), ("live.calm_s=9.0", [])],
 )
 def test_a_changed_parameter_computes_again_what_depends_on_it_and_nothing_else(folder, change, again) -> None:
     assert computed(folder, job_of(folder, change)) == again
@@ -80,29 +65,24 @@ def test_a_changed_parameter_computes_again_what_depends_on_it_and_nothing_else(
 def test_a_changed_interval_or_truth_leaves_what_does_not_depend_on_it(folder) -> None:
     stages = computed(folder, job_of(folder, interval=2))
     assert [stage for stage in stages if "score" not in stage] == ["tracking", "association"]
-    job = job_of(folder)
-    tracks = job.clip.truth.tracks
-    fewer = replace(job.clip.truth, tracks=tracks.at(tracks.frame != 2))
-    again = computed(folder, replace(job, clip=replace(job.clip, truth=fewer)))
+    tracks = job_of(folder).clip.truth.tracks
+    again = computed(folder, with_truth(job_of(folder), tracks=tracks.at(tracks.frame != 2)))
     assert again == ["motion: score", "tracking: score", "association", "association: score"]
 
 
 def test_a_clip_is_known_by_its_content_not_by_its_place_or_name(folder, tmp_path) -> None:
-    world.followed(tmp_path / "clips", "renamed", 2)
-    (clip,) = read(Source("folder", tmp_path / "clips"), Path()).clips
-    assert computed(folder, replace(job_of(folder), clip=clip)) == []
-    pictures = sorted((tmp_path / "clips" / "renamed" / "frames").iterdir())
+    place = world.followed(tmp_path / "clips", "renamed", 2)
+    assert computed(folder, job_of(tmp_path)) == []
+    pictures = sorted((place / "frames").iterdir())
     pictures[1].write_bytes(pictures[2].read_bytes())
-    assert computed(folder, replace(job_of(folder), clip=clip)) == ALL
+    assert computed(folder, job_of(tmp_path)) == ALL
 
 
 def test_other_code_is_another_key(folder, monkeypatch) -> None:
-    job = job_of(folder)
-    before = make_keys(job)
+    before = make_keys(job_of(folder))
     monkeypatch.setattr(jobs, "code_digest", lambda function, engine="": "another")
-    after = make_keys(job)
-    for task in TASKS:
-        assert before[task].found != after[task].found and before[task].scored != after[task].scored
+    for task, after in make_keys(job_of(folder)).items():
+        assert before[task].found != after.found and before[task].scored != after.scored
 
 
 def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
@@ -117,8 +97,8 @@ def test_a_job_is_kept_only_if_all_of_it_is_whole(folder) -> None:
 
 def test_bad_input_and_faults_are_the_causes_of_the_tasks_that_meet_them(folder, tmp_path, monkeypatch) -> None:
     job = job_of(folder)
-    far = job.clip.truth.tracks._replace(frame=job.clip.truth.tracks.frame + 100)
-    done = do(folder, replace(job, clip=replace(job.clip, truth=replace(job.clip.truth, tracks=far))))
+    tracks = job.clip.truth.tracks
+    done = do(folder, with_truth(job, tracks=tracks._replace(frame=tracks.frame + 100)))
     assert done[0].cause == "" and "goes on to frame" in done[2].cause
     world.followed(tmp_path / "clips", "tracks", 2)
     gone = job_of(tmp_path)
@@ -145,7 +125,6 @@ NODE = """
 """
 SCHEDULER = 'Scheduler(host="127.0.0.1", port=0, dashboard=False, dashboard_address=None)'
 WORKER = "Worker(sys.argv[1], nthreads=1, dashboard=False)"
-
 OTHER_CODE = "import torchvision_dddas.evaluation.studies.jobs as jobs; jobs.code_identity = lambda backend: 'other'"
 
 
@@ -188,7 +167,7 @@ def die_over_tracks(job, keys, store, code):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("deaths", [1, MAX_DEATHS])
+@pytest.mark.parametrize("deaths", [1, jobs.MAX_DEATHS])
 def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(by_name, tmp_path, monkeypatch, deaths) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(jobs, "_do_remotely", die_over_tracks)
@@ -196,10 +175,9 @@ def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(by_name,
     (cache.folder / "deaths").write_text(str(deaths))
     with Workers(2) as team:
         done = run_jobs([by_name["tracks"], by_name["table"]], team, cache)
-    assert all(d.cause == "" for d in done[by_name["table"].number])
-    for outcome in done[by_name["tracks"].number]:
-        lost = f"its worker died {MAX_DEATHS} times; is there memory enough for tracks and onboard?"
-        assert outcome.cause == ("" if deaths == 1 else lost)
+    assert not any(d.cause for d in done[by_name["table"].number])
+    lost = f"its worker died {jobs.MAX_DEATHS} times; is there memory enough for tracks and onboard?"
+    assert {d.cause for d in done[by_name["tracks"].number]} == {"" if deaths == 1 else lost}
 
 
 def stopped_after(line: str, words: list[str], by: signal.Signals) -> int:
@@ -226,17 +204,18 @@ def test_a_study_killed_interrupted_and_resumed_gives_the_same_bytes_as_one_proc
         words = ("--dataset", study, "--out", out, "--cache", tmp_path / cache, "--jobs", count)
         return [*program, "evaluate", *map(str, words)]
 
+    def state():
+        return json.loads((out / "run.json").read_text())["state"]
+
     subprocess.run([*command(whole, "other", 1), "--quiet"], check=True)
     words = command(out, "cache", 2)
     assert stopped_after("1 of 3", words, signal.SIGKILL) == -signal.SIGKILL
-    assert json.loads((out / "run.json").read_text())["state"] == "running"
-    assert not (out / "metrics.json").exists()
+    assert state() == "running" and not (out / "metrics.json").exists()
     assert stopped_after("2 of 3", words, signal.SIGINT) == 130
-    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+    assert state() == "interrupted"
     last = subprocess.run(words, check=True, capture_output=True, text=True)
-    assert last.stderr.count("kept") > 0
+    assert last.stderr.count("kept") > 0 and state() == "complete"
     assert (out / "metrics.json").read_bytes() == (whole / "metrics.json").read_bytes()
-    assert json.loads((out / "run.json").read_text())["state"] == "complete"
 
 
 @pytest.mark.slow
@@ -258,10 +237,9 @@ def test_a_worker_with_another_version_of_the_package_is_one_line(scheduler, by_
     with (
         process(WORKER, scheduler, before=OTHER_CODE),
         Workers(scheduler=scheduler) as cluster,
-        pytest.raises(InputError, match="another version of the package") as caught,
+        pytest.raises(InputError, match=r"^[^\n]*another version of the package[^\n]*$"),
     ):
         run_jobs([by_name["table"]], cluster, Cache(tmp_path / "cache"))
-    assert "\n" not in str(caught.value)
 
 
 def test_a_scheduler_without_workers_is_one_line(scheduler, by_name, tmp_path, monkeypatch) -> None:
@@ -270,16 +248,16 @@ def test_a_scheduler_without_workers_is_one_line(scheduler, by_name, tmp_path, m
         run_jobs([by_name["table"]], cluster, Cache(tmp_path / "cache"))
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:{free}", "nonsense", "foo://127.0.0.1:1", "tcp://", ""])
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:{free}", "foo://127.0.0.1:1", ""])
 def test_a_scheduler_that_cannot_be_reached_is_one_line_within_seconds(address) -> None:
     pytest.importorskip("distributed")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = address.format(free=free.getsockname()[1])
     start_s = time.monotonic()
-    with pytest.raises(InputError, match=r"no Dask scheduler answers at .*wanted an address as tcp://host") as caught:
+    with pytest.raises(InputError, match=r"no Dask scheduler answers at .*wanted an address as tcp://host[^\n]*$"):
         Workers(scheduler=address).__enter__()
-    assert "\n" not in str(caught.value) and time.monotonic() - start_s < 5 * CONNECT_S
+    assert time.monotonic() - start_s < 5 * jobs.CONNECT_S
 
 
 def test_one_process_needs_no_dask_and_others_say_what_to_install(by_name, tmp_path, monkeypatch) -> None:

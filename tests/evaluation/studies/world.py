@@ -6,58 +6,54 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-SIZE = (176, 132)
+from torchvision_dddas.evaluation.datasets.kinds import read
+from torchvision_dddas.evaluation.datasets.record import Clip, Source
+
+WIDTH, HEIGHT = 176, 132
 
 
 def film(seed: int, frames: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Pictures and their masks. The camera moves, and two plates over the ground."""
     rng = np.random.default_rng(seed)
-    width, height = SIZE
-    ground = cv2.GaussianBlur(rng.integers(0, 256, (height + 100, width + 100, 3), dtype=np.uint8), (0, 0), 1.5)
+    ground = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT + 100, WIDTH + 100, 3), dtype=np.uint8), (0, 0), 1.5)
     ground = np.interp(ground, (ground.min(), ground.max()), (20, 200)).astype(np.uint8)
     places = rng.uniform((60, 40), (120, 90), (2, 2))
-    speeds = np.array([[5.0, 0.0], [0.0, -4.0]])
+    speeds, colours = np.array([[5.0, 0.0], [0.0, -4.0]]), ((230, 240, 250), (5, 10, 30))
     for k in range(frames):
         picture, mask = ground.copy(), np.zeros(ground.shape[:2], np.uint8)
-        for value, (place, speed) in enumerate(zip(places, speeds, strict=True), 1):
-            x, y = np.round(place + k * speed).astype(int).tolist()
-            cv2.rectangle(picture, (x, y), (x + 15, y + 11), (230, 240, 250) if value == 1 else (5, 10, 30), -1)
+        for value, (x, y) in enumerate(np.round(places + k * speeds).astype(int).tolist(), 1):
+            cv2.rectangle(picture, (x, y), (x + 15, y + 11), colours[value - 1], -1)
             cv2.rectangle(mask, (x, y), (x + 15, y + 11), value, -1)
-        u, v = 10 + 2 * k, 20 + k
-        noise = rng.normal(0, 1.5, (height, width, 3))
-        view = np.clip(picture[v : v + height, u : u + width] + noise, 0, 255).astype(np.uint8)
-        yield view, mask[v : v + height, u : u + width]
+        seen = slice(20 + k, 20 + k + HEIGHT), slice(10 + 2 * k, 10 + 2 * k + WIDTH)
+        view = picture[seen] + rng.normal(0, 1.5, (HEIGHT, WIDTH, 3))
+        yield np.clip(view, 0, 255).astype(np.uint8), mask[seen]
 
 
 def filmed(folder: Path, name: str, seed: int = 0, frames: int = 10, masks: bool = True) -> Path:
     """A clip, with masks of each frame."""
-    place = folder / name
-    (place / "frames").mkdir(parents=True)
+    for part in ("frames", "masks")[: 1 + masks]:
+        (folder / name / part).mkdir(parents=True)
     for number, (picture, mask) in enumerate(film(seed, frames), 1):
-        cv2.imwrite(str(place / "frames" / f"{number:06d}.png"), picture)
+        cv2.imwrite(str(folder / name / "frames" / f"{number:06d}.png"), picture)
         if masks:
-            (place / "masks").mkdir(exist_ok=True)
-            cv2.imwrite(str(place / "masks" / f"{number:06d}.png"), mask)
-    return place
+            cv2.imwrite(str(folder / name / "masks" / f"{number:06d}.png"), mask)
+    return folder / name
 
 
 def followed(folder: Path, name: str, seed: int = 0, frames: int = 10, pictures: bool = True) -> Path:
     """A clip with true tracks, with or without pictures, and with detections that lack identities."""
-    place = folder / name
     if pictures:
         filmed(folder, name, seed, frames, masks=False)
-    (place / "gt").mkdir(parents=True)
-    (place / "det").mkdir()
-    rows, bare = [], []
-    for number, (_, mask) in enumerate(film(seed, frames), 1):
-        for value in np.unique(mask)[1:].tolist():
-            v, u = np.nonzero(mask == value)
-            box = f"{u.min()},{v.min()},{np.ptp(u) + 1},{np.ptp(v) + 1}"
-            rows.append(f"{number},{value},{box},1,-1,-1,-1\n")
-            bare.append(f"{number},-1,{box},1,-1,-1,-1\n")
-    (place / "gt" / "gt.txt").write_text("".join(rows))
-    (place / "det" / "det.txt").write_text("".join(bare))
-    return place
+    boxes = [
+        (number, value, "{},{},{},{}".format(*cv2.boundingRect((mask == value).astype(np.uint8))))
+        for number, (_, mask) in enumerate(film(seed, frames), 1)
+        for value in np.unique(mask)[1:].tolist()
+    ]
+    for part, identified in (("gt", True), ("det", False)):
+        (folder / name / part).mkdir(parents=True)
+        lines = [f"{number},{value if identified else -1},{box},1,-1,-1,-1\n" for number, value, box in boxes]
+        (folder / name / part / f"{part}.txt").write_text("".join(lines))
+    return folder / name
 
 
 def study(folder: Path, text: str = "") -> Path:
@@ -73,3 +69,8 @@ def three(folder: Path) -> Path:
     followed(folder, "tracks", 2)
     followed(folder, "table", 3, pictures=False)
     return study(folder)
+
+
+def clips_in(folder: Path, *names: str) -> tuple[Clip, ...]:
+    """The clips of a folder, or some of them."""
+    return tuple(read(Source("folder", folder, names or ("*",)), folder).clips)
