@@ -38,14 +38,11 @@ def test_many_distances_and_an_outlier(dddas, file, tmp_path):
 def test_people_all_over_the_picture_tell_how_the_camera_stands(dddas, file, tmp_path):
     rng = np.random.default_rng(0)
     people = np.stack([rng.uniform(-3, 3, 60), rng.uniform(8, 25, 60)], axis=1)
-    lines = [
-        f"{n},-1," + ",".join(f"{v:.3f}" for v in box) + ",1"
-        for n, box in enumerate(boxes(people, 1.75, camera(height_m=3.0, pitch_rad=0.1)), 1)
-    ]
+    seen = enumerate(boxes(people, 1.75, camera(height_m=3.0, pitch_rad=0.1)), 1)
+    table = file("t.txt", "\n".join("{},-1,{:.3f},{:.3f},{:.3f},{:.3f},1".format(n, *box) for n, box in seen))
     known = file("known.toml", "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheading_deg = 30\n")
     out = tmp_path / "camera.toml"
-    words = ("--camera", known, "--body-height", 1.75, "--out", out)
-    result = dddas("calibrate", file("t.txt", "\n".join(lines)), *words)
+    result = dddas("calibrate", table, "--camera", known, "--body-height", 1.75, "--out", out)
     assert result.exit_code == 0, result.output
     found = read_camera(out)
     placed = (found.height_m, found.pitch_rad, found.heading_rad)

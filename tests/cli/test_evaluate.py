@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.cli.conftest import bad
+from tests.cli.conftest import bad, record
 from tests.evaluation.studies import world
 from torchvision_dddas.evaluation.studies.cache import SCORES
 
@@ -12,23 +12,20 @@ TRUTH = "1,1,0,0,10,20,1,-1,-1\n1,2,100,0,10,20,0,-1,-1\n2,1,0,0,10,20,1,-1,-1\n
 FOUND = "1,7,0,0,10,20,1,-1,-1,-1\n1,8,100,0,10,20,1,-1,-1,-1\n2,8,0,0,10,20,1,-1,-1,-1\n"
 
 
-@pytest.fixture
-def places(tmp_path):
+def measures(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_tracks_get_a_table_of_80_columns_and_metrics_beside_the_file(dddas, file, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "gt.txt").write_text(TRUTH)
-    (tmp_path / "out/tracks.txt").write_text(FOUND)
-    return tmp_path / "gt.txt", tmp_path / "out"
-
-
-def test_tracks_get_a_table_of_80_columns_and_metrics_beside_the_file(dddas, places):
-    truth, out = places
+    places = truth, out = file("gt.txt", TRUTH), file("out/tracks.txt", FOUND).parent
     result = dddas("evaluate", truth, out / "tracks.txt")
     assert result.exit_code == 0
     assert all(word in result.stdout for word in ("HOTA", "MOTA", "IDF1", "IDsw", "AR_3"))
     assert max(map(len, result.stdout.splitlines()[:6])) <= 80
-    assert json.loads((out / "metrics.json").read_text())["clips"]["tracks"]["tracks"]["n_switches"] == 1
+    assert measures(out)["clips"]["tracks"]["tracks"]["n_switches"] == 1
     assert dddas("evaluate", *places, "--interval", 2, "--ignored", "removed").exit_code == 0
-    found = json.loads((out / "metrics.json").read_text())["clips"]["out"]["tracks"]
+    found = measures(out)["clips"]["out"]["tracks"]
     assert (found["n_tp"], found["n_fp"], found["n_fn"]) == (1, 0, 0)
     (out / "tracks.txt").write_text(FOUND + "2,8,5,5,10,20,1\n")
     assert "tracks.txt, lines 3 and 4: identity 8 twice in frame 2" in bad(dddas("evaluate", *places))
@@ -49,8 +46,8 @@ def test_many_clips_get_a_pooled_and_a_mean_row(dddas, tmp_path):
 def study(dddas, tmp_path, monkeypatch):
     """Runs `dddas evaluate --dataset` on a study of two tables, whose results go to out/."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    world.followed(tmp_path / "clips", "car[red]s", 3, pictures=False)
-    world.followed(tmp_path / "clips", "other", 4, pictures=False)
+    for seed, name in enumerate(("car[red]s", "other"), 3):
+        world.followed(tmp_path / "clips", name, seed, pictures=False)
     file = world.study(tmp_path / "clips")
 
     def run(*words):
@@ -65,9 +62,8 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     world.filmed(tmp_path / "clips", long_name, masks=False)
     done = study()
     assert done.exit_code == 0, done.output
-    measures = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert set(measures["tasks"]["association"]["clips"]) == {"car[red]s", "other"}
-    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert set(measures(tmp_path / "out")["tasks"]["association"]["clips"]) == {"car[red]s", "other"}
+    run = record(tmp_path / "out")
     assert run["state"] == "complete" and run["study"]["name"] == "study" and len(run["left_out"]) == 1
     assert (tmp_path / "out" / "report.html").read_text().lower().startswith("<!doctype html>")
     lines = done.stdout.splitlines()
@@ -87,29 +83,33 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     assert "holds no study: no scores.bin" in bad(dddas("compare", tmp_path / "out", tmp_path / "clips"))
 
 
-def test_what_clips_that_are_scored_lack_is_a_note_and_not_left_out(dddas, tmp_path) -> None:
+@pytest.fixture
+def own_study(dddas, tmp_path):
+    """Runs `dddas evaluate --dataset` on a file of the test's own."""
+    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
+    return lambda file: dddas("evaluate", "--dataset", file, *words)
+
+
+def test_what_clips_that_are_scored_lack_is_a_note_and_not_left_out(own_study, file, tmp_path) -> None:
     world.followed(tmp_path / "clips", "bare", 3, pictures=False)
     film = world.filmed(tmp_path / "own", "film", 4)
     (film / "frames" / "000004.png").write_bytes(b"no picture")
     tables = (("motchallenge", "clips"), ("folder", "own"))
     text = "".join(f'[[dataset]]\nkind = "{kind}"\nfolder = "{folder}"\n' for kind, folder in tables)
-    (tmp_path / "study.toml").write_text(text)
-    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
-    done = dddas("evaluate", "--dataset", tmp_path / "study.toml", *words)
+    done = own_study(file("study.toml", text))
     assert done.exit_code == 0 and "left out:" not in done.output
     notes = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
     assert notes[0].startswith("note: bare: no pictures, which belong in ")
     assert any(line.startswith("note: film, motion: ") and "000004.png" in line for line in notes[1:])
-    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    run = record(tmp_path / "out")
     assert run["left_out"] == [] and [f"note: {line}" for line in run["notes"]] == notes
     assert "no pictures, which belong in" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_a_study_that_could_score_nothing_fails_and_says_why(dddas, tmp_path) -> None:
+def test_a_study_that_could_score_nothing_fails_and_says_why(own_study, tmp_path) -> None:
     film = world.filmed(tmp_path / "clips", "film", 4)
     (film / "masks" / "000004.png").write_bytes(b"no picture")
-    words = ("--jobs", 1, "--out", tmp_path / "out", "--cache", tmp_path / "cache")
-    done = dddas("evaluate", "--dataset", world.study(tmp_path / "clips"), *words)
+    done = own_study(world.study(tmp_path / "clips"))
     assert done.exit_code == 2
     assert done.stderr.splitlines()[-1].startswith("dddas: nothing could be scored; film, motion: ")
     assert (tmp_path / "out" / "report.html").is_file()
@@ -120,13 +120,11 @@ def test_the_command_line_changes_the_study(study, tmp_path) -> None:
     words = ("--clips", "oth*", "--set", "track.memory_frames=7", "--interval", 2, "--quiet")
     done = study(*words, "--cache", tmp_path / "cache")
     assert done.exit_code == 0 and done.output == ""
-    before = (tmp_path / "out" / "run.json").read_text()
-    run = json.loads(before)
+    run = record(tmp_path / "out")
     assert run["study"]["interval"] == 2 and run["settings"]["track"]["memory_frames"] == 7
-    measures = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert set(measures["tasks"]["tracking"]["clips"]) == {"other"}
+    assert set(measures(tmp_path / "out")["tasks"]["tracking"]["clips"]) == {"other"}
     bad(study("--clips", "nobody"))  # leaves the earlier study as it was
-    assert (tmp_path / "out" / "run.json").read_text() == before
+    assert record(tmp_path / "out") == run
 
 
 @pytest.mark.parametrize(

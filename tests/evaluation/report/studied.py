@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.evaluation.studies.scored_clips import found_of
+from tests.evaluation.studies.scored_clips import found_of, png
 from torchvision_dddas.config import Settings
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
@@ -28,26 +28,28 @@ def found(frame, box_px, identity=None, masks=None, east_north_m=None) -> Found:
     return replace(result, east_north_m=places, covariance_m2=covariance, seconds=seconds, peak_mb=101.0)
 
 
+def scored(clip: Clip, task: Task, result: Found) -> Case:
+    return Case(clip, task, result, score(clip, task, result))
+
+
 def masked_clip(folder: Path, name: str, off: int) -> Case:
     """A square moves; what is found lies `off` pixels to its right."""
-    (folder / name / "frames").mkdir(parents=True)
-    (folder / name / "masks").mkdir()
-    pictures, masks, boxes, true = [], {}, [], {}
+    place = folder / name
+    files = {part: {k: place / part / f"{k:05d}.png" for k in range(1, FRAMES + 1)} for part in ("frames", "masks")}
+    masks = {}
+    for part in files:
+        (place / part).mkdir(parents=True)
     for k in range(1, FRAMES + 1):
-        at = 10 * k
+        square = np.s_[40:60, 10 * k : 10 * k + 20]
         image = np.random.default_rng(k).integers(60, 120, (SIZE[1], SIZE[0], 3), dtype=np.uint8)
-        image[40:60, at : at + 20] = 230
-        pictures.append(folder / name / "frames" / f"{k:05d}.png")
-        cv2.imwrite(str(pictures[-1]), image)
         label = np.zeros(SIZE[::-1], np.uint8)
-        label[40:60, at : at + 20] = 1
-        true[k] = folder / name / "masks" / f"{k:05d}.png"
-        cv2.imwrite(str(true[k]), label)
-        seen = np.roll(label, off * k, axis=1) * 255
-        masks[k] = cv2.imencode(".png", seen)[1].tobytes()
-        boxes.append([at + off * k, 40, 20, 20])
-    truth = Truth("masks", folder / name / "masks", true, {})
-    clip = Clip(name, folder / name, tuple(pictures), 10.0, FRAMES, truth)
+        image[square], label[square] = 230, 1
+        cv2.imwrite(str(files["frames"][k]), image)
+        cv2.imwrite(str(files["masks"][k]), label)
+        masks[k] = png(np.roll(label, off * k, axis=1) * 255)
+    boxes = [[(10 + off) * k, 40, 20, 20] for k in range(1, FRAMES + 1)]
+    truth = Truth("masks", place / "masks", files["masks"], {})
+    clip = Clip(name, place, tuple(files["frames"].values()), 10.0, FRAMES, truth)
     return scored(clip, "motion", found(range(1, FRAMES + 1), boxes, masks=masks))
 
 
@@ -55,12 +57,12 @@ def boxed_truth(place: Path) -> Truth:
     """Two targets side by side, one of which goes to the right, and where they are on the ground."""
     frame = np.repeat(np.arange(1, FRAMES + 1), 2)
     identity = np.tile([1, 2], FRAMES)
-    box_px = np.stack([np.where(identity == 1, 10.0 * frame, 100.0), 20.0 + 50 * (identity == 2)], axis=1)
-    box_px = np.concatenate([box_px, np.full((len(frame), 2), 20.0)], axis=1)
+    side_px = np.full(len(frame), 20.0)
+    box_px = np.stack([np.where(identity == 1, 10.0 * frame, 100.0), 20.0 + 50 * (identity == 2), side_px, side_px], 1)
     places = np.stack([frame * 1.0, identity * 5.0], axis=1)
-    table = TrackTable(frame, identity, box_px)
     by_frame = {int(k): box_px[frame == k] for k in np.unique(frame)}
-    return Truth("boxes", place, {}, by_frame, table, None, FRAMES, positions=Positions(frame, identity, places))
+    table, positions = TrackTable(frame, identity, box_px), Positions(frame, identity, places)
+    return Truth("boxes", place, {}, by_frame, table, None, FRAMES, positions=positions)
 
 
 def tracked_clip(folder: Path, task: Task, name: str) -> Case:
@@ -73,10 +75,6 @@ def tracked_clip(folder: Path, task: Task, name: str) -> Case:
     places = truth.positions.east_north_m + 0.5
     clip = Clip(name, folder, (), 10.0, FRAMES, truth)
     return scored(clip, task, found(frame[kept], box_px[kept] + 1, called[kept], None, places[kept]))
-
-
-def scored(clip: Clip, task: Task, result: Found) -> Case:
-    return Case(clip, task, result, score(clip, task, result))
 
 
 def study(folder: Path) -> Results:

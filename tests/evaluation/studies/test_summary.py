@@ -165,7 +165,9 @@ def test_a_goal_that_the_truth_of_these_clips_does_not_allow_is_refused(tmp_path
         check_possible(parse_goal("motion.pixels.f"), [still])
 
 
-@pytest.mark.parametrize(("group", "measure", "pick"), [("pixels", "f", min), ("ranking", "log_average_miss_rate", max)])
+@pytest.mark.parametrize(
+    ("group", "measure", "pick"), [("pixels", "f", min), ("ranking", "log_average_miss_rate", max)]
+)
 def test_a_goal_is_pooled_the_mean_or_the_worst_which_may_be_the_highest(tmp_path, group, measure, pick) -> None:
     cases = several(tmp_path, masked, "motion", 3)
     mine, done = summed(cases, "motion"), study_of(*cases).cases
