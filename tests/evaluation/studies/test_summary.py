@@ -92,8 +92,10 @@ def test_weights_of_units_are_how_often_each_counts(tmp_path, make, task):
 def test_costs_add_up(tmp_path):
     clip, found = masked(tmp_path / "a")
     more = replace(found, seconds={"find": 1.5, "read": 1.0}, peak_mb=300.0)
-    cases = ((replace(clip, name=name), "motion", result, None, "") for name, result in (("a", found), ("b", more)))
-    costs = summary.summarize_costs(study_of(*cases))["motion"]
+    other = replace(clip, name="b")
+    costs = summary.summarize_costs(study_of((clip, "motion", found, None, ""), (other, "motion", more, None, "")))[
+        "motion"
+    ]
     by_stage = {"find": 2000 / 24, "read": 1000 / 24}
     whole = {"frames": 24, "seconds": 3.0, "frames_per_s": 8.0, "peak_mb": 300.0, "ms_per_frame": by_stage}
     assert costs["all"] == whole
