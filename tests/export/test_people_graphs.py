@@ -1,6 +1,5 @@
 """The graphs of people's scores: the shipped ones are what is made, and compute what `functional.hog` does."""
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from torchvision_dddas.people.onnx_scorer import OnnxScorer
 from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import LinearSvm, Part
 
-NAMES = "people.onnx", "people_histograms.onnx", "people_scores.onnx"
 LAYOUTS = {
     "default": hog.Layout(),
     "small": hog.Layout((32, 64), 4, 8, 4, 8),
@@ -43,8 +41,7 @@ def test_graphs_of_any_layout_score_as_torch_does(layout):
 
 def test_the_same_layout_gives_the_same_bytes():
     first, again = (people.build_graphs(hog.Layout()) for _ in range(2))
-    assert first == again and tuple(first) == NAMES
-    assert all(first[name] != content for name, content in people.build_graphs(hog.Layout(bins=8)).items())
+    assert first == again and set(first) == {"people.onnx", "people_histograms.onnx", "people_scores.onnx"}
 
 
 def test_the_shipped_graphs_are_those_that_are_made_now():
@@ -59,49 +56,33 @@ def test_the_shipped_graphs_are_those_that_are_made_now():
 
 
 def test_the_whole_graph_scores_a_picture_as_opencv_does():
-    random = np.random.default_rng(0)
-    image = cv2.resize(
-        random.integers(0, 256, (12, 10, 3)).astype(np.float32), (150, 190), interpolation=cv2.INTER_CUBIC
-    )
-    image = image.clip(0, 255).astype(np.uint8)
-    svm = read_classifier("opencv", 3780)
-    opencv = cv2.HOGDescriptor()
+    noise = np.random.default_rng(0).integers(0, 256, (12, 10, 3)).astype(np.float32)
+    image = cv2.resize(noise, (150, 190), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
+    svm, opencv = read_classifier("opencv", 3780), cv2.HOGDescriptor()
     opencv.setSVMDetector(np.append(svm.weights, svm.bias).astype(np.float32))
-    places, wanted = (np.asarray(hit) for hit in opencv.detect(image, -1e9, (8, 8), (0, 0)))
-    found = whole_scores(image, svm.weights, svm.bias)
-    assert found.size == len(wanted)
-    np.testing.assert_allclose(found[places[:, 1] // 8, places[:, 0] // 8], wanted.ravel(), atol=2e-5, rtol=0)
-    grey = image[..., :1]
-    np.testing.assert_allclose(
-        whole_scores(grey, svm.weights, svm.bias),
-        whole_scores(np.repeat(grey, 3, axis=2), svm.weights, svm.bias),
-        atol=1e-6,
-    )
+    for picture in (image, image[..., 0].copy()):
+        places, wanted = (np.asarray(hit) for hit in opencv.detect(picture, -1e9, (8, 8), (0, 0)))
+        found = whole_scores(picture, svm.weights, svm.bias)
+        assert found.size == len(wanted)
+        np.testing.assert_allclose(found[places[:, 1] // 8, places[:, 0] // 8], wanted.ravel(), atol=2e-5, rtol=0)
 
 
 def whole_scores(image: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:
     bordered = np.atleast_3d(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101))
     session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
     arranged = hog.arranged(torch.from_numpy(weights), hog.Layout()).numpy()
-    feed = {"image": bordered, "weights": arranged, "bias": np.array(bias, np.float32)}
-    (found,) = session.run(None, {**feed, "clip": np.array(0.2, np.float32)})
-    return found
+    numbers = {"bias": np.array(bias, np.float32), "clip": np.array(0.2, np.float32)}
+    return session.run(None, {"image": bordered, "weights": arranged} | numbers)[0]
 
 
 def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
-    changed: dict[str, Any] = {
-        "cell_px": 4,
-        "block_px": 8,
-        "block_stride_px": 4,
-        "window_width_px": 32,
-        "window_height_px": 64,
-    }
+    sizes = {"cell": 4, "block": 8, "block_stride": 4, "window_width": 32, "window_height": 64}
+    changed: dict[str, Any] = {f"{name}_px": size for name, size in sizes.items()}
     write_graphs(tmp_path / "own", people.export_people(PeopleParameters(**changed)))
     parameters = PeopleParameters(**changed, graphs=str(tmp_path / "own"), window_stride_px=6)
     image = np.random.default_rng(1).integers(0, 256, (80, 70, 3), np.uint8)
-    weights = np.random.default_rng(2).normal(0, 0.05, math.prod((7, 15, 4, 9))).astype(np.float32)
-    svm = LinearSvm(weights, 0.1, "made up")
-    part = Part((70, 80), 0, 0, 70, 80)
+    weights = np.random.default_rng(2).normal(0, 0.05, parameters.features).astype(np.float32)
+    svm, part = LinearSvm(weights, 0.1, "made up"), Part((70, 80), 0, 0, 70, 80)
     ((onboard,),) = OnnxScorer(parameters, svm).scores([image], [[part]])
     ((torch_scores,),) = load_scorer(parameters, "torch", svm).scores([image], [[part]])
     assert onboard.shape == (3, 7)

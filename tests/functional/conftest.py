@@ -10,7 +10,7 @@ import torch
 MARGIN = 40
 
 
-def _texture(seed: int, height: int, width: int) -> np.ndarray:
+def draw_texture(seed: int, height: int, width: int) -> np.ndarray:
     random = np.random.default_rng(seed)
     total = np.zeros((height, width), np.float32)
     for scale in (1.2, 2.5, 6, 15):
@@ -28,7 +28,7 @@ def _texture(seed: int, height: int, width: int) -> np.ndarray:
 @pytest.fixture(scope="session")
 def texture() -> Callable[[int, int, int], np.ndarray]:
     """(seed, height, width) -> uint8 grey picture."""
-    return _texture
+    return draw_texture
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +36,7 @@ def two_views() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """(seed, height, width, later_from_earlier) -> two uint8 views of one plane, no borders in sight."""
 
     def make(seed: int, height: int, width: int, later_from_earlier: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        ground = _texture(seed, height + 2 * MARGIN, width + 2 * MARGIN)
+        ground = draw_texture(seed, height + 2 * MARGIN, width + 2 * MARGIN)
         into = np.array([[1, 0, -MARGIN], [0, 1, -MARGIN], [0, 0, 1]], float)
         later = cv2.warpPerspective(ground, later_from_earlier @ into, (width, height), flags=cv2.INTER_CUBIC)
         return ground[MARGIN : MARGIN + height, MARGIN : MARGIN + width].copy(), later
@@ -47,8 +47,4 @@ def two_views() -> Callable[..., tuple[np.ndarray, np.ndarray]]:
 @pytest.fixture(scope="session")
 def tensor() -> Callable[[np.ndarray], torch.Tensor]:
     """Grey uint8 picture -> (1, 1, H, W) float32 in [0, 1]."""
-
-    def make(picture: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(picture.astype(np.float32) / 255)[None, None]
-
-    return make
+    return lambda picture: torch.from_numpy(picture.astype(np.float32) / 255)[None, None]

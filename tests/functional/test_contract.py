@@ -3,6 +3,8 @@
 import inspect
 import typing
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 
 import jaxtyping
 import pytest
@@ -93,8 +95,7 @@ def test_what_goes_in_and_comes_out_has_the_annotated_shapes(function):
     signature = inspect.signature(function)
     # Inside the context a name such as B means the same size in every annotation.
     with jaxtyping.jaxtyped("context"):
-        given = signature.bind(*CASES[function]).arguments
-        for name, value in given.items():
+        for name, value in signature.bind(*CASES[function]).arguments.items():
             assert agrees(value, signature.parameters[name].annotation), name
         assert agrees(function(*CASES[function]), signature.return_annotation)
 
@@ -123,23 +124,23 @@ def test_a_batch_is_the_same_as_its_members_one_by_one(function):
     given = (CASES | NO_SHAPES)[function]
     together = function(*given)
     for at in range(BATCH):
+        alone = function(*(row(value, at) for value in given))
         # BLAS takes other paths for other batch sizes: the last digits may differ.
-        torch.testing.assert_close(
-            row(together, at), function(*(row(value, at) for value in given)), atol=1e-4, rtol=1e-4
-        )
+        torch.testing.assert_close(row(together, at), alone, atol=1e-4, rtol=1e-4)
 
 
 def double(*shape: int, seed: int = 0) -> torch.Tensor:
     return random(*shape, seed=seed).double()
 
 
-def quad(*points: tuple[float, float]) -> torch.Tensor:
-    return torch.tensor([points], dtype=torch.float64)
+def number(value: float) -> torch.Tensor:
+    return torch.tensor(value).double()
 
 
 FIVE, THERE = 500 * double(1, 5, 2), 500 * double(1, 5, 2) + 3 * double(1, 5, 2, seed=1)
 SIX, SEEN = 500 * double(1, 6, 2), 480 * double(1, 6, 2) + 9 * double(1, 6, 2, seed=1)
-WEIGHTS = torch.linspace(0.5, 1, 6).double()[None]
+FIVE_WEIGHTS, SIX_WEIGHTS = (torch.linspace(0.5, 1, count).double()[None] for count in (5, 6))
+QUAD = torch.tensor([[[0.0, 0], [90, 10], [100, 80], [5, 70]]]).double()
 KNOWN = [torch.ones(2, count, dtype=torch.bool) for count in (4, 3, 5)]
 KNOWN[2][1, 4] = False
 LABELS = torch.tensor([[[[0, 1, 1, 0], [0, 1, 0, 2], [0, 0, 0, 2]]]])
@@ -148,10 +149,7 @@ BOX, THERE_ARE = torch.tensor([[[0.0, 1, 3, 3], [2, 0, 9, 2]]]).double(), torch.
 LOW, HIGH = torch.tensor([[10.0, 80, 60], [170, 100, 0]]).double(), torch.tensor([[25.0, 255, 255], [8, 255, 255]])
 # Smooth functions of the tensors at which their gradient is compared with finite differences.
 GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] = {
-    "plane_maps.fit_affine": (
-        lambda p, q: plane_maps.fit_affine(p, q, torch.linspace(0.5, 1, 5).double()[None])[0],
-        (FIVE, THERE),
-    ),
+    "plane_maps.fit_affine": (lambda p, q: plane_maps.fit_affine(p, q, FIVE_WEIGHTS)[0], (FIVE, THERE)),
     "affinity.pairs": (lambda a, b: affinity.pairs(a, b, *KNOWN[:2]), (double(2, 4, 3), double(2, 3, 3, seed=1))),
     "affinity.triplets": (
         lambda a, b, c: affinity.triplets(a, b, c, *KNOWN),
@@ -180,18 +178,12 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
     ),
     "plane_maps.four_point": (
         lambda p, q: plane_maps.four_point(p, q)[0],
-        (quad((0, 0), (90, 10), (100, 80), (5, 70)), quad((3, 1), (95, 15), (99, 90), (1, 72))),
+        (QUAD, QUAD + 5 * double(1, 4, 2)),
     ),
-    "plane_maps.fit_homography": (
-        lambda *x: plane_maps.fit_homography(*x)[0],
-        (SIX, SEEN, torch.linspace(0.5, 1, 6).double()[None]),
-    ),
+    "plane_maps.fit_homography": (lambda *x: plane_maps.fit_homography(*x)[0], (SIX, SEEN, SIX_WEIGHTS)),
     **{
-        f"plane_maps.fit_raw {count}": (
-            lambda p, q: plane_maps.fit_raw(p, q)[0],
-            (SIX[:, :count] / 300, SEEN[:, :count] / 300),
-        )
-        for count in (4, 6)
+        f"plane_maps.fit_raw {n}": (lambda *x: plane_maps.fit_raw(*x)[0], (SIX[:, :n] / 300, SEEN[:, :n] / 300))
+        for n in (4, 6)
     },
     "keypoints.min_eigenvalue": (keypoints.min_eigenvalue, (double(1, 1, 6, 7),)),
     **{
@@ -204,7 +196,7 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
     "soft.step": (lambda x: soft.step(x, 0.2), (torch.linspace(-1, 1, 7).double(),)),
     "soft.gate_regions": (
         lambda m, e, a, p: soft.gate_regions(m, e, LABELS, 2, a, p, 0.3),
-        (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), torch.tensor(1.5).double(), torch.tensor(6.0).double()),
+        (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), number(1.5), number(6.0)),
     ),
     "warp.resize": (lambda x: warp.resize(x, (9, 4), rounded=False), (255 * double(1, 2, 6, 7),)),
 }
@@ -215,3 +207,30 @@ def test_gradients_are_those_of_finite_differences(name):
     function, inputs = GRADIENTS[name]
     asked = tuple(value.clone().requires_grad_() for value in inputs)
     assert torch.autograd.gradcheck(function, asked, eps=1e-7 if "histogram" in name else 1e-6)
+
+
+TWO, SPOTS = torch.ones(BATCH, 2, dtype=torch.bool), (LABELS > 0).float()
+SOFT: dict[str, Callable[[float], torch.Tensor]] = {
+    "soft.step": lambda s: soft.step(torch.tensor([-0.3, -0.01, 0.01, 0.3]), s),
+    "soft.gate_regions": lambda s: soft.gate_regions(SPOTS, 8 * GREY[:1, :, :3, :4], LABELS, 2, 2.5, 4.0, s),
+    "color.within_ranges": lambda s: color.within_ranges(color.bgr_to_hsv(COLOUR), LOW.float(), HIGH.float(), s),
+    "color.rgb_histogram": lambda s: color.rgb_histogram(COLOUR, BOXES, TWO, s, normalize=False)[0],
+    **{
+        f"morphology.{operation.__name__} {size} {shape}": partial(
+            lambda s, operation, size, shape: operation(4 * GREY - 2, size, shape, s),
+            operation=operation,
+            size=size,
+            shape=shape,
+        )
+        for operation in (morphology.dilate, morphology.erode, morphology.closing, morphology.opening)
+        for size, shape in (((1, 1), "ellipse"), ((4, 7), "rectangle"), ((25, 25), "ellipse"))
+    },
+}
+
+
+@pytest.mark.parametrize("name", SOFT)
+def test_soft_results_tend_to_the_hard_one_as_softness_vanishes(name):
+    hard, *softened = (SOFT[name](softness) for softness in (0.0, 0.5, 0.1, 0.02, 0.001))
+    misses = [float((one - hard).abs().mean()) for one in softened]
+    assert all(later <= sooner + 1e-6 for sooner, later in pairwise(misses))
+    assert misses[-1] < 0.02 and (misses[0] > 0.001 or "(1, 1)" in name)

@@ -21,21 +21,19 @@ def pyramids(tensor, first, second, levels) -> tuple[flow.Pyramid, flow.Pyramid]
     return flow.pyramid(tensor(first), levels), flow.pyramid(tensor(second), levels)
 
 
-def by_opencv(first, second, corners, levels, window=21, **rest):
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        corners,
-        winSize=(window, window),
-        maxLevel=levels - 1,
-        criteria=criteria,
-        **({"nextPts": None} | rest),
-    )
+def inner(points: torch.Tensor, left: float, top: float, right: float, bottom: float) -> torch.Tensor:
+    return ((points > torch.tensor([left, top])) & (points < torch.tensor([right, bottom]))).all(-1)
+
+
+def by_opencv(first, second, corners, levels, window=21, start=None):
+    rest = {"winSize": (window, window), "maxLevel": levels - 1}
+    criteria = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01
+    flags = 0 if start is None else cv2.OPTFLOW_USE_INITIAL_FLOW
+    found, status, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, start, criteria=criteria, flags=flags, **rest)
     return torch.from_numpy(found[:, 0]), torch.from_numpy(status[:, 0] > 0)
 
 
-@pytest.mark.parametrize(("levels", "window"), [(3, 21), (3, 15), (4, 21), (2, 11)])
+@pytest.mark.parametrize(("levels", "window"), [(3, 21), (3, 15), (2, 11)])
 def test_agrees_with_opencv_to_a_hundredth_of_a_pixel(scene, tensor, levels, window):
     first, second, corners, points = scene
     found, ok = flow.track(points, *pyramids(tensor, first, second, levels), window_px=window)
@@ -45,23 +43,20 @@ def test_agrees_with_opencv_to_a_hundredth_of_a_pixel(scene, tensor, levels, win
     both = ok[0] & status
     apart = (found[0] - wanted).norm(dim=-1)[both]
     assert both.sum() >= 0.97 * status.sum()
-    assert apart.median() < 0.001
-    assert apart.quantile(0.9) < 0.01
+    assert apart.median() < 0.001 and apart.quantile(0.9) < 0.01
 
 
 def test_with_a_prediction_one_level_and_a_small_table_do(scene, tensor):
     first, second, corners, points = scene
     truth = plane_maps.transfer(torch.from_numpy(MOTION).float()[None], points)
     guess = truth + 0.4 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
-    found, ok = flow.track(
-        points, *pyramids(tensor, first, second, 1), guess=guess, window_px=15, iterations=5, reach_px=2
-    )
-    start = guess[0].numpy()[:, None].copy()
-    wanted, _ = by_opencv(first, second, corners, 1, 15, nextPts=start, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    inner = ((truth > 10) & (truth < torch.tensor([250.0, 190.0]))).all(-1)
-    assert (ok & inner).sum() >= 0.97 * inner.sum()
+    views, how = pyramids(tensor, first, second, 1), {"window_px": 15, "iterations": 5, "reach_px": 2}
+    found, ok = flow.track(points, *views, guess=guess, **how)
+    wanted, _ = by_opencv(first, second, corners, 1, 15, guess[0].numpy()[:, None].copy())
+    seen = inner(truth, 10, 10, 250, 190)
+    assert (ok & seen).sum() >= 0.97 * seen.sum()
     assert (found[0] - wanted).norm(dim=-1)[ok[0]].median() < 0.001
-    assert (found - truth).norm(dim=-1)[ok & inner].median() < 0.1
+    assert (found - truth).norm(dim=-1)[ok & seen].median() < 0.1
 
 
 def test_a_point_that_needs_more_than_one_table_is_found_in_further_rounds(two_views, tensor):
@@ -78,8 +73,7 @@ def test_a_point_that_needs_more_than_one_table_is_found_in_further_rounds(two_v
 def test_nothing_is_found_on_a_blank_picture(shape):
     blank = flow.pyramid(torch.full((2, 1, *shape), 0.3), 2)
     found, ok = flow.track(torch.full((2, 5, 2), 4.0), blank, blank)
-    assert not ok.any()
-    assert torch.isfinite(found).all()
+    assert not ok.any() and torch.isfinite(found).all()
 
 
 def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tensor, texture):
@@ -87,27 +81,23 @@ def test_forward_backward_drops_points_on_what_was_covered_meanwhile(scene, tens
     covered = second.copy()
     covered[60:140, 80:180] = texture(9, 80, 100)
     truth = plane_maps.transfer(torch.from_numpy(MOTION).float()[None], points)
-    inside = ((truth > torch.tensor([90.0, 70.0])) & (truth < torch.tensor([170.0, 130.0]))).all(-1)
-    away = ((truth < torch.tensor([60.0, 40.0])) | (truth > torch.tensor([200.0, 160.0]))).any(-1)
-    away &= ((truth > 10) & (truth < torch.tensor([250.0, 190.0]))).all(-1)
+    hidden, near = inner(truth, 90, 70, 170, 130), inner(truth, 60, 40, 200, 160)
     _, found = flow.forward_backward(points, *pyramids(tensor, first, covered, 3))
-    assert inside.sum() >= 8
-    assert found[inside].float().mean() < 0.2
-    assert found[away].float().mean() > 0.9
+    assert hidden.sum() >= 8 and found[hidden].float().mean() < 0.2
+    assert found[~near & inner(truth, 10, 10, 250, 190)].float().mean() > 0.9
 
 
 def test_gradients_are_those_of_finite_differences(two_views, tensor):
-    first, second = two_views(5, 18, 18, np.array([[1, 0, 0.4], [0, 1, -0.3], [0, 0, 1.0]]))
+    views = two_views(5, 18, 18, np.array([[1, 0, 0.4], [0, 1, -0.3], [0, 0, 1.0]]))
+    first, second = (tensor(view).double() for view in views)
     points = torch.tensor([[[9.2, 8.7]]], dtype=torch.float64)
-    images = (tensor(first).double().requires_grad_(), tensor(second).double().requires_grad_())
 
     def moved(a, b, p):
         return flow.track(p, [a], [b], window_px=7, iterations=4, epsilon_px=0.0, reach_px=1)[0]
 
-    assert flow.track(points, [images[0]], [images[1]], window_px=7, reach_px=1)[1].all()
-    assert torch.autograd.gradcheck(lambda b: moved(images[0].detach(), b, points), (images[1],), fast_mode=True)
-    assert torch.autograd.gradcheck(lambda a: moved(a, images[1].detach(), points), (images[0],), fast_mode=True)
+    assert flow.track(points, [first], [second], window_px=7, reach_px=1)[1].all()
     # Where a point goes also depends on where it started.
-    assert torch.autograd.gradcheck(
-        lambda p: moved(images[0].detach(), images[1].detach(), p), (points.requires_grad_(),)
-    )
+    for varied in (first, second, points):
+        varied.requires_grad_()
+        assert torch.autograd.gradcheck(moved, (first, second, points), fast_mode=varied is not points)
+        varied.requires_grad_(False)

@@ -48,15 +48,10 @@ def samples(count: int, points: int, size: int = 4, clips: int = 2) -> torch.Ten
     return plane_maps.draw_samples(torch.Generator().manual_seed(1), clips, count, points, size=size)
 
 
-def test_solves_a_system_worked_by_hand_that_needs_a_row_exchange():
-    matrix = torch.tensor([[[0.0, 2.0], [4.0, 2.0]]])
-    x, valid = plane_maps.solve_linear(matrix, torch.tensor([[[6.0], [10.0]]]))
-    assert valid.all() and torch.equal(x, torch.tensor([[[1.0], [3.0]]]))
-
-
 def test_agrees_with_lapack_on_random_systems_and_is_valid_in_any_unit():
     generator = torch.Generator().manual_seed(0)
     matrix = torch.randn(50, 8, 8, generator=generator, dtype=torch.float64)
+    matrix[0, 0, 0] = 0  # rows have to be exchanged
     right = torch.randn(50, 8, 3, generator=generator, dtype=torch.float64)
     x, valid = plane_maps.solve_linear(matrix, right)
     assert valid.all()
@@ -70,14 +65,6 @@ def test_a_singular_member_is_marked_and_leaves_the_others_alone():
     x, valid = plane_maps.solve_linear(matrix, torch.arange(9.0).reshape(3, 3, 1))
     assert valid.tolist() == [True, False, False]
     assert torch.equal(x, torch.tensor([[0.0, 1, 2], [0, 0, 0], [0, 0, 0]])[..., None])
-
-
-def test_a_square_moved_and_doubled_gives_the_matrix_written_by_hand(model):
-    module, _, size = model
-    p = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[:size]
-    found, valid = module.minimal(p, 2 * p + torch.tensor([3.0, -1.0]))
-    assert valid
-    torch.testing.assert_close(found, torch.tensor([[2.0, 0, 3], [0, 2, -1], [0, 0, 1]]), atol=1e-6, rtol=0)
 
 
 def test_the_fewest_points_give_what_opencv_gives(model):
@@ -98,12 +85,10 @@ def test_the_fewest_points_give_what_opencv_gives(model):
     ("name", "bad"),
     [
         ("homography", [[0, 0], [10, 10], [20, 20], [0, 30]]),
-        ("homography", [[0, 0], [0, 0], [20, 20], [0, 30]]),
         ("homography", [[5, 5]] * 4),
         ("homography", [[0, 0], [9, 0], [0, 9], [9, 9]]),  # in order, but its partner is turned over
         ("affine", [[0, 0], [5, 5], [10, 10]]),
         ("affine", [[1, 1], [1, 1], [4, 7]]),
-        ("affine", [[3, 3]] * 3),
     ],
 )
 def test_points_that_fix_no_map_are_marked_and_finite(name, bad):
@@ -116,35 +101,17 @@ def test_an_affine_fit_is_the_least_squares_solution():
     p, q, _ = pairs(noise=2.0, true=AFFINE)
     found, valid = plane_maps.fit_affine(p, q, torch.ones(2, 200))
     rows = torch.cat([p, torch.ones(2, 200, 1)], -1).double()
-    assert valid.all()
     wanted = torch.linalg.lstsq(rows, q.double()).solution.mT.float()
+    assert valid.all()
     torch.testing.assert_close(found[:, :2], wanted, atol=1e-3, rtol=1e-4)
 
 
-def test_a_homography_fit_equals_the_normalised_dlt_to_a_fiftieth_of_the_noise():
+def test_a_homography_fit_is_opencvs_to_a_fifth_of_the_noise():
     p, q, _ = pairs(noise=0.5)
     found, _ = fit_homography(p, q, torch.ones(2, 200))
     for clip in range(2):
         wanted, _ = cv2.findHomography(p[clip].numpy(), q[clip].numpy(), 0)
         assert corner_error(found[clip], torch.from_numpy(wanted).float()) < 0.1
-        # cv2 goes on to the reprojection error; the DLT itself is compared more closely.
-        assert corner_error(found[clip], _dlt(p[clip], q[clip])) < 0.01
-
-
-def _dlt(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """Homogeneous least squares by SVD (A h = 0), Hartley-normalised."""
-
-    def normaliser(x):
-        scale = np.sqrt(2) / np.sqrt(((x - x.mean(0)) ** 2).sum(1).mean())
-        return np.array([[scale, 0, -scale * x[:, 0].mean()], [0, scale, -scale * x[:, 1].mean()], [0, 0, 1]])
-
-    a, b = p.numpy().astype(float), q.numpy().astype(float)
-    from_a, from_b = normaliser(a), normaliser(b)
-    a, b = (np.c_[x, np.ones(len(x))] @ n.T for x, n in ((a, from_a), (b, from_b)))
-    zero = np.zeros_like(a)
-    rows = np.r_[np.c_[a, zero, -b[:, :1] * a], np.c_[zero, a, -b[:, 1:2] * a]]
-    matrix = np.linalg.inv(from_b) @ np.linalg.svd(rows)[2][-1].reshape(3, 3) @ from_a
-    return torch.from_numpy(matrix / matrix[2, 2]).float()
 
 
 def test_a_fit_leaves_out_pairs_of_weight_zero_even_where_they_hold_no_numbers():
@@ -173,7 +140,7 @@ def test_fit_with_a_point_behind_the_horizon_is_marked():
         assert fit_homography(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
 
 
-@pytest.mark.parametrize("count", [4, 7, 16])
+@pytest.mark.parametrize("count", [4, 16])
 def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
     p, q, _ = pairs(count=count, noise=1.0)
     p, q = 0.05 * p[:1].double() + 2000, q[:1].double()
@@ -186,15 +153,13 @@ def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
 
 
 def test_the_source_as_printed_agrees_with_least_squares_about_the_origin_and_not_far_from_it():
-    p, q, _ = pairs(count=6)
+    p, _, _ = pairs(count=6)
     p, q = p[:1].double() / 100, plane_maps.transfer(PROJECTIVE[:1].double(), p[:1].double()) / 100
-    near, valid = plane_maps.fit_raw(p, q)
-    assert valid.all()
-    assert plane_maps.transfer_error(near, p, q).max() < 1e-8
-    for count, low, high in ((6, 1e-3, torch.inf), (4, 0, 1e-3)):
-        far, valid = plane_maps.fit_raw(p[:, :count] / 1e4 + 100, q[:, :count])
+    for count, away, low, high in ((6, 0, 0, 1e-8), (6, 100, 1e-3, torch.inf), (4, 100, 0, 1e-3)):
+        ground = p[:, :count] if not away else p[:, :count] / 1e4 + away
+        found, valid = plane_maps.fit_raw(ground, q[:, :count])
         assert valid.all()
-        assert low <= plane_maps.transfer_error(far, p[:, :count] / 1e4 + 100, q[:, :count]).max() < high
+        assert low <= plane_maps.transfer_error(found, ground, q[:, :count]).max() < high
 
 
 def test_the_source_as_printed_refuses_only_what_is_exactly_singular():
@@ -223,8 +188,7 @@ def test_ransac_uses_valid_points_only_even_when_few():
     p, q, _ = pairs(noise=0.1)
     known = (torch.arange(200) % 10 == 0).expand(2, -1)
     found, inliers, valid = ransac(p, torch.where(known[..., None], q, q + 50), known, samples(128, 200))
-    assert valid.all() and torch.equal(inliers, known)
-    assert corner_error(found, PROJECTIVE) < 1.0
+    assert valid.all() and torch.equal(inliers, known) and corner_error(found, PROJECTIVE) < 1.0
 
 
 @pytest.mark.parametrize("count", [0, 3])
@@ -236,24 +200,10 @@ def test_ransac_without_four_valid_points_or_on_one_line_is_marked_and_gives_the
     assert not ransac(line(), line() + 3, torch.ones(1, 30).bool(), samples(16, 30, clips=1))[2].any()
 
 
-def test_what_a_pair_gives_does_not_depend_on_its_company():
-    p, q, right = (part.repeat(2, *[1] * (part.ndim - 1)) for part in pairs(count=300, noise=0.3, wrong=0.4))
-    p, q = p.double() + torch.arange(4.0)[:, None, None], q.double()
-    drawn = samples(64, 300, clips=1)
-    together = ransac(p, q, right, drawn.expand(4, -1, -1))
-    for k in range(4):
-        alone = ransac(p[k : k + 1], q[k : k + 1], right[k : k + 1], drawn)
-        # BLAS takes other paths for other batch sizes: the last digits may differ.
-        torch.testing.assert_close(together[0][k], alone[0][0], atol=1e-9, rtol=1e-9)
-        assert torch.equal(together[1][k], alone[1][0])
-
-
 def test_samples_repeat_with_the_seed_and_never_draw_a_point_twice():
     first = samples(500, 5)
-    assert torch.equal(first, samples(500, 5))
-    assert first.shape == (2, 500, 4)
+    assert torch.equal(first, samples(500, 5)) and first.shape == (2, 500, 4)
     assert (first.sort(-1).values.diff(dim=-1) > 0).all()
-    assert first.min() == 0 and first.max() == 4
     # Every point is drawn equally often: 4/5 of 1000 times, give or take four standard deviations.
     assert (torch.bincount(first.flatten(), minlength=5) - 800).abs().max() < 51
     with pytest.raises(InputError, match=r"drawn from 4 points; got room for 3"):

@@ -16,9 +16,8 @@ from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.nn import Core
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.motion import LOSSES, MotionFamily, label_regions, soft_masks, stack_frames
-from torchvision_dddas.tuning.parameters import Parameters
 
-CPU = torch.device("cpu")
+CPU, THRESHOLD = torch.device("cpu"), "difference.threshold"
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +31,6 @@ def examples(clip: Clip) -> list[Example]:
 
 
 def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example]) -> None:
-    """At the settings that the examples were prepared with: what comes after the hulls is then as it was."""
     final = {s.frame.number: s.mask > 0 for s in detect_motion(open_clip(clip), SETTINGS, "onboard")}
     assert [example.frame for example in examples] == list(range(1, 10))
     for example in examples:
@@ -41,59 +39,32 @@ def test_hard_masks_are_those_of_the_pipeline(clip: Clip, examples: list[Example
 
 
 def test_the_loss_tends_to_that_of_hard_masks(examples: list[Example]) -> None:
-    parameters = {"difference.threshold": torch.tensor(4.0)}
-    family = MotionFamily()
+    parameters, family = {THRESHOLD: torch.tensor(4.0)}, MotionFamily()
     hard = family.loss(parameters, examples, 0.0)
     misses = [float((family.loss(parameters, examples, softness) - hard).abs().mean()) for softness in (0.5, 0.1, 0.01)]
     assert misses[0] > misses[1] > misses[2] and misses[2] < 0.02
 
 
-def test_a_step_down_the_slope_of_a_threshold_that_is_too_high_lowers_it(clip: Clip) -> None:
-    family, settings = MotionFamily(with_later_steps=False), with_parameters(SETTINGS, {"difference.threshold": 10.0})
-    examples = family.examples([clip], settings)[3:6]
-    parameters = Parameters(settings, ["difference.threshold"])
-    family.loss(parameters.values(), examples, 0.3).sum().backward()
-    assert float(parameters.free[0].grad) > 0
-
-
-def test_a_clip_without_masks_is_refused_in_one_line(clip: Clip) -> None:
+def test_a_clip_without_masks_is_refused_before_any_is_computed(clip: Clip) -> None:
     assert clip.truth is not None
-    for truth in (None, replace(clip.truth, masks={})):
-        bare = replace(clip, name="bare", truth=truth)
-        with pytest.raises(InputError, match="bare has no masks of what moves; choose clips"):
-            MotionFamily().examples([clip, bare], SETTINGS, lambda: pytest.fail("a clip was computed before"))
+    bare = replace(clip, name="bare", truth=replace(clip.truth, masks={}))
+    with pytest.raises(InputError, match="bare has no masks of what moves; choose clips"):
+        MotionFamily().examples([clip, bare], SETTINGS, lambda: pytest.fail("a clip was computed before"))
     with pytest.raises(InputError, match=r"difference\.halved"):
         MotionFamily().examples([clip], with_parameters(SETTINGS, {"difference.halved": True}))
 
 
-def test_of_a_clip_in_which_nothing_moves_whatever_is_found_is_false(clip: Clip) -> None:
-    still = replace(clip, name="still", truth=None, still=True)
+def test_of_a_clip_in_which_nothing_moves_all_that_is_found_is_false(clip: Clip) -> None:
     family = MotionFamily(with_later_steps=False)
-    examples = family.examples([still], SETTINGS)
+    examples = family.examples([replace(clip, name="still", truth=None, still=True)], SETTINGS)
     assert [example.clip for example in examples] == ["still"] * 9
     assert not any(bool(example.content.truth.any()) for example in examples)
-    calm, alarmed = (
-        family.loss({"difference.threshold": torch.tensor(at)}, examples, 0.02).mean() for at in (60.0, 4.0)
-    )
+    calm, alarmed = (family.loss({THRESHOLD: torch.tensor(at)}, examples, 0.02).mean() for at in (60.0, 4.0))
     assert float(calm) < 0.01 and float(alarmed) > 0.9
 
 
-def test_a_loss_of_another_name_is_another_loss_of_the_same_masks(examples: list[Example]) -> None:
-    parameters = {"difference.threshold": torch.tensor(4.0)}
-    family = MotionFamily(with_later_steps=False)
-    found = {name: family.with_loss(name).loss(parameters, examples, 0.0) for name in family.losses}
-    assert family.with_loss("dice").with_later_steps is False
-    assert torch.equal(found["f"], family.loss(parameters, examples, 0.0))
-    assert not torch.allclose(found["f"], found["focal"])
-    # Squares of hard masks are the masks.
-    torch.testing.assert_close(found["f"], found["dice"])
-
-
-TRUTH = torch.zeros(2, 1, 40, 50, dtype=torch.bool)
+TRUTH, KNOWN = torch.zeros(2, 1, 40, 50, dtype=torch.bool), torch.ones(2, 1, 40, 50, dtype=torch.bool)
 TRUTH[:, :, 5:25, 10:30] = True
-
-
-KNOWN = torch.ones_like(TRUTH)
 
 
 def test_of_hard_masks_the_loss_is_one_less_f() -> None:
@@ -106,28 +77,18 @@ def test_of_hard_masks_the_loss_is_one_less_f() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
-def test_what_nobody_labelled_does_not_count(loss) -> None:
+def test_each_loss_ignores_what_nobody_labelled_accepts_empty_frames_and_has_the_right_gradient(loss) -> None:
     found = TRUTH.double()
-    wrong = found.clone()
-    wrong[:, :, 30:] = 1
-    known = KNOWN.clone()
-    known[:, :, 30:] = False
+    wrong, known = found.clone(), KNOWN.clone()
+    wrong[:, :, 30:], known[:, :, 30:] = 1, False
     assert torch.equal(loss(wrong, TRUTH, known), loss(found, TRUTH, known))
     assert bool((loss(wrong, TRUTH, KNOWN) > loss(found, TRUTH, KNOWN)).all())
-
-
-@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
-def test_an_empty_frame_in_which_nothing_is_found_is_right(loss) -> None:
     none = torch.zeros_like(TRUTH)
     assert float(loss(none.double(), none, KNOWN).max()) == pytest.approx(0.0, abs=1e-6)
     assert bool(torch.isfinite(loss(none.double(), none, none)).all())
-
-
-@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
-def test_losses_have_the_right_gradient(loss) -> None:
-    found = 0.05 + 0.9 * torch.rand(2, 1, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    mask = 0.05 + 0.9 * torch.rand(2, 1, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     truth, known = TRUTH[..., 3:7, 8:13], KNOWN[..., 3:7, 8:13]
-    assert torch.autograd.gradcheck(lambda mask: loss(mask, truth, known), (found.requires_grad_(),))
+    assert torch.autograd.gradcheck(lambda soft: loss(soft, truth, known), (mask.requires_grad_(),))
 
 
 def core(*boxes: tuple[int, int, int, int, float]) -> Core:
@@ -139,13 +100,16 @@ def core(*boxes: tuple[int, int, int, int, float]) -> Core:
 
 
 def test_regions_are_numbered_and_their_hulls_filled() -> None:
-    found = label_regions(core((5, 5, 15, 8, 1.0), (5, 5, 8, 15, 1.0), (40, 20, 50, 30, 2.0)), hull=True)
+    bend = (5, 5, 15, 8, 1.0), (5, 5, 8, 15, 1.0)
+    found = label_regions(core(*bend, (40, 20, 50, 30, 2.0)), hull=True)
     assert found.count == 2
     assert len({int(found.near[0, 0, 6, 10]), int(found.near[0, 0, 25, 45]), 0}) == 3
     assert int(found.near[0, 0, 10, 10]) == 0, "the bend of the L is no part of it"
     assert int(found.filled[0, 0, 9, 9]) == int(found.near[0, 0, 6, 6]), "but of its hull"
-    plain = label_regions(core((5, 5, 15, 8, 1.0), (5, 5, 8, 15, 1.0)), hull=False)
+    plain = label_regions(core(*bend), hull=False)
     assert torch.equal(plain.filled, plain.near)
+    none = label_regions(core(), hull=True, reach=1.0)
+    assert none.count == 0 and not none.near.any() and not none.filled.any()
 
 
 def test_a_speck_within_a_large_hull_keeps_its_own_number_and_lies_in_the_hull() -> None:
@@ -163,8 +127,3 @@ def test_what_just_misses_the_threshold_goes_to_the_nearest_region_or_makes_its_
     assert int(found.near[0, 0, 25, 45]) not in (0, int(found.near[0, 0, 10, 7]))
     assert not found.filled[0, 0, 20:30, 40:50].any(), "it is not there yet"
     assert int(found.near[0, 0, 35, 5]) == 0
-
-
-def test_a_mask_of_nothing_has_no_regions() -> None:
-    found = label_regions(core(), hull=True, reach=1.0)
-    assert found.count == 0 and not found.near.any() and not found.filled.any()

@@ -24,13 +24,9 @@ from torchvision_dddas.tuning.report import tuning_report
 from torchvision_dddas.tuning.time_cost import Curve, TimeCost, frame_timer, measure_cost, read_cost, timed_points
 from torchvision_dddas.tuning.verdict import Verdict, _say_change, judge
 
-THRESHOLD, CLOSE, BLUR = "difference.threshold", "morphology.close_px", "difference.blur_px"
-
-
+THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
+CLOSE, BLUR = "morphology.close_px", "difference.blur_px"
 GOAL = parse_goal("motion.pixels.f")
-
-
-KNOBS = {THRESHOLD: 40.0}
 
 
 @pytest.fixture(scope="module")
@@ -47,63 +43,53 @@ def found(clips) -> Verdict:
     with pytest.MonkeyPatch.context() as here:
         here.setattr(bootstrap, "effects", partial(bootstrap.effects, resamples=40, most=200))
         spec = read_spec(clips)
-        return judge(spec, clips.parent, GOAL, KNOBS, ("one", "two"), ("held",), 1, clips.parent / "cache")
+        return judge(spec, clips.parent, GOAL, {THRESHOLD: 40.0}, ("one", "two"), ("held",), 1, clips.parent / "cache")
 
 
 def test_the_figures_are_those_of_the_study_before_and_after(clips, found) -> None:
-    overrides = ("difference.threshold=40.0",)
-    for when, more in enumerate(((), overrides)):
-        one = replace(read_spec(clips), overrides=more, tasks=("motion",))
+    for when, overrides in enumerate(((), ("difference.threshold=40.0",))):
+        one = replace(read_spec(clips), overrides=overrides, tasks=("motion",))
         cases = run_study(one, clips.parent, cache=clips.parent / "cache").cases
         of = {names: [case for case in cases if case.clip.name in names] for names in (("one", "two"), ("held",))}
         assert found.tuned.pooled[when] == goal_value(GOAL, of["one", "two"])[0]
         assert found.held is not None and found.held.pooled[when] == goal_value(GOAL, of["held",])[0]
 
 
-def test_a_change_for_the_worse_is_called_so_and_never_better(found) -> None:
+def test_a_change_for_the_worse_is_never_called_better(found) -> None:
     assert found.tuned.pooled[0] > found.tuned.pooled[1]
     assert found.tuned.mean[0] > found.tuned.mean[1]
     assert "better" not in found.tuned.says
-    told = found.as_json()
-    assert told["held_out"]["clips"] == ("held",) and told["better"] == "more"
-    assert told["tuned"]["frame_ms"]["before"] > 0
+    assert found.as_json()["held_out"]["clips"] == ("held",) and found.as_json()["tuned"]["frame_ms"]["before"] > 0
 
 
-def test_the_goal_is_judged_by_itself_and_less_may_be_better() -> None:
-    way = {"p": 0.03, "p_holm": 0.4, "interval": [-0.3, -0.1], "enough": True}
-    entry = {"change": -0.2, "over_clips": None, "over_frames": way}
-    changes = {"tasks": {"motion": {"pooled": {"pixels": {"f": entry}, "target": {"other_blobs_per_frame": entry}}}}}
-    assert _say_change(GOAL, changes) == "worse on these clips"
-    assert _say_change(parse_goal("motion.target.other_blobs_per_frame"), changes) == "better on these clips"
-    entry["over_clips"] = {**way, "p": 0.01}
-    assert _say_change(GOAL, changes) == "worse"
-    entry["over_clips"], entry["over_frames"] = None, {**way, "p": 0.2}
-    assert _say_change(GOAL, changes) == "within noise"
-    assert _say_change(GOAL, None) == ""
+@pytest.mark.parametrize(
+    ("goal", "p", "over_clips", "wanted"),
+    [
+        ("motion.pixels.f", 0.03, None, "worse on these clips"),
+        ("motion.target.other_blobs_per_frame", 0.03, None, "better on these clips"),
+        ("motion.pixels.f", 0.03, 0.01, "worse"),
+        ("motion.pixels.f", 0.2, None, "within noise"),
+    ],
+)
+def test_the_goal_is_judged_by_itself_and_less_may_be_better(goal, p, over_clips, wanted) -> None:
+    way = {"p": p, "p_holm": 0.4, "interval": [-0.3, -0.1], "enough": True}
+    entry = {"change": -0.2, "over_clips": over_clips and {**way, "p": over_clips}, "over_frames": way}
+    pooled = {"pixels": {"f": entry}, "target": {"other_blobs_per_frame": entry}}
+    assert _say_change(parse_goal(goal), {"tasks": {"motion": {"pooled": pooled}}}) == wanted
 
 
 def test_parameters_that_did_not_move_change_nothing(clips) -> None:
-    same = {"difference.threshold": load_config("fast").difference.threshold}
-    assert with_parameters(load_config("fast"), same) == load_config("fast")
+    same = {THRESHOLD: load_config("fast").difference.threshold}
     spec = read_spec(clips)
-    told = judge(spec, clips.parent, GOAL, same, ("held",), (), 1, clips.parent / "cache")
-    assert told.tuned.says == "the same" and told.held is None
-    assert told.tuned.changes is not None and told.tuned.changes["tasks"]["motion"]["same"] == ["held"]
-
-
-NAMES = (THRESHOLD, "difference.noise_levels")
+    verdict = judge(spec, clips.parent, GOAL, same, ("held",), (), 1, clips.parent / "cache")
+    assert verdict.tuned.says == "the same" and verdict.held is None
+    assert verdict.tuned.changes is not None and verdict.tuned.changes["tasks"]["motion"]["same"] == ["held"]
 
 
 def side(clips, before, after, says):
-    return {
-        "clips": clips,
-        "pooled": {"before": before, "after": after},
-        "mean": {"before": before, "after": after},
-        "says": says,
-        "frame_ms": {"before": 20.0, "after": 15.0},
-        "changes": comparison(CLIPS),
-        "notes": ["lost <one>, after: it failed"],
-    }
+    both, frame_ms = {"before": before, "after": after}, {"before": 20.0, "after": 15.0}
+    figures = {"clips": clips, "pooled": both, "mean": both, "frame_ms": frame_ms, "says": says}
+    return figures | {"changes": comparison(CLIPS), "notes": ["lost <one>, after: it failed"]}
 
 
 def record(**changed):
@@ -113,28 +99,18 @@ def record(**changed):
             "softness": 0.5 / max(k, 1),
             "loss": math.nan if k == 0 else 1 / k,
             "watched": 0.9 - 0.1 * k if k % 2 == 0 else None,
-            "knobs": {NAMES[0]: 4.0 + k, NAMES[1]: 2.0},
+            "knobs": {THRESHOLD: 4.0 + k, NOISE: 2.0},
         }
         for k in range(5)
     ]
-    parameters = {
-        name: {
-            "before": 4,
-            "after": 8.0,
-            "unit": "-",
-            "range": "0.1 to 255",
-            "meaning": "a <b>larger</b> one",
-            "idle": name == NAMES[1],
-        }
-        for name in NAMES
-    }
-    told = {
+    knob = {"before": 4, "after": 8.0, "unit": "-", "range": "0.1 to 255", "meaning": "a <b>larger</b> one"}
+    whole = {
         "state": "complete",
         "study": {"name": "a <b> study"},
         "family": "motion",
         "plan": {"batch": 8, "seed": 3, "steps": 4, "watched": 0.25},
         "examples": 20,
-        "knobs": parameters,
+        "knobs": {THRESHOLD: knob | {"idle": False}, NOISE: knob | {"idle": True}},
         "best": 4,
         "taken": 4,
         "ended": "all 4 steps were taken",
@@ -149,56 +125,44 @@ def record(**changed):
         },
         "seconds": {"descent": 8.0},
     }
-    return finite({**told, **changed})
+    return finite(whole | changed)
 
 
-def said(text):
-    return " ".join(" ".join(Page(text).words).split())
+NOTHING = side(["one"], None, None, "") | {"changes": None}
+TIMED = {"weight": 0.1, "seconds": 0.02, "expected": 0.015}
+TIMES = [{"knob": THRESHOLD, "values": [2.0, 4.0], "times": [1.3, 1.0]}]
+FAILED = "the loss of motion is no number for one, frame 3, with difference.threshold = 12, at step 2"
 
 
-def test_it_says_first_what_tuning_was_worth_on_clips_tuned_on_and_held_out():
-    start = said(tuning_report(record()))
-    assert "Clips tuned on 0.600 F, pixels, all together; before 0.500 +0.100" in start
-    assert "Clips held out 0.500 F, pixels, all together; before 0.550 −0.050" in start
-    assert "mean of 2 clips: 0.500 → 0.600" in start and "20.0 → 15.0 ms a frame" in start
-    assert "within noise" in start and "2.00 s a step, 20 examples" in start
-    assert "4.00 s a step" in said(tuning_report(record(taken=2)))
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, "Clips tuned on 0.600 F, pixels, all together; before 0.500 +0.100|mean of 2 clips: 0.500 → 0.600"),
+        ({}, "Clips held out 0.500 F, pixels, all together; before 0.550 −0.050|within noise"),
+        ({}, "20.0 → 15.0 ms a frame|2.00 s a step, 20 examples|last 25% of each clip"),
+        ({"taken": 2}, "4.00 s a step"),
+        ({"verdict": record()["verdict"] | {"held_out": None}}, "none; give --holdout"),
+        ({"failed": FAILED}, f"Stopped: {FAILED}. The parameters are the last good ones."),
+        ({"cost": TIMED | {"curves": TIMES}}, "a loss of 0.1. Expected: 20.0 → 15.0 ms a frame.|1.3, 1"),
+        ({"cost": TIMED | {"curves": []}}, "No parameter changed the time by more than repeats differ."),
+        (
+            {"verdict": {"measure": "motion.pixels.f", "tuned": NOTHING, "held_out": None}},
+            "no F before and after|Nothing to compare",
+        ),
+        ({"plan": record()["plan"] | {"watched": 0.0}}, "The same examples are watched"),
+    ],
+)
+def test_the_page_says_what_tuning_was_worth_and_how_it_went(changed, words):
+    text = " ".join(" ".join(Page(tuning_report(record(**changed))).words).split())
+    for part in words.split("|"):
+        assert part in text
 
 
-def test_each_parameter_has_its_plot_and_row_and_one_without_effect_is_marked():
+def test_each_parameter_has_its_plot_and_row_and_words_of_the_user_are_no_markup():
     text = tuning_report(record())
     assert text.count("<svg") >= 4
-    for name in NAMES:
-        assert f">{name}</text>" in text
-    assert said(text).count("no effect on the loss") == 1
-
-
-def test_without_clips_held_out_it_says_how_to_have_some():
-    verdict = {**record()["verdict"], "held_out": None}
-    assert "none; give --holdout" in said(tuning_report(record(verdict=verdict)))
-
-
-def test_a_descent_that_was_stopped_says_so_at_once():
-    failed = "the loss of motion is no number for one, frame 3, with difference.threshold = 12, at step 2"
-    assert f"Stopped: {failed}. The parameters are the last good ones." in said(tuning_report(record(failed=failed)))
-
-
-def test_the_time_of_each_parameter_is_shown():
-    curves = [{"knob": NAMES[0], "values": [2.0, 4.0], "times": [1.3, 1.0]}]
-    text = said(tuning_report(record(cost={"weight": 0.1, "seconds": 0.02, "expected": 0.015, "curves": curves})))
-    assert "a loss of 0.1. Expected: 20.0 → 15.0 ms a frame." in text and "1.3, 1" in text
-    none = said(tuning_report(record(cost={"weight": 0.1, "seconds": 0.02, "expected": 0.02, "curves": []})))
-    assert "No parameter changed the time by more than repeats differ." in none
-
-
-def test_clips_without_any_result_make_a_page_too():
-    nothing = side(["one"], None, None, "") | {"changes": None}
-    text = said(tuning_report(record(verdict={"measure": "motion.pixels.f", "tuned": nothing, "held_out": None})))
-    assert "no F before and after" in text and "Nothing to compare" in text
-
-
-def test_words_of_the_user_are_no_markup_and_no_host_is_asked():
-    text = tuning_report(record())
+    assert f">{THRESHOLD}</text>" in text and f">{NOISE}</text>" in text
+    assert " ".join(Page(text).words).count("no effect on the loss") == 1
     assert "<b> study" not in text and "<b>larger" not in text and "lost <one>" not in text
     assert "http" not in text
 
@@ -209,76 +173,52 @@ def test_on_a_phone_nothing_hangs_over_the_edge(tmp_path):
     assert evaluate(tuning_report(record()), "return page.documentElement.scrollWidth;", tmp_path, 390) <= 390
 
 
-def test_the_page_says_what_was_watched() -> None:
-    told = record()
-    assert "last 25% of each clip" in tuning_report(told)
-    assert "The same examples are watched" in tuning_report(told | {"plan": told["plan"] | {"watched": 0.0}})
-
-
 def scalar(value: float) -> torch.Tensor:
     return torch.tensor(value, dtype=torch.float64, requires_grad=True)
 
 
 def test_a_factor_is_measured_at_what_was_measured_and_lies_between_elsewhere() -> None:
     curve = Curve(THRESHOLD, (2.0, 4.0, 8.0), (2.0, 1.0, 0.8))
-    assert [float(curve.factor(scalar(v)).detach()) for v in (2.0, 4.0, 8.0)] == pytest.approx([2.0, 1.0, 0.8])
-    # The knob's scale is that of factors: the middle of 2 and 8 is 4, that of 2 and 4 their geometric mean.
-    assert float(curve.factor(scalar(8**0.5)).detach()) == pytest.approx(1.5)
-    assert [float(curve.factor(scalar(v)).detach()) for v in (0.5, 90.0)] == pytest.approx([2.0, 0.8])
+    # The knob's scale is that of factors: the middle of 2 and 4 is their geometric mean.
+    at = {2.0: 2.0, 4.0: 1.0, 8.0: 0.8, 8**0.5: 1.5, 0.5: 2.0, 90.0: 0.8}
+    assert [float(curve.factor(scalar(value)).detach()) for value in at] == pytest.approx(list(at.values()))
 
 
-def test_the_term_has_the_slope_of_what_was_measured() -> None:
-    cost = TimeCost(0.5, 0.02, (Curve(THRESHOLD, (2.0, 4.0), (2.0, 1.0)),))
+def test_the_term_is_nothing_at_the_settings_and_twice_the_time_costs_the_weight() -> None:
+    cost = TimeCost(0.5, 0.02, (Curve(THRESHOLD, (2.0, 4.0), (2.0, 1.0)), Curve(CLOSE, (5.0, 10.0), (1.0, 1.5))))
+    assert float(cost.term({THRESHOLD: scalar(4.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0)
+    assert float(cost.term({THRESHOLD: scalar(2.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0.5)
+    assert float(cost.expected({THRESHOLD: scalar(2.0), CLOSE: scalar(10.0)}).detach()) == pytest.approx(0.06)
     value = scalar(3.0)
     cost.term({THRESHOLD: value}).backward()
     assert value.grad is not None and float(value.grad) < 0
     assert torch.autograd.gradcheck(lambda v: cost.term({THRESHOLD: v}), scalar(3.0))
 
 
-def test_as_the_settings_are_the_term_is_nothing_and_twice_the_time_costs_the_weight() -> None:
-    cost = TimeCost(0.5, 0.02, (Curve(THRESHOLD, (2.0, 4.0), (2.0, 1.0)), Curve(CLOSE, (5.0, 10.0), (1.0, 1.5))))
-    assert float(cost.term({THRESHOLD: scalar(4.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0)
-    assert float(cost.term({THRESHOLD: scalar(2.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0.5)
-    assert float(cost.expected({THRESHOLD: scalar(2.0), CLOSE: scalar(10.0)}).detach()) == pytest.approx(0.06)
-
-
 def test_the_points_are_allowed_values_on_either_side_of_the_parameters_own() -> None:
     settings = with_parameters(Settings(), {THRESHOLD: 200.0, BLUR: 5})
-    assert list(timed_points(settings, [THRESHOLD, BLUR])) == [
-        ("", 0.0),
-        (THRESHOLD, 100.0),
-        (THRESHOLD, 255.0),
-        (BLUR, 3.0),
-        (BLUR, 11.0),
-    ]
+    points = [("", 0.0), (THRESHOLD, 100.0), (THRESHOLD, 255.0), (BLUR, 3.0), (BLUR, 11.0)]
+    assert list(timed_points(settings, [THRESHOLD, BLUR])) == points
 
 
 def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() -> None:
     settings = with_parameters(Settings(), {THRESHOLD: 8.0})
     noise = iter(1 + 0.01 * k for k in (0, 1, -1, 2, 0, 1, -2, 0, 1, 0, 2, -1, 1, 0, -1, 0, 1, 2, 0, 0))
-
-    def timed(changed: Settings) -> float:
-        return 0.1 * 8 / changed.difference.threshold * next(noise)
-
-    cost = measure_cost(timed, settings, [THRESHOLD, CLOSE], 1.0)
+    cost = measure_cost(
+        lambda changed: 0.1 * 8 / changed.difference.threshold * next(noise), settings, [THRESHOLD, CLOSE], 1.0
+    )
     (curve,) = cost.curves
     assert curve.parameter == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
     assert curve.times == pytest.approx((2, 1, 0.5), rel=0.05) and cost.seconds == pytest.approx(0.1, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "[]",
-        '{"weight": 1, "seconds": 1, "curves": [1]}',
-        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.threshold", "values": ["a"], "times": [1]}]}',
-        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.threshold", "values": [1, 2], "times": [1]}]}',
-        '{"weight": 1, "seconds": 1, "curves": [{"knob": "difference.absent", "values": [1], "times": [1]}]}',
-    ],
-)
-def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, content: str) -> None:
-    (tmp_path / "cost.json").write_text(content)
+CURVE = '{"knob": "difference.threshold", "values": [1, 2], "times": [1]}'
+
+
+@pytest.mark.parametrize("curves", [None, "1", CURVE, CURVE.replace("1, 2", '"a"'), CURVE.replace("threshold", "no")])
+def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, curves: str | None) -> None:
+    text = f'{{"weight": 1, "seconds": 1, "curves": [{curves}]}}' if curves else ""
+    (tmp_path / "cost.json").write_text(text)
     with pytest.raises(InputError, match="does not hold the cost"):
         read_cost(tmp_path / "cost.json")
 
