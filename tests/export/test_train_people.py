@@ -47,7 +47,7 @@ def stick(image, feet, height, rng):
 
 
 def line(image, start, end, colour, thick):
-    cv2.line(image, *(tuple(map(round, place)) for place in (start, end)), colour, max(1, round(thick)))
+    cv2.line(image, tuple(map(round, start)), tuple(map(round, end)), colour, max(1, round(thick)))
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +131,6 @@ def test_descriptors_are_opencvs():
     window = background(np.random.default_rng(2), (66, 130))
     theirs = np.ravel(cv2.HOGDescriptor().compute(window, winStride=(8, 8), locations=[(1, 1)]))
     np.testing.assert_allclose(script.descriptors(window[None], PeopleParameters())[0], theirs, atol=1e-5)
-
-
-def test_the_windows_that_score_highest_are_the_hardest():
-    parts = [Part((64, 96), 0, 0, 64, 96), Part((40, 70), 0, 0, 40, 70)]
-    maps = [np.array([[0.1, 0.9, -2], [0.3, -0.6, 0]], np.float32), np.array([[0.5, -0.4]], np.float32)]
-    found = script.hardest(parts, maps, SMALL, -0.5, 4)
-    assert [(part.level[0], part.x, part.y) for part in found] == [(64, 8, 0), (40, 0, 0), (64, 0, 8), (64, 0, 0)]
-    assert len(script.hardest(parts, maps, SMALL, -0.5, 100)) == 6
-    assert script.hardest(parts, maps, SMALL, 1.0, 4) == []
 
 
 def error_line(capsys, *words):

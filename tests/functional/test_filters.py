@@ -108,12 +108,6 @@ def test_the_gradient_is_opencvs(texture):
     np.testing.assert_array_equal(difference.gradient(batch(picture))[0, 0].numpy().astype(np.uint8), wanted)
 
 
-def test_the_masked_median_is_of_the_masked_values_alone():
-    values = torch.tensor([[5.0, 1.0, 9.0, 3.0, 7.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
-    mask = torch.tensor([[True, True, False, True, True], [False] * 5])
-    assert difference.masked_median(values, mask).tolist() == [[3.0], [0.0]]
-
-
 @pytest.mark.parametrize("block", [2, 3, 5, 7])
 def test_min_eigenvalue_is_opencvs_to_a_millionth_of_its_maximum(texture, tensor, block):
     picture = texture(0, 37, 53)

@@ -50,8 +50,8 @@ def test_with_a_prediction_one_level_and_a_small_table_do(scene, tensor):
     first, second, corners, points = scene
     truth = plane_maps.transfer(torch.from_numpy(MOTION).float()[None], points)
     guess = truth + 0.4 * torch.randn(points.shape, generator=torch.Generator().manual_seed(0))
-    views, how = pyramids(tensor, first, second, 1), {"window_px": 15, "iterations": 5, "reach_px": 2}
-    found, ok = flow.track(points, *views, guess=guess, **how)
+    views = pyramids(tensor, first, second, 1)
+    found, ok = flow.track(points, *views, guess=guess, window_px=15, iterations=5, reach_px=2)
     wanted, _ = by_opencv(first, second, corners, 1, 15, guess[0].numpy()[:, None].copy())
     seen = inner(truth, 10, 10, 250, 190)
     assert (ok & seen).sum() >= 0.97 * seen.sum()

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -51,11 +50,12 @@ def sides(found: Descended) -> list[float]:
     return [step.parameters[ERODE] for step in found.history]
 
 
-def test_the_same_arguments_give_the_same_steps_and_another_seed_gives_others() -> None:
+def test_steps_repeat_with_the_seed_and_softness_goes_down_evenly_in_its_logarithm() -> None:
     first, again = (descend(Bowl(), parameters(), pieces(), QUICK) for _ in range(2))
     other = descend(Bowl(), parameters(), pieces(), replace(QUICK, seed=1))
     assert same(first, again)
     assert first.history[-1].parameters != other.history[-1].parameters
+    assert [step.softness for step in first.history[1:]] == pytest.approx([0.1 ** (k / 11) for k in range(12)])
 
 
 @pytest.mark.parametrize("stop", [0, 5, 6, 12])
@@ -103,31 +103,14 @@ def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path: Path, content: by
         descend(Bowl(), parameters(), pieces(), QUICK, place=place, resume=True)
 
 
-def test_softness_goes_down_evenly_in_its_logarithm() -> None:
-    softness = [step.softness for step in descend(Bowl(), parameters(), pieces(), QUICK).history[1:]]
-    assert softness[0] == pytest.approx(1) and softness[-1] == pytest.approx(0.1)
-    ratios = [b / a for a, b in pairwise(softness)]
-    assert max(ratios) == pytest.approx(min(ratios)) and max(ratios) < 1
-
-
-def shifted(learned: float, watched: float) -> list[Example]:
-    """Examples with one lowest place for what is learned from and another for what is watched."""
-    return [replace(one, content=one.content + (learned if one.frame <= 6 else watched)) for one in pieces(spread=0.0)]
-
-
 def test_it_stops_where_the_watched_examples_gain_no_more_and_keeps_their_best_state() -> None:
+    # What is learned from lies far above what is watched: every step beyond the watched ones' place is a loss.
+    examples = [replace(one, content=one.content + 2.0 * (one.frame <= 6)) for one in pieces(spread=0.0)]
     plan = Plan(steps=200, rate=0.1, look_every=2, patience=3)
-    found = descend(Bowl(), parameters(names=[THRESHOLD]), shifted(2.0, 0.0), plan)
+    found = descend(Bowl(), parameters(names=[THRESHOLD]), examples, plan)
     assert "no gain" in found.ended and found.history[-1].step == found.best + 6 < 200
     assert found.settings.difference.threshold == pytest.approx(math.exp(3), rel=0.2)
     assert found.history[-1].parameters[THRESHOLD] > found.settings.difference.threshold * 1.2
-
-
-def test_where_nothing_is_gained_the_settings_are_as_they_were() -> None:
-    start = with_parameters(Settings(), {THRESHOLD: 10.0, NOISE: 2.0})
-    away = shifted(5.0, math.log(10) - 3)
-    found = descend(Bowl(), Parameters(start, [THRESHOLD]), away, replace(QUICK, patience=2))
-    assert found.best == 0 and found.settings == start
 
 
 @pytest.mark.parametrize(
@@ -148,11 +131,6 @@ def test_what_is_no_number_names_clip_frame_and_parameter_and_the_last_good_stat
     assert all(math.isfinite(value) for step in found.history for value in step.parameters.values())
 
 
-def test_a_loss_that_is_no_number_from_the_start_is_bad_input() -> None:
-    with pytest.raises(InputError, match="two, frame 8, whatever the parameters, before the first step"):
-        descend(Bowl(wrong=("two", 8)), parameters(), pieces(), QUICK)
-
-
 @pytest.mark.slow
 def test_a_pull_keeps_parameters_near_their_start_and_the_stronger_the_nearer() -> None:
     plan = Plan(steps=80, rate=0.1)
@@ -167,8 +145,18 @@ def test_a_pull_keeps_parameters_near_their_start_and_the_stronger_the_nearer() 
 def test_an_impossible_plan_is_refused(wrong: dict) -> None:
     with pytest.raises(InputError, match="must be"):
         replace(QUICK, **wrong)
-    with pytest.raises(InputError, match="nothing to tune motion on"):
-        descend(Bowl(), parameters(), [], QUICK)
+
+
+@pytest.mark.parametrize(
+    ("examples", "line"),
+    [
+        ([], "nothing to tune motion on"),
+        (pieces(), "two, frame 8, whatever the parameters, before the first step"),
+    ],
+)
+def test_examples_without_a_loss_are_refused(examples, line) -> None:
+    with pytest.raises(InputError, match=line):
+        descend(Bowl(wrong=("two", 8)), parameters(), examples, QUICK)
 
 
 def test_states_are_watched_as_the_settings_round_them() -> None:

@@ -12,7 +12,7 @@ from tests.tuning.worlds import filmed_clip, flown, seen, spotted_clip, walk
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.tuning.family import FAMILIES, Example, Family, load_family
+from torchvision_dddas.tuning.family import Example, Family, load_family
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
 
 SETTINGS = Settings()
@@ -101,19 +101,10 @@ def tuned(case: Case) -> Parameters:
     return Parameters(case.settings, [name for name, one in TUNABLE.items() if one.family == case.name])
 
 
-def test_a_family_names_itself_and_its_measure(made: Made) -> None:
-    case, family, *_ = made
-    assert family.name == case.name in FAMILIES
-    assert family.measure.split(".")[0] == family.task
-    first, last = family.softness
-    assert first >= last >= 0
-    family.check([], case.settings)
-
-
 def test_examples_are_the_labelled_frames_in_order_with_their_settings(made: Made) -> None:
-    case, _, clip, examples = made
-    assert [example.frame for example in examples] == case.frames
-    assert {example.clip for example in examples} == {clip.name}
+    case, family, clip, examples = made
+    assert family.measure.split(".")[0] == family.task
+    assert [(example.clip, example.frame) for example in examples] == [(clip.name, frame) for frame in case.frames]
     assert all(example.settings is case.settings for example in examples)
 
 

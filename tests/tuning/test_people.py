@@ -1,6 +1,7 @@
 """The family of people: its parts are those of the hard detector, and parameters that drew the truth are found."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def picture(seed: int, true: PeopleParameters) -> ScoredPicture:
 
 @pytest.mark.slow
 def test_parameters_that_drew_the_truth_are_found_again():
-    shares = {"height_share": 0.8, "width_share": 0.42, "feet_share": 0.9}
+    shares: dict[str, Any] = {"height_share": 0.8, "width_share": 0.42, "feet_share": 0.9}
     true = PeopleParameters(**shares, probability_slope=4.0, probability_even=0.5)
     batch = [Example("drawn", seed, picture(seed, true)) for seed in range(20)]
     plan = Plan(steps=60, batch=10, rate=0.1, look_every=20, watched=0)
@@ -77,24 +78,16 @@ def test_soft_f_tends_to_hard_as_softness_vanishes():
     assert hard == pytest.approx(2 * 2 / (3 + 4))
     away = [abs(one - hard) for one in soft]
     assert away == sorted(away, reverse=True) and away[-1] < 1e-3
-
-
-def test_f_of_a_picture_without_people_falls_with_every_false_one():
-    margin, wrong, threshold = torch.tensor([2.0, 1.0]), torch.zeros(2), torch.tensor(0.0)
-    f = [float(soft_f1(margin[:n], wrong[:n], 0, threshold, 0.0)) for n in (0, 1, 2)]
-    assert f == pytest.approx([1, 1 / 2, 1 / 3])
+    without_people = [float(soft_f1(margin[:n], 0 * right[:n], 0, torch.tensor(0.0), 0.0)) for n in (0, 1, 2)]
+    assert without_people == pytest.approx([1, 1 / 2, 1 / 3])
 
 
 def test_detections_below_the_threshold_are_kept_without_a_probability() -> None:
     image, true = spotted()
-    truth = Truth("boxes", Path("spots"), {}, {1: true})
-    found = score_picture(image, truth, 1, PeopleParameters(), Spots())
+    found = score_picture(image, Truth("boxes", Path("spots"), {}, {1: true}), 1, PeopleParameters(), Spots())
     assert found.margin.tolist() == pytest.approx([1.5, 0.5, -0.5])
     assert found.right.tolist() == [1, 0, 0] and (found.shown, found.people) == (2, 1)
     np.testing.assert_allclose(found.true_px.numpy(), true)
     np.testing.assert_allclose(found.window_px.numpy(), [[8, 16, 64, 128]])
-
-
-def test_other_suppressions_than_nms_are_refused() -> None:
     with pytest.raises(InputError, match="set it to nms"):
         PeopleFamily().examples([], with_parameters(Settings(), {"people.suppression": "opencv"}))

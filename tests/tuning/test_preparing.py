@@ -30,11 +30,13 @@ def test_examples_are_of_the_clips_that_are_not_held_out(clips) -> None:
     assert set(ready.parameters.names) >= {"difference.threshold", "difference.noise_levels"}
 
 
-def test_a_clip_without_the_truth_that_is_needed_is_named(clips) -> None:
-    with pytest.raises(InputError, match="boxes"):
-        prepare(read_spec(clips), clips.parent, ["difference.threshold"], (), ["boxes"])
-
-
-def test_parameters_of_several_families_are_refused(clips) -> None:
-    with pytest.raises(InputError, match=r"motion: difference\.threshold; tracking: track\.speed"):
-        prepare(read_spec(clips), clips.parent, ["difference.threshold", "track.speed"])
+@pytest.mark.parametrize(
+    ("names", "chosen", "line"),
+    [
+        (["difference.threshold"], ["boxes"], "boxes"),
+        (["difference.threshold", "track.speed"], (), r"motion: difference\.threshold; tracking: track\.speed"),
+    ],
+)
+def test_clips_without_truth_and_parameters_of_several_families_are_refused(clips, names, chosen, line) -> None:
+    with pytest.raises(InputError, match=line):
+        prepare(read_spec(clips), clips.parent, names, (), chosen)

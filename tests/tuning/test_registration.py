@@ -112,10 +112,9 @@ def test_what_is_too_wide_takes_in_what_moves_slowly_and_its_slope_says_so() -> 
 
 
 def test_what_does_not_find_back_is_left_out_by_the_check() -> None:
-    points = scene(slow_px=0.0)
-    off = [float(refit_motion(points, TRUE, number(4.0), check, fit).off_px) for check in (None, number(1.0))]
+    points, check = scene(slow_px=0.0), number(2.1)
+    off = [float(refit_motion(points, TRUE, number(4.0), one, fit).off_px) for one in (None, number(1.0))]
     assert off[1] < off[0]
-    check = number(2.1)
     refit_motion(points, TRUE, number(4.0), check, fit, 0.2).off_px.backward()
     assert check.grad is not None and float(check.grad) > 0
 

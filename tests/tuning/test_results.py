@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -53,13 +54,7 @@ def test_the_figures_are_those_of_the_study_before_and_after(clips, found) -> No
         of = {names: [case for case in cases if case.clip.name in names] for names in (("one", "two"), ("held",))}
         assert found.tuned.pooled[when] == goal_value(GOAL, of["one", "two"])[0]
         assert found.held is not None and found.held.pooled[when] == goal_value(GOAL, of["held",])[0]
-
-
-def test_a_change_for_the_worse_is_never_called_better(found) -> None:
-    assert found.tuned.pooled[0] > found.tuned.pooled[1]
-    assert found.tuned.mean[0] > found.tuned.mean[1]
-    assert "better" not in found.tuned.says
-    assert found.as_json()["held_out"]["clips"] == ("held",) and found.as_json()["tuned"]["frame_ms"]["before"] > 0
+    assert found.tuned.mean[0] > found.tuned.mean[1] and "better" not in found.tuned.says
 
 
 @pytest.mark.parametrize(
@@ -201,15 +196,15 @@ def test_the_points_are_allowed_values_on_either_side_of_the_parameters_own() ->
     assert list(timed_points(settings, [THRESHOLD, BLUR])) == points
 
 
-def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing() -> None:
-    settings = with_parameters(Settings(), {THRESHOLD: 8.0})
-    noise = iter(1 + 0.01 * k for k in (0, 1, -1, 2, 0, 1, -2, 0, 1, 0, 2, -1, 1, 0, -1, 0, 1, 2, 0, 0))
+def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing(tmp_path: Path) -> None:
+    settings, noise = with_parameters(Settings(), {THRESHOLD: 8.0}), cycle((1.0, 1.01, 0.99, 1.02, 1.0, 1.01, 0.98))
     cost = measure_cost(
         lambda changed: 0.1 * 8 / changed.difference.threshold * next(noise), settings, [THRESHOLD, CLOSE], 1.0
     )
     (curve,) = cost.curves
     assert curve.parameter == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
     assert curve.times == pytest.approx((2, 1, 0.5), rel=0.05) and cost.seconds == pytest.approx(0.1, rel=0.05)
+    assert 0 < frame_timer(filmed_clip(tmp_path, 5), "motion", load_config("fast"), "onboard")(load_config("fast")) < 10
 
 
 CURVE = '{"knob": "difference.threshold", "values": [1, 2], "times": [1]}'
@@ -227,8 +222,3 @@ def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
     cost = TimeCost(0.1, 1 / 3, (Curve(THRESHOLD, (2.0, 4.0), (1.1, 1.0)),))
     (tmp_path / "cost.json").write_text(json.dumps(cost.as_json()))
     assert read_cost(tmp_path / "cost.json") == cost
-
-
-def test_a_frame_is_timed_by_the_hard_pipeline(tmp_path: Path) -> None:
-    timed = frame_timer(filmed_clip(tmp_path, 5), "motion", load_config("fast"), "onboard")
-    assert 0 < timed(load_config("fast")) < 10
