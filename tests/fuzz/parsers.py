@@ -16,7 +16,6 @@ import numpy as np
 
 from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
-from tests.fuzz.layouts import LAYOUTS, ROOT
 from torchvision_dddas.cli.colours import parse_box, parse_names
 from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError
@@ -27,13 +26,7 @@ from torchvision_dddas.evaluation.metrics import truth
 from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.geo.site import looks_swapped
 from torchvision_dddas.geometry import poses_at
-from torchvision_dddas.io.camera_files import (
-    describe_missing,
-    has_measurements,
-    read_camera,
-    read_measurements,
-    read_poses,
-)
+from torchvision_dddas.io import camera_files
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import check_table, read_detections, read_header, read_rows
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
@@ -64,11 +57,11 @@ class Parser:
     file: str
     seeds: Callable[[], Sequence[bytes]]
     read: Callable[[Path], object]
-    text: bool = True
     words: Sequence[str] = ()
+    share: float = 1.0
+    text: bool = True
     beside: Callable[[], Mapping[str, bytes]] = dict
     needs: str = ""
-    share: float = 1.0
 
     @property
     def there(self) -> bool:
@@ -76,7 +69,7 @@ class Parser:
         return not self.needs or find_spec(self.needs) is not None
 
     def case(self, seed: int, number: int) -> bytes:
-        """The input of a number: the same whenever and wherever it is asked for. Number 0 is a whole file."""
+        """The input of a number: the same whenever and wherever it is asked for. The first are the whole files."""
         whole = self.seeds()
         if number < len(whole):
             return whole[number]
@@ -84,12 +77,11 @@ class Parser:
 
     def prepare(self, folder: Path) -> Path:
         """The folder with what lies beside the input; the input's path in it."""
-        path = folder / self.file
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for name, content in self.beside().items():
+        for name, content in {self.file: b"", **self.beside()}.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_bytes(content)
-        return path
+            if name != self.file:
+                (folder / name).write_bytes(content)
+        return folder / self.file
 
     def try_on(self, path: Path, content: bytes) -> str | None:
         """What the reader says of a content: None where it takes it, the refusal where it does not.
@@ -110,8 +102,9 @@ class Parser:
 # -- What is done with each --------------------------------------------------------------------------------------------
 
 _CAMERA = Camera("a", (640, 480), (500.0, 500.0), (319.5, 239.5), (0.0, 0.0), False)
-_GRAPHS = ("people_histograms.onnx", "people_scores.onnx")
 _CORNERS = np.array([[0.0, 0.0], [10.0, 10.0]])
+ROOT = "set"
+"""The folder of a data set."""
 _CLIP = {
     "true/gt.txt": seeds.TEXT["mot"][0].encode(),
     "true/seqinfo.ini": seeds.TEXT["seqinfo"][0].encode(),
@@ -162,17 +155,17 @@ def _landmarks(path: Path) -> None:
 
 
 def _measurements(path: Path) -> None:
-    has_measurements(path)
-    _check_finite(*read_measurements(path))
+    camera_files.has_measurements(path)
+    _check_finite(*camera_files.read_measurements(path))
 
 
 def _camera(path: Path) -> None:
-    describe_missing(path)
-    read_camera(path)
+    camera_files.describe_missing(path)
+    camera_files.read_camera(path)
 
 
 def _poses(path: Path) -> None:
-    _, poses = poses_at(_CAMERA, read_poses(path), np.array([1, 3, 5]), 10.0)
+    _, poses = poses_at(_CAMERA, camera_files.read_poses(path), np.array([1, 3, 5]), 10.0)
     _check_finite(*(np.asarray(values) for values in vars(poses).values()))
 
 
@@ -256,63 +249,96 @@ def _dataset(kind: str, path: Path) -> None:
         assert true.frames and true.frames[0] >= 1
 
 
-_PLACES = ("east_m", "north_m", "longitude_deg", "latitude_deg", "frame", "time_s", "score", "1", "10000001")
-_TOML = (
-    *("[[", "]]", "[a]", "low", "high", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "1e400"),
-    "0x7fffffffffffffffff",
-)
-_JSON = ("Infinity", "NaN", "null", "[]", "{}", '"x"')
+# -- The readers -------------------------------------------------------------------------------------------------------
 
-# Name, file, seeds, what is done, words, share.
-_TEXTS: tuple[tuple[str, str, str, Callable[[Path], object], Sequence[str], float], ...] = (
-    ("MOT text", "gt.txt", "mot", _truth, (), 1),
-    ("truth of a clip", "true/gt.txt", "mot", _evaluated, (), 1),
-    ("tracks of a result", "found/tracks.txt", "mot", _evaluated, (), 1),
-    ("seqinfo.ini", "true/seqinfo.ini", "seqinfo", _evaluated, (), 0.5),
-    ("run.json", "found/run.json", "record", _record, _JSON, 0.5),
-    ("detections as text", "detections.txt", "mot", _detections, (), 1),
-    ("detections as CSV", "detections.csv", "detections", _detections, _PLACES, 1),
-    ("positions CSV", "p.csv", "positions", lambda path: _check_finite(read_positions(path).east_north_m), _PLACES, 1),
-    ("landmarks CSV", "landmarks.csv", "landmarks", _landmarks, _PLACES, 1),
-    ("measurements CSV", "measured.csv", "measurements", _measurements, (), 0.5),
-    ("poses CSV", "poses.csv", "poses", _poses, _PLACES, 1),
-    ("camera TOML", "camera.toml", "camera", _camera, _TOML, 1),
-    ("colours TOML", "colours.toml", "colours", read_colours, _TOML, 1),
-    ("settings TOML", "settings.toml", "settings", lambda path: changes(load_config(path)), _TOML, 1),
-    ("overrides", "override.txt", "overrides", _overrides, ("=", ".", "world.side_m=1", "crowd.1.people=2"), 1),
-    ("scenario TOML", "scenario.toml", "scenario", _scenario, _TOML, 1),
-    ("telemetry CSV", "flight.csv", "own telemetry", _telemetry, _PLACES, 1),
-    ("tables of other programs", "flight.csv", "program telemetry", _telemetry, ("frame", "date", "(rad)"), 1),
-    ("SRT", "a.SRT", "subtitles", _telemetry, ("-->", "GPS(", "[latitude:", "H 5m", "00:00:01,000 --> "), 1),
-    ("NMEA 0183", "track.nmea", "nmea", _telemetry, ("$GPGGA,", "*00", "$", "A", "V", "W"), 1),
-    ("classifier as text", "a.txt", "classifier text", _classifier, (), 0.3),
-    ("addresses to serve at", "address.txt", "addresses", _address, (), 0.3),
-    ("names of streams", "stream.txt", "streams", _stream_word, ("json:", "cot:"), 0.3),
-    ("names of inputs", "input.txt", "input names", _input_name, (), 0.5),
-    ("other words", "words.txt", "other words", _other_words, ("camera:", "://", "@"), 1),
-    ("studies", "study.toml", "studies", read_spec, (*_TOML, "[[dataset]]", "kind = ", "folder = "), 1),
+_PLACES = ("east_m", "north_m", "longitude_deg", "latitude_deg", "frame", "time_s", "score", "1", "10000001")
+_TOML = ("[[", "]]", "[a]", "low", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "1e400", "0x7fffffffffffffffff")
+# Name, file, what is done, seeds, words, share.
+_TEXTS: tuple[tuple[str, str, Callable[[Path], object], str, Sequence[str], float], ...] = (
+    ("MOT text", "gt.txt", _truth, "mot", (), 1),
+    ("truth of a clip", "true/gt.txt", _evaluated, "mot", (), 1),
+    ("tracks of a result", "found/tracks.txt", _evaluated, "mot", (), 1),
+    ("seqinfo.ini", "true/seqinfo.ini", _evaluated, "seqinfo", (), 0.5),
+    ("run.json", "found/run.json", _record, "record", ("Infinity", "NaN", "null", "[]", "{}", '"x"'), 0.5),
+    ("detections as text", "detections.txt", _detections, "mot", (), 1),
+    ("detections as CSV", "detections.csv", _detections, "detections", _PLACES, 1),
+    ("positions CSV", "p.csv", lambda path: _check_finite(read_positions(path).east_north_m), "positions", _PLACES, 1),
+    ("landmarks CSV", "landmarks.csv", _landmarks, "landmarks", _PLACES, 1),
+    ("measurements CSV", "measured.csv", _measurements, "measurements", (), 0.5),
+    ("poses CSV", "poses.csv", _poses, "poses", _PLACES, 1),
+    ("camera TOML", "camera.toml", _camera, "camera", _TOML, 1),
+    ("colours TOML", "colours.toml", read_colours, "colours", _TOML, 1),
+    ("settings TOML", "settings.toml", lambda path: changes(load_config(path)), "settings", _TOML, 1),
+    ("overrides", "override.txt", _overrides, "overrides", ("=", ".", "world.side_m=1", "crowd.1.people=2"), 1),
+    ("scenario TOML", "scenario.toml", _scenario, "scenario", _TOML, 1),
+    ("telemetry CSV", "flight.csv", _telemetry, "own telemetry", _PLACES, 1),
+    ("tables of other programs", "flight.csv", _telemetry, "program telemetry", ("frame", "date", "(rad)"), 1),
+    ("SRT", "a.SRT", _telemetry, "subtitles", ("-->", "GPS(", "[latitude:", "H 5m", "00:00:01,000 --> "), 1),
+    ("NMEA 0183", "track.nmea", _telemetry, "nmea", ("$GPGGA,", "*00", "$", "A", "V", "W"), 1),
+    ("classifier as text", "a.txt", _classifier, "classifier text", (), 0.3),
+    ("addresses to serve at", "address.txt", _address, "addresses", (), 0.3),
+    ("names of streams", "stream.txt", _stream_word, "streams", ("json:", "cot:"), 0.3),
+    ("names of inputs", "input.txt", _input_name, "input names", (), 0.5),
+    ("other words", "words.txt", _other_words, "other words", ("camera:", "://", "@"), 1),
+    ("studies", "study.toml", read_spec, "studies", (*_TOML, "[[dataset]]", "kind = ", "folder = "), 1),
 )
-# Name, file, what is done, seeds, a library that is needed, share.
-_BYTES: tuple[tuple[str, str, Callable[[Path], object], Callable[[], Sequence[bytes]], str, float], ...] = (
-    ("MISB ST 0601 in MPEG-TS", "video.ts", _telemetry, seeds.misb, "", 1),
-    ("KLV", "flight.klv", _telemetry, seeds.klv, "", 1),
-    ("MAVLink tlog", "flight.tlog", _telemetry, seeds.mavlink, "pymavlink", 1),
-    ("PX4 ULog", "flight.ulg", _telemetry, seeds.px4, "pyulog", 0.7),
+# Name, file, what is done, seeds and what they are given, a library that is needed, share.
+_BYTES: tuple[tuple[str, str, Callable[[Path], object], Callable[..., Sequence[bytes]], tuple, str, float], ...] = (
+    ("MISB ST 0601 in MPEG-TS", "video.ts", _telemetry, seeds.klv, (True,), "", 1),
+    ("KLV", "flight.klv", _telemetry, seeds.klv, (False,), "", 1),
+    ("MAVLink tlog", "flight.tlog", _telemetry, seeds.mavlink, (), "pymavlink", 1),
+    ("PX4 ULog", "flight.ulg", _telemetry, seeds.px4, (), "pyulog", 0.7),
     *(
-        (f"classifier .{e}", f"a.{e}", _classifier, partial(seeds.classifiers, f".{e}"), "", 0.3)
-        for e in ("npy", "npz")
+        ("classifier " + e, "a" + e, _classifier, seeds.classifiers, (e,), "", 0.3)
+        for e in (".npy", ".npz", ".yml", ".xml", ".json")
     ),
-    ("folder of PNGs", "clip/frame2.png", _folder, partial(seeds.pictures, ".png", True), "", 1),
-    ("folder of JPEGs", "clip/frame1.jpg", _folder, partial(seeds.pictures, ".jpg"), "", 1),
-    ("folder of TIFFs", "clip/frame1.tif", _folder, partial(seeds.pictures, ".tiff", True), "", 1),
-    ("folder of BMPs", "clip/a.bmp", _folder, partial(seeds.pictures, ".bmp"), "", 0.5),
-    ("masks", "000001.png", truth.read_mask, partial(seeds.pictures, ".png", True), "", 0.5),
-    ("video .avi", "a.avi", _video, partial(seeds.videos, ".avi", "MJPG"), "", 0.15),
-    ("video .mp4", "a.mp4", _video, partial(seeds.videos, ".mp4", "mp4v"), "", 0.15),
-    ("video H.264", "a.mp4", _video, seeds.h264, "av", 0.15),
-    ("elevation", "a.tif", lambda p: read_elevation(p, _CORNERS, None, 30), partial(seeds.raster, 1), "rasterio", 0.3),
-    ("photo", "a.tif", lambda p: read_ortho(p, _CORNERS, None, 30), partial(seeds.raster, 3), "rasterio", 0.3),
+    ("folder of PNGs", "clip/frame2.png", _folder, seeds.pictures, (".png", True), "", 1),
+    ("folder of JPEGs", "clip/frame1.jpg", _folder, seeds.pictures, (".jpg",), "", 1),
+    ("folder of TIFFs", "clip/frame1.tif", _folder, seeds.pictures, (".tiff", True), "", 1),
+    ("folder of BMPs", "clip/a.bmp", _folder, seeds.pictures, (".bmp",), "", 0.5),
+    ("folder of other images", "clip/a.ppm", _folder, seeds.pictures, (".ppm",), "", 0.5),
+    ("masks", "000001.png", truth.read_mask, seeds.pictures, (".png", True), "", 0.5),
+    ("video .avi", "a.avi", _video, seeds.videos, (".avi", "MJPG"), "", 0.15),
+    ("video .mp4", "a.mp4", _video, seeds.videos, (".mp4", "mp4v"), "", 0.15),
+    ("video H.264", "a.mp4", _video, seeds.videos, (".mp4", "libx264"), "av", 0.15),
+    ("elevation", "a.tif", lambda path: read_elevation(path, _CORNERS, None, 30), seeds.raster, (1,), "rasterio", 0.3),
+    ("photo", "a.tif", lambda path: read_ortho(path, _CORNERS, None, 30), seeds.raster, (3,), "rasterio", 0.3),
 )
+_OPENCV = ("a.yml", "a.xml", "a.json")
+_CONFIG = (
+    "function seqs=configSeqs\n\nseqUAV123 = {struct('name','car_1','path','D:\\data_seq\\UAV123\\car\\',"
+    "'startFrame',1,'endFrame',3,'nz',6,'ext','jpg','init_rect',[0,0,0,0])};\n"
+)
+_VIVID = "name,frame,id,x,y,w,h\ncar,0,7,1,2,8,5\ntruck,0,9,15,2,8,5\ncar,1,7,3,2,8,5\n"
+_OF_2017 = "1,1,1,2,30,40,1,1,1\n1,2,100,20,30,40,0,2,0.5\n2,1,2,2,30,40,1,1,0.8\n3,5,40,20,30,40,0,3,1\n"
+_GT = "UAV-benchmark-MOTD_v1.0/GT/M1_gt_"
+# Name, kind, clip, file, contents besides those of a good clip.
+_DATA_SETS: tuple[tuple[str, str, str, str, Sequence[str]], ...] = (
+    ("MOTChallenge's gt.txt", "motchallenge", "S", "S/gt/gt.txt", [_OF_2017]),
+    ("MOTChallenge's seqinfo.ini", "motchallenge", "S", "S/seqinfo.ini", []),
+    ("VisDrone-MOT", "visdrone", "a", "annotations/a.txt", []),
+    ("UAVDT's truth", "uavdt", "M1", f"{_GT}whole.txt", []),
+    ("UAVDT's ignored regions", "uavdt", "M1", f"{_GT}ignore.txt", ["1,1,20,0,10,10,1,-1,-1\n"]),
+    ("Stanford Drone", "sdd", "a-b", "annotations/a/b/annotations.txt", []),
+    ("CVML", "cvml", "a", "a.xml", []),
+    *((f"KITTI's {part}", "kitti", "0", f"training/{part}/0.txt", []) for part in ("label_02", "calib", "oxts")),
+    ("INRIA's annotations", "inria", "a", "Test/annotations/a.txt", []),
+    ("BMS's definition", "bms", "cars", "Trainingset/cars/GroundTruth/carsDef.dat", []),
+    ("CDnet's temporal region", "cdnet", "PTZ-zoom", "PTZ/zoom/temporalROI.txt", ["2\t2"]),
+    ("UAV123's boxes", "uav123", "bike1", "anno/UAV123/bike1.txt", []),
+    ("UAV123's clips", "uav123", "car", "configSeqs.m", [_CONFIG]),
+    ("VIVID's vehicles", "vivid", "egtest01", "egtest01_truth.csv", [_VIVID]),
+    ("VIVID's target", "vivid", "egtest01", "egtest01_gt.txt", ["1,2,8,5\n" * 21]),
+)
+_WORDS = {
+    "motchallenge": ("imDir=..", "%(name)s", "frameRate=nan", "[DEFAULT]"),
+    "sdd": ('"Biker"', "Car", '"'),
+    "cvml": ("<frame", "</objectlist>", 'id="', "&amp;", "&a;", "<!DOCTYPE a [", 'encoding="utf-7"', "]]>", "<box/>"),
+    "kitti": ("DontCare", "Car", "R_rect", "Tr_velo_cam", "-1000", "1e9"),
+    "inria": ("(Xmin, Ymin)", "object 3", "-99999999", "Image size (X x Y x C) :"),
+    "bms": ("File name:", "Frame number:", "Scale of region 1:", "../../a.pgm", "/"),
+    "uav123": ("NaN,NaN,NaN,NaN", "'startFrame',", "'endFrame',9", "'name','..'", "'path','/'"),
+}
 
 
 def _beside(file: str) -> Mapping[str, bytes]:
@@ -324,31 +350,32 @@ def _beside(file: str) -> Mapping[str, bytes]:
     return {"clip/frame2.jpg": seeds.pictures(".jpg")[0]} if file == "clip/frame1.jpg" else {}
 
 
+def _data_set(name: str, kind: str, clip: str, file: str, more: Sequence[str]) -> Parser:
+    """A data set of which one file is damaged."""
+
+    def files() -> dict[str, bytes]:
+        own = {} if file != "configSeqs.m" else {f"anno/UAV123/{clip}_1.txt": b"1,2,30,4\nNaN,NaN,NaN,NaN\n3,2,30,4\n"}
+        return {f"{ROOT}/{path}": content for path, content in {**seeds.data_set(kind, clip), **own}.items()}
+
+    def whole() -> list[bytes]:
+        return [content for path, content in files().items() if path == f"{ROOT}/{file}"] + [m.encode() for m in more]
+
+    return Parser(name, f"{ROOT}/{file}", whole, partial(_dataset, kind), _WORDS.get(kind, ()), 0.5, beside=files)
+
+
 PARSERS: tuple[Parser, ...] = (
     *(
-        Parser(name, file, partial(seeds.text, kind), read, True, words, partial(_beside, file), share=share)
-        for name, file, kind, read, words, share in _TEXTS
+        Parser(name, file, partial(seeds.text, kind), read, words, share, beside=partial(_beside, file))
+        for name, file, read, kind, words, share in _TEXTS
     ),
     *(
-        Parser(name, file, whole, read, False, (), partial(_beside, file), needs, share)
-        for name, file, read, whole, needs, share in _BYTES
+        Parser(name, file, partial(make, *given), read, (), share, file in _OPENCV, partial(_beside, file), needs)
+        for name, file, read, make, given, needs, share in _BYTES
     ),
-    *(
-        Parser(f"classifier .{ending}", f"a.{ending}", partial(seeds.classifiers, f".{ending}"), _classifier, share=0.3)
-        for ending in ("yml", "xml", "json")
-    ),
-    Parser("folder of other images", "clip/a.ppm", partial(seeds.pictures, ".ppm"), _folder, share=0.5),
     Parser(
-        "manifest of graphs",
-        "manifest.json",
-        lambda: [(SHIPPED / MANIFEST).read_bytes()],
+        *("manifest of graphs", "manifest.json", lambda: [(SHIPPED / MANIFEST).read_bytes()]),
         lambda path: find_graphs(PeopleParameters(graphs=str(path.parent))),
-        beside=lambda: {name: (SHIPPED / name).read_bytes() for name in _GRAPHS},
+        beside=lambda: {path.name: path.read_bytes() for path in SHIPPED.glob("people_*.onnx")},
     ),
-    *(
-        Parser(
-            one.name, f"{ROOT}/{one.file}", one.seeds, partial(_dataset, one.kind), True, one.words, one.others, "", 0.5
-        )
-        for one in LAYOUTS
-    ),
+    *(_data_set(*row) for row in _DATA_SETS),
 )

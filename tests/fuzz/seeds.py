@@ -1,18 +1,33 @@
 """Whole files of every kind that is read, small, from which damaged ones are made."""
 
-import json
 import tempfile
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from tests.io.flights import global_position, local_set, sentence, spread, tlog, transport_stream, ulog
+from tests.evaluation.datasets.layouts import MAKE
+from tests.io.clips import write_by_av, write_video
+from tests.io.flights import attitude, eastward, packet, sentence, spread, tlog, transport_stream, ulog
 
 FEATURES = 3780
 """Of the descriptor that the classifiers here fit."""
 
+
+def _subtitles(body: str) -> str:
+    return "".join(f"{i + 1}\n00:00:0{i},000 --> 00:00:0{i + 1},000\n{body.format(i=i)}\n\n" for i in range(5))
+
+
+def _rows(header: str, row: str, count: int = 8) -> str:
+    return header + "\n" + "".join(row.format(i=i, even=160 + i) + "\n" for i in range(count))
+
+
+_RMC = "GNRMC,12003{i}.50,A,4807.0380,N,01131.0000,W,10.0,084.4,230394,003.1,W"
+_NMEA = ("GPGGA,12003{i}.50,4807.0380,N,01131.0000,W,1,08,0.9,545.4,M,46.9,M,,", _RMC, "HEHDT,274.0,T")
+_UNCHECKED = ("$GPGLL,4807.038,N,01131.000,E,12003{i},A", f"${_RMC}", "$GPVTG,084.4,T,081.3,M,010.0,N,018.5,K")
+_COVARIANCE = "var_east_m2,cov_east_north_m2,var_north_m2"
 TEXT: dict[str, tuple[str, ...]] = {
     "mot": (
         "1,1,10,20,30,40,0.9,-1,-1,-1\n1,2,60,20,30.5,40,1,-1,-1,-1\n2,1,11,20,30,40,0,-1,-1,-1\n3,2,60,21,30,40,1\n",
@@ -21,25 +36,21 @@ TEXT: dict[str, tuple[str, ...]] = {
         "10,20,30,40\n11,20,30,40\nnan,nan,nan,nan\n12 20 30 40\n",
     ),
     "detections": (
-        ("frame,x_px,y_px,width_px,height_px,score,identity,cut,feet_u_px,feet_v_px\n"
-        "1,10,20,30,40,0.9,1,0,25,59.5\n2,11,20,30,40,0.8,1,1,,\n3,12,20,30,40,0.7,,0,27,59\n"),
+        ("frame,x_px,y_px,width_px,height_px,score,identity,cut,feet_u_px,feet_v_px\n1,10,20,30,40,0.9,1,0,25,59.5\n"
+        "2,11,20,30,40,0.8,1,1,,\n3,12,20,30,40,0.7,,0,27,59\n"),
         "frame,identity,x_px,y_px,width_px,height_px,score,kind,row,speed_px_per_frame\n1,1,1,2,3,4,0.5,moving,1,2.5\n",
     ),
     "positions": (
-        ("frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,longitude_deg,latitude_deg,score\n"
+        (f"frame,target,east_m,north_m,{_COVARIANCE},longitude_deg,latitude_deg,score\n"
         "1,1,0.5,1.5,1,0.1,1,-110.95,32.23,0.9\n2,1,0.6,1.5,1,0.1,1,-110.95,32.23,\n2,2,8,9,,,,-110.95,32.23,1\n"),
         "frame,target,east_m,north_m\n1,1,0,0\n5,2,1e3,-2\n",
     ),
     "landmarks": (
-        ("frame,landmark,u_px,v_px,longitude_deg,latitude_deg,sigma_m,planned\n"
-        "1,red,10,20,-110.95,32.23,1.5,0\n1,blue,300,20,-110.951,32.23,,\n2,red,11,20,-110.95,32.23,1.5,0\n"
-        "2,blue,,,-110.951,32.231,2,1\n"),
+        ("frame,landmark,u_px,v_px,longitude_deg,latitude_deg,sigma_m,planned\n1,red,10,20,-110.95,32.23,1.5,0\n"
+        "1,blue,300,20,-110.951,32.23,,\n2,red,11,20,-110.95,32.23,1.5,0\n2,blue,,,-110.951,32.231,2,1\n"),
         "time_s,landmark,u_px,v_px,east_m,north_m\n0.0,1,10,20,0,0\n0.0,2,90,20,10,0\n0.1,1,10,21,0,0\n0.1,2,,,,\n",
     ),
-    "measurements": (
-        "distance_m,height_px\n10,180\n20,91\n\n30.5,60\n",
-        "height_px, distance_m ,note\n180,10,x\n91,20,\n",
-    ),
+    "measurements": ("distance_m,height_px\n10,180\n20,91\n\n30.5,60\n", "height_px, distance_m ,note\n180,10,x\n"),
     "poses": (
         "frame,east_m,north_m,heading_deg,pitch_deg\n1,0,0,10,1\n5,1,0.5,350,2\n9,2,1,355,2\n",
         "time_s,longitude_deg,latitude_deg,heading_deg\n0,179.9999,32,10\n0.5,-179.9999,32,15\n2,-179.9998,32.0001,20\n",
@@ -51,94 +62,60 @@ TEXT: dict[str, tuple[str, ...]] = {
     ),
     "colours": (
         "[red]\nlow = [172, 90, 60]\nhigh = [8, 255, 255]\n\n[blue]\nlow = [100, 90, 60]\nhigh = [125, 255, 255]\n",
-        "[\"a.b\"]\nlow = [0, 0, 0]\nhigh = [180, 255, 255]\n",
     ),
     "settings": (
-        ('[registration]\nmodel = "affine"\nkeypoints = 300\nquality = 0.02\n[interval]\nminimum_frames = 1\n'
-        "[small]\non = true\n[live]\npace = 2.0\n"),
-        "[people]\nwindow_width_px = 64\nbins = 9\n[track]\nbirth_score = 0.9\n",
+        ('[registration]\nmodel = "affine"\nkeypoints = 300\nquality = 0.02\n[interval]\nminimum_frames = 1\n[small]\n'
+        "on = true\n[live]\npace = 2.0\n[people]\nwindow_width_px = 64\nbins = 9\n[track]\nbirth_score = 0.9\n"),
     ),
-    "overrides": (
-        "registration.keypoints=500", "small.on=true", "registration.model=affine", "interval.minimum_frames=2",
-    ),
+    "overrides": ("registration.keypoints=500", "small.on=true", "registration.model=affine"),
     "scenario": (
-        ('about = "a crowd and faults"\nseed = 7\n[clip]\nseconds = 20.0\n[world]\nside_m = 120.0\n'
-        "[uav]\naltitude_m = 40.0\n"
-        "start_m = [-10.0, 0.0]\nway_m = [[10.0, 0.0], [0.0, 5.0]]\n[team]\nugvs = 4\nmiddle_m = [0.0, 0.0]\n"
-        "[[crowd]]\npeople = 8\nstart_m = [-14.0, -20.0]\nway_m = [[0.0, 0.0]]\n[[crowd]]\npeople = 3\n"
-        '[[car]]\nstart_m = [-40.0, 11.0]\n[[happening]]\ntime_s = 5.0\nwhat = "join"\ncrowds = [1, 2]\n'
+        ('about = "a crowd and faults"\nseed = 7\n[clip]\nseconds = 20.0\n[world]\nside_m = 120.0\n[uav]\n'
+        "altitude_m = 40.0\nstart_m = [-10.0, 0.0]\nway_m = [[10.0, 0.0], [0.0, 5.0]]\n[team]\nugvs = 4\n"
+        "middle_m = [0.0, 0.0]\n[[crowd]]\npeople = 8\nstart_m = [-14.0, -20.0]\nway_m = [[0.0, 0.0]]\n[[crowd]]\n"
+        'people = 3\n[[car]]\nstart_m = [-40.0, 11.0]\n[[happening]]\ntime_s = 5.0\nwhat = "join"\ncrowds = [1, 2]\n'
         '[[fault]]\nwhat = "gps_dropout"\ntime_s = 3.0\nvehicle = 2\n[settings.registration]\nkeypoints = 300\n'),
     ),
     "own telemetry": (
-        "time_s,altitude_m,speed_m_s\n" + "".join(f"{i},{50 + i},5\n" for i in range(12)),
-        "time_s,above_sea_m,longitude_deg,latitude_deg,heading_deg,pitch_deg,roll_deg,hfov_deg,vehicle_heading_deg\n"
-        + "".join(f"{i / 10},150,-110.95{i},32.23,{350 + i},90,0.5,60,10\n" for i in range(8)),
+        _rows("time_s,altitude_m,speed_m_s", "{i},{even},5"),
+        _rows(
+            "time_s,above_sea_m,longitude_deg,latitude_deg,heading_deg,pitch_deg,roll_deg,hfov_deg,vehicle_heading_deg",
+            "0.{i},150,-110.95{i},32.23,35{i},90,0.5,60,10",
+        ),
         "time_s,altitude_m,east_m,north_m\n0,50,0,0\n1,,1,0\n2,52,,\n9,52,3,0\n",
     ),
     "program telemetry": (
-        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),speed(mph),compass_heading(degrees)\n"
-        + "".join(f"{100 * i},2023-05-01 12:00:{i:02d},32.2{i},-110.9{i},{160 + i},5,{i}\n" for i in range(8)),
-        "OSD.latitude,OSD.longitude,OSD.height [ft],GIMBAL.pitch,CUSTOM.date,timestamp\n"
-        + "".join(f"32.2,-110.9,{100 + i},-90,x,{1_683_000_000_000 + 100 * i}\n" for i in range(8)),
+        _rows(
+            "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),speed(mph),"
+            "compass_heading(degrees)",
+            "{i}00,2023-05-01 12:00:0{i},32.2{i},-110.9{i},{even},5,{i}",
+        ),
+        _rows(
+            "OSD.latitude,OSD.longitude,OSD.height [ft],GIMBAL.pitch,CUSTOM.date,timestamp",
+            "32.2,-110.9,{even},-90,x,1683000000{i}00",
+        ),
         "frame,latitude,longitude,altitude\n1,32.2,-110.9,50\n2,32.2,-110.9,51\n3,32.2,-110.9,52\n",
     ),
     "subtitles": (
-        "".join(
-            f"{i + 1}\n00:00:0{i},000 --> 00:00:0{i + 1},000\n"
-            f'<font size="28">FrameCnt: {i}, DiffTime: 33ms\n2024-05-27 13:10:0{i}.033\n[fnum: 1.8] [focal_len: 24.00] '
+        _subtitles(
+            '<font size="28">FrameCnt: {i}, DiffTime: 33ms\n2024-05-27 13:10:0{i}.033\n[fnum: 1.8] [focal_len: 24.00] '
             "[dzoom_ratio: 1.00], [latitude: 53.365080] [longitude: 6.460739] [rel_alt: 5.400 abs_alt: 44.744] "
-            "[gb_yaw: -162.8 gb_pitch: -30.0 gb_roll: 1.0]</font>\n\n"
-            for i in range(5)
+            "[gb_yaw: -162.8 gb_pitch: -30.0 gb_roll: 1.0]</font>"
         ),
-        "".join(
-            f"{i + 1}\n00:00:0{i},000 --> 00:00:0{i + 1},000\nHOME(-58.4,-34.7) 2017.07.03 10:15:0{i}\n"
-            f"GPS(-58.4,-34.7,19) BAROMETER:2{i}.1\n\n"
-            for i in range(5)
-        ),
-        "".join(
-            f"{i + 1}\n00:00:0{i},000 --> 00:00:0{i + 1},000\nF/2.8, SS 200, ISO 100, EV 0, GPS (8.5, 47.3, 19), "
-            f"D 24.5m, H {i}.0m, H.S 1.4m/s, V.S 0.1m/s, F.PRY (1.0°, -3.8°, 30.0°), G.PRY (-30.0°, 0.0°, 29.8°)\n\n"
-            for i in range(5)
+        _subtitles("HOME(-58.4,-34.7) 2017.07.03 10:15:0{i}\nGPS(-58.4,-34.7,19) BAROMETER:2{i}.1"),
+        _subtitles(
+            "F/2.8, SS 200, ISO 100, EV 0, GPS (8.5, 47.3, 19), D 24.5m, H {i}.0m, H.S 1.4m/s, V.S 0.1m/s, "
+            "F.PRY (1.0°, -3.8°, 30.0°), G.PRY (-30.0°, 0.0°, 29.8°)"
         ),
     ),
     "nmea": (
-        "\r\n".join(
-            line
-            for i in range(8)
-            for line in (
-                sentence(f"GPGGA,12003{i}.50,4807.0380,N,01131.0000,W,1,08,0.9,545.4,M,46.9,M,,"),
-                sentence(f"GNRMC,12003{i}.50,A,4807.0380,N,01131.0000,W,10.0,084.4,230394,003.1,W"),
-                sentence("HEHDT,274.0,T"),
-            )
-        ),
-        # Without checksums whatever a line says gets to the reader.
-        "\n".join(
-            line
-            for i in range(8)
-            for line in (
-                f"$GPGLL,4807.038,N,01131.000,E,12003{i},A",
-                f"$GPRMC,12003{i},A,4807.0380,N,01131.0000,W,10.0,084.4,230394,003.1,W",
-                "$GPVTG,084.4,T,081.3,M,010.0,N,018.5,K",
-                "$HETHS,274.0,A",
-            )
-        ),
+        "\r\n".join(sentence(line.format(i=i)) for i in range(8) for line in _NMEA),
+        "\n".join(line.format(i=i) for i in range(8) for line in (*_UNCHECKED, "$HETHS,274.0,A")),
     ),
-    "classifier text": (
-        "# weights\n" + " ".join("0.25" for _ in range(FEATURES)) + "\n-1.5\n",
-        ",".join("1e-3" for _ in range(FEATURES)),
-    ),
+    "classifier text": ("# weights\n" + "0.25 " * FEATURES + "\n-1.5\n", ",".join(["1e-3"] * FEATURES)),
     "seqinfo": ("[Sequence]\nname=x\nimDir=img1\nframeRate=30\nseqLength=5\nimWidth=640\nimHeight=480\nimExt=.jpg\n",),
     "record": (
-        json.dumps(
-            {
-                "frames": {"read": 5, "written": 5},
-                "state": "complete",
-                "outputs": ["masks", "tables"],
-                "interval_frames": 2,
-                "last_frame": 9,
-                "versions": {"torchvision_dddas": "0.1.0"},
-            }
-        ),
+        ('{"frames": {"read": 5, "written": 5}, "state": "complete", "outputs": ["masks", "tables"], '
+        '"interval_frames": 2, "last_frame": 9, "versions": {"torchvision_dddas": "0.1.0"}}'),
     ),
     "studies": (
         ('name = "all"\ntasks = ["motion", "tracking"]\nconfig = "fast"\nset = ["track.birth_score=0.5"]\n'
@@ -147,12 +124,9 @@ TEXT: dict[str, tuple[str, ...]] = {
     ),
     "addresses": ("8080", "0.0.0.0:8080", "[::1]:9000"),
     "streams": ("json:rows.jsonl", "mot:rows.txt", "json:/dev/null"),
-    "input names": (
-        "camera:0", "sim:four", "nowhere.mp4", "frames/*.png", "frames/frame[0-9].png", "sim:nowhere.toml", "x/",
-        "sim:",
-    ),
+    "input names": ("camera:0", "sim:four", "nowhere.mp4", "frames/frame[0-9].png", "sim:nowhere.toml", "x/", "sim:"),
     "other words": (
-        "camera:0", "camera:12", "rtsp://user:word@host/stream", "red=410,220,24,16", "a=b=1,2,3,4",
+        *("camera:0", "camera:12", "rtsp://user:word@host/stream", "red=410,220,24,16", "a=b=1,2,3,4"),
         "frame1.png\nframe2.png\nframe10.png\n1a2b3.png\n000.png\n",
     ),
 }  # fmt: skip
@@ -162,129 +136,73 @@ def text(kind: str) -> list[bytes]:
     return [content.encode() for content in TEXT[kind]]
 
 
+def saved(name: str, *saves: Callable[[Path], object]) -> list[bytes]:
+    """What is written into a file of the name by each."""
+    contents = []
+    for save in saves:
+        with tempfile.TemporaryDirectory() as folder:
+            save(Path(folder) / name)
+            contents.append((Path(folder) / name).read_bytes())
+    return contents
+
+
 @cache
 def mavlink() -> list[bytes]:
-    clock_s = 1_533_737_161.0
-    level = {"roll": 0, "pitch": 0, "rollspeed": 0, "pitchspeed": 0, "yawspeed": 0}
-    said: list[tuple[float, str, dict]] = []
-    for i in range(10):
-        came, boot_ms = clock_s + 0.25 * i, 5000 + 250 * i
-        said.append((came, "GLOBAL_POSITION_INT", global_position(boot_ms, 149.0 + i * 1e-5, -35.0, 50 + i)))
-        said.append((came, "ATTITUDE", {"time_boot_ms": boot_ms + 10, "yaw": 1.7, **level}))
-        said.append((came, "MOUNT_ORIENTATION", {"time_boot_ms": boot_ms, "roll": 0, "pitch": -30, "yaw": 5}))
-    first = [one for one in said if one[1] != "MOUNT_ORIENTATION"]  # the first version has no such number
-    return [tlog(first, version=1), tlog(said, version=2)]
+    said = eastward(10)
+    angles = {"roll": 0, "pitch": -30, "yaw": 5}
+    turns = [(row[0], "MOUNT_ORIENTATION", {"time_boot_ms": 5000 + 125 * k, **angles}) for k, row in enumerate(said)]
+    return [tlog(said, version=1), tlog(sorted(said + turns, key=lambda row: row[0]), version=2)]
 
 
 @cache
 def px4() -> list[bytes]:
     place = ["double lat", "double lon", "float alt"]
     local = ["float x", "float y", "float z", "float vx", "float vy", "bool z_valid", "bool v_xy_valid"]
-    turned = ["float[4] q"]
-    return [
-        ulog(
-            {
-                "vehicle_global_position": (
-                    place,
-                    [(100_000 * i, 32.2, -110.9 + 1e-5 * i, 800 + i) for i in range(12)],
-                ),
-                "vehicle_local_position": (local, [(100_000 * i, i, 0, -50, 1, 0, 1, 1) for i in range(12)]),
-                "vehicle_attitude": (turned, [(100_000 * i, 1, 0, 0, 0) for i in range(12)]),
-            }
-        )
-    ]
-
-
-def _packet(i: int) -> bytes:
-    return local_set(
-        {
-            2: (1_340_980_354_100_000 + i * 40_000).to_bytes(8, "big"),
-            5: spread(159.97, 0, 360, 2),
-            6: spread(-0.43, 0, 20, 2, True),
-            7: spread(3.4, 0, 50, 2, True),
-            13: spread(34.7211, 0, 90, 4, True),
-            14: spread(-86.6891, 0, 180, 4, True),
-            15: spread(3048, -900, 19000, 2),
-            16: spread(60, 0, 180, 2),
-            18: spread(100, 0, 360, 4),
-            19: spread(-30, 0, 180, 4, True),
-            25: spread(300, -900, 19000, 2),
-        }
-    )
+    topics: dict = {
+        "vehicle_global_position": (place, [(100_000 * i, 32.2, -110.9 + 1e-5 * i, 800 + i) for i in range(12)]),
+        "vehicle_local_position": (local, [(100_000 * i, i, 0, -50, 1, 0, 1, 1) for i in range(12)]),
+        "vehicle_attitude": (["float[4] q"], [(100_000 * i, 1, 0, 0, 0) for i in range(12)]),
+    }
+    return [ulog(topics)]
 
 
 @cache
-def misb() -> list[bytes]:
-    return [transport_stream([3600 * i for i in range(5)], [(3600 * i, _packet(i)) for i in range(5)])]
-
-
-@cache
-def klv() -> list[bytes]:
-    return [b"".join(_packet(i) for i in range(6))]
+def klv(in_stream: bool) -> list[bytes]:
+    view = {16: spread(60, 0, 180, 2), 25: spread(300, -900, 19000, 2)}
+    packets = [packet(i, {**attitude(159.97, -0.43, 3.4, 100, -30, 0), **view}) for i in range(6)]
+    times = [3600 * i for i in range(6)]
+    return [transport_stream(times, list(zip(times, packets, strict=True))) if in_stream else b"".join(packets)]
 
 
 @cache
 def classifiers(suffix: str) -> list[bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"a{suffix}"
-        if suffix == ".npy":
-            np.save(path, np.linspace(-1, 1, FEATURES + 1, dtype=np.float32))
-        elif suffix == ".npz":
-            np.savez(path, weights=np.ones(FEATURES, np.float32), bias=np.float32(1), bins=9, cell=8)
-        else:
-            descriptor = cv2.HOGDescriptor()
-            descriptor.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
-            descriptor.save(str(path))
-            svm = cv2.ml.SVM.create()
-            svm.setKernel(cv2.ml.SVM_LINEAR)
-            rows = np.array([[k, 1 - k, 0.5] for k in (0, 1, 0.1, 0.9)], np.float32)
-            svm.train(rows, cv2.ml.ROW_SAMPLE, np.array([0, 1, 0, 1], np.int32))
-            first = path.read_bytes()
-            svm.save(str(path))
-            return [first, path.read_bytes()]
-        return [path.read_bytes()]
+    weights = np.linspace(-1, 1, FEATURES + 1, dtype=np.float32)
+    if suffix == ".npy":
+        return saved("a.npy", lambda path: np.save(path, weights))
+    if suffix == ".npz":
+        return saved("a.npz", lambda path: np.savez(path, weights=weights[1:], bias=np.float32(1), bins=9, cell=8))
+    descriptor, svm = cv2.HOGDescriptor(), cv2.ml.SVM.create()
+    descriptor.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
+    svm.setKernel(cv2.ml.SVM_LINEAR)
+    rows = np.array([[k, 1 - k, 0.5] for k in (0, 1, 0.1, 0.9)], np.float32)
+    svm.train(rows, cv2.ml.ROW_SAMPLE, np.array([0, 1, 0, 1], np.int32))
+    return saved(f"a{suffix}", lambda path: descriptor.save(str(path)), lambda path: svm.save(str(path)))
 
 
 @cache
 def pictures(suffix: str, deep: bool = False) -> list[bytes]:
     image = np.full((24, 32, 3), 90, np.uint8)
     image[6:14, 8:20] = (200, 160, 120)
-    kinds: list[np.ndarray] = [image]
-    if suffix != ".ppm":
-        kinds.append(np.ascontiguousarray(image[..., 0]))
-    if deep:
-        kinds.append(image[..., 0].astype(np.uint16) * 250)
+    grey = np.ascontiguousarray(image[..., 0])
+    kinds = [image, *([grey] if suffix != ".ppm" else []), *([grey.astype(np.uint16) * 250] if deep else [])]
     return [cv2.imencode(suffix, kind)[1].tobytes() for kind in kinds]
 
 
 @cache
 def videos(suffix: str, codec: str) -> list[bytes]:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"a{suffix}"
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), 10, (64, 48))
-        for number in range(8):
-            image = np.full((48, 64, 3), 90, np.uint8)
-            image[10:20, 5 * number : 5 * number + 10] = 200
-            writer.write(image)
-        writer.release()
-        return [path.read_bytes()]
-
-
-@cache
-def h264() -> list[bytes]:
-    import av
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.mp4"
-        with av.open(str(path), "w") as file:
-            stream = file.add_stream("libx264", rate=10, options={"g": "4"})
-            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-            for number in range(8):
-                image = np.full((48, 64, 3), 90, np.uint8)
-                image[10:20, 5 * number : 5 * number + 10] = 200
-                file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-            file.mux(stream.encode())
-        return [path.read_bytes()]
+    if codec == "libx264":
+        return saved(f"a{suffix}", lambda path: write_by_av(path, codec, list(range(0, 800, 100)), g="4"))
+    return saved(f"a{suffix}", lambda path: write_video(path, codec, frames=8))
 
 
 @cache
@@ -297,6 +215,14 @@ def raster(bands: int) -> list[bytes]:
     corner = rasterio.transform.from_origin(-80, 80, 10, 10)
     with rasterio.MemoryFile() as memory:
         with memory.open(driver="GTiff", crs="EPSG:32612", transform=corner, **shape) as file:
-            for band in range(1, bands + 1):
-                file.write(values, band)
+            file.write(np.repeat(values[None], bands, axis=0))
         return [bytes(memory.read())]
+
+
+@cache
+def data_set(kind: str, clip: str) -> Mapping[str, bytes]:
+    """The files of a data set of one clip, by their paths in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        MAKE[kind](Path(folder), clip)
+        files = [path for path in sorted(Path(folder).rglob("*")) if path.is_file()]
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}

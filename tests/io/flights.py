@@ -2,7 +2,7 @@
 
 import functools
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
 
@@ -25,6 +25,21 @@ def local_set(tags: dict[int, bytes], long_length: bool = False) -> bytes:
     packet = KEY + size + body
     total = sum(byte << (8 * ((i + 1) % 2)) for i, byte in enumerate(packet)) & 0xFFFF
     return packet + total.to_bytes(2, "big")
+
+
+START_US = 1_340_980_354_100_000
+PLACE = {13: spread(34.7211, 0, 90, 4, True), 14: spread(-86.6891, 0, 180, 4, True), 15: spread(3048, -900, 19000, 2)}
+
+
+def packet(i: int, tags: Mapping[int, bytes] = {}) -> bytes:
+    """The place 40 ms after the packet before, and further tags."""
+    return local_set({2: (START_US + i * 40_000).to_bytes(8, "big"), **PLACE, **tags})
+
+
+def attitude(heading: float, pitch: float, roll: float, azimuth: float, elevation: float, turn: float) -> dict:
+    vehicle = {5: spread(heading, 0, 360, 2), 6: spread(pitch, 0, 20, 2, True), 7: spread(roll, 0, 50, 2, True)}
+    camera = {18: spread(azimuth, 0, 360, 4), 19: spread(elevation, 0, 180, 4, True), 20: spread(turn, 0, 360, 4)}
+    return {**vehicle, **camera}
 
 
 def _pes(stream: int, payload: bytes, pts: int | None) -> bytes:
@@ -81,6 +96,20 @@ def global_position(time_boot_ms: int, lon: float, lat: float, above_m: float = 
     heights = {"alt": round((above_m + 100) * 1000), "relative_alt": round(above_m * 1000)}
     place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7)}
     return {"time_boot_ms": time_boot_ms, **place, **heights, "vx": round(v_m_s * 100), "vy": 0, "vz": 0, "hdg": 9000}
+
+
+CLOCK_S = 1_533_737_161.0
+
+
+def eastward(count: int = 20, step_s: float = 0.25, delays_s: Sequence[float] = ()) -> list[tuple[float, str, dict]]:
+    """Positions eastwards, each followed by an attitude whose heading is 100 degrees."""
+    said: list[tuple[float, str, dict]] = []
+    for i in range(count):
+        came, boot_ms = CLOCK_S + i * step_s + (delays_s[i] if len(delays_s) else 0), round(5000 + 1000 * i * step_s)
+        said.append((came, "GLOBAL_POSITION_INT", global_position(boot_ms, 149.0 + i * 1e-5, -35.0, 50 + i)))
+        still = dict.fromkeys(("roll", "pitch", "rollspeed", "pitchspeed", "yawspeed"), 0)
+        said.append((came, "ATTITUDE", {"time_boot_ms": boot_ms + 10, "yaw": 1.7453293, **still}))
+    return said
 
 
 # -- PX4 ---------------------------------------------------------------------------------------------------------------
