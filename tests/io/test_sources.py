@@ -22,19 +22,6 @@ def save(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), image)
 
 
-def numbers_of(source):
-    return [frame.number for frame in source]
-
-
-def check_tail(source):
-    """Frames are missing, but the last one has its own number."""
-    frames = list(source)
-    numbers = [frame.number for frame in frames]
-    assert len(numbers) < 30 and numbers == sorted(set(numbers)) and numbers[-1] == 30 and source.problems
-    assert abs(number_of(frames[-1].image) - 30) <= 1
-    return frames
-
-
 # -- Videos ------------------------------------------------------------------------------------------------------------
 
 
@@ -53,12 +40,7 @@ def test_a_whole_video_is_read_in_order_with_its_times(tmp_path, name, codec, in
     assert [frame.time_s for frame in frames] == pytest.approx((numbers - 1) / 10, abs=1e-3)
     assert frames[0].image.shape == (48, 64, 3) and frames[0].image.dtype == np.uint8
     assert (source.last, source.problems, source.exact) == (30, [], True)
-
-
-def test_a_given_rate_replaces_the_files(tmp_path):
-    source = open_source(write_video(tmp_path / "clip.mp4", "mp4v", frames=4), rate_hz=25)
-    assert source.rate_hz == 25
-    assert [frame.time_s for frame in source] == pytest.approx([0, 0.04, 0.08, 0.12])
+    assert open_source(tmp_path / name, rate_hz=25).rate_hz == 25
 
 
 def test_a_rotated_video_comes_upright(tmp_path):
@@ -72,13 +54,7 @@ def test_a_rotated_video_comes_upright(tmp_path):
 
 @pytest.mark.parametrize(
     ("spoiled", "problems"),
-    [
-        (
-            [12, 20, 21],
-            ["frame 12 could not be decoded and was left out", "frames 20 to 21 could not be decoded and were"],
-        ),
-        ([29, 30], ["frames 29 to 30 could not be decoded and were left out"]),
-    ],
+    [([12, 20, 21], ["frame 12 could not be decoded", "frames 20 to 21 could"]), ([29, 30], ["frames 29 to 30 could"])],
 )
 def test_undecodable_frames_leave_gaps_in_the_numbers_and_are_named(avi, spoiled, problems):
     for number in spoiled:
@@ -90,37 +66,37 @@ def test_undecodable_frames_leave_gaps_in_the_numbers_and_are_named(avi, spoiled
         assert all(abs(number_of(frame.image) - frame.number) <= 1 for frame in frames)
         assert len(source.problems) == len(problems) and source.last == 30
         assert all(str(found).startswith(words) for found, words in zip(source.problems, problems, strict=True))
-    assert [n for n in numbers_of(source.every(3)) if n in spoiled] == []
+    assert [n for n in [frame.number for frame in source.every(3)] if n in spoiled] == []
     assert len(source.problems) == len(problems)  # named whether or not they are wanted
 
 
 def test_a_truncated_video_gives_what_it_holds_and_says_where_it_ends(avi):
     avi.write_bytes(avi.read_bytes()[: avi.stat().st_size // 2])
     source = open_source(avi)
-    numbers = numbers_of(source)
+    numbers = [frame.number for frame in source]
     assert 3 <= len(numbers) < 30 and numbers == list(range(1, len(numbers) + 1)) and source.last == len(numbers)
     (problem,) = source.problems
     assert f"ends after frame {len(numbers)} but announces 30" in str(problem)
 
 
-def test_a_damaged_stretch_of_an_mp4_does_not_shift_the_frames_after_it(tmp_path):
-    path = write_video(tmp_path / "clip.mp4", "mp4v")
-    data = bytearray(path.read_bytes())
-    middle = (data.index(b"mdat") + data.index(b"moov")) // 2
-    data[middle : middle + 200] = bytes(200)
-    path.write_bytes(data)
-    check_tail(open_source(path))
-
-
-def test_a_damaged_h264_keeps_order_numbers_and_times(tmp_path):
-    path = write_by_av(tmp_path / "clip.mp4", "libx264", list(range(0, 3000, 100)), g="8", bf="2")
+@pytest.mark.parametrize(("codec", "filling"), [("mp4v", b"\0" * 200), ("libx264", b"\xff" * 300)])
+def test_a_damaged_stretch_does_not_shift_the_frames_after_it(tmp_path, codec, filling):
+    path = tmp_path / "clip.mp4"
+    if codec == "mp4v":
+        write_video(path, codec)
+    else:
+        write_by_av(path, codec, list(range(0, 3000, 100)), g="8", bf="2")
     data = bytearray(path.read_bytes())
     start = data.index(b"mdat")
     place = start + (data.index(b"moov") - start) * 2 // 3
-    data[place : place + 300] = b"\xff" * 300
+    data[place : place + len(filling)] = filling
     path.write_bytes(data)
-    frames = check_tail(open_source(path))
-    assert [frame.time_s for frame in frames] == pytest.approx([(frame.number - 1) / 10 for frame in frames])
+    source = open_source(path)
+    frames = list(source)
+    numbers = [frame.number for frame in frames]
+    assert len(numbers) < 30 and numbers == sorted(set(numbers)) and numbers[-1] == 30 and source.problems
+    assert abs(number_of(frames[-1].image) - 30) <= 1
+    assert [frame.time_s for frame in frames] == pytest.approx([(number - 1) / 10 for number in numbers])
 
 
 def cut_mp4(folder):
@@ -141,12 +117,6 @@ def test_a_video_whose_first_frame_is_damaged_and_a_camera_that_is_none_are_refu
     for spec, words in ((avi, "first frame"), ("camera:97", "cannot open camera 97"), ("camera:front", "no camera")):
         with pytest.raises(InputError, match=words):
             open_source(spec)
-
-
-def test_odd_sizes_are_kept(tmp_path):
-    source = open_source(write_by_av(tmp_path / "clip.mkv", "ffv1", [0, 100, 200], size=(63, 47)))
-    assert source.size == (63, 47)
-    np.testing.assert_array_equal(next(iter(source)).image, picture(1, 63, 47))
 
 
 @pytest.mark.parametrize(
@@ -257,7 +227,7 @@ def test_pixels_are_those_of_the_file_without_alpha(tmp_path, make, shape):
     np.testing.assert_array_equal(frame.image, written[..., :3] if written.ndim == 3 else written)
 
 
-@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("bits", [8, 12, 16])
 def test_sixteen_bit_files_are_scaled_by_the_sensor_that_holds_their_brightest_pixel(tmp_path, bits):
     top = 2**bits - 1
     ramp = np.linspace(0, 0.6, 64 * 48).reshape(48, 64)
@@ -293,14 +263,14 @@ def test_exif_rotation_is_honoured(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".tiff", ".bmp"])
-@pytest.mark.parametrize("keep", [0, 40, 0.5, 0.95])
+@pytest.mark.parametrize("keep", [0, 40, 0.95])
 def test_a_damaged_image_is_left_out_and_the_others_keep_their_numbers(tmp_path, suffix, keep):
     write_images(tmp_path, range(1, 6), suffix)
     damaged = tmp_path / f"frame3{suffix}"
     whole = damaged.read_bytes()
     damaged.write_bytes(whole[: int(keep * len(whole)) if keep < 1 else int(keep)])
     source = open_source(tmp_path)
-    assert numbers_of(source) == [1, 2, 4, 5] and source.last == source.count
+    assert [frame.number for frame in source] == [1, 2, 4, 5] and source.last == source.count
     (problem,) = source.problems
     assert problem.frame == 3 and damaged.name in str(problem)
 
@@ -318,7 +288,7 @@ def test_the_first_image_decides_on_colour_size_and_depth(tmp_path):
             list(open_source(tmp_path))
         source = open_source(tmp_path)
         source.tolerant = True  # type: ignore[attr-defined]
-        assert numbers_of(source) == [1, 2, 3] and "left out" in str(source.problems[0])
+        assert [frame.number for frame in source] == [1, 2, 3] and "left out" in str(source.problems[0])
 
 
 def test_what_is_no_clip_gets_one_line_that_says_what_to_do(tmp_path):
