@@ -133,19 +133,9 @@ def _detections(path: Path) -> None:
     check_table(table, 2)
 
 
-def _truth(path: Path) -> None:
-    _ = truth.load_truth(path).frames
-    load_result(path)
-
-
 def _evaluated(path: Path) -> None:
     """The input is the truth, the result or the record of a clip that is scored."""
     evaluate(path.parents[1] / "true", path.parents[1] / "found")
-
-
-def _record(path: Path) -> None:
-    read_run_record(path.parent)
-    load_result(path.parent)
 
 
 def _landmarks(path: Path) -> None:
@@ -157,11 +147,6 @@ def _landmarks(path: Path) -> None:
 def _measurements(path: Path) -> None:
     camera_files.has_measurements(path)
     _check_finite(*camera_files.read_measurements(path))
-
-
-def _camera(path: Path) -> None:
-    camera_files.describe_missing(path)
-    camera_files.read_camera(path)
 
 
 def _poses(path: Path) -> None:
@@ -252,21 +237,29 @@ def _dataset(kind: str, path: Path) -> None:
 # -- The readers -------------------------------------------------------------------------------------------------------
 
 _PLACES = ("east_m", "north_m", "longitude_deg", "latitude_deg", "frame", "time_s", "score", "1", "10000001")
+_JSON = ("Infinity", "NaN", "null", "[]", "{}", '"x"')
 _TOML = ("[[", "]]", "[a]", "low", "{}", "[]", "[[]]", "1.0", "inf", "nan", '"x"', "'", "1e400", "0x7fffffffffffffffff")
 # Name, file, what is done, seeds, words, share.
 _TEXTS: tuple[tuple[str, str, Callable[[Path], object], str, Sequence[str], float], ...] = (
-    ("MOT text", "gt.txt", _truth, "mot", (), 1),
+    ("MOT text", "gt.txt", lambda path: (truth.load_truth(path).frames, load_result(path)), "mot", (), 1),
     ("truth of a clip", "true/gt.txt", _evaluated, "mot", (), 1),
     ("tracks of a result", "found/tracks.txt", _evaluated, "mot", (), 1),
     ("seqinfo.ini", "true/seqinfo.ini", _evaluated, "seqinfo", (), 0.5),
-    ("run.json", "found/run.json", _record, "record", ("Infinity", "NaN", "null", "[]", "{}", '"x"'), 0.5),
+    ("run.json", "found/run.json", lambda p: (read_run_record(p.parent), load_result(p.parent)), "record", _JSON, 0.5),
     ("detections as text", "detections.txt", _detections, "mot", (), 1),
     ("detections as CSV", "detections.csv", _detections, "detections", _PLACES, 1),
     ("positions CSV", "p.csv", lambda path: _check_finite(read_positions(path).east_north_m), "positions", _PLACES, 1),
     ("landmarks CSV", "landmarks.csv", _landmarks, "landmarks", _PLACES, 1),
     ("measurements CSV", "measured.csv", _measurements, "measurements", (), 0.5),
     ("poses CSV", "poses.csv", _poses, "poses", _PLACES, 1),
-    ("camera TOML", "camera.toml", _camera, "camera", _TOML, 1),
+    (
+        "camera TOML",
+        "camera.toml",
+        lambda path: (camera_files.describe_missing(path), camera_files.read_camera(path)),
+        "camera",
+        _TOML,
+        1,
+    ),
     ("colours TOML", "colours.toml", read_colours, "colours", _TOML, 1),
     ("settings TOML", "settings.toml", lambda path: changes(load_config(path)), "settings", _TOML, 1),
     ("overrides", "override.txt", _overrides, "overrides", ("=", ".", "world.side_m=1", "crowd.1.people=2"), 1),

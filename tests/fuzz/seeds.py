@@ -194,7 +194,11 @@ def pictures(suffix: str, deep: bool = False) -> list[bytes]:
     image = np.full((24, 32, 3), 90, np.uint8)
     image[6:14, 8:20] = (200, 160, 120)
     grey = np.ascontiguousarray(image[..., 0])
-    kinds = [image, *([grey] if suffix != ".ppm" else []), *([grey.astype(np.uint16) * 250] if deep else [])]
+    kinds: list[np.ndarray] = [
+        image,
+        *([grey] if suffix != ".ppm" else []),
+        *([grey.astype(np.uint16) * 250] if deep else []),
+    ]
     return [cv2.imencode(suffix, kind)[1].tobytes() for kind in kinds]
 
 

@@ -105,7 +105,7 @@ def eastward(count: int = 20, step_s: float = 0.25, delays_s: Sequence[float] = 
     """Positions eastwards, each followed by an attitude whose heading is 100 degrees."""
     said: list[tuple[float, str, dict]] = []
     for i in range(count):
-        came, boot_ms = CLOCK_S + i * step_s + (delays_s[i] if len(delays_s) else 0), round(5000 + 1000 * i * step_s)
+        came, boot_ms = CLOCK_S + i * step_s + (delays_s[i] if delays_s else 0), round(5000 + 1000 * i * step_s)
         said.append((came, "GLOBAL_POSITION_INT", global_position(boot_ms, 149.0 + i * 1e-5, -35.0, 50 + i)))
         still = dict.fromkeys(("roll", "pitch", "rollspeed", "pitchspeed", "yawspeed"), 0)
         said.append((came, "ATTITUDE", {"time_boot_ms": boot_ms + 10, "yaw": 1.7453293, **still}))

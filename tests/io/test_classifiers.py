@@ -114,7 +114,6 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
     ("name", "content", "wanted"),
     [
         ("w.txt", "", ["is empty", "6 weights"]),
-        ("w.txt", "# nothing\n", ["is empty"]),
         ("w.txt", "1 2 3\n4 five\n", ["line 2", "'five' is not a number"]),
         ("w.txt", "1 2 3\n4 nan 6", ["line 2", "'nan'", "finite"]),
         ("w.txt", "1 2 3 4 5 1e60", ["number 6 is inf", "finite"]),
@@ -124,7 +123,6 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
         ("w.npy", np.array(["a"] * 6), ["holds <U1", "wanted numbers"]),
         ("w.npy", np.ones(9), ["has 9 numbers", "settings has 6"]),
         ("w.npy", b"not an array", ["NumPy's format"]),
-        ("w.npy", b"", ["NumPy's format"]),
         ("w.npz", BROKEN_ZIP, ["broken"]),
         ("w.npz", {"coefficients": WEIGHTS}, ["holds coefficients", "wanted weights"]),
         ("w.npz", {"weights": WEIGHTS, "bias": np.ones(2)}, ["bias of 2 numbers", "wanted one"]),
@@ -134,11 +132,9 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
             {"weights": WEIGHTS, "window": (32, 64)},
             ["window of 32 x 64", "64 x 128", "people.window_width_px"],
         ),
-        ("w.npz", {"weights": WEIGHTS, "stride": 16}, ["stride of 16", "settings say 8", "people.block_stride_px"]),
         ("w.npz", {"weights": WEIGHTS, "signed": True}, ["signed of true", "settings say false", "people.signed"]),
         ("w.yml", "1 2 3", ["not a file that OpenCV saved"]),
         ("w.yml", "%YAML:1.0\n---\nother: 3\n", ["neither an SVMDetector"]),
-        ("w.yml", "%YAML:1.0\n---\n", ["neither an SVMDetector"]),
         ("w.yml", KERNEL, ["kernel RBF", "linear"]),
         ("w.yml", SVM, ["lacks alpha"]),
         ("w.yml", SVM + "         alpha: [ 1., 2. ]\n         rho: 0.5\n", ["broken", "do not fit"]),
@@ -146,7 +142,6 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
         ("w.yml", SVM.partition("   decision")[0] + "   decision_functions: 3\n", ["broken", "do not fit"]),
         ("w.txt", "1_0 2 3 4 5 6", ["line 1", "'1_0' is not a number"]),
         ("w.xml", "<html></html>", ["OpenCV"]),
-        ("w.xml", b"\xff\xfe", ["OpenCV"]),
     ],
 )
 def test_a_mistake_gets_one_line_that_says_what_to_do(tmp_path, name, content, wanted, capfd):

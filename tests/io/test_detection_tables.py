@@ -40,7 +40,6 @@ def read(write):
     "text",
     [
         "3 -1 10 20 30 40 0.5",
-        "3\t-1\t10\t20\t30\t40\t0.5\t-1",
         "3, 8, 10, 20, 30, 40, 0.5",
         "3.0,person,1e1,20,30,40,.5,words,are,ignored",
         "\ufeff3,-1,10,20,30,40,0.5\r\n\r\n",
@@ -116,14 +115,11 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
     ("text", "words"),
     [
         ("1,-1,2,3,4,5\n\n1,-1,2,3,4,x", "line 3: height_px is 'x'; wanted pixels from 0.001 to 1e+09"),
-        ("1,-1,2,nan,4,5", "y_px is 'nan'; wanted pixels from -1e+09"),
         ("1,-1,inf,3,4,5", "x_px is 'inf'"),
         ("1,-1,2,3,4,5,nan", "score is 'nan'; wanted a finite number"),
         ("1,-1,2,3,0.000999,5", "width_px is '0.000999'; wanted pixels from 0.001"),
-        ("1,-1,1_0,3,4,5", "x_px is '1_0'"),
         ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
         (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
-        (",-1,2,3,4,5", "frame is ''"),
         ("1,-1,2,3,4", "5 columns; wanted frame,id,x,y,w,h[,score]"),
         ("1;-1;2;3;4;5", "1 column; wanted"),
         ("frame,x,y\n1,2,3", "lacks x_px, y_px, width_px, height_px; its columns are frame, x, y"),

@@ -46,7 +46,7 @@ def test_positions_of_a_mavlink_log_since_the_first_of_them(fly, version):
 
 def test_messages_that_come_late_keep_the_times_at_which_they_were_sent(fly):
     delay = np.random.default_rng(2).uniform(0, 1.2, 60) * (np.arange(60) % 3 > 0)
-    flown = fly(in_order(eastward(60, delays_s=delay)), "flight.tlog")
+    flown = fly(in_order(eastward(60, delays_s=delay.tolist())), "flight.tlog")
     assert [flown.at(i * 0.25).altitude_m for i in (7, 20, 41)] == pytest.approx([57, 70, 91], abs=0.1)
 
 

@@ -56,8 +56,8 @@ def test_a_packet_is_whole_only_with_its_checksum(long_length):
         damaged[i] ^= 0x04
         assert not any(one.whole for one in local_sets(bytes(damaged)))
         assert not any(one.whole for one in local_sets(content[:i]))
-    damaged = content[:17] + b"\xf0" + content[18:]
-    assert [one.whole for one in local_sets(damaged + packet(1))] == [False, True]
+    behind = content[:17] + b"\xf0" + content[18:] + packet(1)
+    assert [one.whole for one in local_sets(behind)] == [False, True]
 
 
 @pytest.mark.parametrize(("kind", "before"), [(0x06, b""), (0x15, b""), (0x06, b"time")])
