@@ -80,7 +80,7 @@ class StandingSurface:
         self.tallest_m = float(highest.max())
         # In bytes, which the processor's cache can hold; rounded up.
         self._code_m = max(self.tallest_m, _LOWEST_M) / 255
-        self._highest = [np.ceil(highest / np.float32(self._code_m)).clip(0, 255).astype(np.uint8)]
+        self._highest: list[np.ndarray] = [np.ceil(highest / np.float32(self._code_m)).clip(0, 255).astype(np.uint8)]
 
     def met(self, sights: SightLines, top_m: np.ndarray, bottom_m: np.ndarray) -> Hits | None:
         """What is met by lines of sight between two heights (N,); None: nothing is."""

@@ -156,7 +156,7 @@ def _coloured(
     dull = 1 + 0.05 * of["broad"] + 0.2 * ragged + 0.045 * small + 0.05 * grain
     height = of["gravel"] * (0.012 * large + 0.01 * middle + 0.008 * small + 0.008 * grain)
     stones, bare = np.minimum(of["stones"] * of["gravel"], 50), np.ones_like(large)
-    overlays = []
+    overlays: list[tuple[np.ndarray, np.ndarray]] = []
     from_bank = of["wash"] - of["wash_half"]
     if from_bank.min() < 3:
         in_wash = np.clip(ragged - from_bank / 0.8, 0, 1)
@@ -197,7 +197,7 @@ def _coloured(
     green = np.clip(of["green"] + 0.25 * middle + 0.2 * large, 0, 1)
     planes = []
     for k in range(3):
-        plane = tone[k]
+        plane: np.ndarray = tone[k]
         for share, colour in overlays:
             plane = plane + share * (colour[k] - plane)
         plane = plane + clumps * (_STRAW[k] + green * (_GREEN[k] - _STRAW[k]) - plane)
