@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.simulation import Scenario
+from torchvision_dddas.simulation import Scenario, scenario_toml
 from torchvision_dddas.simulation.agents import Moment
 from torchvision_dddas.types import Bodies, CameraPose
 
@@ -29,17 +29,14 @@ def small(**tables):
 
 def as_file(path, scenario):
     """The same as a file, whose path is returned."""
-    from torchvision_dddas.simulation import scenario_toml
-
     path.write_text(scenario_toml(scenario))
     return path
 
 
-def bodies_at(place_m, kind="person", **columns):
+def bodies_at(place_m=(), kind="person", **columns):
     """Bodies of one or several kinds that stand at (N, 3), each a target of its own; columns replace what they have."""
     n = len(place_m)
     kinds = np.array([kind] * n if isinstance(kind, str) else kind, dtype="U6")
-    plate = np.where((kinds == "ugv")[:, None], (0.0, 0.0, 255.0), np.nan)
     defaults = {
         "number": np.arange(1, n + 1),
         "kind": kinds,
@@ -50,7 +47,7 @@ def bodies_at(place_m, kind="person", **columns):
         "height_m": np.full(n, 1.75),
         "phase": np.zeros(n),
         "colour": np.full((n, 3), 200.0),
-        "plate": plate,
+        "plate": np.where((kinds == "ugv")[:, None], (0.0, 0.0, 255.0), np.nan),
         "hidden": np.zeros(n, bool),
     }
     return Bodies(**{**defaults, **columns})

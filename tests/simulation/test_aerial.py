@@ -41,6 +41,11 @@ def people(places, world):
     return bodies_at(on_ground(world, places), target=np.ones(len(places), np.int64))
 
 
+def middle(mask):
+    """(u, v) of the pixels that are True."""
+    return np.argwhere(mask).mean(axis=0)[::-1]
+
+
 def moment(bodies, altitude=50.0, pitch=90.0, heading=25.0, roll=2.0, **how):
     """The camera looks at the origin, with its upper edge towards its heading."""
     axes = camera_axes(*np.radians([heading, pitch, roll]))
@@ -48,7 +53,7 @@ def moment(bodies, altitude=50.0, pitch=90.0, heading=25.0, roll=2.0, **how):
 
 
 def empty(**how):
-    return moment(bodies_at(np.zeros((0, 3))), **how)
+    return moment(bodies_at(), **how)
 
 
 def marked(world, places=PLACES):
@@ -73,7 +78,7 @@ def spots(image, near):
     return np.array(found)
 
 
-@pytest.mark.parametrize(("pitch", "altitude"), [(90, 60), (60, 55), (45, 50)])
+@pytest.mark.parametrize(("pitch", "altitude"), [(90, 60), (45, 50)])
 def test_a_point_of_the_ground_appears_where_the_camera_projects_it(bare, pitch, altitude):
     camera, now = camera_of(marked(bare)), empty(altitude=altitude, pitch=pitch)
     image, _, _ = camera.take(now)
@@ -81,32 +86,28 @@ def test_a_point_of_the_ground_appears_where_the_camera_projects_it(bare, pitch,
     assert np.abs(spots(image, expected) - expected).max() < 0.1
 
 
-def test_a_rolling_shutter_shifts_each_row_by_what_the_camera_did_until_it_was_read(bare):
+def test_a_rolling_shutter_shifts_each_row_by_the_camera_s_motion(bare):
     world = marked(bare)
     moving = empty(altitude=60, velocity=(8.0, -5.0, 1.0), turn=(0.1, -0.2, 0.3))
     camera = camera_of(world, readout_s=0.03)
-    view = view_from_pose(moving.pose, camera.camera)
-    points = on_ground(world, PLACES)
-    expected = []
-    for point in points:
-        pixel = view.project(point)
+    steady = view_from_pose(moving.pose, camera.camera).project(on_ground(world, PLACES))
+    expected = steady.copy()
+    for k, point in enumerate(on_ground(world, PLACES)):
         for _ in range(4):
-            lag = (pixel[1] / 479 - 0.5) * 0.03
+            lag = (expected[k, 1] / 479 - 0.5) * 0.03
             turned, _ = cv2.Rodrigues(moving.turn_rad_s * lag)
             pose = CameraPose(moving.pose.place_m + lag * moving.velocity_m_s, turned @ moving.pose.axes)
-            pixel = view_from_pose(pose, camera.camera).project(point)
-        expected.append(pixel)
-    assert np.abs(np.array(expected) - view.project(points)).max() > 1
+            expected[k] = view_from_pose(pose, camera.camera).project(point)
+    assert np.abs(expected - steady).max() > 1
     image, _, _ = camera.take(moving)
-    assert np.abs(spots(image, np.array(expected)) - expected).max() < 0.1
+    assert np.abs(spots(image, expected) - expected).max() < 0.1
     # Bodies are read row by row as well.
     _, _, bodies = camera.take(replace(moving, bodies=people(PLACES, world)))
     for k, pixel in enumerate(expected):
-        v, u = np.nonzero(bodies == k + 1)
-        assert np.hypot(u.mean() - pixel[0], v.mean() - pixel[1]) < 0.5 * np.hypot(*(pixel - (319.5, 239.5))) * 0.05 + 3
+        assert np.hypot(*(middle(bodies == k + 1) - pixel)) < 0.025 * np.hypot(*(pixel - (319.5, 239.5))) + 3
 
 
-def test_vibration_moves_rows_aside_anew_in_each_picture_and_only_while_the_shutter_rolls(bare):
+def test_vibration_moves_rows_anew_in_each_picture_while_the_shutter_rolls(bare):
     world, calm = marked(bare), empty(altitude=60)
     camera = camera_of(world, readout_s=0.015, vibration_px=2)
     steady = view_from_pose(calm.pose, camera.camera).project(on_ground(world, PLACES))
@@ -118,29 +119,26 @@ def test_vibration_moves_rows_aside_anew_in_each_picture_and_only_while_the_shut
         offs.append(spots(image, steady) - steady)
         # The truth moves with the picture.
         _, _, bodies = camera.take(replace(calm, number=number, bodies=crowd))
-        for k in range(len(PLACES)):
-            shown, meant = (np.argwhere(mask == k + 1).mean(axis=0)[::-1] for mask in (bodies, unmoved))
-            assert np.abs(shown - meant - offs[-1][k]).max() < 0.6
+        shifts = [middle(bodies == k) - middle(unmoved == k) for k in crowd.number]
+        assert np.abs(shifts - offs[-1]).max() < 0.6
     assert np.abs(offs[0] - offs[1]).max() > 1
     assert np.abs(offs).max() < 2 * np.sqrt(2) + 0.1
     assert np.ptp(offs[0], axis=0).max() > 1
     image, _, _ = camera_of(world, readout_s=0, vibration_px=2).take(calm)
-    plain = spots(image, steady) - steady
-    assert np.abs(plain - plain[0]).max() < 0.1
+    assert np.ptp(spots(image, steady) - steady, axis=0).max() < 0.1
 
 
-@pytest.mark.parametrize(("altitude", "pitch"), [(50, 90), (50, 45), (150, 90)])
+@pytest.mark.parametrize(("altitude", "pitch"), [(50, 45), (150, 90)])
 def test_the_mask_of_a_crowd_lies_where_its_people_are(bare, altitude, pitch):
-    grid = np.stack(np.meshgrid(np.arange(-2, 3), np.arange(-2, 3)), axis=-1).reshape(-1, 2)
-    crowd = people(2.5 * grid, bare)
+    crowd = people(2.5 * (np.argwhere(np.ones((5, 5))) - 2), bare)
     camera, now = camera_of(bare, width_px=1280, height_px=720), moment(crowd, altitude, pitch)
     _, targets, bodies = camera.take(now)
     assert set(np.unique(targets)) == {0, 1}
     assert ((targets > 0) == (bodies > 0)).all()
-    middle = view_from_pose(now.pose, camera.camera).project(crowd.place_m + np.array([0, 0, 0.95]))
-    seen = np.array([np.argwhere(bodies == number).mean(axis=0)[::-1] for number in crowd.number])
-    assert np.abs((seen - middle).mean(axis=0)).max() < 0.6
-    assert np.linalg.norm(seen - middle, axis=1).max() < 2.5
+    off = view_from_pose(now.pose, camera.camera).project(crowd.place_m + np.array([0, 0, 0.95]))
+    off -= [middle(bodies == number) for number in crowd.number]
+    assert np.abs(off.mean(axis=0)).max() < 0.6
+    assert np.linalg.norm(off, axis=1).max() < 2.5
 
 
 def box(world, low, high, height_m, grey=120):
@@ -154,17 +152,15 @@ def box(world, low, high, height_m, grey=120):
     return replace(world, surface=surface, albedo=albedo, relief=level)
 
 
-def test_people_behind_a_building_are_hidden_and_those_in_front_of_it_are_not(bare):
+@pytest.mark.parametrize(("pitch", "seen"), [(45, {0, 2, 3}), (90, {0, 1, 2, 3})])
+def test_people_behind_a_building_are_hidden_from_aslant_and_not_from_above(bare, pitch, seen):
     world = box(bare, (-6, 2), (6, 5), 5.0)
-    # The camera looks north: behind is where it cannot see.
     crowd = people(np.array([[0.0, 6.0], [0.0, 1.0], [0.0, 14.0]]), world)
-    _, _, bodies = camera_of(world).take(moment(crowd, 40, 45, heading=0, roll=0))
-    assert set(np.unique(bodies)) == {0, 2, 3}
-    _, _, bodies = camera_of(world).take(moment(crowd, 40, 90, heading=0, roll=0))
-    assert set(np.unique(bodies)) == {0, 1, 2, 3}
+    _, _, bodies = camera_of(world).take(moment(crowd, 40, pitch, heading=0, roll=0))
+    assert set(np.unique(bodies)) == seen
 
 
-@pytest.mark.parametrize("pitch", [90, 60, 45])
+@pytest.mark.parametrize("pitch", [90, 45])
 def test_the_top_of_a_building_appears_where_the_camera_projects_it(bare, pitch):
     world = box(bare, (-4, -3), (8, 3), 6.0, 240)
     camera, now = camera_of(world), empty(altitude=60, pitch=pitch)
@@ -184,7 +180,7 @@ def test_a_body_casts_a_shadow_away_from_the_sun_and_the_shadow_is_no_target(bar
     dark = (with_body.astype(int) - without).max(axis=2) < -20
     dark &= cv2.dilate(targets.astype(np.uint8), np.ones((3, 3))) == 0
     assert dark.sum() > 40
-    away = (np.argwhere(dark).mean(axis=0) - np.argwhere(targets).mean(axis=0))[::-1]
+    away = middle(dark) - middle(targets)
     to_sun = (bare.to_sun @ now.pose.axes)[:2]
     assert away @ to_sun < -0.9 * np.linalg.norm(away) * np.linalg.norm(to_sun)
 
@@ -196,8 +192,7 @@ def test_a_plate_shows_its_colour_and_a_covered_one_does_not(bare):
     red, none = ((image[..., 2] > 180) & (image[..., 0] < 60) for image in (shown, covered))
     assert red.sum() > 150
     assert not none.any()
-    # The plate is in the middle of its vehicle.
-    assert np.abs(np.argwhere(red).mean(axis=0) - np.argwhere(targets > 0).mean(axis=0)).max() < 0.6
+    assert np.abs(middle(red) - middle(targets > 0)).max() < 0.6
 
 
 @pytest.mark.parametrize(("kind", "length"), [("car", 4.4), ("ugv", 2.4)])
@@ -211,18 +206,7 @@ def test_vehicles_have_their_length_and_lie_along_their_heading(bare, kind, leng
     assert np.ptp(points[:, 1]) > 1.2 * np.ptp(points[:, 0])
 
 
-def test_a_picture_depends_on_the_seed_and_its_moment_alone():
-    world = build_world(WorldParameters(side_m=SIDE_M), seed=2)
-    crowd = people(np.array([[0.0, 1.0], [2.0, 2.0]]), world)
-    first, second, other = (AerialCamera(world, Scenario(seed=seed)) for seed in (7, 7, 8))
-    for number in (1, 2, 3):
-        first.take(moment(crowd, number=number))
-    ours, theirs, others = (camera.take(moment(crowd, number=4)) for camera in (first, second, other))
-    assert all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
-    assert not np.array_equal(others[0], ours[0])
-
-
-def test_nothing_is_left_to_see_where_a_hill_lies_between(bare):
+def test_a_hill_hides_who_is_behind_it(bare):
     up = np.zeros((25, 25))
     up[12:14, :] = 12.0  # a ridge from west to east, just north of the middle
     ridge = replace(bare, relief=Elevation(up, (-SIDE_M / 2,) * 2, SIDE_M / 24))
@@ -233,8 +217,7 @@ def test_nothing_is_left_to_see_where_a_hill_lies_between(bare):
 
 
 def test_the_horizon_is_hazy(bare):
-    pose = CameraPose(np.array([0.0, 0.0, 30.0]), camera_axes(0.0, np.radians(10), 0.0))
-    image, _, _ = camera_of(bare).take(moment_of(bodies_at(np.zeros((0, 3))), pose))
+    image, _, _ = camera_of(bare).take(empty(altitude=30, pitch=10, roll=0))
     assert image[0].mean() > image[-1].mean() + 50
 
 
@@ -271,32 +254,25 @@ def test_bodies_in_the_shade_of_a_building_are_darker_and_cast_no_shadow(bare):
     assert shadow[1] > 10
 
 
-def dot():
-    picture = np.zeros((81, 121, 3), np.uint8)
-    picture[38:43, 58:63] = 250
-    return picture
-
-
 def spread(picture):
     """Middle (u, v) and variances of the light."""
     light = picture[..., 0].astype(float) / picture[..., 0].sum()
     v, u = np.mgrid[: picture.shape[0], : picture.shape[1]]
-    middle = np.array([(light * u).sum(), (light * v).sum()])
-    return middle, np.array([(light * (u - middle[0]) ** 2).sum(), (light * (v - middle[1]) ** 2).sum()])
+    at = np.array([(light * u).sum(), (light * v).sum()])
+    return at, np.array([(light * (u - at[0]) ** 2).sum(), (light * (v - at[1]) ** 2).sum()])
 
 
-@pytest.mark.parametrize("way", [(12.0, 0.0), (0.0, -7.5), (9.0, 5.0)])
-def test_a_way_common_to_all_draws_out_by_its_length_and_moves_nothing(way):
-    blurred = motion_blur(dot(), np.broadcast_to(np.float32(way), (3, 3, 2)))
-    (before, own), (after, now) = spread(dot()), spread(blurred)
-    assert np.abs(after - before).max() < 0.1
-    assert now - own == pytest.approx(np.square(way) / 12, abs=0.6)
+ACROSS = np.zeros((3, 3, 2), np.float32)
+ACROSS[..., 0] = [0.0, 10.0, 20.0]
 
 
-def test_where_ways_differ_each_part_is_drawn_out_by_its_own():
-    way = np.zeros((3, 3, 2), np.float32)
-    way[..., 0] = [0.0, 10.0, 20.0]
-    (before, own), (after, now) = spread(dot()), spread(motion_blur(dot(), way))
-    assert np.abs(after - before).max() < 0.6
-    assert (now - own)[0] == pytest.approx(100 / 12, rel=0.15)
-    assert (now - own)[1] < 0.1
+@pytest.mark.parametrize(
+    ("way", "middle_way"),
+    [((12.0, 0.0), (12.0, 0.0)), ((0.0, -7.5), (0.0, -7.5)), ((9.0, 5.0), (9.0, 5.0)), (ACROSS, (10.0, 0.0))],
+)
+def test_motion_blur_draws_out_by_the_length_of_the_way_there_and_moves_nothing(way, middle_way):
+    dot = np.zeros((81, 121, 3), np.uint8)
+    dot[38:43, 58:63] = 250
+    (before, own), (after, now) = spread(dot), spread(motion_blur(dot, np.broadcast_to(np.float32(way), (3, 3, 2))))
+    assert np.abs(after - before).max() < (0.6 if way is ACROSS else 0.1)
+    assert now - own == pytest.approx(np.square(middle_way) / 12, abs=1.25 if way is ACROSS else 0.6)

@@ -1,5 +1,6 @@
 """The world's inhabitants: people and cars on their own, and all together with the faults that show and end."""
 
+from dataclasses import astuple
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,6 @@ from torchvision_dddas.simulation.crowds import FASTEST_M, SLOWEST_M, UNIT_S, Cr
 from torchvision_dddas.simulation.ground_vehicles import RADIUS_M, Cars
 from torchvision_dddas.simulation.movement import Obstacles, near_pairs
 from torchvision_dddas.simulation.scenario import Happening
-from torchvision_dddas.types import Command, Order
 
 NOTHING = np.zeros((0, 5))
 
@@ -39,13 +39,12 @@ def bearing_deg(way):
     return np.degrees(np.arctan2(*way))
 
 
-def test_a_crowd_at_random_goes_as_fast_as_the_source_says():
+def test_a_random_crowd_moves_at_the_speeds_of_its_source():
     crowds = people(*(CrowdPlan(people=1, start_m=(0.0, y), behaviour="random") for y in range(-80, 81, 10)))
     middles = [crowds._groups.middle.copy()]
-    for step in range(400):
-        crowds.step((step + 1) / 10, 0.1, NOTHING)
-        if (step + 1) % round(UNIT_S * 10) == 0:
-            middles.append(crowds._groups.middle.copy())
+    for unit in range(40):
+        walk(crowds, UNIT_S, unit * UNIT_S)
+        middles.append(crowds._groups.middle.copy())
     steps = np.abs(np.diff(middles, axis=0))
     # Few of them had to wait or turn back.
     within = ((steps > SLOWEST_M - 1e-6) & (steps < FASTEST_M + 1e-6)).all(axis=2)
@@ -54,21 +53,14 @@ def test_a_crowd_at_random_goes_as_fast_as_the_source_says():
 
 
 @pytest.mark.parametrize("speed_m_s", [0.8, 3.0])
-def test_walkers_walk_at_their_speed_and_with_their_heading(speed_m_s):
+def test_walkers_walk_at_their_speed_and_heading(speed_m_s):
     places, _ = walk(people(CrowdPlan(people=15, heading_deg=30.0, speed_m_s=speed_m_s)), 20)
     gone = (places[-1] - places[50]).mean(axis=0) / 15
     assert np.linalg.norm(gone) == pytest.approx(speed_m_s, rel=0.05)
     assert bearing_deg(gone) == pytest.approx(30.0, abs=3.0)
 
 
-def test_members_stay_with_their_crowd_though_not_in_step():
-    places, _ = walk(people(CrowdPlan(people=20, radius_m=3.0, behaviour="random")), 60)
-    about = places - places.mean(axis=1, keepdims=True)
-    assert np.linalg.norm(about, axis=2).max() < 3.0 + 2.5
-    assert np.std(about - about[0], axis=0).mean() > 0.1
-
-
-def test_nobody_steps_on_another_even_where_many_stand():
+def test_nobody_steps_on_another_in_a_dense_crowd():
     crowds = people(CrowdPlan(people=150, radius_m=1.0), CrowdPlan(people=60, start_m=(25.0, 0.0), heading_deg=270.0))
     places, _ = walk(crowds, 20)
     apart = np.linalg.norm(places[::5, :, None] - places[::5, None], axis=3) + 10 * np.eye(210)
@@ -76,15 +68,10 @@ def test_nobody_steps_on_another_even_where_many_stand():
     assert np.median(apart.min(axis=(1, 2))) > 0.48
 
 
-def test_a_crowd_stands_until_its_time_and_goes_its_way_there_and_back():
-    places, _ = walk(people(CrowdPlan(people=6, from_s=5.0)), 10)
-    middle = places.mean(axis=1)
+def test_a_crowd_waits_for_its_start_time():
+    middle = walk(people(CrowdPlan(people=6, from_s=5.0)), 10)[0].mean(axis=1)
     assert np.linalg.norm(middle[49] - middle[0]) < 0.3
     assert np.linalg.norm(middle[-1] - middle[49]) == pytest.approx(1.4 * 5, rel=0.15)
-    places, _ = walk(people(CrowdPlan(people=4, way_m=((0.0, 0.0), (14.0, 0.0), (14.0, 14.0)))), 42)
-    middle = places.mean(axis=1)
-    for corner, since in (((14.0, 0.0), 0), ((14.0, 14.0), 0), ((0.0, 0.0), 350)):
-        assert np.linalg.norm(middle[since:] - corner, axis=1).min() < 1.0
 
 
 def test_crowds_turn_back_at_the_edge_and_walk_round_a_building():
@@ -96,7 +83,7 @@ def test_crowds_turn_back_at_the_edge_and_walk_round_a_building():
     assert places[-1, :, 0].min() > 30.0
 
 
-def test_crowds_that_join_become_the_first_and_go_on_as_it():
+def test_crowds_that_join_become_the_first():
     crowds = people(
         CrowdPlan(people=8, start_m=(-10.0, 0.0), heading_deg=0.0),
         CrowdPlan(people=5, start_m=(10.0, 0.0), behaviour="stand"),
@@ -123,7 +110,7 @@ def test_half_of_a_crowd_that_splits_gets_a_number_and_a_way_of_its_own(plan):
             assert bearing_deg((places[-1] - places[50])[mine].mean(axis=0)) == pytest.approx(heading, abs=5.0)
 
 
-def test_a_crowd_that_scatters_is_as_many_as_it_has_people_and_runs_apart():
+def test_a_crowd_that_scatters_runs_apart_one_by_one():
     crowds = people(CrowdPlan(people=9, behaviour="stand"), happen=(Happening(time_s=1.0, what="scatter"),), seed=2)
     places, events = walk(crowds, 6)
     assert events == ["the 9 of crowd 1 scatter"]
@@ -133,20 +120,15 @@ def test_a_crowd_that_scatters_is_as_many_as_it_has_people_and_runs_apart():
     assert spread[-1] > 8 * spread[0]
 
 
-def test_what_happens_to_crowds_that_are_no_more_harms_nobody():
-    happen = (
-        Happening(time_s=0.5, what="join", crowds=(1, 2)),
-        Happening(time_s=1.0, what="scatter", crowds=(1, 2)),
-        Happening(time_s=1.5, what="split", crowds=(1,)),
-        Happening(time_s=1.7, what="scatter", crowds=(1,)),
-        Happening(time_s=2.0, what="join", crowds=(1, 2)),
-    )
+def test_happenings_of_crowds_that_are_no_more_do_nothing():
+    order = (("join", (1, 2)), ("scatter", (1, 2)), ("split", (1,)), ("scatter", (1,)), ("join", (1, 2)))
+    happen = tuple(Happening(time_s=0.5 * (k + 1), what=what, crowds=of) for k, (what, of) in enumerate(order))
     crowds = people(CrowdPlan(people=3), CrowdPlan(people=1, start_m=(20.0, 0.0)), happen=happen)
     walk(crowds, 5)
     assert len(set(crowds.target)) == 4
 
 
-def test_legs_go_with_the_way_and_velocities_are_those_of_the_places():
+def test_velocities_and_strides_follow_the_places():
     crowds = people(CrowdPlan(people=5, behaviour="walk"), CrowdPlan(people=5, start_m=(0, 30.0), behaviour="stand"))
     walk(crowds, 5)
     before, phase = crowds.place, crowds.phase
@@ -165,20 +147,18 @@ def test_people_make_way_for_vehicles():
     assert ((ahead > 2.0) | (aside > 1.0)).all()
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 300])
-def test_the_grid_finds_the_pairs_that_a_search_of_all_finds(count):
+@pytest.mark.parametrize("count", [0, 1, 300])
+def test_near_pairs_are_those_of_a_search_of_all(count):
     place = np.random.default_rng(count).uniform(-6, 6, (count, 2))
-    first, second = near_pairs(place, 0.9)
-    found = {(min(a, b), max(a, b)) for a, b in zip(first.tolist(), second.tolist(), strict=True)}
+    found = [tuple(sorted(pair)) for pair in zip(*(side.tolist() for side in near_pairs(place, 0.9)), strict=True)]
     away = np.linalg.norm(place[:, None] - place, axis=2)
-    assert found == {(int(a), int(b)) for a, b in zip(*np.nonzero(np.triu(away < 0.9, 1)), strict=True)}
-    assert len(found) == len(first)
+    assert sorted(found) == [tuple(pair) for pair in np.argwhere(np.triu(away < 0.9, 1)).tolist()]
 
 
-def drive(plan, seconds, others=None):
+def drive(plan, seconds, others=()):
     cars, places = Cars((plan,), 200.0, Obstacles(standing(), 200.0), 0), []
     for step in range(round(seconds * 10)):
-        cars.step((step + 1) / 10, 0.1, np.zeros((0, 2)) if others is None else others)
+        cars.step((step + 1) / 10, 0.1, np.reshape(others, (-1, 2)))
         places.append(cars.place[0].copy())
     return np.array(places)
 
@@ -194,7 +174,7 @@ def test_a_car_drives_its_way_and_turns_no_narrower_than_it_can():
     assert gone.max() <= 0.6 + 1e-6
 
 
-def test_a_car_stops_before_a_wall_of_people_and_passes_one_who_stands_in_its_way():
+def test_a_car_stops_before_many_people_and_passes_one():
     wall = np.stack([np.zeros(41), np.linspace(-20, 20, 41)], axis=1)
     places = drive(CarPlan(start_m=(-50.0, 0.0), speed_m_s=10.0), 15, wall)
     assert np.linalg.norm(places[:, None] - wall, axis=2).min() > 2.0
@@ -244,28 +224,24 @@ def moments(scenario, count, every=1):
     return [run(agents, every) for _ in range(count)]
 
 
-def same(one, other):
+def is_same(one, other):
+    """Where both hold NaN, they are the same."""
     arrays = [
         (m.bodies.place_m, m.bodies.target, m.bodies.phase, m.pose.place_m, m.pose.axes, m.turn_rad_s,
-         m.reported_lonlat_deg, m.heading_rad)
+         m.reported_lonlat_deg, m.heading_rad, np.hstack(astuple(m.flight)))
         for m in (one, other)
     ]  # fmt: skip
-    return one.flight == other.flight and all(np.array_equal(a, b, True) for a, b in zip(*arrays, strict=True))
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(*arrays, strict=True))
 
 
-def test_the_same_seed_gives_the_same_run_and_another_seed_another():
-    one, again, other = (moments(busy(seed=seed), 40)[-1] for seed in (5, 5, 6))
-    assert same(one, again)
-    assert not np.allclose(one.bodies.place_m[:10], other.bodies.place_m[:10])
-
-
-def test_what_happens_does_not_depend_on_how_many_frames_are_looked_at():
-    each, some = moments(busy(), 40), moments(busy(), 8, 5)
-    assert all(same(each[5 * k + 4], found) for k, found in enumerate(some))
+def test_a_run_depends_on_its_seed_and_not_on_skipped_frames():
+    each, some, other = moments(busy(), 40), moments(busy(), 8, 5), moments(busy(seed=6), 40)
+    assert all(is_same(each[5 * k + 4], found) for k, found in enumerate(some))
     assert [one.number for one in some] == [6 + 5 * k for k in range(8)]
     said = [[(r.vehicle, r.frame, r.planned, *r.lonlat_deg) for m in run for r in m.reports] for run in (each, some)]
     assert said[0] == said[1]
     assert [e for one in each for e in one.events] == [e for one in some for e in one.events]
+    assert not np.allclose(each[-1].bodies.place_m[:10], other[-1].bodies.place_m[:10])
 
 
 def test_nobody_leaves_the_world_and_feet_are_on_the_ground():
@@ -281,20 +257,8 @@ def test_nobody_leaves_the_world_and_feet_are_on_the_ground():
         assert np.allclose(place[:, 2], world_of().up_m(place[:, :2]))
 
 
-def test_nobody_is_run_over():
-    across = ({"people": 12, "start_m": (0.0, -20.0), "heading_deg": 0.0}, {"people": 8, "behaviour": "stand"})
-    scenario = busy(crowd=across, happening=(), car=({"start_m": (-60.0, 0.0), "speed_m_s": 8.0},))
-    for found in moments(scenario, 100, 2):
-        bodies = found.bodies
-        car = np.flatnonzero(bodies.kind == "car")[0]
-        ahead = np.array([np.sin(bodies.facing_rad[car]), np.cos(bodies.facing_rad[car])])
-        to = bodies.place_m[bodies.kind == "person", :2] - bodies.place_m[car, :2]
-        assert ((np.abs(to @ ahead) > 2.2) | (np.abs(to @ (ahead[1], -ahead[0])) > 0.9)).all()
-
-
 def test_bodies_keep_their_numbers_and_vehicles_their_targets():
-    found = moments(busy(), 60)
-    first, last = found[0].bodies, found[-1].bodies
+    first, *_, last = (found.bodies for found in moments(busy(), 60))
     assert np.array_equal(first.number, last.number)
     machines = first.kind != "person"
     assert np.array_equal(first.target[machines], last.target[machines])
@@ -310,7 +274,7 @@ def test_a_world_without_people_and_vehicles_goes_on():
     assert last.reported_lonlat_deg.shape == (0, 2)
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 7.0, 30.0])
+@pytest.mark.parametrize("rate_hz", [1.0, 7.0])
 def test_any_rate_of_frames_is_possible(rate_hz):
     scenario = busy(clip={"rate_hz": rate_hz})
     found = moments(scenario, 20)
@@ -361,7 +325,7 @@ def test_a_fault_shows_from_its_first_event_to_its_last(what, begins, ends):
         assert is_silent or off[1] == pytest.approx(10.0 * (is_on(one) and what == "gps_jump"), abs=1e-4)
 
 
-def test_a_lost_vehicle_stands_still_and_is_silent_and_one_without_gps_shares_its_plans():
+def test_a_lost_vehicle_stands_still_and_one_without_gps_shares_its_plans():
     found = faulty("ugv_lost")
     lost = [one for one in found if is_on(one)]
     places = np.array([one.bodies.place_m[1] for one in lost])
@@ -378,18 +342,3 @@ def test_a_gust_pushes_the_uav_about_as_fast_as_it_is():
     for size, fastest in ((10.0, pytest.approx(10.0, rel=0.4)), (0.0, pytest.approx(2.0, abs=2.0))):
         found = [np.linalg.norm(one.velocity_m_s[:2]) for one in faulty("gust", size=size) if is_on(one)]
         assert max(found) == fastest
-
-
-def test_orders_in_degrees_reach_the_vehicles_and_hold():
-    scenario = busy(crowd=(), car=(), happening=())
-    agents = Agents(scenario, world_of(trees=0))
-    goal, seen = np.array([18.0, -12.0]), np.array([18.0, 40.0])
-    goal_deg, seen_deg = geometry.lonlat(np.stack([goal, seen]), scenario.world.origin_deg)
-    run(agents, 1)
-    agents.steer(Command(orders=(Order("ugv3", goal_deg, 3.0, seen_deg),)))
-    run(agents, 50)
-    agents.steer(Command())
-    found = run(agents, 200)
-    assert found.bodies.place_m[2, :2] == pytest.approx(goal, abs=0.5)
-    bearing = np.arctan2(*(seen - found.bodies.place_m[2, :2]))
-    assert np.cos(found.heading_rad[2] - bearing) > np.cos(0.01)

@@ -43,7 +43,7 @@ def look(world, now):
     return image.astype(int), mask, view, people
 
 
-def test_a_picture_comes_with_the_camera_that_the_vehicle_reports(bare):
+def test_a_picture_comes_with_the_camera_that_its_vehicle_reports_and_a_silent_one_takes_none(bare):
     picture = GroundCamera(bare, SMALL).take(moment((0, 8)), 0)
     assert picture is not None
     camera = picture.camera
@@ -52,10 +52,8 @@ def test_a_picture_comes_with_the_camera_that_the_vehicle_reports(bare):
     assert (camera.heading_rad, camera.pitch_rad, camera.height_m) == (0.02, 0.0, 1.3)
     assert camera.position_sigma_m == pytest.approx(3.5 / 2.4477)
     assert 2 * np.degrees(np.arctan(160 / camera.focal_px[0])) == pytest.approx(56)
-
-
-def test_a_vehicle_that_is_silent_takes_no_picture(bare):
-    assert GroundCamera(bare, SMALL).take(moment((0, 8), reported_lonlat_deg=np.full((1, 2), np.nan)), 0) is None
+    silent = moment((0, 8), reported_lonlat_deg=np.full((1, 2), np.nan))
+    assert GroundCamera(bare, SMALL).take(silent, 0) is None
 
 
 def test_someone_stands_where_the_camera_s_geometry_says(bare):
@@ -77,8 +75,8 @@ def test_the_nearer_of_two_hides_the_farther(bare):
     assert people[3][-1] > 0.95
 
 
-@pytest.mark.parametrize("place", [(0, -8), (8, 2), (-9, 1)])
-def test_whoever_is_beside_or_behind_the_camera_is_not_in_the_picture(bare, place):
+@pytest.mark.parametrize("place", [(0, -8), (8, 2)])
+def test_people_beside_or_behind_the_camera_are_not_in_the_picture(bare, place):
     (seen, mask, _, _), (empty, _, _, _) = look(bare, moment(place)), look(bare, moment())
     assert not mask.any()
     # Their shadow may reach into it.
@@ -101,7 +99,6 @@ def test_the_same_moment_gives_the_same_picture_whatever_was_taken_before(bare):
     first.look(moment((2, 9), (0, 5), number=4), 0)
     a, b = (camera.look(moment((0, 7), number=5), 0)[0] for camera in (first, second))
     assert np.array_equal(a, b)
-    assert not np.array_equal(a, first.look(moment((0, 7), number=6), 0)[0])
 
 
 def test_a_hill_hides_who_stands_behind_it(bare):
@@ -113,10 +110,14 @@ def test_a_hill_hides_who_stands_behind_it(bare):
     assert over[2][-1] == 0
 
 
-def test_sky_is_above_and_ground_below_and_plants_and_buildings_stand_between(bare):
+def test_sky_is_above_and_ground_below(bare):
     empty, *_ = look(bare, moment())
     assert empty[:40, :, 0].mean() > empty[:40, :, 2].mean() + 30
     assert empty[-40:, :, 2].mean() > empty[-40:, :, 0].mean()
-    for grown in ({"bushes_per_ha": 300.0}, {"trees_per_ha": 100.0}, {"buildings": 20}):
-        full, *_ = look(build_world(BARE.model_copy(update=grown), 3), moment())
-        assert np.abs(full - empty).max(axis=2)[100:180].mean() > 4
+
+
+@pytest.mark.parametrize("grown", [{"bushes_per_ha": 300.0}, {"trees_per_ha": 100.0}, {"buildings": 20}])
+def test_plants_and_buildings_stand_in_the_picture(bare, grown):
+    empty, *_ = look(bare, moment())
+    full, *_ = look(build_world(BARE.model_copy(update=grown), 3), moment())
+    assert np.abs(full - empty).max(axis=2)[100:180].mean() > 4

@@ -15,11 +15,7 @@ from torchvision_dddas.simulation.sensors import Receivers, Sensor
 from torchvision_dddas.simulation.uav import Aircraft, ReportedPose, Swaying
 from torchvision_dddas.types import Camera
 
-NOBODY = np.zeros((0, 2))
 CAMERA = Camera("air", (640, 480), (554.0, 554.0), (319.5, 239.5))
-
-
-# The receivers.
 
 
 def errors_of(receivers, count, seconds):
@@ -58,13 +54,13 @@ def drive(team, seconds, start_s=0.0):
     """(T, K, ...) places, courses and speeds."""
     found = []
     for step in range(round(seconds * 10)):
-        team.step(start_s + (step + 1) / 10, 0.1, (), NOBODY)
+        team.step(start_s + (step + 1) / 10, 0.1, (), np.zeros((0, 2)))
         found.append((team.place, team.course, team.speed))
     return [np.array(column) for column in zip(*found, strict=True)]
 
 
 @pytest.mark.parametrize("patrol", ["stand", "random", "gather", "along"])
-def test_vehicles_move_within_their_limits_and_come_by_their_planned_waypoints(patrol):
+def test_vehicles_move_within_their_limits_past_their_planned_waypoints(patrol):
     team = team_of(patrol=patrol, ugvs=6)
     drive(team, 3)
     planned, start = team.waypoints(3.0, 5, ()), team.place
@@ -80,7 +76,7 @@ def test_vehicles_move_within_their_limits_and_come_by_their_planned_waypoints(p
 def test_each_patrol_goes_where_it_should():
     stood, _, _ = drive(team_of(patrol="stand"), 10)
     assert np.ptp(stood, axis=0).max() < 0.1
-    around, _, _ = drive(team_of(patrol="random", ring_m=14.0), 60)
+    around, _, _ = drive(team_of(patrol="random", ring_m=14.0), 40)
     assert np.linalg.norm(around, axis=2).max() < 16.0
     assert np.ptp(around, axis=0).min() > 5.0
     gathered, _, speed = drive(team_of(patrol="gather", ring_m=30.0, patrol_m_s=1.0), 30)
@@ -121,13 +117,10 @@ def in_ranges(hsv, colours):
     return inside & ((rest >= low[:, 1:]) & (rest <= high[:, 1:])).all(axis=2)
 
 
-@pytest.mark.parametrize("count", [0, 1, 4, 12])
-def test_colours_of_plates_are_each_in_their_own_range_alone(count):
+@pytest.mark.parametrize("count", [0, 1, 12])
+def test_colour_ranges_of_plates_do_not_overlap(count):
     names, bgr, colours = marker_plates(count)
     assert len(names) == len(bgr) == len(colours) == count
-    if count:
-        hsv = cv2.cvtColor(np.round(bgr).astype(np.uint8)[None], cv2.COLOR_BGR2HSV)[0]
-        assert (in_ranges(hsv, colours) == np.eye(count, dtype=bool)).all()
     every = np.stack(np.meshgrid(np.arange(180), [200], [200], indexing="ij"), axis=-1).reshape(-1, 3)
     assert in_ranges(every, colours).sum(axis=1).max(initial=0) <= 1
 
@@ -150,15 +143,11 @@ def test_plates_keep_their_colours_in_shade_noise_and_compression(light):
 # The UAV.
 
 
-def level(places):
-    return np.zeros(len(places))
-
-
 def hilly(places):
     return 3 * np.sin(places[:, 0] / 40) + 2 * np.cos(places[:, 1] / 30)
 
 
-def craft(up_m=level, wind_m_s=0.0, shake_deg=0.0, **parameters):
+def craft(up_m=lambda places: np.zeros(len(places)), wind_m_s=0.0, shake_deg=0.0, **parameters):
     given = {"wind_m_s": wind_m_s, "shake_deg": shake_deg, **parameters}
     return Aircraft(AircraftParameters.model_validate(given), 200.0, up_m, 0)
 
@@ -173,7 +162,7 @@ def fly(aircraft, seconds, step_s=0.1, start_s=0.0):
     return poses, np.array(velocity), np.array(turn)
 
 
-@pytest.mark.parametrize("pitch_deg", [90.0, 60.0, 45.0])
+@pytest.mark.parametrize("pitch_deg", [90.0, 45.0])
 def test_the_point_of_the_way_is_in_the_middle_of_the_picture(pitch_deg):
     aircraft = craft(pitch_deg=pitch_deg, heading_deg=30.0, start_m=(5.0, -3.0), way_m=((65.0, -3.0),))
     poses, _, _ = fly(aircraft, 20)
@@ -213,11 +202,10 @@ def test_rates_of_the_pose_are_its_derivatives(steered):
 
 def test_gusts_and_shaking_have_their_standard_deviation_and_last_for_their_time():
     swaying = Swaying(np.full(3000, 0.5), 0.8, np.random.default_rng(0))
-    assert swaying.value.std() == pytest.approx(0.5, rel=0.05)
     before = swaying.value.copy()
     for _ in range(8):
         swaying.step(0.1)
-    assert swaying.value.std() == pytest.approx(0.5, rel=0.05)
+    assert (before.std(), swaying.value.std()) == pytest.approx((0.5, 0.5), rel=0.05)
     assert swaying.rate.std() == pytest.approx(0.5 / 0.8, rel=0.05)
     # Matern 3/2: (1 + t / tau) exp(-t / tau).
     assert np.corrcoef(before, swaying.value)[0, 1] == pytest.approx(2 * np.exp(-1), abs=0.03)
@@ -248,17 +236,9 @@ def test_its_telemetry_errs_lastingly_by_its_parameters():
 
 def test_a_way_goes_there_and_back_at_its_speed():
     way = Waypoints(np.array([[0.0, 0], [10, 0], [10, 0], [10, 5]]), 2.0)
-    for time, place, velocity in (
-        (0.0, (0, 0), (2, 0)),
-        (4.0, (8, 0), (2, 0)),
-        (6.0, (10, 2), (0, 2)),
-        (9.0, (10, 2), (0, -2)),
-        (13.0, (4, 0), (-2, 0)),
-        (16.0, (2, 0), (2, 0)),
-    ):
-        at, going = way.at(time)
-        assert at == pytest.approx(place)
-        assert going == pytest.approx(velocity)
+    places, velocities = zip(*(way.at(time) for time in (4.0, 6.0, 9.0, 13.0, 16.0)), strict=True)
+    np.testing.assert_allclose(places, [(8, 0), (10, 2), (10, 2), (4, 0), (2, 0)], atol=1e-9)
+    np.testing.assert_allclose(velocities, [(2, 0), (0, 2), (0, -2), (-2, 0), (2, 0)], atol=1e-9)
     assert Waypoints(np.zeros((1, 2)), 2.0).at(3.0)[1] == pytest.approx((0, 0))
 
 
@@ -281,12 +261,6 @@ def test_the_variance_of_the_noise_grows_with_the_light(value):
     assert noisy.mean() == pytest.approx(value, abs=0.1)
 
 
-def test_the_noise_of_pictures_is_independent():
-    camera = sensor(read_noise=3.0)
-    pictures = [camera.expose(grey(100), number, 0.0).astype(float).ravel() for number in range(1, 9)]
-    assert np.abs(np.corrcoef(pictures) - np.eye(8)).max() < 0.02
-
-
 def test_exposure_drifts_slowly_and_no_further_than_asked():
     camera = sensor(drift=0.1)
     gain = np.array([camera.gain(t) for t in np.arange(0, 300, 0.1)])
@@ -295,11 +269,11 @@ def test_exposure_drifts_slowly_and_no_further_than_asked():
     assert np.abs(np.diff(gain)).max() < 0.01
 
 
-def test_a_picture_depends_on_seed_stream_and_number_and_on_nothing_before_it():
+def test_noise_depends_on_seed_stream_and_number_and_on_nothing_before_it():
     parameters = {"shot_noise": 0.2, "read_noise": 1.0, "drift": 0.05, "quality": 90, "sharpness_px": 0.6}
     first, second = sensor(3, **parameters), sensor(3, **parameters)
     first.expose(grey(90), 1, 0.1)
     expected = second.expose(grey(90), 2, 0.2)
     assert np.array_equal(first.expose(grey(90), 2, 0.2), expected)
     for other, number in ((sensor(4, **parameters), 2), (sensor(3, stream=1, **parameters), 2), (second, 3)):
-        assert not np.array_equal(other.expose(grey(90), number, 0.2), expected)
+        assert np.corrcoef(other.expose(grey(90), number, 0.2).ravel(), expected.ravel())[0, 1] < 0.02
