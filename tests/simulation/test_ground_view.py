@@ -102,18 +102,11 @@ def test_the_same_moment_gives_the_same_picture_whatever_was_taken_before(bare):
 
 
 def test_a_hill_hides_who_stands_behind_it(bare):
-    rows = bare.relief.corner_m[1] + bare.relief.step_m * np.arange(bare.relief.up_m.shape[0])
-    ridge = np.broadcast_to(3.0 * np.exp(-(((rows - 15) / 3) ** 2))[:, None], bare.relief.up_m.shape)
+    north = bare.relief.corner_m[1] + bare.relief.step_m * np.arange(len(bare.relief.up_m))
+    ridge = np.broadcast_to(3.0 * np.exp(-(((north - 15) / 3) ** 2))[:, None], bare.relief.up_m.shape)
     hilly = replace(bare, relief=replace(bare.relief, up_m=ridge))
     (_, _, _, over), (_, _, _, flat) = (look(world, moment((0, 30))) for world in (hilly, bare))
-    assert flat[2][-1] > 0
-    assert over[2][-1] == 0
-
-
-def test_sky_is_above_and_ground_below(bare):
-    empty, *_ = look(bare, moment())
-    assert empty[:40, :, 0].mean() > empty[:40, :, 2].mean() + 30
-    assert empty[-40:, :, 2].mean() > empty[-40:, :, 0].mean()
+    assert flat[2][-1] > over[2][-1] == 0
 
 
 @pytest.mark.parametrize("grown", [{"bushes_per_ha": 300.0}, {"trees_per_ha": 100.0}, {"buildings": 20}])

@@ -44,7 +44,6 @@ def test_overrides_change_what_they_name_and_nothing_else():
 def test_an_override_can_bring_a_whole_list_or_parameters_of_the_system():
     scenario = load_scenario("quiet", ["fault=[{what='gust', time_s=3, seconds=1}]", "settings.crowds.join_m=4"])
     assert scenario.fault[0].what == "gust"
-    assert scenario_settings(scenario)["crowds.join_m"] == 4
     assert with_parameters(Settings(), scenario_settings(scenario)).crowds.join_m == 4
 
 
@@ -52,35 +51,27 @@ def test_an_override_can_bring_a_whole_list_or_parameters_of_the_system():
     ("override", "line"),
     [
         ("uav.altitude_m=1", "uav.altitude_m must be between 2 and 2000 m, got 1"),
-        ("uav.altitud_m=9", "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
         ("crowd.1.peple=9", "unknown parameter 'crowd.1.peple'; did you mean crowd.1.people"),
         ("crowd.1.people=0.5", "crowd.1.people must be a whole number between 1 and 5000 people, got 0.5"),
         ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ..., of which there are 2"),
         ("crowd.people=2", "'crowd.people' names no parameter; wanted such as crowd.1.people"),
-        ("crowd=3", "crowd must be a list of tables, got 3"),
-        ("uav=3", "uav must be a table, got 3"),
         ("weather.rain=3", "unknown parameter 'weather'; its tables are clip, world, uav"),
         ("seed=-1", "seed must be a whole number from 0 to 2147483647, got -1"),
         ("crowd.1.start_m=3", "crowd.1.start_m must be two numbers, [east, north], got 3"),
         ("crowd.1.way_m=[[1, 2], 3]", "crowd.1.way_m must be a list of places"),
         ("happening.1.what=jump", "happening.1.what must be join or split or scatter"),
-        ("settings.crowds.join=3", "settings: unknown parameter 'crowds.join'; did you mean crowds.join_m"),
         ("settings.crowds.join_m=-3", "settings: crowds.join_m must be between 0 and 100 m, got -3"),
         ("uav.altitude_m", "is no override; wanted group.parameter=value"),
-        ("crowd.1.start_m=[400, 0]", "crowd.1.start_m = [400, 0] with 2.5 m about it is outside the world; wanted"),
         ("crowd.1.start_m=[116, 0]", "is outside the world; wanted within 118 m"),
         ("crowd.2.way_m=[[0, 0], [0, -119]]", "crowd.2.way_m = [0, -119] is outside the world"),
-        ("car.1.start_m=[0, 119]", "car.1.start_m = [0, 119] is outside"),
         ("team.ring_m=119", "team.middle_m = [0, 0] with 119 m about it is outside"),
         ("uav.way_m=[[0, 200]]", "uav.way_m = [0, 200] is outside"),
         ("team.ugvs=3", "team.ugvs must be 4 or more in a clip located by landmarks, got 3"),
         ("happening.1.crowds=[1, 3]", "happening.1.crowds names crowd 3, of which there are 2"),
         ("happening.1.crowds=[1, 1]", "must name two or more crowds to join"),
         ("happening.1.time_s=40", "happening.1.time_s = 40 is after the end; clip.seconds = 40"),
-        ("fault=[{what='gust', time_s=50}]", "fault.1.time_s = 50 is after the end"),
         ("fault=[{what='gps_jump', vehicle=5}]", "fault.1.vehicle = 5 is not there; team.ugvs = 4"),
         ("world.elevation=no.tif", "world.elevation: there is no file no.tif"),
-        ("world.photo=no.tif", "world.photo: there is no file no.tif"),
         ("happening=[{what='split', crowds=[1, 1]}]", "happening.1.crowds = [1, 1] names a crowd twice"),
         ("camera.exposure_s=0.2", "is longer than from picture to picture; wanted 0.1 s or less"),
         ("world.origin_deg=[200, 0]", "world.origin_deg must be a longitude from -180 to 180 and a latitude from -85"),
@@ -101,17 +92,10 @@ def test_a_person_alone_cannot_split_and_few_vehicles_suffice_where_telemetry_lo
     check_scenario(small(team={"ugvs": 4}, fault=({"what": "frozen", "time_s": 0.5, "vehicle": 9},)))
 
 
-@pytest.mark.parametrize(
-    ("name", "line"),
-    [
-        ("", r"there are border100, .* or give a TOML file"),
-        ("Joining", r"there are border100, .* or give a TOML file"),
-        ("folder/gone.toml", r"no such scenario file: .*gone\.toml"),
-    ],
-)
-def test_an_unknown_scenario_is_refused(name, line):
-    with pytest.raises(InputError, match=line):
-        load_scenario(name)
+def test_an_unknown_scenario_is_refused():
+    for name, line in (("Joining", "there are border100, .* or give a TOML file"), ("a/gone.toml", "no such scenario")):
+        with pytest.raises(InputError, match=line):
+            load_scenario(name)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +107,6 @@ def test_an_unknown_scenario_is_refused(name, line):
         ("[[uav]]\naltitude_m = 5\n", "must be a table"),
         ("[crowd]\npeople = 5\n", "must be a list of tables"),
         ("[settings.crowds]\njoin = 5\n", "odd.toml: settings: unknown parameter"),
-        ("[settings]\ncrowds = 5\n", "must be a table"),
         ("altitude_m = 5\n", "unknown parameter 'altitude_m'; did you mean uav.altitude_m"),
     ],
 )
