@@ -2,6 +2,7 @@
 
 from dataclasses import astuple
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_a_crowd_that_scatters_runs_apart_one_by_one():
 
 
 def test_happenings_of_crowds_that_are_no_more_do_nothing():
-    order = (("join", (1, 2)), ("scatter", (1, 2)), ("split", (1,)), ("scatter", (1,)), ("join", (1, 2)))
+    order: Any = (("join", (1, 2)), ("scatter", (1, 2)), ("split", (1,)), ("scatter", (1,)), ("join", (1, 2)))
     happen = tuple(Happening(time_s=0.5 * (k + 1), what=what, crowds=of) for k, (what, of) in enumerate(order))
     crowds = people(CrowdPlan(people=3), CrowdPlan(people=1, start_m=(20.0, 0.0)), happen=happen)
     walk(crowds, 5)
