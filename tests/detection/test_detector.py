@@ -1,7 +1,6 @@
-"""The detector on small films: what comes out, when, and what happens where the film is bad."""
+"""The detector on small films, good and bad."""
 
-import subprocess
-import sys
+import weakref
 from collections.abc import Sequence
 
 import cv2
@@ -29,13 +28,17 @@ def detect(frames: Sequence[Frame | np.ndarray], settings: Settings, batch: int 
     return [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
 
 
+def is_empty(scene: Scene) -> bool:
+    return not scene.reliable and bool(scene.cause) and not scene.mask.any() and len(scene.detections) == 0
+
+
 class Film:
-    """A source of frames at hand."""
+    """A source of frames in memory."""
 
     rate_hz = RATE_HZ
 
-    def __init__(self, images: Sequence[np.ndarray], count: int | None = None, last: int = 0) -> None:
-        self.frames, self.count, self.last = frames_of(images), count, last
+    def __init__(self, images: Sequence[np.ndarray], count: int | None = None) -> None:
+        self.frames, self.count, self.last = frames_of(images), count, 0
 
     def __iter__(self):
         return iter(self.frames)
@@ -76,10 +79,13 @@ def pan(ground: np.ndarray, frames: int, size=SIZE, car: float | None = None) ->
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(config, film):
-    found = detect(frames_of(film.images), load_config(config))
+def test_every_frame_has_one_scene_in_order_and_missing_frames_an_empty_one(config, film):
+    frames = [frame for frame in frames_of(film.images) if frame.number not in (1, 6, 7)]
+    found = detect(frames, load_config(config))
     assert [s.frame.number for s in found] == list(range(1, 17))
     for scene in found:
+        missing = scene.frame.number in (1, 6, 7)
+        assert is_empty(scene) == missing == (scene.cause == "the frame could not be read")
         assert scene.mask.shape == (SIZE[1], SIZE[0]) and scene.mask.dtype == np.uint16
         assert scene.mask.max() <= len(scene.detections)
         for i, (x, y, width, height) in enumerate(scene.detections.box_px):
@@ -89,40 +95,34 @@ def test_every_frame_has_a_scene_in_order_with_a_mask_and_boxes_that_agree(confi
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_a_car_that_drives_under_a_panning_camera_is_found_with_its_heading_and_speed(config, noise):
-    settings = load_config(config)
-    found = detect(frames_of(pan(noise, 14, car=5.0)), settings)
-    hits, headings, speeds = 0, [], []
-    for k, scene in enumerate(found):
+def test_a_car_under_a_panning_camera_is_detected_with_its_heading_and_speed(config, noise):
+    settings, hits = load_config(config), []
+    for k, scene in enumerate(detect(frames_of(pan(noise, 14, car=5.0)), settings)):
         assert scene.reliable
-        centre = 20 + 5 * k - 10 - 2 * k + 36, 88
-        for (x, y, width, height), heading, speed in zip(
-            scene.detections.box_px, scene.detections.heading_rad, scene.detections.speed_px, strict=True
-        ):
-            if x <= centre[0] <= x + width and y <= centre[1] <= y + height:
-                hits += 1
-                headings.append(heading)
-                speeds.append(speed)
-                break
-    assert hits >= 11
-    if not settings.history.on:  # then the quick chain tells none, rather than a guess
+        boxes = scene.detections
+        left, top, width, height = boxes.box_px.T
+        u, v = 20 + 5 * k - 10 - 2 * k + 36, 88
+        on_car = (left <= u) & (u <= left + width) & (top <= v) & (v <= top + height)
+        hits += list(zip(boxes.heading_rad[on_car], boxes.speed_px[on_car], strict=True))[:1]
+    assert len(hits) >= 11
+    headings, speeds = np.transpose(hits)
+    if settings.history.on:
+        assert abs(np.degrees(np.nanmedian(headings))) < 20
+        assert np.nanmedian(speeds) == pytest.approx(5.0, rel=0.4)
+    else:  # the quick chain has none, rather than a guess
         assert np.isnan(headings).all() and np.isnan(speeds).all()
-        return
-    assert abs(np.degrees(np.nanmedian(headings))) < 20
-    assert np.nanmedian(speeds) == pytest.approx(5.0, rel=0.4)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_the_result_does_not_depend_on_the_batch_size(config, film):
+def test_the_batch_size_does_not_change_the_result(config, film):
     settings = load_config(config)
     one = detect(frames_of(film.images), settings)
-    for batch in (3, 8, 50):
+    for batch in (3, 50):
         assert all(same(a, b) for a, b in zip(one, detect(frames_of(film.images), settings, batch), strict=True))
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
-    """A live stream gets the result of a file: the scene of t is the same whatever follows t + 2 intervals."""
+def test_frames_more_than_two_intervals_ahead_do_not_change_a_scene(config, film):
     settings = load_config(config)
     whole = detect(frames_of(film.images), settings)
     for kept in (8, 11):
@@ -134,42 +134,24 @@ def test_no_frame_more_than_two_intervals_ahead_changes_a_scene(config, film):
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_a_cut_gives_no_full_mask_and_is_not_looked_across(config, noise):
+def test_each_side_of_a_cut_is_detected_on_its_own(config, noise):
     one, two = pan(noise, 8, car=5.0), pan(255 - noise[::-1, ::-1], 8, car=5.0)
     settings = load_config(config)
     found = detect(frames_of(one + two), settings)
     assert max((s.mask > 0).mean() for s in found) < 0.25
-    # The first frame after it is flagged, and nothing else.
-    assert [s.frame.number for s in found if not s.reliable] == [9]
-    assert found[8].cause and not found[8].mask.any() and len(found[8].detections) == 0
-    # Each side is as if it were alone.
+    assert [s.frame.number for s in found if not s.reliable] == [9] and is_empty(found[8])
     alone = detect(frames_of(one), settings)
     assert all(np.array_equal(a.mask, b.mask) for a, b in zip(found[:8], alone, strict=True))
 
 
-@pytest.mark.parametrize("config", CONFIGS)
-@pytest.mark.parametrize("level", [0, 128, 255])
+@pytest.mark.parametrize(("config", "level"), [(None, 0), ("source", 128), ("fast", 255), ("fast", 0)])
 def test_blank_frames_in_the_middle_are_unreliable_and_empty(config, level, noise):
     images = pan(noise, 15, car=5.0)
-    for k in (6, 7):
-        images[k] = np.full_like(images[k], level)
+    images[6] = images[7] = np.full_like(images[6], level)
     found = detect(frames_of(images), load_config(config))
-    for k in (6, 7):
-        assert not found[k].reliable and found[k].cause
-        assert not found[k].mask.any() and len(found[k].detections) == 0
+    assert is_empty(found[6]) and is_empty(found[7])
     assert all(s.reliable for s in found[:5] + found[9:])
     assert max((s.mask > 0).mean() for s in found) < 0.25
-
-
-@pytest.mark.parametrize("config", CONFIGS)
-def test_frame_numbers_that_are_missing_get_empty_unreliable_scenes(config, film):
-    frames = [frame for frame in frames_of(film.images) if frame.number not in (1, 6, 7)]
-    found = detect(frames, load_config(config))
-    assert [s.frame.number for s in found] == list(range(1, 17))
-    for number in (1, 6, 7):
-        scene = found[number - 1]
-        assert (scene.reliable, scene.cause) == (False, "the frame could not be read")
-        assert not scene.mask.any() and len(scene.detections) == 0
 
 
 def flight(time_s, altitude_m=60.0) -> Telemetry:
@@ -177,75 +159,60 @@ def flight(time_s, altitude_m=60.0) -> Telemetry:
     return Telemetry(time, np.broadcast_to(altitude_m, time.shape), np.full(time.shape, 5.0))
 
 
-@pytest.mark.parametrize("count", [16, None])
-@pytest.mark.parametrize(("from_s", "to_s"), [(50.0, 60.0), (-60.0, -50.0)])
-def test_telemetry_of_another_time_is_refused_naming_both_spans(count, from_s, to_s, film):
-    settings = load_config("fast")
-    told = detect_motion(Film(film.images, count), settings, "onboard", flight([from_s, to_s]))
+@pytest.mark.parametrize(("count", "from_s", "to_s"), [(16, 50.0, 60.0), (None, 50.0, 60.0), (16, -60.0, -50.0)])
+def test_telemetry_of_another_time_is_refused_with_both_spans(count, from_s, to_s, film):
+    scenes = detect_motion(Film(film.images, count), load_config("fast"), "onboard", flight([from_s, to_s]))
     with pytest.raises(InputError, match=f"{from_s} to {to_s} s, the clip 0.0 to 1.5 s"):
-        list(told)
+        list(scenes)
 
 
-def test_the_interval_follows_the_telemetry_and_the_change_is_recorded(film):
-    settings = with_parameters(
-        load_config(), {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
-    )
+def test_the_interval_adapts_to_the_telemetry_and_the_change_is_recorded(film):
+    changed = {"interval.frames": 3, "interval.minimum_frames": 3, "interval.maximum_frames": 6}
     altitude = np.where(np.arange(16) < 8, 60.0, 100.0)
-    told = list(detect_motion(Film(film.images), settings, "onboard", flight(np.arange(16) / 10, altitude)))
-    assert [s.interval_frames for s in told] == [3] * 8 + [5] * 8
-    (moved,) = [a for s in told for a in s.adjustments if a.parameter == "interval.frames"]
+    telemetry = flight(np.arange(16) / 10, altitude)
+    scenes = list(detect_motion(Film(film.images), with_parameters(load_config(), changed), "onboard", telemetry))
+    assert [s.interval_frames for s in scenes] == [3] * 8 + [5] * 8
+    (moved,) = [a for s in scenes for a in s.adjustments if a.parameter == "interval.frames"]
     assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
     assert "altitude 100.0 m" in moved.cause
-    gates = [a for s in told for a in s.adjustments if a.parameter == "gates.max_size_px"]
-    assert [a.frame for a in gates] == [1, 9]
+    assert [a.frame for s in scenes for a in s.adjustments if a.parameter == "gates.max_size_px"] == [1, 9]
 
 
-def test_targets_larger_or_faster_than_the_gates_allow_at_that_altitude_are_left_out(noise):
+def test_targets_outside_the_gates_of_the_altitude_are_left_out(noise):
     images = pan(noise, 12, car=5.0)
     base = {"gates.focal_px": 1000.0, "gates.min_size_m": 0.2, "gates.max_size_m": 25.0, "gates.max_speed_m_s": 60.0}
 
     def count(**parameters: float) -> int:
         settings = with_parameters(load_config("fast"), base | {f"gates.{k}": v for k, v in parameters.items()})
-        told = detect_motion(Film(images), settings, "onboard", flight([0, 1.1], altitude_m=100.0))
-        return sum(len(s.detections) for s in told)
+        scenes = detect_motion(Film(images), settings, "onboard", flight([0, 1.1], altitude_m=100.0))
+        return sum(len(s.detections) for s in scenes)
 
-    seen = count()
-    assert seen >= 8
-    assert count(max_size_m=5.0) < 0.4 * seen  # the car is 72 px: 7.2 m at 100 m
+    everything = count()
+    assert everything >= 8
+    assert count(max_size_m=5.0) < 0.4 * everything  # the car is 72 px: 7.2 m at 100 m
     assert count(min_size_m=20.0) == 0
 
 
 @pytest.mark.parametrize("config", [None, "fast"])
-def test_what_no_window_looks_at_again_is_let_go(config, film):
-    """No more colour pictures are held than a window spans, however long the clip; a settled frame's is not."""
+def test_no_more_pictures_are_held_than_a_window_spans(config, film):
     settings = with_parameters(load_config(config), {"interval.rule": False})
-    loop, there_and_back = MotionDetector(settings, "onboard", RATE_HZ), [*film.images, *film.images[::-1]]
-    held = []
-    for frame in frames_of(there_and_back * 2):
-        for _ in loop.update(frame):
-            pass
-        colours = {id(picture) for slot in loop._slots for picture in (slot.frame.image, slot.view.image)}
-        colours -= {id(slot.view.grey) for slot in loop._slots}
-        held.append((len(loop._slots), len(colours)))
-    assert max(held) == max(held[-10:])
-    parameters = settings.difference
-    ahead = look_ahead(settings.interval.frames, settings) + settling_delay(settings.interval.frames, settings)
-    assert max(colours for _, colours in held) <= parameters.wide_frames + ahead + 1
+    detector, pictures, held = MotionDetector(settings, "onboard", RATE_HZ), [], []
+    for k in range(64):
+        image = film.images[min(k % 32, 31 - k % 32)].copy()
+        pictures.append(weakref.ref(image))
+        detector.update(image)
+        del image
+        held.append(sum(picture() is not None for picture in pictures))
+    frames = settings.interval.frames
+    ahead = look_ahead(frames, settings) + settling_delay(frames, settings)
+    assert max(held) == max(held[-10:]) <= settings.difference.wide_frames + ahead + 1
 
 
-def test_a_run_loads_neither_scipy_nor_torch():
-    code = (
-        "import sys, torchvision_dddas.detection.detector; print([m for m in ('scipy', 'torch') if m in sys.modules])"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
-
-
-def test_plain_images_give_what_frames_give_and_so_does_the_generator(film):
+def test_images_frames_and_the_generator_give_the_same_scenes(film):
     settings = load_config("fast")
     wanted = detect(frames_of(film.images), settings)
     for found in (detect(film.images, settings), list(detect_motion(Film(film.images), settings, "onboard"))):
-        assert [s.frame.number for s in found] == [s.frame.number for s in wanted]
-        assert [s.frame.time_s for s in found] == [s.frame.time_s for s in wanted]
+        assert [(s.frame.number, s.frame.time_s) for s in found] == [(s.frame.number, s.frame.time_s) for s in wanted]
         assert all(same(a, b) for a, b in zip(found, wanted, strict=True))
 
 
@@ -254,18 +221,17 @@ def test_plain_images_give_what_frames_give_and_so_does_the_generator(film):
     [
         (np.zeros((4, 5, 3)), r"uint8 of shape \(H, W\) or \(H, W, 3\), got float64 of shape \(4, 5, 3\)"),
         (np.zeros((4, 5, 4), np.uint8), r"got uint8 of shape \(4, 5, 4\)"),
-        (np.zeros(9, np.uint8), r"got uint8 of shape \(9,\)"),
         (np.zeros((0, 5), np.uint8), r"got uint8 of shape \(0, 5\)"),
         ([[1, 2], [3, 4]], "a Frame or a NumPy image, got list"),
     ],
 )
-def test_what_is_no_image_is_refused_in_one_line(image, says):
+def test_anything_but_an_image_is_refused(image, says):
     with pytest.raises(InputError, match=says):
         MotionDetector(backend="onboard").update(image)
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_three_frames_are_enough_and_fewer_are_refused_with_the_number_that_is_missing(config, noise):
+def test_three_frames_are_enough_and_fewer_are_refused(config, noise):
     images = pan(noise, 3, car=5.0)
     assert [s.reliable for s in detect(images, load_config(config))] == [True] * 3
     for count, says in enumerate(("no frame", "1 frame ", "2 frames")):

@@ -20,77 +20,71 @@ from torchvision_dddas.people.confirmation import (
 from torchvision_dddas.types import Camera
 
 KNOBS = ConfirmParameters(spread_m=0.0)
+CROWD = [[0.2, 10], [-0.3, 10.1], [0.1, 9.8], [5, 12]]
 NORTH = View(np.zeros(2), 0.0, math.radians(30), 2.0, 20.0)
 
 
-def square(sigma_m, n):
-    return np.tile(sigma_m**2 * np.eye(2), (n, 1, 1))
-
-
-def seen(blobs, people=(), views=(NORTH,), parameters=KNOBS, blob_sigma=0.3, person_sigma=0.1, score=None):
-    blobs, people = np.reshape(blobs, (-1, 2)).astype(float), np.reshape(people, (-1, 2)).astype(float)
+def observed(blobs, people=(), views=(NORTH,), score=None):
+    blobs, people = (np.reshape(places, (-1, 2)).astype(float) for places in (blobs, people))
     score = np.ones(len(people)) if score is None else np.array(score)
-    return observe_ground(
-        blobs, square(blob_sigma, len(blobs)), people, square(person_sigma, len(people)), score, views, parameters
-    )
+    sigma, person_sigma = (np.tile(s**2 * np.eye(2), (len(x), 1, 1)) for s, x in ((0.3, blobs), (0.1, people)))
+    return observe_ground(blobs, sigma, people, person_sigma, score, views, KNOBS)
 
 
-def test_a_person_inside_the_gate_is_at_the_blob_and_the_distance_is_kept():
-    found = seen([0, 10], [0.3, 10.4])
-    assert (found.looked.tolist(), found.people.tolist(), found.best.tolist()) == ([True], [1], [1.0])
+def test_the_distance_to_the_nearest_person_is_kept():
+    found = observed([0, 10], [0.3, 10.4])
     assert found.nearest_m[0] == pytest.approx(0.5)
     assert found.nearest_sigmas[0] == pytest.approx(0.5 / math.hypot(0.3, 0.1))
 
 
 @pytest.mark.parametrize(
-    "blob",
-    [(0, 1.5), (0, 30), (0, -10), (8, 10), (0, 2.3), (0, 19.7)],
-    ids=["near", "far", "behind", "side", "2", "20"],
+    ("blobs", "people", "visible"),
+    [
+        *(([blob], [], [False]) for blob in [(0, 1.5), (0, 30), (0, -10), (8, 10), (0, 2.3), (0, 19.7)]),
+        ([[0, 5], [0, 10]], [], [True, False]),  # hidden by a blob
+        ([[-1, 5], [1, 10]], [], [True, True]),
+        ([[0, 10]], [[0, 5]], [False]),  # hidden by a person
+    ],
 )
-def test_a_blob_outside_the_view_or_at_its_edge_is_unseen(blob):
-    assert not seen(blob).looked[0]
+def test_a_blob_outside_the_view_at_its_edge_or_hidden_is_unseen(blobs, people, visible):
+    assert observed(blobs, people).looked.tolist() == visible
 
 
-def test_a_blob_behind_another_is_hidden_and_one_beside_it_is_not():
-    assert seen([[0, 5], [0, 10]]).looked.tolist() == [True, False]
-    assert seen([[-1, 5], [1, 10]]).looked.tolist() == [True, True]
-    assert seen([[0, 10]], [[0, 5]]).looked.tolist() == [False]
-
-
-def test_a_person_between_two_blobs_is_at_one_and_leaves_the_other_in_doubt_and_crowds_are_counted():
-    people = [[0.2, 10], [-0.3, 10.1], [0.1, 9.8], [5, 12]]
-    found = seen([[0, 10], [5, 12]], people, score=[0.6, 0.9, 0.7, 0.8])
-    assert (found.people.tolist(), found.best.tolist()) == ([3, 1], [0.9, 0.8])
-    found = seen([[0, 10], [0.8, 10]], [0.2, 10])
-    assert (found.people.tolist(), found.looked.tolist()) == ([1, 0], [True, False])
+@pytest.mark.parametrize(
+    ("blobs", "people", "score", "counts", "best", "visible"),
+    [
+        ([0, 10], [0.3, 10.4], [1.0], [1], [1.0], [True]),
+        ([[0, 10], [5, 12]], CROWD, [0.6, 0.9, 0.7, 0.8], [3, 1], [0.9, 0.8], [True, True]),
+        ([[0, 10], [0.8, 10]], [0.2, 10], [1.0], [1, 0], [1.0, 0.0], [True, False]),  # a person between two blobs
+    ],
+)
+def test_people_inside_the_gate_are_counted_at_one_blob(blobs, people, score, counts, best, visible):
+    found = observed(blobs, people, score=score)
+    assert (found.people.tolist(), found.best.tolist(), found.looked.tolist()) == (counts, best, visible)
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-1e4, 1e4), st.floats(-1e4, 1e4))
 @settings(max_examples=50, deadline=None)
-def test_nothing_changes_when_the_whole_scene_is_turned_and_moved(angle, east, north):
-    rng = np.random.default_rng(3)
-    blobs, people = rng.uniform((-6, 1), (6, 22), (12, 2)), rng.uniform((-6, 1), (6, 22), (6, 2))
-    first = seen(blobs, people)
+def test_turning_and_moving_the_whole_scene_changes_nothing(angle, east, north):
+    blobs, people = np.random.default_rng(3).uniform((-6, 1), (6, 22), (2, 12, 2))
+    first = observed(blobs, people)
     # Clockwise, as headings go.
     turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
     view = View(np.array([east, north]), angle, NORTH.half_rad, NORTH.near_m, NORTH.far_m)
-    second = seen(blobs @ turn.T + (east, north), people @ turn.T + (east, north), views=[view])
+    second = observed(blobs @ turn.T + (east, north), people @ turn.T + (east, north), views=[view])
     np.testing.assert_array_equal(first.looked, second.looked)
     np.testing.assert_array_equal(first.people, second.people)
     np.testing.assert_allclose(first.nearest_sigmas, second.nearest_sigmas, atol=1e-6)
 
 
-def test_a_cameras_view_reaches_as_far_as_bodies_are_large_enough():
+@pytest.mark.parametrize(("enlarge", "step"), [(1.0, 1.05), (2.0, 2**0.25)])  # whole steps to twice the size
+def test_a_view_ends_where_bodies_become_too_small(enlarge, step):
     camera = Camera("ugv", (800, 600), (1000.0, 1000.0), (399.5, 299.5))
-    view = field_of_view(
-        camera, np.zeros(2), 0.0, PeopleParameters(enlarge=1.0, height_share=0.75), GroundParameters(body_height_m=1.8)
-    )
-    assert view.far_m == pytest.approx(1000 * 1.8 / 96)
+    parameters = PeopleParameters(enlarge=enlarge, scale_step=step, height_share=0.75)
+    view = field_of_view(camera, np.zeros(2), 0.0, parameters, GroundParameters(body_height_m=1.8))
+    assert view.far_m == pytest.approx(enlarge * 1000 * 1.8 / 96)
     assert view.near_m == pytest.approx(3.0)
     assert view.half_rad == pytest.approx(math.atan(0.4))
-    twice = PeopleParameters(enlarge=2.0, scale_step=2**0.25, height_share=0.75)  # whole steps to twice the size
-    closer = field_of_view(camera, np.zeros(2), 0.0, twice, GroundParameters(body_height_m=1.8))
-    assert closer.far_m == pytest.approx(2 * view.far_m)
 
 
 def one(looked, people=0, best=0.0):
@@ -98,7 +92,7 @@ def one(looked, people=0, best=0.0):
     return GroundObservation(np.array([looked]), np.array([people]), nothing, nothing, np.array([best]))
 
 
-def test_a_look_weighs_as_bayes_says():
+def test_the_evidence_of_an_observation_is_bayes_rule():
     parameters = ConfirmParameters(detection_rate=0.8, false_rate=0.1, prior=0.25)
     beliefs = Beliefs(parameters)
     beliefs.add(["blob"], [("ugv", one(True, 1, 1.0))])
@@ -109,21 +103,20 @@ def test_a_look_weighs_as_bayes_says():
     assert beliefs.kind("other") == "unseen" and beliefs.probability("other") == pytest.approx(0.25)
 
 
-def test_one_chance_hit_makes_no_crowd_of_a_car():
-    person, car, crowd = [[0, 0, 50, 130]], [[0, 0, 400, 130]], [[0, 0, 400, 130]]
+def test_one_false_hit_does_not_make_a_car_a_crowd():
+    person, wide = np.array([[0, 0, 50, 130.0]]), np.array([[0, 0, 400, 130.0]])
     one_hit, many = [[5, 5, 45, 120.0]], [[x, 5, 45, 120.0] for x in range(5, 350, 80)]
 
     def weight(blob, people):
-        found = observe_picture(np.array(blob, float), np.array(people), np.full(len(people), 0.8), KNOBS)
+        found = observe_picture(blob, np.reshape(people, (-1, 4)), np.full(len(people), 0.8), KNOBS)
         return evidence(found, KNOBS)[0]
 
     assert weight(person, one_hit) > 0.5
-    assert weight(car, one_hit) < 0
-    assert weight(crowd, many) > 0
-    assert weight(car, np.zeros((0, 4))) < weight(person, np.zeros((0, 4)))
+    assert weight(wide, one_hit) < 0 < weight(wide, many)
+    assert weight(wide, []) < weight(person, [])
 
 
-def test_boxes_are_confirmed_by_the_people_they_share():
+def test_boxes_are_confirmed_by_the_people_in_them():
     blobs = np.array([[100, 100, 60, 130], [300, 100, 60, 130], [500, 150, 30, 40], [0, 0, 200, 20.0]])
     people = np.array([[110, 95, 40, 120], [500, 120, 40, 110.0], [330, 400, 40, 100]])
     found = observe_picture(blobs, people, np.array([0.9, 0.6, 0.8]), KNOBS, least_px=96)
@@ -133,10 +126,7 @@ def test_boxes_are_confirmed_by_the_people_they_share():
     assert found.best.tolist() == [0.9, 0, 0.6, 0]
 
 
-@pytest.mark.parametrize("which", ["blobs", "people", "both"])
-def test_nothing_to_compare_is_fine(which):
-    blobs = np.zeros((0, 2)) if which != "people" else np.array([[0, 10.0]])
-    people = np.zeros((0, 2)) if which != "blobs" else np.array([[0, 10.0]])
-    assert len(seen(blobs, people).looked) == len(blobs)
-    boxes = observe_picture(np.zeros((len(blobs), 4)), np.zeros((len(people), 4)), np.ones(len(people)), KNOBS)
-    assert len(boxes.people) == len(blobs)
+@pytest.mark.parametrize(("blobs", "people"), [(0, 1), (1, 0), (0, 0)])
+def test_no_blobs_or_no_people_give_an_empty_observation(blobs, people):
+    assert len(observed([(0, 10)] * blobs, [(0, 10)] * people).looked) == blobs
+    assert len(observe_picture(np.zeros((blobs, 4)), np.zeros((people, 4)), np.ones(people), KNOBS).people) == blobs

@@ -1,4 +1,4 @@
-"""People in pictures and clips, and beside what moves in the scenes of a run."""
+"""People in pictures and clips, and beside the motion of a run."""
 
 from dataclasses import dataclass, field
 
@@ -16,12 +16,12 @@ SIZE = (320, 240)
 
 
 class Brightest:
-    """A recognizer for which a window is a person where its middle is white; it counts what it is asked for."""
+    """A scorer for which a window is a person where its middle is white; it counts what it is asked for."""
 
     name = "stub"
 
-    def __init__(self):
-        self.calls, self.windows = [], 0
+    def __init__(self, scale=1.0):
+        self.calls, self.windows, self.scale = [], 0, scale
 
     def scores(self, images, parts):
         self.calls.append(len(images))
@@ -29,40 +29,35 @@ class Brightest:
 
     def _map(self, image, part):
         level = cv2.resize(image, part.level).astype(np.float32)
-        if level.ndim == 3:
-            level = level.mean(axis=2)
-        nx, ny = (part.width - 64) // 8 + 1, (part.height - 128) // 8 + 1
-        self.windows += nx * ny
-        return np.array(
-            [[level[part.y + 8 * j + 63, part.x + 8 * i + 31] / 127.5 - 1 for i in range(nx)] for j in range(ny)],
-            np.float32,
-        ).reshape(ny, nx)
+        level = level.mean(axis=2) if level.ndim == 3 else level
+        middles = level[part.y + 63 : part.y + part.height - 64 : 8, part.x + 31 : part.x + part.width - 32 : 8]
+        self.windows += middles.size
+        return self.scale * (middles / 127.5 - 1)
 
 
 @dataclass
 class Clip:
-    """Frames at hand, some of them missing."""
+    """Frames of a white disk that moves by 4 px a frame; some may be missing."""
 
     numbers: tuple[int, ...] = tuple(range(1, 13))
     last: int = 12
     rate_hz: float = 10.0
-    step_px: float = 4.0
     images: dict = field(default_factory=dict)
 
     def __iter__(self):
         for number in self.numbers:
             image = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-            cv2.circle(image, (round(80 + self.step_px * number), 120), 6, (255, 255, 255), -1)
+            cv2.circle(image, (80 + 4 * number, 120), 6, (255, 255, 255), -1)
             yield Frame(number, (number - 1) / self.rate_hz, self.images.get(number, image))
+
+
+def is_at_the_disk(result):
+    x, y, width, height = result.people.window_px[0]
+    return (x + width / 2, y + height / 2) == pytest.approx((80 + 4 * result.frame.number, 120), abs=20)
 
 
 def settings(**parameters):
     return Settings(people=PeopleParameters(**parameters))
-
-
-def table(rows):
-    rows = np.array(rows, float).reshape(-1, 5)
-    return DetectionTable("t", rows[:, 0].astype(int), rows[:, 1:], np.ones(len(rows)), np.arange(len(rows)))
 
 
 def same(one, other):
@@ -72,19 +67,13 @@ def same(one, other):
     )
 
 
-def test_who_is_there_is_found_where_he_is_in_every_frame():
-    made = list(detect_in_clip(Clip(), Brightest(), settings()))
-    assert [r.frame.number for r in made] == list(range(1, 13))
-    for r in made:
-        middle = r.people.window_px[0, :2] + r.people.window_px[0, 2:] / 2
-        assert middle == pytest.approx([80 + 4 * r.frame.number, 120], abs=20)
-        assert (r.regions_px, r.share, r.cause, r.adjustments) == (None, 1.0, "", ())
-        assert set(r.seconds) == {"read", "plan", "score", "people"}
+ROWS = np.array([[60.0 + 4 * n, 70, 40, 100] for n in (1, 2, 5, 9)] + [[200.0, 70, 40, 100]])
+TABLE = DetectionTable("t", np.array([1, 2, 5, 9, 3]), ROWS, np.ones(5), np.arange(5))
 
 
-@pytest.mark.parametrize("around", [None, table([[n, 60 + 4 * n, 70, 40, 100] for n in (1, 2, 5, 9)])])
-@pytest.mark.parametrize("batch", [2, 5, 40])
-def test_the_result_does_not_depend_on_the_batch(batch, around):
+@pytest.mark.parametrize("around", [None, TABLE])
+@pytest.mark.parametrize("batch", [2, 40])
+def test_a_person_is_detected_in_every_frame_whatever_the_batch(batch, around):
     clip = Clip(numbers=(1, 2, 3, 5, 6, 9, 10), last=11)
     alone = list(detect_in_clip(clip, Brightest(), settings(), around, batch=1))
     engine = Brightest()
@@ -94,62 +83,56 @@ def test_the_result_does_not_depend_on_the_batch(batch, around):
     for one, other in zip(alone, together, strict=True):
         assert same(one.people, other.people)
         assert (one.share, one.cause) == (other.share, other.cause)
+        assert set(one.seconds) == {"read", "plan", "score", "people"}
+        read = one.frame.number in clip.numbers
+        in_region = around is None or one.frame.number in (1, 2, 5, 9)  # in frame 3 the row is elsewhere
+        assert len(one.people) == (read and in_region)
+        assert not len(one.people) or is_at_the_disk(one)
+        if around is None:
+            assert (one.regions_px, one.share) == (None, float(read))
+        elif read:
+            assert (0 < one.share < 1) == (len(one.regions_px) == 1) == (one.frame.number in around.frame)
 
 
-def test_in_regions_a_frame_waits_for_the_one_before_and_finds_the_same_with_fewer_windows():
+def test_a_search_in_regions_detects_the_same_with_fewer_windows():
     whole, parts = Brightest(), Brightest()
     everywhere = list(detect_in_clip(Clip(), whole, settings()))
     regions = list(detect_in_clip(Clip(), parts, settings(search="regions"), batch=8))
-    assert set(parts.calls) == {1}
+    assert set(parts.calls) == {1}  # each frame needs the people of the one before
     assert parts.windows < 0.5 * whole.windows
     assert len(everywhere) == len(regions) == 12
-    for r in regions:
-        middle = r.people.window_px[0, :2] + r.people.window_px[0, 2:] / 2
-        assert middle == pytest.approx([80 + 4 * r.frame.number, 120], abs=20)
+    assert all(is_at_the_disk(result) for result in everywhere + regions)
     assert [a.frame for r in regions for a in r.adjustments][:1] == [2]
 
 
-def test_frames_that_could_not_be_read_are_black_and_say_so():
+def test_unreadable_frames_are_black_with_the_cause():
     made = list(detect_in_clip(Clip(numbers=(2, 3, 6), last=8), Brightest(), settings(), batch=2))
     assert [r.frame.number for r in made] == list(range(1, 9))
-    unread = [r for r in made if r.cause]
-    assert [r.frame.number for r in unread] == [1, 4, 5, 7, 8]
-    for r in unread:
+    assert [r.frame.number for r in made if r.cause] == [1, 4, 5, 7, 8]
+    for r in (r for r in made if r.cause):
         assert (r.cause, len(r.people), r.share) == (UNREAD, 0, 0)
         assert r.frame.image.shape == (SIZE[1], SIZE[0], 3) and not r.frame.image.any()
         assert r.frame.time_s == pytest.approx((r.frame.number - 1) / 10)
 
 
-def test_around_a_table_nobody_is_found_elsewhere():
-    boxes = table([[2, 68, 70, 40, 100], [3, 200, 70, 40, 100]])
-    made = {r.frame.number: r for r in detect_in_clip(Clip(), Brightest(), settings(), boxes)}
-    assert len(made[2].people) and not len(made[3].people)
-    assert made[1].share == 0 and len(made[1].people) == 0
-    assert 0 < made[2].share < 1
-    assert made[2].regions_px is not None and made[2].regions_px.shape == (1, 4)
-
-
-BAD_PICTURES = [
-    (np.zeros((200, 100), np.float32), "frame 1 holds float32 pixels; wanted 8 bits"),
-    (np.full((200, 100, 3), np.nan), "frame 1 holds float64 pixels, NaN among them"),
-    (np.zeros((200, 100), np.uint16), "uint16"),
-    (np.zeros((200, 100, 4), np.uint8), "200 x 100 x 4; wanted height x width, or these x 1 or 3 channels"),
-    (np.zeros((1, 3, 200, 100), np.uint8), "1 x 3 x 200 x 100"),
-    (np.zeros(0, np.uint8), "an array of 0"),
-    (np.zeros((0, 100), np.uint8), "0 x 100"),
-    (np.uint8(3), "a single uint8; wanted height x width"),
-    (None, "is None; could its file be read?"),
-]
-
-
-@pytest.mark.parametrize(("image", "says"), BAD_PICTURES)
-def test_what_is_no_picture_is_one_line(image, says):
+@pytest.mark.parametrize(
+    ("image", "says"),
+    [
+        (np.zeros((200, 100), np.float32), "frame 1 holds float32 pixels; wanted 8 bits"),
+        (np.full((200, 100, 3), np.nan), "frame 1 holds float64 pixels, NaN among them"),
+        (np.zeros((200, 100, 4), np.uint8), "200 x 100 x 4; wanted height x width, or these x 1 or 3 channels"),
+        (np.zeros((0, 100), np.uint8), "0 x 100"),
+        (np.uint8(3), "a single uint8; wanted height x width"),
+        (None, "is None; could its file be read?"),
+    ],
+)
+def test_anything_but_a_picture_is_refused_in_one_line(image, says):
     with pytest.raises(InputError) as error:
         list(detect_in_clip(Clip(numbers=(1,), images={1: image}), Brightest(), settings()))
     assert says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypatch):
+def test_the_public_detector_takes_one_picture_or_several(monkeypatch):
     monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", lambda parameters, backend: Brightest())
     detector = PersonDetector()
     picture = np.zeros((160, 120), np.uint8)
@@ -164,87 +147,61 @@ def test_the_public_detector_gives_the_people_of_one_picture_or_several(monkeypa
         PersonDetector(backend="quantum")
 
 
-SETTINGS = Settings.model_validate({"people": {"search": "regions"}})
+REGIONS = settings(search="regions")
 STILL = Registration(np.eye(3), 100, 100, 0.1, 0.0)
 
 
-def person_tracker(scorer, settings, interval, size):
-    return PersonTracker(scorer, settings, interval, size, FrameTracker(settings, interval, size, pictures=False))
+def person_tracker(scorer, interval=1, size=SIZE):
+    tracker = FrameTracker(REGIONS, interval, size, pictures=False)
+    return PersonTracker(scorer, REGIONS, interval, size, tracker)
 
 
-class Sure(Brightest):
-    """Certain enough for an identity."""
-
-    def _map(self, image, part):
-        return 5 * super()._map(image, part)
-
-
-def scenes(clip=None, interval=1):
-    for frame in clip or Clip():
-        yield Scene(frame, np.zeros(SIZE[::-1], np.uint16), Detections(), interval, step=STILL)
-
-
-def tracked(scenes, interval=1, settings=SETTINGS):
-    tracker = person_tracker(Sure(), settings, interval, SIZE)
-    for scene in scenes:
+def tracked(tracker):
+    for frame in Clip():
+        scene = Scene(frame, np.zeros(SIZE[::-1], np.uint16), Detections(), 1, step=STILL)
         tracker.update(scene)
-    return tracker
+        yield scene
 
 
-def test_one_who_walks_keeps_an_identity_and_each_frame_is_told_once():
-    tracker = tracked(scenes())
+def test_a_walker_keeps_an_identity_and_each_frame_comes_out_once():
+    tracker = person_tracker(Brightest(5))  # certain enough for an identity
+    assert len(list(tracked(tracker))) == 12
     found = [tracker.people_of(number, True) for number in range(1, 13)]
     assert [frame.number for frame in found] == list(range(1, 13))
     assert all(frame.detections.kind == "person" for frame in found)
-    (identity,) = {name for frame in found for name in frame.tracks.identity.tolist()}
-    assert identity == 1
+    assert {name for frame in found for name in frame.tracks.identity.tolist()} == {1}
     at = [frame.tracks.box_px[0, 0] for frame in found if len(frame.tracks)]
-    assert len(at) >= 10
-    assert at[-1] - at[0] > 20  # it went along
+    assert len(at) >= 10 and at[-1] - at[0] > 20
     assert tracker.people_of(12, True) is None
-    assert tracked(scenes()).people_of(12, False) is None
-    of_third = tracked(scenes(), interval=3)
-    assert [number for number in range(1, 13) if of_third.people_of(number, True) is not None] == [1, 4, 7, 10]
+    third = person_tracker(Brightest(5), interval=3)
+    list(tracked(third))
+    assert [number for number in range(1, 13) if third.people_of(number, True) is not None] == [1, 4, 7, 10]
     with pytest.raises(InputError):
-        person_tracker(Brightest(), SETTINGS, 1, (40, 60))
+        person_tracker(Brightest(), size=(40, 60))
 
 
-def test_people_settle_with_the_frames_of_what_moves():
-    tracker = person_tracker(Sure(), SETTINGS, 1, SIZE)
-
-    def seen():
-        for scene in scenes():
-            tracker.update(scene)
-            yield scene
-
-    settled = []
-    for frame in track_scenes(seen(), SETTINGS, 1, SIZE):
-        people = tracker.people_of(frame.number, False)
-        settled.append(people is not None)
-    # Only the frames that the end itself settles wait for it.
-    assert sum(settled) >= 6
+def test_people_settle_with_the_frames_of_the_motion_but_for_the_last():
+    tracker = person_tracker(Brightest(5))
+    frames = track_scenes(tracked(tracker), REGIONS, 1, SIZE)
+    settled = [tracker.people_of(frame.number, False) is not None for frame in frames]
+    assert len(settled) == 12 and sum(settled) >= 6
     assert settled == sorted(settled, reverse=True)
 
 
-def test_a_frame_that_could_not_be_read_has_nobody():
-    (scene,) = scenes(Clip(numbers=(1,)))
-    unread = Scene(scene.frame, scene.mask, scene.detections, 1, False, UNREAD)
-    tracker = person_tracker(Brightest(), SETTINGS, 1, SIZE)
-    tracker.update(unread)
-    people = tracker.people_of(1, True)
-    assert people is not None
-    assert len(people.detections) == 0
+def test_an_unreadable_frame_has_no_people():
+    (frame,) = Clip(numbers=(1,))
+    tracker = person_tracker(Brightest())
+    tracker.update(Scene(frame, np.zeros(SIZE[::-1], np.uint16), Detections(), 1, False, UNREAD))
+    assert len(tracker.people_of(1, True).detections) == 0
 
 
-def test_a_narrower_search_looks_at_less():
-    def windows(settings):
+def test_a_smaller_share_searches_fewer_windows():
+    def windows(share):
         scorer = Brightest()
-        tracker = person_tracker(scorer, SETTINGS, 1, SIZE)
-        for scene in scenes():
+        tracker = person_tracker(scorer)
+        for scene in tracked(tracker):
             if scene.frame.number == 3:
-                tracker.retune(settings)
-            tracker.update(scene)
+                tracker.retune(settings(search="regions", **share))
         return scorer.windows
 
-    narrow = Settings.model_validate({"people": {"search": "regions", "look_share": 0.05}})
-    assert windows(narrow) < windows(SETTINGS)
+    assert windows({"look_share": 0.05}) < windows({})
