@@ -67,8 +67,8 @@ def same(one, other):
     )
 
 
-ROWS = np.array([[60.0 + 4 * n, 70, 40, 100] for n in (1, 2, 5, 9)] + [[200.0, 70, 40, 100]])
-TABLE = DetectionTable("t", np.array([1, 2, 5, 9, 3]), ROWS, np.ones(5), np.arange(5))
+ROWS = np.array([[200.0 if n == 3 else 60 + 4 * n, 70, 40, 100] for n in (1, 2, 3, 5, 9)])
+TABLE = DetectionTable("t", np.array([1, 2, 3, 5, 9]), ROWS, np.ones(5), np.arange(5))
 
 
 @pytest.mark.parametrize("around", [None, TABLE])
@@ -83,15 +83,15 @@ def test_a_person_is_detected_in_every_frame_whatever_the_batch(batch, around):
     for one, other in zip(alone, together, strict=True):
         assert same(one.people, other.people)
         assert (one.share, one.cause) == (other.share, other.cause)
-        assert set(one.seconds) == {"read", "plan", "score", "people"}
         read = one.frame.number in clip.numbers
+        assert set(one.seconds) == {name for name in ("read", "plan", "score", "people") if read}
         in_region = around is None or one.frame.number in (1, 2, 5, 9)  # in frame 3 the row is elsewhere
         assert len(one.people) == (read and in_region)
         assert not len(one.people) or is_at_the_disk(one)
         if around is None:
-            assert (one.regions_px, one.share) == (None, float(read))
+            assert one.share == float(read)
         elif read:
-            assert (0 < one.share < 1) == (len(one.regions_px) == 1) == (one.frame.number in around.frame)
+            assert (0 < one.share < 1) == (len(one.regions_px) == 1) == bool(np.isin(one.frame.number, around.frame))
 
 
 def test_a_search_in_regions_detects_the_same_with_fewer_windows():

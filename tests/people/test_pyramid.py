@@ -15,48 +15,25 @@ SIZE = (180, 220)
 
 
 def parameters(**changed) -> PeopleParameters:
-    return load_config(
-        overrides=[
-            f"people.{k}={v}" for k, v in ({"enlarge": 1.0, "padding_px": 0, "threshold": 0.0} | changed).items()
-        ]
-    ).people
-
-
-@pytest.fixture(scope="module")
-def hog():
-    detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
-    return detector
-
-
-@pytest.fixture(scope="module")
-def picture():
-    """Smooth noise: its windows score around -2."""
-    rng = np.random.default_rng(3)
-    noise = cv2.GaussianBlur(rng.normal(size=(SIZE[1], SIZE[0], 3)), (0, 0), 4)
-    return np.clip(128 + 400 * noise, 0, 255).astype(np.uint8)
-
-
-def maps_of(picture, parts, parameters, hog):
-    """What a recognizer gives, by OpenCV, for whole levels."""
-    stride, pad, maps = parameters.window_stride_px, parameters.padding_px, []
-    for part in parts:
-        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        place, score = hog.detect(level, -1e9, (stride, stride), (pad, pad))
-        shape = (part.height - 128) // stride + 1, (part.width - 64) // stride + 1
-        found = np.full(shape, np.nan, np.float32)
-        found[(place[:, 1] + pad) // stride, (place[:, 0] + pad) // stride] = np.ravel(score)
-        maps.append(found)
-    return maps
+    changed = {"enlarge": 1.0, "padding_px": 0, "threshold": 0.0} | changed
+    return load_config(overrides=[f"people.{k}={v}" for k, v in changed.items()]).people
 
 
 @pytest.mark.parametrize("changed", [{}, {"padding_px": 16}, {"window_stride_px": 4, "scale_step": 1.1}])
-def test_levels_and_windows_are_those_of_opencv(hog, picture, changed):
-    k = parameters(suppression="opencv", threshold=-2.0, **changed)
-    parts = pyramid.everywhere(SIZE, k)
-    box, margin = pyramid.windows(parts, maps_of(picture, parts, k, hog), SIZE, k)
-    stride, pad = k.window_stride_px, k.padding_px
-    theirs, weight = hog.detectMultiScale(picture, -2.0, (stride, stride), (pad, pad), k.scale_step, 0)
+def test_levels_and_windows_are_those_of_opencv(changed):
+    k, hog = parameters(suppression="opencv", threshold=-2.0, **changed), cv2.HOGDescriptor()
+    hog.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(SIZE[1], SIZE[0], 3)), (0, 0), 4)
+    picture = np.clip(128 + 400 * noise, 0, 255).astype(np.uint8)  # its windows score around -2
+    stride, pad = (k.window_stride_px,) * 2, (k.padding_px,) * 2
+    parts, maps = pyramid.everywhere(SIZE, k), []
+    for part in parts:
+        level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
+        place, score = hog.detect(level, -1e9, stride, pad)
+        maps.append(np.full(((part.height - 128) // stride[0] + 1, (part.width - 64) // stride[0] + 1), np.nan))
+        maps[-1][tuple((place[:, ::-1] + pad).T // stride[0])] = np.ravel(score)
+    box, margin = pyramid.windows(parts, [m.astype(np.float32) for m in maps], SIZE, k)
+    theirs, weight = hog.detectMultiScale(picture, -2.0, stride, pad, k.scale_step, 0)
     # Padded windows may lie outside; detectMultiScale clips what it returns.
     low = np.maximum(box[:, :2], 0)
     clipped = np.concatenate([low, np.minimum(box[:, :2] + box[:, 2:], SIZE) - low], axis=1)
@@ -96,7 +73,7 @@ HEIGHTS = np.array([[80.0, 100], [100, 130], [np.nan, np.nan]])
 
 
 @pytest.mark.parametrize("changed", [{}, {"padding_px": 20, "enlarge": 1.4, "window_stride_px": 4}])
-def test_parts_hold_every_window_whose_body_lies_in_its_region_where_a_search_everywhere_has_it(changed):
+def test_parts_hold_every_window_whose_body_lies_in_its_region(changed):
     k = parameters(**changed)
     everywhere = positions(pyramid.everywhere(SIZE, k), k)
     within = set(positions(pyramid.within(REGIONS, HEIGHTS, SIZE, k), k))
@@ -104,19 +81,18 @@ def test_parts_hold_every_window_whose_body_lies_in_its_region_where_a_search_ev
     scale = {level.size: level.scale for level in pyramid.levels(SIZE, k)}
     window = np.array([(x, y, 64, 128) for _, x, y in everywhere]) * [[scale[size]] for size, _, _ in everywhere]
     bodies, wanted = body_boxes(window, k), set()
+    low, high = bodies[:, :2], bodies[:, :2] + bodies[:, 2:]
     for region, (least, largest) in zip(REGIONS, HEIGHTS, strict=True):
-        inside = (bodies[:, :2] >= region[:2]).all(1) & (bodies[:, :2] + bodies[:, 2:] <= region[:2] + region[2:]).all(
-            1
-        )
+        inside = (low >= region[:2]).all(axis=1) & (high <= region[:2] + region[2:]).all(axis=1)
         fits = np.isnan(least) | ((bodies[:, 3] >= least) & (bodies[:, 3] <= largest))
         wanted |= {everywhere[i] for i in np.flatnonzero(inside & fits)}
-    assert len(wanted) > 20
-    assert wanted <= within
+    assert len(wanted) > 20 and wanted <= within
     assert len(within) < 0.5 * len(everywhere)
 
 
-def test_no_part_is_made_for_bodies_that_the_pyramid_does_not_reach_or_regions_off_the_picture():
-    k = parameters()
-    assert pyramid.within(np.array([[10.0, 10, 90, 150]]), np.array([[20.0, 40]]), SIZE, k) == []
-    assert pyramid.within(np.array([[500.0, 500, 90, 150]]), np.array([[np.nan, np.nan]]), SIZE, k) == []
-    assert pyramid.within(np.zeros((0, 4)), np.zeros((0, 2)), SIZE, k) == []
+@pytest.mark.parametrize(
+    ("region", "heights"), [([10, 10, 90, 150], [20, 40]), ([500, 500, 90, 150], [np.nan] * 2), ([], [])]
+)
+def test_bodies_too_small_for_the_pyramid_and_regions_off_the_picture_have_no_parts(region, heights):
+    region, heights = np.reshape(region, (-1, 4)).astype(float), np.reshape(heights, (-1, 2)).astype(float)
+    assert pyramid.within(region, heights, SIZE, parameters()) == []

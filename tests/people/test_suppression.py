@@ -13,31 +13,28 @@ from torchvision_dddas.people.suppression import (
 )
 
 
-def boxes(*rows):
-    return np.array(rows, float).reshape(-1, 4)
-
-
 def iou(a, b):
     side = np.minimum(a[:2] + a[2:], b[:2] + b[2:]) - np.maximum(a[:2], b[:2])
     shared = np.prod(np.maximum(side, 0))
     return shared / (a[2:].prod() + b[2:].prod() - shared)
 
 
-def crowd(seed, number=120):
-    rng = np.random.default_rng(seed)
-    height = rng.uniform(60, 120, number)
-    return np.column_stack([rng.uniform(0, 300, (number, 2)), height / 2, height]), rng.normal(size=number)
+def test_a_box_inside_a_better_one_is_suppressed_where_containment_counts():
+    box, score = np.array([[0, 0, 40, 100], [10, 60, 20, 40.0]]), np.array([2.0, 1])
+    assert non_maximum_suppression(box, score, 0.4).tolist() == [0, 1]
+    assert non_maximum_suppression(box, score, 0.4, contained=0.7).tolist() == [0]
 
 
-def test_a_part_of_a_better_box_goes_where_containment_counts():
-    box = boxes([0, 0, 40, 100], [10, 60, 20, 40])
-    assert non_maximum_suppression(box, np.array([2.0, 1]), 0.4).tolist() == [0, 1]
-    assert non_maximum_suppression(box, np.array([2.0, 1]), 0.4, contained=0.7).tolist() == [0]
+def test_a_refined_box_is_the_weighted_mean_of_its_neighbours():
+    box = np.array([[0, 0, 40, 100], [4, 8, 40, 100], [300, 0, 40, 100.0]])
+    np.testing.assert_allclose(refine_boxes(box, np.array([3.0, 1, 5]), np.array([0]), 0.7), [[1, 2, 40, 100]])
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_those_that_stay_are_apart_and_each_that_goes_has_a_better_one_on_it(seed):
-    box, score = crowd(seed)
+def test_kept_boxes_are_apart_and_each_suppressed_one_overlaps_a_better_one(seed):
+    random = np.random.default_rng(seed)
+    height, score = random.uniform(60, 120, 120), random.normal(size=120)
+    box = np.column_stack([random.uniform(0, 300, (120, 2)), height / 2, height])
     kept = non_maximum_suppression(box, score, 0.3)
     assert (np.diff(score[kept]) <= 0).all()
     for place, i in enumerate(kept):
@@ -46,32 +43,25 @@ def test_those_that_stay_are_apart_and_each_that_goes_has_a_better_one_on_it(see
         assert any(iou(box[i], box[j]) > 0.3 and score[j] >= score[i] for j in kept)
 
 
-def test_a_box_settles_on_the_weighted_mean_of_its_neighbours():
-    box = boxes([0, 0, 40, 100], [4, 8, 40, 100], [300, 0, 40, 100])
-    np.testing.assert_allclose(refine_boxes(box, np.array([3.0, 1, 5]), np.array([0]), 0.7), [[1, 2, 40, 100]])
-
-
-@pytest.fixture(scope="module")
-def scored():
-    """HOG windows of noise and a few bright columns, many of them alike."""
-    rng = np.random.default_rng(5)
-    image = np.clip(128 + 300 * cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 3), 0, 255).astype(np.uint8)
-    for x in (60, 150, 230):
-        cv2.ellipse(image, (x, 130), (16, 50), 0, 0, 360, (240, 240, 240), -1)
-        cv2.circle(image, (x, 70), 10, (240, 240, 240), -1)
-    detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
-    # Several threads report windows in an order of chance, on which the weights of OpenCV's groups depend.
+@pytest.fixture
+def one_opencv_thread():
+    """Several threads report windows in an order of chance, on which the weights of OpenCV's groups depend."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    yield image, detector
+    yield
     cv2.setNumThreads(threads)
 
 
 @pytest.mark.parametrize("least", [0, 1, 2, 3])
 @pytest.mark.parametrize("threshold", [-1.2, -1.0, -0.7])
-def test_groups_are_those_of_opencv_to_the_rectangle_and_the_weight(scored, threshold, least):
-    image, detector = scored
+def test_groups_are_those_of_opencv_to_the_rectangle_and_the_weight(one_opencv_thread, threshold, least):
+    noise = cv2.GaussianBlur(np.random.default_rng(5).normal(size=(240, 320, 3)), (0, 0), 3)
+    image = np.clip(128 + 300 * noise, 0, 255).astype(np.uint8)
+    for x in (60, 150, 230):
+        cv2.ellipse(image, (x, 130), (16, 50), 0, 0, 360, (240, 240, 240), -1)
+        cv2.circle(image, (x, 70), 10, (240, 240, 240), -1)
+    detector = cv2.HOGDescriptor()
+    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
     every, weight = detector.detectMultiScale(image, threshold, (8, 8), (0, 0), 1.05, 0)
     assert len(every) > 30
     box, best = group_rectangles(every, np.ravel(weight), least)
@@ -91,48 +81,38 @@ def parameters(**changed):
     return load_config(overrides=[f"people.{name}={value}" for name, value in changed.items()]).people
 
 
-def around(box, k):
-    """The window whose body a box is."""
-    x, y, wide, tall = np.asarray(box, float).T
-    width, height = wide / k.width_share, tall / k.height_share
-    return np.stack([x - (width - wide) / 2, y + tall - k.feet_share * height, width, height], axis=-1)
-
-
-def test_windows_around_one_person_are_one_between_them():
+def test_windows_around_one_person_become_one_between_them():
     window = np.array([[100.0, 50, 64, 128], [108, 50, 64, 128], [104, 46, 67.2, 134.4], [400, 100, 64, 128]])
     people = people_from_windows(window, np.array([1.0, 1.0, 0.5, 0.3]), SIZE, parameters())
-    assert len(people) == 2
     assert people.margin.tolist() == [1.0, 0.3]
-    middle = people.box_px[0, 0] + people.box_px[0, 2] / 2
-    assert 100 + 32 < middle < 108 + 32
+    assert 100 + 32 < people.box_px[0, 0] + people.box_px[0, 2] / 2 < 108 + 32
     np.testing.assert_allclose(people.window_px[1], window[3])
 
 
-def test_people_come_best_first_with_a_probability_that_rises_with_the_score():
-    window = np.array([[0.0, 50, 64, 128], [200, 50, 64, 128], [400, 50, 64, 128]])
-    for suppression in ("nms", "opencv", "none"):
-        people = people_from_windows(
-            window, np.array([0.5, 2.0, 1.0]), SIZE, parameters(suppression=suppression, group=0)
-        )
-        assert people.margin.tolist() == [2.0, 1.0, 0.5]
-        assert (np.diff(people.score) < 0).all()
-        nobody = people_from_windows(window[:0], np.zeros(0), SIZE, parameters(suppression=suppression))
-        assert len(nobody) == 0 and nobody.box_px.shape == nobody.window_px.shape == (0, 4)
+@pytest.mark.parametrize("suppression", ["nms", "opencv", "none"])
+def test_people_are_sorted_by_score_and_may_be_none(suppression):
+    window, k = np.array([[x, 50, 64, 128.0] for x in (0, 200, 400)]), parameters(suppression=suppression, group=0)
+    people = people_from_windows(window, np.array([0.5, 2.0, 1.0]), SIZE, k)
+    assert people.margin.tolist() == [2.0, 1.0, 0.5]
+    assert (np.diff(people.score) < 0).all()
+    nobody = people_from_windows(window[:0], np.zeros(0), SIZE, parameters(suppression=suppression))
+    assert len(nobody) == 0 and nobody.box_px.shape == nobody.window_px.shape == (0, 4)
 
 
 @pytest.mark.parametrize(
-    ("box", "cut"),
+    ("x", "y", "cut"),
     [
-        ((300, 200, 40, 100), False),
-        ((300, -1, 40, 100), True),
-        ((300, 381, 40, 100), True),
-        ((300, 379, 40, 100), True),  # the feet end 1 px above the border: they may go on below it
-        ((-10, 200, 40, 100), True),
-        ((610, 200, 40, 100), True),
-        ((300, 370, 40, 100), False),
+        (300, 200, False),
+        (300, -1, True),
+        (300, 381, True),
+        (300, 379, True),  # the feet end 1 px above the border: they may go on below it
+        (-10, 200, True),
+        (610, 200, True),
+        (300, 370, False),
     ],
 )
-def test_a_body_that_meets_the_border_is_flagged(box, cut):
-    k = parameters()
-    people = people_from_windows(around(np.array([box], float), k), np.array([1.0]), SIZE, k)
-    assert people.cut.tolist() == [cut]
+def test_a_body_that_meets_the_border_is_flagged(x, y, cut):
+    k, wide, tall = parameters(), 40, 100
+    width, height = wide / k.width_share, tall / k.height_share
+    window = np.array([[x - (width - wide) / 2, y + tall - k.feet_share * height, width, height]])
+    assert people_from_windows(window, np.array([1.0]), SIZE, k).cut.tolist() == [cut]
