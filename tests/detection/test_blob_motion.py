@@ -23,7 +23,7 @@ def textured(shift: tuple[int, int]) -> np.ndarray:
     ground, body = (cv2.GaussianBlur(p, (0, 0), 2.0) for p in np.random.default_rng(0).normal(size=(2, *SHAPE)))
     x, y, width, height = BOX
     ground[y + shift[1] : y + shift[1] + height, x + shift[0] : x + shift[0] + width] = body[:height, :width]
-    return cv2.normalize(ground, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    return cv2.normalize(ground, ground.copy(), 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
 
 
 @pytest.mark.parametrize("velocity", [(2, 0), (-1, 2), (3, -3)])

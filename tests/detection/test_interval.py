@@ -133,8 +133,8 @@ def test_windows_stay_in_the_clip_and_within_two_intervals_ahead(name, interval)
     ahead = windows.look_ahead(interval, settings)
     assert interval == 1 or ahead + windows.settling_delay(interval, settings) <= 2 * interval
     for first in (0, 17, 19, 20):  # frames after the reach do not matter, so a stream equals a file
-        near = windows.choose_pairs(20, interval, first, 20 + ahead, settings)
-        assert windows.choose_pairs(20, interval, first, 60, settings) == near
+        expected = windows.choose_pairs(20, interval, first, 20 + ahead, settings)
+        assert windows.choose_pairs(20, interval, first, 60, settings) == expected
 
 
 @pytest.mark.parametrize(("interval", "on", "pair"), [(2, True, None), (3, True, (17, 23)), (3, False, None)])

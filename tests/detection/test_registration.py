@@ -29,7 +29,7 @@ def greys() -> list[np.ndarray]:
 @pytest.mark.parametrize(("gain", "offset"), [(1.15, 0), (0.85, 0), (1.35, 0), (0.74, 0), (1.0, 12), (0.9, 15)])
 def test_the_darker_frame_is_matched_to_the_exposure_of_the_brighter(greys, gain, offset) -> None:
     same, moved = greys[0].astype(int), greys[1]
-    earlier, later = match_exposure(View(greys[0], greys[0]), View(*[lit(moved, gain, offset)] * 2))
+    earlier, later = match_exposure(View(greys[0], greys[0]), View(lit(moved, gain, offset), lit(moved, gain, offset)))
     changed = later if gain * 128 + offset < 128 else earlier
     wanted = moved if gain * 128 + offset < 128 else lit(same, gain, offset)
     unclipped = (wanted > 5) & (wanted < 250)

@@ -22,14 +22,14 @@ def parameters(**changed) -> PeopleParameters:
 @pytest.mark.parametrize("changed", [{}, {"padding_px": 16}, {"window_stride_px": 4, "scale_step": 1.1}])
 def test_levels_and_windows_are_those_of_opencv(changed):
     k, hog = parameters(suppression="opencv", threshold=-2.0, **changed), cv2.HOGDescriptor()
-    hog.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    hog.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
     noise = cv2.GaussianBlur(np.random.default_rng(3).normal(size=(SIZE[1], SIZE[0], 3)), (0, 0), 4)
     picture = np.clip(128 + 400 * noise, 0, 255).astype(np.uint8)  # its windows score around -2
     stride, pad = (k.window_stride_px,) * 2, (k.padding_px,) * 2
     parts, maps = pyramid.everywhere(SIZE, k), []
     for part in parts:
         level = cv2.resize(picture, part.level, interpolation=cv2.INTER_LINEAR_EXACT)
-        place, score = hog.detect(level, -1e9, stride, pad)
+        place, score = map(np.asarray, hog.detect(level, -1e9, stride, pad))
         maps.append(np.full(((part.height - 128) // stride[0] + 1, (part.width - 64) // stride[0] + 1), np.nan))
         maps[-1][tuple((place[:, ::-1] + pad).T // stride[0])] = np.ravel(score)
     box, margin = pyramid.windows(parts, [m.astype(np.float32) for m in maps], SIZE, k)
@@ -38,7 +38,9 @@ def test_levels_and_windows_are_those_of_opencv(changed):
     low = np.maximum(box[:, :2], 0)
     clipped = np.concatenate([low, np.minimum(box[:, :2] + box[:, 2:], SIZE) - low], axis=1)
     ours = sorted((*row, round(m, 4)) for row, m in zip(clipped.astype(int).tolist(), margin.tolist(), strict=True))
-    wanted = sorted((*row, round(w, 4)) for row, w in zip(theirs.tolist(), np.ravel(weight).tolist(), strict=True))
+    wanted = sorted(
+        (*row, round(w, 4)) for row, w in zip(np.asarray(theirs).tolist(), np.ravel(weight).tolist(), strict=True)
+    )
     assert len(ours) > 20
     assert ours == wanted
 

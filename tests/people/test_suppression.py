@@ -61,10 +61,10 @@ def test_groups_are_those_of_opencv_to_the_rectangle_and_the_weight(one_opencv_t
         cv2.ellipse(image, (x, 130), (16, 50), 0, 0, 360, (240, 240, 240), -1)
         cv2.circle(image, (x, 70), 10, (240, 240, 240), -1)
     detector = cv2.HOGDescriptor()
-    detector.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
+    detector.setSVMDetector(np.array(cv2.HOGDescriptor.getDefaultPeopleDetector()))
     every, weight = detector.detectMultiScale(image, threshold, (8, 8), (0, 0), 1.05, 0)
     assert len(every) > 30
-    box, best = group_rectangles(every, np.ravel(weight), least)
+    box, best = group_rectangles(np.asarray(every), np.ravel(weight), least)
     theirs, weight = detector.detectMultiScale(image, threshold, (8, 8), (0, 0), 1.05, least)
     corner = np.maximum(box[:, :2], 0)
     box = np.concatenate([corner, np.minimum(box[:, :2] + box[:, 2:], (320, 240)) - corner], axis=1)

@@ -56,6 +56,7 @@ def test_the_motion_is_in_pixels_of_the_picture(ground, size):
     camera = CameraMotion(Counted())
     camera.update(seen(ground, shift(0), 1, size))
     now_from_before, _ = camera.update(seen(ground, shift(7, -4), 2, size))
+    assert now_from_before is not None
     assert corner_error(now_from_before, np.array([[1, 0, -7], [0, 1, 4], [0, 0, 1.0]]), size) < 0.4
 
 

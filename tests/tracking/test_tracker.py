@@ -106,7 +106,7 @@ def test_steps_times_and_adjustments_of_the_frames_between_are_kept():
     assert moves == [None, [-8, 2], [-6, 1.5], [-8, 2]]  # an unknown step counts as none
     assert [len(f.adjustments) for f in frames] == [1, 4, 4, 4]
     assert [f.seconds["foreground"] for f in frames] == [0.5, 2, 2, 2]
-    assert all(f.frame.image.shape == (240, 320, 3) and f.frame.image.strides == (0, 0, 0) for f in frames)  # no copy
+    assert all(f.frame and f.frame.image.strides == (0, 0, 0) for f in frames)  # no picture is held
 
 
 def crowd_table(frames, score=1.0, people=4):
