@@ -52,11 +52,13 @@ def film(folder):
 @every_command
 def test_quiet_says_nothing_and_save_none_writes_tables_alone(dddas, engine, scorer, clip, tmp_path, command):
     out = tmp_path / "out"
-    result = dddas(command, clip, *COMMANDS[command], "--out", out, "--save", "none", "--quiet")
+    words = ("--out", out, "--save", "none", "--quiet", "--set", "registration.keypoints=77", "--config", "fast")
+    result = dddas(command, clip, *COMMANDS[command], *words)
     assert (result.exit_code, result.output) == (0, "")
     assert {f"{TABLES[command]}.csv", f"{TABLES[command]}.txt", "run.json"} <= set(names(out))
     assert not {"masks", "overlay.mp4", "report.html"} & set(names(out))
     assert [row.split(",")[0] for row in (out / f"{TABLES[command]}.txt").read_text().splitlines()] == list("12345")
+    assert record(out)["settings"]["registration"]["keypoints"] == 77
 
 
 @every_command
@@ -69,13 +71,6 @@ def test_a_frame_that_cannot_be_decoded_is_reported_and_recorded(dddas, engine, 
     assert film(tmp_path / "out")[0] == (5 if command == "people" else 4)  # the stand-in for detection skips it
 
 
-@every_command
-def test_parameters_are_set_and_recorded(dddas, engine, scorer, clip, tmp_path, command):
-    words = ("--set", "registration.keypoints=77", "--config", "fast", "--save", "none", "--quiet")
-    assert dddas(command, clip, *COMMANDS[command], *words, "--out", tmp_path / "out").exit_code == 0
-    assert record(tmp_path / "out")["settings"]["registration"]["keypoints"] == 77
-
-
 @pytest.mark.parametrize("command", ["detect", "people"])
 def test_several_clips_get_a_folder_each_and_share_one_engine(dddas, engine, scorer, clip, tmp_path, command):
     loaded = scorer()
@@ -85,17 +80,17 @@ def test_several_clips_get_a_folder_each_and_share_one_engine(dddas, engine, sco
     assert loaded == (["auto"] if command == "people" else [])
 
 
-def test_a_clip_in_which_nothing_is_found_has_empty_tables(dddas, engine, scorer, clip, tmp_path):
+@pytest.mark.parametrize("command", ["detect", "people"])
+def test_a_clip_in_which_nothing_is_found_has_empty_tables(dddas, engine, scorer, clip, tmp_path, command):
     engine(found=False)
     scorer(found=False)
-    for command in ("detect", "people"):
-        out = tmp_path / command
-        assert dddas(command, clip, *COMMANDS[command], "--out", out, "--quiet").exit_code == 0
-        assert (out / "detections.txt").read_text() == ""
-        for given in ([clip], ["--detections", out / "detections.csv"]):
-            assert dddas("track", *given, "--out", tmp_path / "out", "--quiet", "--save", "none").exit_code == 0
-            assert (tmp_path / "out/tracks.txt").read_text() == ""
-            assert (tmp_path / "out/tracks.csv").read_text().count("\n") == 1
+    found = tmp_path / "found"
+    assert dddas(command, clip, *COMMANDS[command], "--out", found, "--quiet").exit_code == 0
+    assert (found / "detections.txt").read_text() == ""
+    for given in ([clip], ["--detections", found / "detections.csv"]):
+        assert dddas("track", *given, "--out", tmp_path / "out", "--quiet", "--save", "none").exit_code == 0
+        assert (tmp_path / "out/tracks.txt").read_text() == ""
+        assert (tmp_path / "out/tracks.csv").read_text().count("\n") == 1
 
 
 # Detect.
@@ -153,9 +148,8 @@ def test_a_picture_of_any_depth_and_colour_gives_a_picture(dddas, scorer, tmp_pa
 @pytest.mark.parametrize("name", ["detections.txt", "detections.csv"])
 def test_track_and_evaluate_take_the_tables_of_people(dddas, scorer, clip, tmp_path, name):
     dddas("people", clip, *WINDOW, "--out", tmp_path / "out", "--quiet")
-    found = tmp_path / "out" / name
+    found, truth = tmp_path / "out" / name, tmp_path / "gt.txt"
     assert dddas("track", "--detections", found, "--out", tmp_path / "tracks", "--quiet").exit_code == 0
-    truth = tmp_path / "gt.txt"
     boxes = read_detections(found).box_px
     truth.write_text("".join(f"{n},1,{x},{y},{w},{h},1,1,1\n" for n, (x, y, w, h) in enumerate(boxes, start=1)))
     for folder, kind, measure in (("out", "boxes", "f1"), ("tracks", "tracks", "idf1")):
@@ -195,8 +189,7 @@ def test_each_engine_runs_and_finds_nobody_in_noise(dddas, tmp_path, backend):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")
-@pytest.mark.parametrize("search", ["everywhere", "regions"])
-def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(search, tmp_path):
+def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(tmp_path):
     """A film besides takes 35 MB more: PyAV and its encoder."""
     for name in ("1.png", "2.png"):
         image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
@@ -215,10 +208,9 @@ def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(search,
             peak_mb = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
             print(json.dumps([stop.code, peak_mb, [name for name in ("scipy", "torch") if name in sys.modules]]))
     """
-    chosen = ["--set", f"people.search={search}", "--set", "people.scale_step=1.2", "--save", "none", "--quiet"]
-    words = [sys.executable, "-c", textwrap.dedent(program), "people", str(tmp_path), *chosen]
-    words += ["--out", str(tmp_path / "out")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, cwd=ROOT, check=False)
+    words = f"people {tmp_path} --set people.search=regions --set people.scale_step=1.2 --save none --quiet"
+    command = [sys.executable, "-c", textwrap.dedent(program), *words.split(), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     code, peak_mb, loaded = json.loads(done.stdout)
     assert not code and loaded == []
@@ -265,29 +257,29 @@ def test_the_tables_of_detect_can_be_tracked_as_text_and_as_csv(dddas, engine, c
     assert (tmp_path / "detections.txt/tracks.txt").read_text() == (tmp_path / "detections.csv/tracks.txt").read_text()
 
 
-def test_moving_targets_of_a_csv_get_identities_however_low_their_scores(dddas, clip, table, tmp_path):
-    header = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
-    text = header + "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
-    for words in ((), (clip,)):
-        result = dddas("track", *words, "--detections", table(text), "--out", tmp_path / "out", "--save", "none")
-        assert "5 detections, 1 identities, 0 detections without one" in result.stdout
-        assert "note: all rows are moving targets of dddas detect" in result.stdout
-        assert tracks(tmp_path / "out")[:, 6].tolist() == [0.41] * 5
+MOVING = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
+MOVING += "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
+NOTED = {
+    "moving targets": (MOVING, "note: all rows are moving targets of dddas detect", 0.41),
+    "SVM margins": (walker(range(1, 6)).replace("0.95", "43.332"), "scores from 43.332 to 43.332 are no prob", 43.332),
+    "unlikely rows": (
+        walker(range(1, 6)) + walker(range(1, 6), x=40).replace("0.95", "0.05"),
+        "10 detections, 1 identities, 5 detections without one",
+        0.95,
+    ),
+}
 
 
-def test_scores_that_are_no_probabilities_are_reported_and_kept(dddas, table, tmp_path):
-    text = walker(range(1, 6)).replace("0.95", "43.332")
-    result = dddas("track", "--detections", table(text), "--out", tmp_path / "out")
-    assert "note: scores from 43.332 to 43.332 are no probabilities" in result.stdout
-    assert set(tracks(tmp_path / "out")[:, 6]) == {43.332}
-
-
-def test_rows_without_an_identity_are_counted_and_stay_in_the_csv(dddas, table, tmp_path):
-    text = walker(range(1, 6)) + walker(range(1, 6), x=40).replace("0.95", "0.05")
-    result = dddas("track", "--detections", table(text), "--out", tmp_path / "out")
-    assert "10 detections, 1 identities, 5 detections without one" in result.stdout
-    assert (tmp_path / "out/tracks.csv").read_text().count("untracked") == 5
-    assert len(tracks(tmp_path / "out")) == 5
+@pytest.mark.parametrize("with_clip", [False, True])
+@pytest.mark.parametrize(("text", "said", "score"), NOTED.values(), ids=NOTED)
+def test_scores_of_a_table_decide_what_is_tracked_and_are_kept(
+    dddas, clip, table, tmp_path, text, said, score, with_clip
+):
+    words = (clip,) if with_clip else ()
+    result = dddas("track", *words, "--detections", table(text), "--out", tmp_path / "out", "--save", "none")
+    assert said in result.stdout and "1 identities" in result.stdout
+    assert tracks(tmp_path / "out")[:, 6].tolist() == [score] * 5
+    assert (tmp_path / "out/tracks.csv").read_text().count("untracked") == text.count("0.05")
 
 
 def test_the_record_of_a_table_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
@@ -338,19 +330,6 @@ def folder(tmp_path):
     return write
 
 
-@pytest.fixture
-def detected(dddas, tmp_path):
-    """Detect, expect success, and give the record and the masks."""
-
-    def detect(clip, *words):
-        result = dddas("detect", clip, "--out", tmp_path / "out", "--quiet", *words)
-        assert (result.exit_code, result.output) == (0, "")
-        masks = [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in sorted((tmp_path / "out/masks").iterdir())]
-        return record(tmp_path / "out"), masks
-
-    return detect
-
-
 ODD = {
     "16-bit grey": (grey16, (180, 240)),
     "portrait": (lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE), (240, 180)),
@@ -361,38 +340,39 @@ ODD = {
 }
 
 
-@pytest.mark.parametrize("config", [(), ("--config", "fast"), ("--config", "source")])
-@pytest.mark.parametrize(("change", "shape"), ODD.values(), ids=ODD)
-def test_any_depth_and_size_gives_a_mask_for_every_frame(folder, detected, images, change, shape, config):
-    kept, masks = detected(folder([change(image) for image in images]), *config)
-    assert kept["frames"]["written"] == 9
-    assert [mask.shape for mask in masks] == [shape] * 9
-    if change is grey16 and not config:
-        assert any(mask.any() for mask in masks)
+def masks(folder):
+    return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((folder / "masks").iterdir())]
 
 
-@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(
+    "words", [("detect",), ("detect", "--config", "source"), ("track",), ("track", "--detections")]
+)
 @pytest.mark.parametrize(("change", "shape"), ODD.values(), ids=ODD)
-def test_clips_of_any_size_and_depth_can_be_tracked(dddas, folder, images, table, tmp_path, change, shape, given):
-    words = ("--detections", table()) if given else ()
-    clip = folder([change(image) for image in images[:6]])
-    result = dddas("track", clip, *words, "--out", tmp_path / "out", "--quiet")
+def test_clips_of_any_depth_and_size_can_be_used(dddas, folder, images, table, tmp_path, change, shape, words):
+    out, given = tmp_path / "out", "--detections" in words
+    clip = folder([change(image) for image in images])
+    result = dddas(*words, *([table()] if given else []), clip, "--out", out, "--quiet")
     assert (result.exit_code, result.output) == (0, "")
-    assert record(tmp_path / "out")["frames"]["written"] == film(tmp_path / "out")[0] == 6
-    assert (tmp_path / "out/tracks.csv").read_text().count("\n") >= 1 + 5 * given
+    assert record(out)["frames"]["written"] == film(out)[0] == 9
+    if words[0] == "detect":
+        assert [mask.shape for mask in masks(out)] == [shape] * 9
+    if words == ("detect",) and change is grey16:
+        assert any(mask.any() for mask in masks(out))
+    if given:
+        assert (out / "tracks.csv").read_text().count("\n") >= 6
 
 
-@pytest.mark.parametrize("numbers", [(4,), (8, 9), (3, 4, 9)])
-def test_undecodable_frames_get_empty_masks_and_are_recorded(folder, detected, images, numbers):
-    clip = folder(images)
+@pytest.mark.parametrize("numbers", [(8, 9), (3, 4, 9)])
+def test_undecodable_frames_get_empty_masks_and_are_recorded(dddas, folder, images, tmp_path, numbers):
+    clip, out = folder(images), tmp_path / "out"
     for number in numbers:
         (clip / f"{number:05d}.png").write_bytes(b"no picture")
-    kept, masks = detected(clip, "--config", "fast")
-    assert len(masks) == 9
-    assert not any(masks[number - 1].any() for number in numbers)
+    assert dddas("detect", clip, "--out", out, "--config", "fast", "--quiet").exit_code == 0
+    assert [mask.any() for mask in masks(out)].count(False) >= len(numbers) and len(masks(out)) == 9
+    assert not any(masks(out)[number - 1].any() for number in numbers)
+    kept = record(out)
     assert len(kept["problems"]) == len(numbers)
-    lost = [n for row in kept["unreliable"] for n in range(row["first"], row["last"] + 1)]
-    assert set(numbers) <= set(lost)
+    assert set(numbers) <= {n for row in kept["unreliable"] for n in range(row["first"], row["last"] + 1)}
 
 
 def test_a_frame_of_another_size_late_in_a_clip_leaves_nothing_that_looks_whole(dddas, folder, images, tmp_path):

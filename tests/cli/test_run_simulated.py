@@ -33,40 +33,33 @@ def made(tmp_path_factory):
 def test_results_and_truth_are_places_on_the_same_earth(made):
     folder, _ = made
     found, true = read_positions(folder / "positions.csv"), read_positions(folder / "truth" / "positions.csv")
-    assert found.lonlat_deg is not None
-    assert true.lonlat_deg is not None
-    assert len(found) > 5
-    kind = np.array([row["kind"] for row in rows(folder / "truth" / "positions.csv")])
+    assert found.lonlat_deg is not None and true.lonlat_deg is not None and len(found) > 5
+    people = np.array([row["kind"] == "person" for row in rows(folder / "truth" / "positions.csv")])
     nearest = []
     for frame, place in zip(found.frame.tolist(), found.lonlat_deg, strict=True):
-        crowd = true.lonlat_deg[(true.frame == frame) & (kind == "person")]
+        crowd = true.lonlat_deg[(true.frame == frame) & people]
         nearest.append(np.linalg.norm(geometry.east_north(crowd, (place[0], place[1])), axis=1).min())
     assert np.median(nearest) < 2.0
 
 
-def test_the_truth_is_judged_by_evaluate(made, dddas):
+def test_the_command_that_is_proposed_evaluates_the_run(made, dddas):
     folder, said = made
-    assert f"dddas evaluate {folder / 'truth' / 'gt.txt'} {folder}" in said
-    result = dddas("evaluate", folder / "truth" / "gt.txt", folder)
+    words = ("evaluate", folder / "truth" / "gt.txt", folder)
+    assert f"dddas {' '.join(map(str, words))}" in said
+    result = dddas(*words)
     assert result.exit_code == 0, result.output
     assert "HOTA" in result.stdout
 
 
-def test_the_log_tells_what_the_run_itself_noticed(made):
-    folder, _ = made
-    noticed = [line for line in (folder / "log.txt").read_text().splitlines() if " noticed " in line]
-    assert "the camera is frozen" in noticed[0]
-    assert "3 pictures repeated" in noticed[1]
-    assert "noticed" in (folder / "report.html").read_text()
-    assert "frame 17 was dropped by the camera" in (folder / "log.txt").read_text()
-
-
-def test_the_record_says_how_good_it_was(made):
+def test_log_and_record_tell_what_the_run_noticed_and_how_good_it_was(made):
     folder, said = made
+    log = (folder / "log.txt").read_text()
+    noticed = [line for line in log.splitlines() if " noticed " in line]
+    assert "the camera is frozen" in noticed[0] and "3 pictures repeated" in noticed[1]
+    assert "frame 17 was dropped by the camera" in log
+    assert "noticed" in (folder / "report.html").read_text()
     kept = record(folder)
-    assert kept["state"] == "complete"
-    assert kept["frames"]["written"] == 24
-    assert kept["truth_score"]
+    assert kept["state"] == "complete" and kept["frames"]["written"] == 24 and kept["truth_score"]
     assert "crowds: " in said
 
 
@@ -82,20 +75,18 @@ def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dd
             raise KeyboardInterrupt
 
     monkeypatch.setattr(SimulatedRunRecorder, "write", short)
-    out = tmp_path / "out"
-    path = scenario(tmp_path / "tiny.toml")
-    result = dddas("run", f"sim:{path}", "--out", out, "--save", "truth", "--quiet", "--set", "steering.sampling=false")
-    assert result.exit_code == 130
+    path, out = scenario(tmp_path / "tiny.toml"), tmp_path / "out"
+    words = ("--save", "truth", "--quiet", "--set", "steering.sampling=false")
+    assert dddas("run", f"sim:{path}", "--out", out, *words).exit_code == 130
     assert record(out)["state"] == "interrupted"
     assert max(int(row["frame"]) for row in rows(out / "truth" / "positions.csv")) == 6
     assert len(rows(out / "fixes.csv")) == 6
 
 
 @pytest.mark.slow
-def test_truth_that_is_not_asked_for_goes_with_the_earlier_run(made, dddas, tmp_path):
+def test_a_run_without_truth_removes_that_of_the_earlier_run(dddas, tmp_path):
     path = scenario(tmp_path / "tiny.toml", clip={"seconds": 0.5})
     for save, there in (("truth", True), ("none", False)):
         result = dddas("run", f"sim:{path}", "--out", tmp_path / "out", "--save", save, "--quiet")
-        assert result.exit_code == 0, result.output
-        assert result.output == ""
+        assert (result.exit_code, result.output) == (0, "")
         assert (tmp_path / "out" / "truth" / "gt.txt").exists() == there

@@ -175,7 +175,7 @@ def with_signs(*verdicts, looks=()):
     return map_picture(east, NONE, signs=signs)[:-100].astype(int)
 
 
-def test_the_map_shows_where_a_target_was_told_human_and_where_not():
+def test_the_map_shows_where_a_target_was_human_and_where_not():
     def count(picture, kind):
         return int((np.abs(picture - VERDICTS[kind]).max(axis=2) < 12).sum())
 

@@ -60,13 +60,9 @@ def test_a_track_has_its_frames_times_and_errors_beside_its_places():
     assert properties["times"][:2] == ["2020-09-13T12:26:40.250Z", "2020-09-13T12:26:40.350Z"]
     assert properties["sigma_m"][0] == pytest.approx(np.sqrt(5), abs=1e-3)
     assert shape["coordinates"][0] == pytest.approx(ORIGIN)
-
-
-def test_without_a_clock_times_are_seconds_and_without_any_there_are_none():
-    one, _ = features(tracks(walk(), **UNCLOCKED))
-    assert one["properties"]["seconds"][:3] == [0, 0.1, 0.2] and "times" not in one["properties"]
-    one, _ = features(tracks(walk(), timed=False))
-    assert not {"seconds", "times"} & one["properties"].keys()
+    seconds, none = (features(tracks(walk(), **how))[0]["properties"] for how in (UNCLOCKED, {"timed": False}))
+    assert seconds["seconds"][:3] == [0, 0.1, 0.2] and "times" not in seconds
+    assert not {"seconds", "times"} & none.keys()
 
 
 def test_ellipses_are_polygons_of_95_percent_where_the_error_is_known_and_landmarks_are_named():
@@ -111,13 +107,19 @@ def marks_of(root, name):
     return folders[0].findall(f"{KML}Placemark") if folders else []
 
 
-def test_a_track_has_a_time_for_each_of_its_places():
+def test_places_and_ellipses_of_a_track_have_times():
     one, two = marks_of(read_kml(tracks(walk())), "tracks")
     track = one.find(f"{GX}Track")
     assert track is not None and two.findtext(f"{KML}name") == "target 2"
     assert [e.tag for e in track] == [f"{KML}altitudeMode", *[f"{KML}when"] * 30, *[f"{GX}coord"] * 30]
     assert track[2].text == "2020-09-13T12:26:40.350Z"
     assert [float(v) for v in (track[31].text or "").split()] == pytest.approx([*ORIGIN, 0])
+    found = marks_of(read_kml(tracks(walk())), "95 % ellipses")
+    assert found[1].findtext(f"{KML}TimeStamp/{KML}when") == "2020-09-13T12:26:41.250Z"
+    for mark in found:
+        text = mark.findtext(f"{KML}Polygon/{KML}outerBoundaryIs/{KML}LinearRing/{KML}coordinates") or ""
+        ring = [[float(v) for v in place.split(",")] for place in text.split()]
+        assert ring[0] == ring[-1] and signed_area(ring) > 0
 
 
 def test_without_a_clock_a_track_is_a_line_and_has_only_its_last_ellipse():
@@ -127,15 +129,6 @@ def test_without_a_clock_a_track_is_a_line_and_has_only_its_last_ellipse():
     assert len(line) == 30 and [float(v) for v in line[0].split(",")] == pytest.approx([*ORIGIN, 0])
     names = [m.findtext(f"{KML}name") for m in marks_of(root, "95 % ellipses")]
     assert names == ["target 1, frame 30", "target 2, frame 30"]
-
-
-def test_ellipses_have_times_and_closed_anticlockwise_rings():
-    found = marks_of(read_kml(tracks(walk())), "95 % ellipses")
-    assert found[1].findtext(f"{KML}TimeStamp/{KML}when") == "2020-09-13T12:26:41.250Z"
-    for mark in found:
-        text = mark.findtext(f"{KML}Polygon/{KML}outerBoundaryIs/{KML}LinearRing/{KML}coordinates") or ""
-        ring = [[float(v) for v in place.split(",")] for place in text.split()]
-        assert ring[0] == ring[-1] and signed_area(ring) > 0
 
 
 def test_the_document_follows_the_schema_has_its_styles_and_keeps_names():
@@ -164,19 +157,15 @@ def test_a_track_over_180_degrees_is_several_whose_places_are_all_there():
 
 def test_people_located_from_the_ground_are_written_too(tmp_path):
     none = np.zeros(0)
-    sightings = Sightings(
-        np.zeros((0, 2)), none, none, none, np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros((0, 2, 6))
-    )
-    for geographic in (True, False):
-        with GroundRecorder(tmp_path) as output:
-            output.begin({}, ("a",), geographic)
-            for frame in walk(3, origin=ORIGIN if geographic else None):
-                rest = (np.zeros((2, 1), int), sightings, none, none, none, none, np.zeros((0, 4)))
-                output.write(GroundLocations(int(frame.frame[0]), frame, *rest))
-        if geographic:
-            root = ElementTree.parse(tmp_path / "tracks.kml").getroot()
-            assert [m.findtext(f"{KML}name") for m in marks_of(root, "tracks")] == ["target 1", "target 2"]
-    assert {path.name for path in tmp_path.iterdir()} == {"positions.csv", "sightings.csv", "run.json"}
+    places = np.zeros((0, 2))
+    sightings = Sightings(places, none, none, none, np.zeros((0, 2, 2)), places, np.zeros((0, 2, 6)))
+    with GroundRecorder(tmp_path) as output:
+        output.begin({}, ("a",), True)
+        for frame in walk(3):
+            rest = (np.zeros((2, 1), int), sightings, none, none, none, none, np.zeros((0, 4)))
+            output.write(GroundLocations(int(frame.frame[0]), frame, *rest))
+    root = ElementTree.parse(tmp_path / "tracks.kml").getroot()
+    assert [m.findtext(f"{KML}name") for m in marks_of(root, "tracks")] == ["target 1", "target 2"]
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -121,7 +121,7 @@ def test_people_have_boxes_and_feet_those_cut_another_colour_and_unlikely_ones_a
     assert (both[70:150, 60] == PERSON).all()
 
 
-def test_of_labels_that_overlap_the_best_is_on_top():
+def test_of_overlapping_labels_the_best_is_on_top():
     pair = [(60, 60, 40, 100), (70, 60, 40, 100)]
     best_first = draw_people(people(pair, score=(0.99, 0.6)))
     np.testing.assert_array_equal(best_first, draw_people(people(pair[::-1], score=(0.6, 0.99))))

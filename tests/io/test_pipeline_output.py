@@ -1,7 +1,5 @@
 """What a run of the whole pipeline leaves in its folder, and what its pictures show."""
 
-import csv
-import json
 import re
 from dataclasses import replace
 
@@ -9,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.cli.conftest import record, rows
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.output import PROBLEM, PipelineRecorder, Site
 from torchvision_dddas.io.output.tables import landmark_table
@@ -47,16 +46,8 @@ def located(frame, by="pose", cause="", states=("used", "excluded"), geographic=
     variance = np.tile(0.04 * np.eye(2), (at, 1, 1))
     positions = Positions(np.full(at, frame), np.full(at, 3), np.zeros((at, 2)), variance, np.ones(at))
     fix = Fix(frame, by, landmark=np.arange(2), state=states, cause=cause)
-    rest = (
-        np.arange(at),
-        np.zeros((at, 2, 2)),
-        np.full((at, 2), np.nan),
-        boxes,
-        fix,
-        marks,
-        adjustments,
-        {"fix": 0.01},
-    )
+    unsure = np.zeros((at, 2, 2)), np.full((at, 2), np.nan)
+    rest = (np.arange(at), *unsure, boxes, fix, marks, adjustments, {"fix": 0.01})
     degrees = np.array([[-110.95, 32.23], [-110.94, 32.24]]) if geographic else None
     return FrameResult(tracked, AerialLocations(frame, frame / 10, positions, *rest), ("motion", "colour"), degrees)
 
@@ -79,16 +70,11 @@ def run(folder, frames, save=("report",), events=(), score=None, site=Site(NAMES
             output.write(frame)
         if score:
             output.story.score(*score)
-    return json.loads((folder / "run.json").read_text())
+    return record(folder)
 
 
 def log(folder):
     return (folder / "log.txt").read_text().splitlines()[3:]
-
-
-def rows(path):
-    with path.open(newline="") as text:
-        return list(csv.DictReader(text))
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -110,22 +96,22 @@ def test_the_landmarks_table_can_be_read_as_one(tmp_path, geographic):
 
 
 def test_the_record_counts_identities_beside_what_was_located(tmp_path):
-    record = run(tmp_path, [located(1), located(2)], save=())
-    assert record["identities"] == 3 and record["positions"] == 2 and record["landmarks"]["blue"]["used"] == 0
+    kept = run(tmp_path, [located(1), located(2)], save=())
+    assert kept["identities"] == 3 and kept["positions"] == 2 and kept["landmarks"]["blue"]["used"] == 0
     assert len(rows(tmp_path / "tracks.csv")) == len(rows(tmp_path / "detections.csv")) == 2
     assert not (tmp_path / "overlay.mp4").exists()
 
 
-def test_what_ground_vehicles_say_is_a_table_if_they_looked_and_is_counted(tmp_path):
+def test_what_ground_vehicles_say_is_a_table_and_counted(tmp_path):
     said = [("unseen", ()), ("human", ("blue",)), ("not_human", ("ugv, red", "blue"))]
-    record = run(tmp_path, [*(confirmed(located(k), *one) for k, one in enumerate(said, 1)), located(4)])
+    kept = run(tmp_path, [*(confirmed(located(k), *one) for k, one in enumerate(said, 1)), located(4)])
     table = rows(tmp_path / "confirmed.csv")
     assert [(row["frame"], row["target"], row["kind"]) for row in table] == [
         ("1", "3", "unseen"), ("2", "3", "human"), ("3", "3", "not_human"),
     ]  # fmt: skip
     assert table[1]["probability"] == "0.9600" and table[1]["seen_by"] == "blue" and table[1]["best_score"] == ""
     assert table[2]["seen_by"] == "ugv, red;blue" and float(table[2]["east_m"]) == 0
-    assert record["kinds"] == {"unseen": 1, "human": 1, "not_human": 1} and record["rows_looked_at"] == 2
+    assert kept["kinds"] == {"unseen": 1, "human": 1, "not_human": 1} and kept["rows_looked_at"] == 2
     assert "it was told human before" in log(tmp_path)[-1]
     assert "kinds" not in run(tmp_path, [located(1)]) and not (tmp_path / "confirmed.csv").exists()
 
@@ -154,7 +140,7 @@ def test_the_log_tells_the_run_from_top_to_bottom(tmp_path):
     assert lines[4].startswith("0.500 5 told target 3 is human") and "seen by blue" in lines[4] and len(lines) == 5
 
 
-def test_a_landmark_that_is_not_seen_for_a_while_is_told_once(tmp_path):
+def test_a_landmark_not_seen_for_a_while_is_logged_once(tmp_path):
     def without(frame):
         item = located(frame)
         marks = item.locations.marks
@@ -167,9 +153,7 @@ def test_a_landmark_that_is_not_seen_for_a_while_is_told_once(tmp_path):
 
 
 @pytest.mark.parametrize("geographic", [False, True])
-def test_the_first_order_is_told_and_then_those_that_lead_elsewhere_unless_an_adjustment_explains_them(
-    tmp_path, geographic
-):
+def test_orders_are_logged_when_they_lead_elsewhere_and_no_adjustment_explains_them(tmp_path, geographic):
     def sent(frame, east_m, *adjustments):
         place = np.array([east_m, 0.0])
         goal = [-110.95, 32.23] + (place - (1, 2)) * (0.005, 0.005) if geographic else place  # 0.01 degrees are 2 m
@@ -190,7 +174,7 @@ def test_the_report_is_one_light_page_with_plots_of_parameters_key_frames_and_ca
     at = {k: (Adjustment(k, "interval.frames", k % 3, (k + 10) % 3, f"flow <{k}>"),) for k in range(5, 60, 10)}
     score = ({"crowd_error_m": 0.25, "of": {"count": 3}}, ["places 0.25 m off"])
     frames = [located(k, adjustments=at.get(k, ())) for k in range(1, 61)]
-    record = run(tmp_path, frames, events=[(30, "crowds 1 & 2 join")], score=score)
+    kept = run(tmp_path, frames, events=[(30, "crowds 1 & 2 join")], score=score)
     text = (tmp_path / "report.html").read_text()
     assert len(text) < 2_000_000
     assert not re.search(r"https?:|//[a-z]|url\(|@import|<link|<iframe", re.sub(r'"data:[^"]*"', "", text))
@@ -198,8 +182,8 @@ def test_the_report_is_one_light_page_with_plots_of_parameters_key_frames_and_ca
     assert 'class="title">interval.frames</text>' in text and 'class="title">time spent on a frame' in text
     assert "flow &lt;15&gt;" in text and "crowds 1 &amp; 2 join" in text
     assert "<h2>Against the truth</h2>" in text and "places 0.25 m off" in text
-    assert record["truth_score"] == {"crowd_error_m": 0.25, "of": {"count": 3}}
-    assert record["events"] == [{"frame": 30, "time_s": 3.0, "what": "crowds 1 & 2 join"}]
+    assert kept["truth_score"] == {"crowd_error_m": 0.25, "of": {"count": 3}}
+    assert kept["events"] == [{"frame": 30, "time_s": 3.0, "what": "crowds 1 & 2 join"}]
     assert "truth_score" not in run(tmp_path, [located(1), located(2)])
     assert "Against the truth" not in (tmp_path / "report.html").read_text()
 
@@ -236,7 +220,7 @@ def test_the_caption_says_why_a_frame_is_not_located_and_frames_without_places_s
     assert plain.shape == (120, 200, 3) and (plain != 128).any()
 
 
-def test_the_overlay_says_what_a_target_was_told_to_be():
+def test_the_overlay_differs_with_what_ground_vehicles_say_of_a_target():
     results = [located(1), *(confirmed(located(1), kind) for kind in ("human", "not_human", "unseen"))]
     pictures = [RunPictures(SIZE, NAMES)(result)[:40, :60] for result in results]
     assert all(cv2.absdiff(a, b).any() for k, a in enumerate(pictures) for b in pictures[:k])
