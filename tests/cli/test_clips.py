@@ -248,15 +248,6 @@ def test_a_clip_with_a_table_gives_a_film_of_the_sampled_frames(dddas, clip, tab
     assert (kept["interval_frames"], kept["backend"], kept["clip"]["size"]) == (2, "onboard", [64, 48])
 
 
-def test_the_tables_of_detect_can_be_tracked_as_text_and_as_csv(dddas, engine, clip, tmp_path):
-    dddas("detect", clip, "--out", tmp_path / "found", "--quiet")
-    for name in ("detections.txt", "detections.csv"):
-        words = ("--detections", tmp_path / "found" / name, "--out", tmp_path / name, "--quiet")
-        assert dddas("track", *words).exit_code == 0
-        assert len(tracks(tmp_path / name)) == 5
-    assert (tmp_path / "detections.txt/tracks.txt").read_text() == (tmp_path / "detections.csv/tracks.txt").read_text()
-
-
 MOVING = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
 MOVING += "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
 NOTED = {

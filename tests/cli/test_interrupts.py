@@ -1,6 +1,5 @@
 """Ctrl-C: exit code 130, one line, and whole files of what was done until then."""
 
-import json
 import shlex
 import signal
 import subprocess
@@ -10,6 +9,8 @@ from pathlib import Path
 
 import cv2
 import pytest
+
+from tests.cli.conftest import record
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -62,8 +63,8 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path, line, ta
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert error == "dddas: interrupted; results up to here are kept\n"
-    record = json.loads((out / "run.json").read_text())
-    assert (record["interrupted"], record["frames"]["written"]) == (True, 3)
+    kept = record(out)
+    assert (kept["interrupted"], kept["frames"]["written"]) == (True, 3)
     assert {row.split(",")[0] for row in (out / table).read_text().splitlines()} <= {"1", "2", "3"}
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
     assert not list(out.rglob("*.part*"))

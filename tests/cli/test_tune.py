@@ -96,14 +96,6 @@ def test_a_resumed_run_does_no_step_twice_and_says_the_same(clips, tuned) -> Non
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
-def test_a_pull_holds_the_parameter_where_it_began(one, tuned, tmp_path) -> None:
-    result = one("--pull", "100")
-    assert result.exit_code == 0, result.output
-    held, free = (record(out)["history"] for out in (tmp_path, tuned[0]))
-    moved = [abs(steps[-1]["knobs"][THRESHOLD] - steps[0]["knobs"][THRESHOLD]) for steps in (held, free)]
-    assert moved[0] < moved[1] / 2
-
-
 def test_a_cost_is_measured_once_and_kept_for_a_resumed_run(one, tmp_path, monkeypatch) -> None:
     calls = list[float]()
 

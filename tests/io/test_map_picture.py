@@ -147,17 +147,15 @@ def test_the_view_of_a_homography_is_its_border_on_the_ground():
         assert len(view_of(replace(fix, image_from_ground=unknown), CAMERA)) == 0
 
 
-@pytest.mark.parametrize("found", [NONE, walk(frames=[1]), tracks([positions(1, [[7, 7]], np.full((2, 2), np.nan))])])
-def test_a_map_of_little_or_nothing_is_drawn(found):
+CROWD = positions(1, np.random.default_rng(1).normal(0, 1, (150, 2)), None, None)
+UNSURE = positions(1, [[7, 7]], np.full((2, 2), np.nan))
+
+
+@pytest.mark.parametrize("found", [NONE, walk(frames=[1]), tracks([UNSURE]), tracks([CROWD])])
+def test_a_map_of_little_or_nothing_or_of_a_crowd_is_drawn(found):
     assert map_picture(found, NONE).shape[1] == WIDTH
-
-
-def test_names_beyond_ascii_crowds_and_signs_far_outside_do_not_break_it():
-    crowd = tracks([positions(1, np.random.default_rng(1).normal(0, 1, (150, 2)), None, None)])
     camera = CameraPath(np.zeros((1, 2)), DOWN[:, :2])
-    assert map_picture(crowd, landmarks([0, 0]), ("Żółw 🐢",), camera).shape[1] == WIDTH
-    picture = with_signs(([1e7, -1e7], "human"), looks=[([-1e7, 1e7], [0.0, 0.0])])
-    assert picture.shape == with_signs().shape
+    assert map_picture(found, landmarks([0, 0]), ("Żółw 🐢",), camera).shape[1] == WIDTH
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -190,6 +188,8 @@ def test_a_wedge_opens_from_the_vehicle_towards_what_it_saw():
     rows, columns = np.nonzero(changed)
     widths = [np.ptp(columns[rows == row]) for row in (rows.min() + 3, rows.max() - 3)]
     assert len(rows) > 100 and widths[1] > 2 * widths[0]
+    far = with_signs(([1e7, -1e7], "human"), looks=[([-1e7, 1e7], [0.0, 0.0])])
+    assert far.shape == with_signs().shape
 
 
 def test_looks_from_one_place_are_one_those_from_nowhere_none_and_memory_is_bounded():

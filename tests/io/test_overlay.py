@@ -68,20 +68,14 @@ def shows(picture, colour):
 
 @pytest.mark.parametrize("grey", [False, True])
 @pytest.mark.parametrize("kind", DRAWERS)
-def test_a_picture_is_drawn_on_a_copy_in_colour(kind, grey):
+def test_boxes_anywhere_and_of_any_size_are_drawn_on_a_copy_in_colour(kind, grey):
     make, draw = DRAWERS[kind]
-    item = make(grey=grey)
-    drawn = draw(item)
-    assert drawn.shape == (*item.frame.image.shape[:2], 3) and (drawn != 90).any()
-    assert (item.frame.image == 90).all()
-
-
-@pytest.mark.parametrize("kind", DRAWERS)
-def test_boxes_anywhere_and_of_any_size_can_be_drawn(kind):
-    make, draw = DRAWERS[kind]
-    for box in ((-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (-1e9, -1e9, 3e9, 3e9), (3, 3, 1e-3, 1e-3)):
-        item = make([box], grey=True)
-        assert draw(item).shape == (*item.frame.image.shape[:2], 3)
+    far = [(-500, -500, 20, 20), (1e9, 1e9, 1e9, 1e9), (-1e9, -1e9, 3e9, 3e9), (3, 3, 1e-3, 1e-3)]
+    for item in (make(grey=grey), *(make([box], grey=grey) for box in far)):
+        drawn = draw(item)
+        assert drawn.shape == (*item.frame.image.shape[:2], 3)
+        assert (item.frame.image == 90).all()
+    assert (draw(make(grey=grey)) != 90).any()
 
 
 @pytest.mark.parametrize("kind", DRAWERS)
@@ -110,22 +104,24 @@ def test_detections_without_identity_and_frames_without_picture_are_drawn():
     assert drawn.shape == (90, 120, 3) and (drawn[20, 5:25] == UNTRACKED).all()
 
 
-def test_people_have_boxes_and_feet_those_cut_another_colour_and_unlikely_ones_are_grey_below():
+PAIR = [(60, 60, 40, 100), (70, 60, 40, 100)]
+
+
+def test_people_have_boxes_and_feet_in_the_colour_of_their_kind():
     drawn = draw_people(people())
     assert (drawn[70:150, 60] == PERSON).all() and (drawn[160, 80] == PERSON).all() and not shows(drawn, CUT)
-    both = draw_people(people([(60, 60, 40, 100), (-20, 60, 60, 140)], cut=(1,)))
+    both = draw_people(people([PAIR[0], (-20, 60, 60, 140)], cut=(1,)))
     assert shows(both, PERSON) and shows(both, CUT)
     alone = draw_people(people(score=0.4, cut=(0,)))
     assert (alone[70:150, 60] == UNLIKELY).all() and not shows(alone, PERSON) and not shows(alone, CUT)
-    both = draw_people(people([(60, 60, 40, 100), (60, 60, 40, 100)], score=(0.6, 0.4)))
-    assert (both[70:150, 60] == PERSON).all()
 
 
-def test_of_overlapping_labels_the_best_is_on_top():
-    pair = [(60, 60, 40, 100), (70, 60, 40, 100)]
-    best_first = draw_people(people(pair, score=(0.99, 0.6)))
-    np.testing.assert_array_equal(best_first, draw_people(people(pair[::-1], score=(0.6, 0.99))))
-    alone = draw_people(people(pair[:1], score=0.99))
+def test_of_boxes_and_labels_that_overlap_the_best_is_on_top():
+    same = draw_people(people([PAIR[0], PAIR[0]], score=(0.6, 0.4)))
+    assert (same[70:150, 60] == PERSON).all()
+    best_first = draw_people(people(PAIR, score=(0.99, 0.6)))
+    np.testing.assert_array_equal(best_first, draw_people(people(PAIR[::-1], score=(0.6, 0.99))))
+    alone = draw_people(people(PAIR[:1], score=0.99))
     np.testing.assert_array_equal(best_first[40:58, 62:85], alone[40:58, 62:85])
 
 
@@ -174,21 +170,21 @@ def test_a_video_that_cannot_be_opened_again_is_none(tmp_path, scene, monkeypatc
 
 @pytest.mark.parametrize("is_video", [True, False])
 def test_an_overlay_is_written_whole_or_not_at_all(tmp_path, is_video):
-    folders = {name: tmp_path / name for name in ("kept", "dropped", "empty")}
-    overlays: dict[str, Any] = {}
-    for name, folder in folders.items():
+    def written(name, pictures, end):
+        folder = tmp_path / name
         folder.mkdir()
-        overlays[name] = OverlayVideo(folder, 10, draw_people) if is_video else OverlayPicture(folder, draw_people)
-    for name in ("kept", "dropped"):
-        overlays[name].write(people())
-    assert not list(folders["kept"].glob("overlay*"))
-    overlays["kept"].close(complete=True)
-    overlays["dropped"].discard()
-    overlays["empty"].close(complete=True)
-    assert [len(list(folder.iterdir())) for folder in folders.values()] == [1, 0, 0]
-    if not is_video:
-        read = cv2.imread(str(folders["kept"] / "overlay.png"))
-        assert read is not None and np.array_equal(read, draw_people(people()))
+        overlay: Any = OverlayVideo(folder, 10, draw_people) if is_video else OverlayPicture(folder, draw_people)
+        for picture in pictures:
+            overlay.write(picture)
+        assert not list(folder.glob("overlay*"))
+        end(overlay)
+        return list(folder.iterdir())
+
+    (kept,) = written("kept", [people()], lambda overlay: overlay.close(complete=True))
+    assert written("dropped", [people()], lambda overlay: overlay.discard()) == []
+    assert written("empty", [], lambda overlay: overlay.close(complete=True)) == []
+    read = cv2.imread(str(kept))
+    assert is_video or (read is not None and np.array_equal(read, draw_people(people())))
 
 
 class Writer(ThreadedWriter):

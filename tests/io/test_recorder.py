@@ -283,11 +283,3 @@ def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(
     assert kept["unreliable"] == [{"first": 3, "last": 3, "cause": "the frame could not be read"}]
     assert [a["cause"] for a in kept["adjustments"]] == ["2 people expected"]
     assert kept["seconds"]["stages"]["score"]["total"] == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(("single", "name"), [(False, "overlay.mp4"), (True, "overlay.png")])
-def test_a_clip_gets_a_video_and_a_picture_a_picture(tmp_path, single, name):
-    with PeopleRecorder(tmp_path) as output:
-        output.begin({}, 10, single)
-        output.write(people_frame(1))
-    assert [file for file in visible(tmp_path) if "overlay" in file] == [name]

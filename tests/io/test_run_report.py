@@ -61,11 +61,10 @@ def test_what_lasts_is_one_line_that_says_how_long_though_its_numbers_differ(fra
     assert len(lines) == len(ends) and all(line.endswith(end) for line, end in zip(lines, ends, strict=True))
 
 
-@pytest.mark.parametrize(("frame", "time_s"), [(1, 0.0), (11, 1.0), (51, 5.0), (121, 12.0)])
-def test_the_time_of_a_frame_follows_from_those_around_it_or_goes_on_beyond_them(frame, time_s):
-    assert Clock(np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0])).time_s(
-        Entry(frame, WORLD, "", frame)
-    ) == pytest.approx(time_s)
+def test_the_time_of_a_frame_follows_from_those_around_it_or_goes_on_beyond_them():
+    clock = Clock(np.array([11, 21, 41]), np.array([1.0, 2.0, 4.0]))
+    for frame, time_s in ((1, 0.0), (11, 1.0), (51, 5.0), (121, 12.0)):
+        assert clock.time_s(Entry(frame, WORLD, "", frame)) == pytest.approx(time_s)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -146,7 +145,7 @@ def test_the_page_is_whole_offline_and_all_words_are_escaped(tmp_path):
     assert base64.b64decode(source.removeprefix("data:image/png;base64,")) == b"\x89PNG<>"
 
 
-def test_a_table_says_how_many_rows_it_leaves_out_and_an_empty_one_that_it_is_empty(tmp_path):
+def test_a_table_says_how_many_rows_it_leaves_out_or_that_it_is_empty(tmp_path):
     text = page_of(tmp_path, [(format_span(k, k), "x") for k in range(MOST_TABLE_ROWS + 7)])
     assert "and 7 more" in text and text.count(">x</td>") == MOST_TABLE_ROWS and "none at all" not in text
     assert "none at all" in page_of(tmp_path, [])
@@ -161,18 +160,11 @@ def run(moves=(), frames=range(1, 11), seconds=lambda number: {}, names=(), even
     timeline = Timeline(names)
     for number in frames:
         moved = tuple(Adjustment(at, name, old, new, "why") for at, name, old, new in moves if at == number)
+        rest: Any = {"adjustments": moved, "seconds": seconds(number), "cause": "too dark" if number in causes else ""}
         frame = Frame(number, number / 10, np.zeros((4, 4, 3), np.uint8))
-        tracked = TrackedFrame(
-            number, frame, Detections(), Tracks(number), cause="too dark" if number in causes else "",
-            adjustments=moved, seconds=seconds(number),
-        )  # fmt: skip
-        timeline.add_result(FrameResult(tracked))
+        timeline.add_result(FrameResult(TrackedFrame(number, frame, Detections(), Tracks(number), **rest)))
     timeline.events[WORLD] = list(events)
     return timeline
-
-
-def lines(timeline, title):
-    return dict(timeline.panels())[title]
 
 
 def tick_places(svg):
@@ -217,7 +209,7 @@ def test_a_parameter_holds_its_first_value_until_it_is_moved_and_each_new_one_fr
 def test_only_the_parameters_moved_most_have_panels_and_vehicles_share_theirs():
     moves = [(1, "gates.min_size_px", 0, 5), (3, "ugv1.speed_m_s", 3, 1), (5, "ugv2.speed_m_s", 3, 1)]
     timeline = run([*moves, (6, "uav.altitude_m", 50, 60)], names=("ugv1", "ugv2"))
-    assert [line.name for line in lines(timeline, "speed_m_s of each ground vehicle")] == ["ugv1", "ugv2"]
+    assert [line.name for line in dict(timeline.panels())["speed_m_s of each ground vehicle"]] == ["ugv1", "ugv2"]
     titles = {title for title, _ in timeline.panels()}
     assert "uav.altitude_m" in titles and not {"ugv1.speed_m_s", "gates.min_size_px"} & titles  # one never changed
     many = [(k, f"group.parameter{n:02d}", 0, k) for n in range(30) for k in range(2, 3 + n // 4)]
@@ -228,7 +220,7 @@ def test_only_the_parameters_moved_most_have_panels_and_vehicles_share_theirs():
 def test_stages_are_stacked_up_to_all_the_time_spent():
     spent = {f"stage{k}": 0.001 * (k + 1) for k in range(11)}
     timeline = run(seconds=lambda number: spent if number != 4 else {"rare": 0.5})
-    stages = lines(timeline, "time spent on a frame, ms, stacked")
+    stages = dict(timeline.panels())["time spent on a frame, ms, stacked"]
     heights = np.stack([line.y for line in stages])
     assert (np.diff(heights, axis=0) <= 1e-9).all() and stages[0].name == "other"  # the highest is drawn first
     np.testing.assert_allclose(heights[0], [66, 66, 66, 500, 66, 66, 66, 66, 66, 66], rtol=1e-4)
