@@ -26,12 +26,11 @@ def hill(east_north):
     return 0.1 * east + 0.05 * north + 4 * np.exp(-(east**2 + north**2) / 12**2)
 
 
-def raster(ground, base=1300.0, reach=260.0, step=1.0):
+def raster(ground, reach=260.0):
     """The ground as an elevation about its own origin."""
-    k = np.arange(-reach, reach + step, step)
-    east, north = np.meshgrid(k, k)
-    heights = ground(np.column_stack([east.ravel(), north.ravel()])).reshape(east.shape)
-    return Elevation(heights, (-reach, -reach), step, base)
+    k = np.arange(-reach, reach + 1)
+    heights = ground(np.stack(np.meshgrid(k, k), axis=-1).reshape(-1, 2)).reshape(len(k), len(k))
+    return Elevation(heights, (-reach, -reach), 1.0, 1300.0)
 
 
 @pytest.fixture
@@ -40,8 +39,7 @@ def prepared(tmp_path):
 
     def prepare(flight, elevation=None, telemetry=True, pictured=True, **parameters):
         texts = {"l.csv": flight.landmarks_csv(pictured=pictured), "tel.csv": flight.telemetry_csv()}
-        texts |= {"c.toml": flight.camera_toml(), "t.txt": flight.tracks_txt()}
-        for name, text in texts.items():
+        for name, text in (texts | {"c.toml": flight.camera_toml(), "t.txt": flight.tracks_txt()}).items():
             (tmp_path / name).write_text(text)
         settings = with_parameters(Settings(), parameters)
         flown = read_telemetry(tmp_path / "tel.csv") if telemetry else None
@@ -53,74 +51,63 @@ def prepared(tmp_path):
     return prepare
 
 
-def errors(flight, found):
-    """(N,) metres from the truth, of all frames."""
-    off = [g.positions.east_north_m - flight.targets(g.frame)[g.positions.target - 1] for g in found]
-    return np.linalg.norm(np.concatenate(off), axis=1)
+def flies(locator, **telemetry):
+    """Replace parts of the telemetry."""
+    locator.site = replace(locator.site, telemetry=replace(locator.site.telemetry, **telemetry))
+    return locator
 
 
 def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(prepared):
     flight = Overflight(pitch_deg=45, ground=hill, geographic=False, gps_m=0.1, pixel=0.5)
-    locator, table = prepared(flight)
-    level = errors(flight, locator.locate_table(table))
-    locator, table = prepared(flight, raster(hill))
-    known = errors(flight, locator.locate_table(table))
-    assert np.median(level) > 1.0
-    assert np.median(known) < 0.3
+
+    def error(*elevation):
+        locator, table = prepared(flight, *elevation)
+        found = list(locator.locate_table(table))
+        off = [g.positions.east_north_m - flight.targets(g.frame)[g.positions.target - 1] for g in found]
+        return np.median(np.linalg.norm(np.concatenate(off), axis=1))
+
+    assert error() > 1.0
+    assert error(raster(hill)) < 0.3
 
 
-def test_heights_above_sea_will_do_where_the_ground_is_known(prepared):
+def test_heights_above_sea_will_do_where_the_ground_is_known_and_one_below_the_ground_is_unknown(prepared):
     flight = Overflight(ground=hill, geographic=False)
-    locator, _ = prepared(flight, raster(hill, base=1300.0))
-    flown = locator.site.telemetry
-    height = np.array([flight.vehicle(frame)[2] for frame in flight.numbers()]) + 1300.0
-    unknown = np.full(len(flown), np.nan)
-    locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=unknown, above_sea_m=height))
-    assert locator.telemetry_at(0.0).altitude_m == pytest.approx(flight.vehicle(1)[2], abs=0.01)
-
-
-def test_an_altitude_below_the_ground_counts_as_unknown(prepared):
+    locator, _ = prepared(flight, raster(hill))
+    height = np.array([flight.vehicle(frame)[2] for frame in flight.numbers()])
+    flies(locator, altitude_m=np.full(len(height), np.nan), above_sea_m=height + 1300.0)
+    assert locator.telemetry_at(0.0).altitude_m == pytest.approx(height[0], abs=0.01)
     locator, _ = prepared(Overflight(geographic=False))
     flown = locator.site.telemetry
-    sunk = np.where(flown.time_s < 0.35, -2.0, flown.altitude_m)
-    locator.site = replace(locator.site, telemetry=replace(flown, altitude_m=sunk))
+    flies(locator, altitude_m=np.where(flown.time_s < 0.35, -2.0, flown.altitude_m))
     assert np.isnan(locator.telemetry_at(0.0).altitude_m)
     assert locator.telemetry_at(0.8).altitude_m == pytest.approx(50.0)
 
 
 def test_a_landmark_where_the_raster_has_no_height_is_not_used(prepared):
-    flight = Overflight(ground=hill, geographic=False)
-    holed = raster(hill)
+    flight, holed = Overflight(ground=hill, geographic=False), raster(hill)
     row, column = (int(v) for v in np.rint(flight.marks(1)[2][::-1] + 260))
     holed.up_m[row - 5 : row + 6, column - 5 : column + 6] = np.nan
     locator, table = prepared(flight, holed)
-    first = next(iter(locator.locate_table(table)))
-    assert first.marks.landmark.tolist() == [0, 1, 3]
+    assert next(iter(locator.locate_table(table))).marks.landmark.tolist() == [0, 1, 3]
 
 
 def test_the_point_of_a_box_is_its_feet_its_foot_or_its_centre():
     feet = np.array([[5.0, 9.0], [np.nan, np.nan]])
     targets = Targets(np.array([[0, 0, 11, 21.0]] * 2), np.array([1, 2]), np.ones(2, bool), np.ones(2), feet)
-    parameters = Settings().aerial
-    points, lift = reference_points(targets, parameters, posed=True)
-    assert points.tolist() == [[5, 9], [5, 10]]
-    assert lift.tolist() == [0, 0]
-    bodies = replace(targets, feet_px=None, bodies=True)
-    assert reference_points(bodies, parameters, posed=True)[1].tolist() == [0.85, 0.85]
+    points, lift = reference_points(targets, Settings().aerial, posed=True)
+    assert (points.tolist(), lift.tolist()) == ([[5, 9], [5, 10]], [0, 0])
     # A homography alone cannot tell what lies above the ground.
-    assert reference_points(bodies, parameters, posed=False)[1].tolist() == [0, 0]
+    for posed, middle in ((True, 0.85), (False, 0)):
+        bodies = replace(targets, feet_px=None, bodies=True)
+        assert reference_points(bodies, Settings().aerial, posed)[1].tolist() == [middle, middle]
 
 
 def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess():
     flown = Telemetry(np.zeros(3), np.full(3, 50.0), np.zeros(3), hfov_rad=np.radians([60.0, 60.0, 61.0]))
     camera, known, notes = resolve_camera(None, (1000, 600), flown, Settings())
-    assert known
-    assert not notes
-    assert camera.focal_px[0] == pytest.approx(500 / np.tan(np.radians(30)))
+    assert known and not notes and camera.focal_px[0] == pytest.approx(500 / np.tan(np.radians(30)))
     camera, known, (note,) = resolve_camera(None, (1000, 600), None, Settings())
-    assert not known
-    assert "using 70 degrees" in note
-    assert camera.centre_px == (499.5, 299.5)
+    assert not known and "using 70 degrees" in note and camera.centre_px == (499.5, 299.5)
 
 
 def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prepared):
@@ -132,15 +119,13 @@ def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prep
 
 
 def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
-    flight = Overflight(landmarks=6, geographic=False)
-    locator, table = prepared(flight, **{"landmarks.rule": "source"})
-    calm = list(locator.locate_table(table))
-    assert {len(g.marks) for g in calm} == {4}
-    locator, table = prepared(flight, **{"landmarks.rule": "source", "landmarks.poor_speed_m_s": 0.3})
+    flight, source = Overflight(landmarks=6, geographic=False), {"landmarks.rule": "source"}
+    locator, table = prepared(flight, **source)
+    assert {len(g.marks) for g in locator.locate_table(table)} == {4}
+    locator, table = prepared(flight, **source, **{"landmarks.poor_speed_m_s": 0.3})
     busy = list(locator.locate_table(table))
-    assert len(busy[-1].marks) == 6
     (moved,) = [a for g in busy for a in g.adjustments]
-    assert (moved.parameter, moved.new) == ("landmarks.used", 6)
+    assert len(busy[-1].marks) == 6 and (moved.parameter, moved.new) == ("landmarks.used", 6)
 
 
 def test_places_over_the_date_line_are_near_each_other(prepared):
@@ -160,9 +145,8 @@ def scene(frame, picture, landmark_px):
     for value, (x, y, w, h) in enumerate(boxes.astype(int), 1):
         mask[y : y + h, x : x + w] = value
     found = Detections(boxes, np.ones(2), np.array([729.0, 400]), *np.full((2, 2), np.nan))
-    return Scene(
-        Frame(frame, (frame - 1) / 10, picture), mask, found, 1, step=Registration(np.eye(3), 100, 100, 0.1, 0.0)
-    )
+    step = Registration(np.eye(3), 100, 100, 0.1, 0.0)
+    return Scene(Frame(frame, (frame - 1) / 10, picture), mask, found, 1, step=step)
 
 
 def test_colours_lead_to_the_tables_pixels_and_a_blob_off_its_landmark_gives_way_to_the_colour(prepared, tmp_path):

@@ -14,25 +14,23 @@ from torchvision_dddas.geometry import middles_of
 from torchvision_dddas.simulation.cameras import camera_axes, view_from_pose
 from torchvision_dddas.types import Camera, CameraPose, Detections
 
-STILL = np.zeros((3, 2))
+NAN = np.nan
 
 
-def test_a_chain_of_near_targets_is_one_crowd_and_a_far_one_is_another():
-    place = np.array([[0.0, 0], [4, 0], [8, 0], [30, 0]])
-    assert group_targets(place, np.full(4, 1.0), np.zeros((4, 2)), 2.0, 1.5).tolist() == [0, 0, 0, 1]
-
-
-def test_a_car_that_passes_a_crowd_is_none_of_it():
-    place, velocity = np.array([[0.0, 0], [1, 0]]), np.array([[1.0, 0], [6, 0]])
-    assert group_targets(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 1]
-    velocity[1] = np.nan  # whose way nobody knows goes with all
-    assert group_targets(place, np.ones(2), velocity, 3.0, 1.5).tolist() == [0, 0]
-
-
-def test_targets_of_unknown_place_stay_alone():
-    place = np.array([[0.0, 0], [np.nan, np.nan], [np.nan, np.nan]])
-    assert group_targets(place, np.ones(3), STILL, 100.0, 1.5).tolist() == [0, 1, 2]
-    assert group_targets(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2)), 1.0, 1.0).tolist() == []
+@pytest.mark.parametrize(
+    ("place", "velocity", "reach", "crowds"),
+    [
+        ([[0, 0], [4, 0], [8, 0], [30, 0]], 0, 2.0, [0, 0, 0, 1]),  # a chain, and one far off
+        ([[0, 0], [1, 0]], [[1, 0], [6, 0]], 3.0, [0, 1]),  # a car that passes
+        ([[0, 0], [1, 0]], [[1, 0], [NAN, NAN]], 3.0, [0, 0]),  # whose way nobody knows goes with all
+        ([[0, 0], [NAN, NAN], [NAN, NAN]], 0, 100.0, [0, 1, 2]),
+        ([], 0, 1.0, []),
+    ],
+)
+def test_near_targets_that_go_the_same_way_are_one_crowd(place, velocity, reach, crowds):
+    at = np.array(place, float).reshape(-1, 2)
+    way = np.broadcast_to(np.array(velocity, float), at.shape)
+    assert group_targets(at, np.ones(len(at)), way, reach, 1.5).tolist() == crowds
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30)), min_size=1, max_size=12), st.randoms())
@@ -55,47 +53,30 @@ def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
     found = replace(found, middle_px=middles_of(found.box_px, mask))
     crowds, numbered = merge_detections(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
-    assert crowds.score.tolist() == [0.9, 0.7]
-    assert crowds.area_px.tolist() == [20, 16]
+    assert (crowds.score.tolist(), crowds.area_px.tolist()) == ([0.9, 0.7], [20, 16])
     assert crowds.middle_px[0] == pytest.approx([(16 * 4.5 + 4 * 9.5) / 20, 3.5])
     # Four fifths of it go right at 2 px a frame, one fifth down.
-    assert crowds.speed_px[0] == pytest.approx(np.hypot(1.6, 0.4))
+    assert crowds.speed_px == pytest.approx([np.hypot(1.6, 0.4), np.nan], nan_ok=True)
     assert crowds.heading_rad[0] == pytest.approx(np.arctan2(0.4, 1.6))
-    assert np.isnan(crowds.speed_px[1])
-    assert sorted(np.unique(numbered)) == [0, 1, 2]
-    assert (numbered == 1).sum() == 20
-    assert (numbered > 0).sum() == (mask > 0).sum()
+    assert np.array_equal(numbered, np.choose(mask, [0, 1, 2, 1]))
 
 
-EXACT = 1e-4 * np.eye(2)[None]
-
-
-def fed(places, times, covariance=EXACT, identity=1, movers=None):
+def fed(places, times, movers=None):
     """The velocities, one a place."""
-    movers = movers or TargetSpeeds()
-    return np.array(
-        [
-            movers.update(t, np.array([identity]), np.array([p], float), covariance)[0]
-            for t, p in zip(times, places, strict=True)
-        ]
-    )
+    movers, exact = movers or TargetSpeeds(), 1e-4 * np.eye(2)[None]
+    looks = zip(times, np.asarray(places, float), strict=True)
+    return np.array([movers.update(t, np.array([1]), place[None], exact)[0] for t, place in looks])
 
 
-def test_a_steady_target_has_its_own_velocity():
-    times = np.arange(20) / 10
-    found = fed(np.outer(times, [1.5, -0.5]), times)
+def test_a_steady_target_has_its_own_velocity_and_one_that_comes_back_after_long_begins_anew():
+    times, movers = np.arange(20) / 10, TargetSpeeds()
+    found = fed(np.outer(times, [1.5, -0.5]), times, movers)
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(found[-1], [1.5, -0.5], atol=0.01)
-
-
-def test_a_target_that_comes_back_after_long_begins_anew():
-    movers = TargetSpeeds()
-    fed(np.outer(np.arange(10) / 10, [3.0, 0.0]), np.arange(10) / 10, movers=movers)
-    assert np.isnan(fed([[500.0, 0.0]], [60.0], movers=movers)).all()
+    assert np.isnan(fed([[500.0, 0.0]], [60.0], movers)).all()
 
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
-SUN = np.radians(140.0), np.radians(50.0)
 
 
 def test_the_sun_stands_where_the_reference_algorithm_has_it():
@@ -113,22 +94,18 @@ def test_shadows_fall_away_from_the_sun_as_long_as_it_is_low_and_are_not_counted
     assert shadow_m((1.0, np.radians(5.0)), 1.7).tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("pitch_deg", [90.0, 60.0, 45.0])
+@pytest.mark.parametrize("pitch_deg", [90.0, 45.0])
 def test_the_feet_of_a_strip_of_body_and_one_of_shadow_are_found_from_the_mean_of_their_pixels(pitch_deg):
-    pitch = np.radians(pitch_deg)
-    back = 50 / np.tan(pitch) if pitch_deg < 90 else 0.0
-    pose = CameraPose(np.array([0.0, -back, 50.0]), camera_axes(0.0, pitch, 0.0))
-    view, height = view_from_pose(pose, CAMERA), 1.7
-    foot, shade = np.array([6.0, 4.0, 0.0]), np.append(shadow_m(SUN, height), 0.0)
+    axes, height = camera_axes(0.0, np.radians(pitch_deg), 0.0), 1.7
+    pose = CameraPose(axes[:, 2] * 50 / axes[2, 2], axes)
+    view, foot = view_from_pose(pose, CAMERA), np.array([6.0, 4.0, 0.0])
+    shade = np.append(shadow_m((np.radians(140.0), np.radians(50.0)), height), 0.0)
     share = np.linspace(0, 1, 2001)[:, None]
     body, cast = view.project(foot + share * (0, 0, height)), view.project(foot + share * shade)
-    start = view.project(foot[None])[0]
-    lengths = [np.linalg.norm(strip[-1] - start) for strip in (body, cast)]
-    width = np.linalg.norm(view.project(foot[None] + (BODY_WIDTH_M, 0, 0))[0] - start)
-    lengths[0] = np.hypot(lengths[0], width)
+    start, side = view.project(foot + np.array([[0, 0, 0], [BODY_WIDTH_M, 0, 0]]))
+    lengths = [np.hypot(*np.linalg.norm([body[-1] - start, side - start], axis=1)), np.linalg.norm(cast[-1] - start)]
     middle = np.average([body.mean(axis=0), cast.mean(axis=0)], axis=0, weights=lengths)
     found = remove_shadow(middle[None], foot[None], pose, CAMERA, height, shade[:2])
-    assert np.abs(found[0] - start).max() < 0.1
     # Without a shadow it is the body's middle that counts, half its height up.
     alone = remove_shadow(body.mean(axis=0)[None], foot[None], pose, CAMERA, height, np.zeros(2))
-    assert np.abs(alone[0] - start).max() < 0.1
+    assert np.abs(found[0] - start).max() < 0.1 and np.abs(alone[0] - start).max() < 0.1

@@ -21,17 +21,17 @@ PLATES = {"red": (178, 210, 200), "yellow": (28, 220, 220), "blue": (112, 200, 1
 LEAST = 12
 
 
-def painted(plates, seed=0, shade=1.0):
+def painted(plates, seed=0):
     """A meadow with shrubs, shadows and noise, and plates of 24 x 16 px: the picture and each plate's box."""
     rng = np.random.default_rng(seed)
-    hsv = np.stack([rng.normal(45, 6, (60, 80)), rng.normal(110, 30, (60, 80)), rng.normal(120, 40, (60, 80))], axis=2)
+    hsv = rng.normal((45, 110, 120), (6, 30, 40), (60, 80, 3))
     hsv[rng.random((60, 80)) < 0.05] = (105, 120, 60)  # shadows are blue
     ground = cv2.resize(np.clip(hsv, 0, (179, 255, 255)).astype(np.uint8), (640, 480), interpolation=cv2.INTER_NEAREST)
     image = cv2.GaussianBlur(cv2.cvtColor(ground, cv2.COLOR_HSV2BGR), (0, 0), 2).astype(float)
     boxes = {}
     for k, (name, colour) in enumerate(plates.items()):
         x, y = 60 + 130 * k, int(rng.integers(60, 400))
-        image[y : y + 16, x : x + 24] = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0] * shade
+        image[y : y + 16, x : x + 24] = cv2.cvtColor(np.array([[colour]], np.uint8), cv2.COLOR_HSV2BGR)[0, 0]
         boxes[name] = (x, y, 24, 16)
     image += rng.normal(0, 5, image.shape)
     return cv2.GaussianBlur(np.clip(image, 0, 255).astype(np.uint8), (0, 0), 0.6), boxes
@@ -41,8 +41,7 @@ def painted(plates, seed=0, shade=1.0):
 def test_the_plates_are_found_and_each_range_marks_its_own_and_no_other(seed):
     image, boxes = painted(PLATES, seed)
     found = calibrate_colours([image], LEAST)
-    assert sorted(found.ranges.names) == sorted(PLATES)
-    assert found.others == (0, 0, 0, 0)
+    assert sorted(found.ranges.names) == sorted(PLATES) and found.others == (0, 0, 0, 0)
     for name, low, high in zip(found.ranges.names, found.ranges.low, found.ranges.high, strict=True):
         mask = mask_range(to_hsv(image), low, high) > 0
         for other, (x, y, width, height) in boxes.items():
@@ -59,16 +58,22 @@ def test_names_go_to_the_nearest_hues_or_in_their_order():
     assert two.ranges.names == ("blue-1", "blue-2")
 
 
-def test_too_few_and_too_similar_colours_and_boxes_without_one_are_refused():
-    image, boxes = painted(PLATES)
-    with pytest.raises(InputError, match="of 20 colours stand out in the picture"):
-        calibrate_colours([image], LEAST, 20)
-    with pytest.raises(InputError, match="the hues of a and b are too similar"):
-        calibrate_colours([image], LEAST, boxes=[("a", boxes["blue"]), ("b", boxes["blue"])])
-    with pytest.raises(InputError, match="is not inside the picture, 640 x 480 px"):
-        calibrate_colours([image], LEAST, boxes=[("a", (630, 0, 20, 20))])
-    with pytest.raises(InputError, match="has a strong colour"):
-        calibrate_colours([np.full((20, 20, 3), 128, np.uint8)], LEAST, boxes=[("a", (0, 0, 20, 20))])
+@pytest.mark.parametrize(
+    ("count", "boxes", "words"),
+    [
+        (20, None, "of 20 colours stand out in the picture"),
+        (None, [("a", "blue"), ("b", "blue")], "the hues of a and b are too similar"),
+        (None, [("a", (630, 0, 20, 20))], "is not inside the picture, 640 x 480 px"),
+        (None, [("a", (0, 0, 20, 20))], "has a strong colour"),
+    ],
+)
+def test_too_few_and_too_similar_colours_and_boxes_without_one_are_refused(count, boxes, words):
+    image, plates = painted(PLATES)
+    image[:20, :20] = 128
+    if boxes:
+        boxes = [(name, plates.get(box, box)) for name, box in boxes]
+    with pytest.raises(InputError, match=words):
+        calibrate_colours([image], LEAST, count, boxes=boxes)
 
 
 def test_neighbouring_hues_share_the_gap_between_them():
@@ -83,8 +88,8 @@ def test_neighbouring_hues_share_the_gap_between_them():
 
 def test_a_box_half_on_the_plate_has_the_plates_colour():
     image, boxes = painted({"blue": PLATES["blue"]})
-    x, y, _, _ = boxes["blue"]
-    ((half,),) = calibrate_colours([image], LEAST, boxes=[("blue", (x - 8, y - 4, 24, 16))]).groups
+    box = np.add(boxes["blue"], (-8, -4, 0, 0)).tolist()
+    ((half,),) = calibrate_colours([image], LEAST, boxes=[("blue", tuple(box))]).groups
     assert abs(hue_difference(half.hue, 112)) <= 4
 
 
@@ -108,28 +113,23 @@ def picture(height: int = 120, width: int = 160) -> np.ndarray:
 def by_in_range(image: np.ndarray) -> np.ndarray:
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
     masks = [cv2.inRange(hsv, low, high) for low, high in zip(LOW, HIGH, strict=True)]
-    ends = cv2.inRange(hsv, LOW[0], np.array([180.0, 255, 255])), cv2.inRange(hsv, LOW[0] * (0, 1, 1), HIGH[0])
-    return np.stack([np.maximum(*ends), *masks[1:]])
+    masks[0] = cv2.inRange(hsv, LOW[0], np.array([180.0, 255, 255])) | cv2.inRange(hsv, LOW[0] * (0, 1, 1), HIGH[0])
+    return np.stack(masks)
 
 
-def test_masks_are_those_of_opencv_also_for_a_hue_that_goes_over_zero(finder):
+def test_masks_are_those_of_opencv_also_for_a_hue_that_goes_over_zero_and_empty_for_no_ranges_or_pixels(finder):
     image = picture()
     found, wanted = finder(image, LOW, HIGH), by_in_range(image)
     assert found.dtype == np.uint8 and found.shape == (4, 120, 160) and set(np.unique(found)) == {0, 255}
     assert ((wanted > 0).mean((1, 2)) > 0.002).all()
     assert (found != wanted).mean() <= (0 if finder is mask_colours else 0.002)
-
-
-def test_large_pictures_are_looked_at_in_parts_that_leave_no_trace():
-    image = picture(700, 900)
-    np.testing.assert_array_equal(mask_colours(image, LOW, HIGH), by_in_range(image))
-    wide = picture(20, 140_000 // 10 * 10)
-    np.testing.assert_array_equal(mask_colours(wide, LOW, HIGH), by_in_range(wide))
-
-
-def test_no_ranges_and_no_pixels_give_empty_masks(finder):
-    assert finder(picture(), LOW[:0], HIGH[:0]).shape == (0, 120, 160)
+    assert finder(image, LOW[:0], HIGH[:0]).shape == (0, 120, 160)
     assert finder(np.zeros((0, 5, 3), np.uint8), LOW, HIGH).shape == (4, 0, 5)
+
+
+def test_large_pictures_are_masked_in_parts_that_leave_no_trace():
+    for image in (picture(700, 900), picture(20, 140_000)):
+        np.testing.assert_array_equal(mask_colours(image, LOW, HIGH), by_in_range(image))
 
 
 def test_pictures_of_one_team_are_taken_together():

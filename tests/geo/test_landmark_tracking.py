@@ -1,4 +1,4 @@
-"""Landmarks in the picture: told from targets, tracked by their colours and by what moves, and cut out of blobs."""
+"""Landmarks in the picture: tracked by their colours and by what moves, and cut out of blobs."""
 
 from itertools import permutations
 
@@ -64,25 +64,24 @@ class Tracker:
         return self.tracker.update(frame, masks, found, foreground, None, expected, length)
 
 
-def test_a_landmark_with_a_blob_is_at_the_blobs_centre_and_the_blob_is_no_target():
-    found = Tracker().update(1, plates((100, 50, 10, 10)), (96, 48, 30, 14), (300, 200, 20, 20))
+def test_a_landmark_with_a_blob_is_at_the_blobs_centre_or_by_choice_at_its_colours_and_the_blob_is_no_target():
+    masks, blob = plates((100, 50, 10, 10)), (96, 48, 30, 14)
+    found = Tracker().update(1, masks, blob, (300, 200, 20, 20))
     assert found.image_px.tolist() == [[110.5, 54.5]] and found.by == ("motion",)
     assert found.colour_px.tolist() == [[104.5, 54.5]]
     assert (found.blob.tolist(), found.rows.tolist()) == ([0], [True, False])
-
-
-def test_by_choice_it_is_at_its_colours_centre_and_so_it_is_without_a_blob():
-    masks = plates((100, 50, 10, 10))
-    chosen, alone = Tracker(centre="colour").update(1, masks, (96, 48, 30, 14)), Tracker().update(1, masks)
+    chosen, alone = Tracker(centre="colour").update(1, masks, blob), Tracker().update(1, masks)
     for found in (chosen, alone):
         assert found.image_px.tolist() == [[104.5, 54.5]] and found.by == ("colour",)
     assert chosen.rows.tolist() == [True]
 
 
-def test_a_landmark_that_is_not_seen_or_cut_by_the_border_has_no_place():
+def test_a_landmark_that_is_not_seen_or_cut_by_the_border_has_no_place_and_what_is_expected_there_is_no_target():
     found = Tracker("ab").update(1, plates((0, 50, 10, 10), []), (0, 48, 14, 14))
-    assert np.isnan(found.image_px).all() and found.by == ("", "")
-    assert found.rows.tolist() == [True]
+    assert np.isnan(found.image_px).all() and found.by == ("", "") and found.rows.tolist() == [True]
+    at, boxes = np.array([[4.0, 50.0]]), ((0, 44, 12, 14), (60, 44, 12, 14))
+    found = Tracker().update(1, plates([]), *boxes, expected_px=at, length_px=np.array([20.0]))
+    assert found.rows.tolist() == [True, False] and np.isnan(found.image_px).all()
 
 
 def test_a_blob_much_larger_than_usual_holds_somebody_else_too_and_its_centre_is_not_taken():
@@ -104,13 +103,7 @@ def test_two_landmarks_in_one_blob_are_at_their_colours_and_the_blob_is_no_targe
     assert (found.rows.tolist(), found.shared.tolist()) == ([True], [False])
 
 
-def test_a_vehicle_whose_colour_is_not_seen_is_kept_from_the_targets_where_it_is_expected():
-    at, boxes = np.array([[4.0, 50.0]]), ((0, 44, 12, 14), (60, 44, 12, 14))
-    found = Tracker().update(1, plates([]), *boxes, expected_px=at, length_px=np.array([20.0]))
-    assert found.rows.tolist() == [True, False] and np.isnan(found.image_px).all()
-
-
-def test_a_vehicle_is_told_from_a_larger_roof_of_its_colour_by_its_travel_and_until_then_it_has_no_place():
+def test_a_vehicle_is_recognised_beside_a_larger_roof_of_its_colour_by_its_travel_and_has_no_place_until_then():
     one, seen = Tracker(), []
     for frame in range(1, 15):
         found = one.update(frame, plates([(100 + 3 * frame, 50, 10, 10), (200, 200, 24, 24)]))
@@ -129,24 +122,19 @@ def test_a_landmark_comes_back_after_it_was_hidden():
     assert found.image_px[0] == pytest.approx([104.5 + 2 * 39, 54.5])
 
 
-# Vehicles cut out of the blobs that they share with others.
-
-VEHICLES = np.array([False, True, False])
-
-
-def scene():
-    """A crowd of 40 x 20 px with a vehicle at its left end, a lone vehicle, and a target far away."""
+def cut(middles, radius, least_px, vehicles=(1,), beside=0):
+    """Cut a vehicle at the end of a crowd of 40 x 20 px and a lone one, a target far away; before and after."""
     mask = np.zeros((100, 160), np.uint16)
-    mask[40:60, 20:60], mask[10:22, 100:112], mask[80:90, 130:140] = 1, 2, 3
+    mask[40:60, 20:60], mask[10:22, 100 : 112 + beside], mask[80:90, 130:140] = 1, 2, 3
     boxes = np.array([cv2.boundingRect((mask == value).astype(np.uint8)) for value in (1, 2, 3)], float)
     area = boxes[:, 2:].prod(axis=1)
-    return Detections(boxes, np.array([0.5, 0.6, 0.7]), area, np.full(3, np.nan), np.arange(3.0)), mask
+    found = Detections(boxes, np.array([0.5, 0.6, 0.7]), area, np.full(3, np.nan), np.arange(3.0))
+    own = np.isin(np.arange(3), vehicles)
+    return found, mask, *cut_out_landmarks(found, mask.copy(), own, np.array(middles), np.array(radius), least_px)
 
 
 def test_the_rest_of_a_crowd_stays_a_target_and_what_no_disc_touches_is_as_it_was():
-    found, mask = scene()
-    middles = np.array([[25.0, 50.0], [105.5, 15.5]])
-    left, numbered = cut_out_landmarks(found, mask, VEHICLES, middles, np.array([12.0, 12.0]), 20.0)
+    found, _, left, numbered = cut([[25.0, 50.0], [105.5, 15.5]], [12.0, 12.0], 20.0)
     assert left.score.tolist() == [0.5, 0.7] and left.speed_px.tolist() == [0.0, 2.0]
     x, _, width, _ = left.box_px[0]
     assert 31 <= x <= 38 and x + width == 60
@@ -155,20 +143,12 @@ def test_the_rest_of_a_crowd_stays_a_target_and_what_no_disc_touches_is_as_it_wa
     assert not numbered[50, 25] and sorted(np.unique(numbered)) == [0, 1, 2]
 
 
-def test_what_a_vehicles_own_blob_leaves_must_be_larger_than_a_rest_of_a_crowd():
-    found, mask = scene()
-    mask[10:22, 112:120] = 2  # 96 px beside it
-    found.box_px[1, 2] += 8
-    middles, radius = np.array([[105.5, 15.5]]), np.array([9.0])
-    scores = [
-        cut_out_landmarks(found, mask, vehicles, middles, radius, 30.0)[0].score.tolist()
-        for vehicles in (VEHICLES, np.zeros(3, bool))
-    ]
-    assert scores == [[0.5, 0.7], [0.5, 0.6, 0.7]]
+@pytest.mark.parametrize(("vehicles", "left"), [((1,), [0.5, 0.7]), ((), [0.5, 0.6, 0.7])])
+def test_what_a_vehicles_own_blob_leaves_must_be_larger_than_a_rest_of_a_crowd(vehicles, left):
+    assert cut([[105.5, 15.5]], [9.0], 30.0, vehicles, beside=8)[2].score.tolist() == left
 
 
 def test_of_a_vehicle_whose_middle_is_not_known_nothing_stays_and_of_others_all_does():
-    found, mask = scene()
-    left, numbered = cut_out_landmarks(found, mask, VEHICLES, np.full((1, 2), np.nan), np.array([np.nan]), np.inf)
+    _, mask, left, numbered = cut([[np.nan, np.nan]], [np.nan], np.inf)
     assert left.score.tolist() == [0.5, 0.7]
     assert (numbered > 0).sum() == ((mask == 1) | (mask == 3)).sum()

@@ -17,13 +17,12 @@ RATE = 25.0
 KNOBS = LandmarkParameters(sigma_m=1.0, gap_s=4.0, drift_m_s=0.5, pixel_sigma=2.0, height_m=1.5)
 
 
-def landmarks(rows, names=("a",)):
-    """rows: frame, landmark, east, north, then optionally planned, sigma, u, v."""
-    full = [(*row, *(0, np.nan, np.nan, np.nan)[len(row) - 4 :]) for row in rows]
-    table = np.array(sorted(full, key=lambda row: row[0]), float).reshape(-1, 8)
-    n = len(table)
-    frame, landmark, place = table[:, 0], table[:, 1].astype(np.int64), table[:, 2:4]
-    return Landmarks(names, frame, landmark, table[:, 6:], place, table[:, 5], table[:, 4] == 1, np.arange(n), False)
+def landmarks(rows, names=("a",), geographic=False):
+    """rows: frame, landmark, east, north, and 1 at the end where it is a plan."""
+    table = np.array(sorted((*row, 0)[:5] for row in rows), float)
+    n, frame, which, place = len(table), table[:, 0], table[:, 1].astype(np.int64), table[:, 2:4]
+    unseen, planned = np.full((n, 2), np.nan), table[:, 4] == 1
+    return Landmarks(names, frame, which, unseen, place, unseen[:, 0], planned, np.arange(n), geographic)
 
 
 def reported(seconds, places, names=("a",)):
@@ -61,14 +60,15 @@ def test_a_long_dropout_goes_straight_on_for_gap_s_and_then_the_landmark_is_abse
     assert course.at(1 + 25 * 12).east_north_m[0].tolist() == [24, 0]
 
 
-def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_lay_from_it():
+def test_a_plan_carries_a_dropout_however_long_shifted_by_how_far_the_reports_were_from_it():
     corner = [(1 + 25 * t, 0, *place, 1) for t, place in ((0, (0, 0)), (10, (10, 0)), (20, (10, 10)))]
     reports = [(1 + 25 * t, 0, t, 0.5) for t in range(4)]
     course = LandmarkTrajectories(landmarks(reports + corner), KNOBS, RATE)
+    later = course.at(1 + 25 * 16)
     assert course.at(1 + 25 * 10).east_north_m[0] == pytest.approx([10, 0.5])
-    assert course.at(1 + 25 * 16).east_north_m[0] == pytest.approx([10, 6.5])
+    assert later.east_north_m[0] == pytest.approx([10, 6.5])
     # It strays from its plan by no more than it keeps to it at all.
-    assert course.at(1 + 25 * 16).sigma_m[0] == pytest.approx(np.hypot(1, 1))
+    assert later.sigma_m[0] == pytest.approx(np.hypot(1, 1))
     assert len(course.at(1 + 25 * 21)) == 0  # beyond the plan, long after the last report
 
 
@@ -78,17 +78,12 @@ def test_speeds_are_those_over_the_ground():
 
 
 def test_degrees_are_refused():
-    degrees = landmarks([(1, 0, 0, 0)])
     with pytest.raises(ValueError, match="wanted local metres"):
-        LandmarkTrajectories(Landmarks(**{**vars(degrees), "geographic": True}), KNOBS, RATE)
+        LandmarkTrajectories(landmarks([(1, 0, 0, 0)], geographic=True), KNOBS, RATE)
 
-
-# The 4-or-more rule.
 
 SIX = np.array([[0, 0], [10, 0], [10, 10], [0, 10], [5, 5.2], [5, 0.3]], float)
 SOURCE = LandmarkParameters(rule="source", poor_speed_m_s=2.0)
-
-
 MARKS = LandmarkObservations(np.arange(6), SIX * 20, SIX, np.ones(6), np.ones(6), np.zeros(6))
 
 
