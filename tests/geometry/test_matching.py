@@ -49,6 +49,8 @@ def test_what_a_run_onboard_loads_leaves_the_slow_libraries_out() -> None:
     slow = ("scipy", "jaxtyping", "pymap3d", "onnxruntime", "torch", "rich", "asyncio")
     parts = "cli, torchvision_dddas.pipeline, torchvision_dddas.io.output, torchvision_dddas.detection.opencv_engine"
     assert printed(f"import sys, torchvision_dddas.{parts}; print([n for n in {slow!r} if n in sys.modules])") == "[]"
+    load = "from torchvision_dddas.geo.plane_homography import load_solver; load_solver('auto')"
+    assert printed(f"import sys; {load}; print('torch' in sys.modules)") == "False"
 
 
 @settings(max_examples=80, deadline=None)
