@@ -1,5 +1,6 @@
 """What pictures from the ground say of located targets, and where people are searched for in them."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -24,11 +25,9 @@ def test_people_beside_the_way_of_a_car_do_not_make_it_human_and_its_empty_view_
 
 def regions(camera, *targets):
     """Of targets (ahead, right, radius) in metres, before a camera at (5, -3)."""
-    ahead, aside = np.array([math.sin(HEADING), math.cos(HEADING)]), np.array([math.cos(HEADING), -math.sin(HEADING)])
-    stands = np.array([5.0, -3.0])
-    place = np.array([stands + a * ahead + r * aside for a, r, _ in targets]).reshape(-1, 2)
-    spread = np.tile(0.04 * np.eye(2), (len(targets), 1, 1))
-    radius = np.array([radius for *_, radius in targets])
+    ahead, stands = np.array([math.sin(HEADING), math.cos(HEADING)]), np.array([5.0, -3.0])
+    place = np.array([stands + a * ahead + r * ahead[::-1] * (1, -1) for a, r, _ in targets])
+    spread, radius = np.tile(0.04 * np.eye(2), (len(targets), 1, 1)), np.array([r for *_, r in targets])
     return expected_regions(place, spread, radius, camera, stands, HEADING, GroundParameters())
 
 
@@ -45,11 +44,10 @@ def box_of(camera, ahead, right, tall):
 def test_everybody_of_a_target_is_within_its_region_and_of_an_expected_height(ahead, right, radius, pitch):
     camera = replace(CAMERA, pitch_rad=pitch)
     ((left, top, width, height),), ((least, largest),) = regions(camera, (ahead, right, radius))
-    for turn in np.linspace(0, 2 * np.pi, 12, endpoint=False):
-        for tall in (1.6, 1.9):
-            x, y, w, h = box_of(camera, ahead + radius * math.cos(turn), right + radius * math.sin(turn), tall)
-            assert left <= x and x + w <= left + width and top <= y and y + h <= top + height
-            assert least <= h <= largest
+    for turn, tall in itertools.product(np.linspace(0, 2 * np.pi, 12, endpoint=False), (1.6, 1.9)):
+        x, y, w, h = box_of(camera, ahead + radius * math.cos(turn), right + radius * math.sin(turn), tall)
+        assert left <= x and x + w <= left + width and top <= y and y + h <= top + height
+        assert least <= h <= largest
 
 
 def test_a_target_outside_the_view_has_no_region():

@@ -1,36 +1,23 @@
 """The loop about the whole path, in a world of a few seconds: what is found goes out, what is reported comes in."""
 
-from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.simulation.small import small
 from torchvision_dddas.config import load_config
-from torchvision_dddas.control import Mission, StartedSource, build_mission
+from torchvision_dddas.control import StartedSource, build_mission
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.geometry import east_north, lonlat
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import SimulatorSource
-from torchvision_dddas.types import Command, FrameResult
 
 FAULTS = (
     {"what": "frozen", "time_s": 2.0, "seconds": 0.5},
     {"what": "dropped", "time_s": 3.2, "seconds": 0.3},
     {"what": "ugv_lost", "time_s": 0.5, "seconds": 9.0, "vehicle": 2},
 )
-
-
-@dataclass
-class Flight:
-    """What came of a run: results, commands, notices by frame, true places of the ground vehicles by frame."""
-
-    source: SimulatorSource
-    mission: Mission
-    results: list[FrameResult] = field(default_factory=list)
-    steered: list[Command] = field(default_factory=list)
-    noticed: list[tuple[int, str]] = field(default_factory=list)
-    places: dict[int, np.ndarray] = field(default_factory=dict)
 
 
 OFTEN = ("steering.picture_s=0.5", "steering.sampling=false")
@@ -43,24 +30,24 @@ def world(seconds=6.0, **tables):
     return small(clip=clip, team=team, uav={"altitude_m": 25.0}, **tables)
 
 
-def fly(overrides=(), seconds=6.0, **tables) -> Flight:
-    """Fly a small scenario in the closed loop."""
+def fly(overrides=(), seconds=6.0, **tables):
+    """Fly a small scenario in the closed loop: its results, commands, notices and the ground vehicles' true places."""
     scenario = world(seconds, **tables)
     simulated = SimulatorSource(scenario)
-    steered, steer = [], simulated.steer
+    flown = SimpleNamespace(source=simulated, results=[], steered=[], noticed=[], places={})
+    steer = simulated.steer
 
     def record(command):
-        steered.append(command)
+        flown.steered.append(command)
         steer(command)
 
     simulated.steer = record  # type: ignore[method-assign]
     source, settings = StartedSource(simulated), load_config("patrol", [*overrides])
-    mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
-    flown = Flight(simulated, mission, steered=steered)
-    engine = load_engine("onboard", mission.settings)
-    for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(source):
+    flown.mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
+    engine, settings = load_engine("onboard", flown.mission.settings), flown.mission.settings
+    for result in Pipeline.from_parts(engine, settings, None, flown.mission.watch, 1, flown.mission)(source):
         flown.results.append(result)
-        flown.noticed += [(notice.frame, notice.text) for notice in mission.notices()]
+        flown.noticed += [(notice.frame, notice.text) for notice in flown.mission.notices()]
         flown.places |= own_places(simulated)
     return flown
 

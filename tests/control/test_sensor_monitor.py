@@ -37,29 +37,16 @@ def watched(until, rows, flown=1000):
 
 PLANNED = [(frame, 1, 5.0, 1) for frame in range(30, 100, 10)]
 LEAP = "ugv2's reports leap by 10.0 m within 0.1 s"
+SILENT, MUTE = "ugv2 reports no place for 2.1 s", "the UAV says nothing of itself for 2.1 s"
+BACK = (50, "ugv2 reports its place again, after 3.0 s")
 
 
 @pytest.mark.parametrize(
     ("rows", "flown", "said"),
     [
-        (
-            standing([*range(1, 21), *range(50, 61)]),
-            60,
-            [
-                (41, "ugv2 reports no place for 2.1 s: nothing stands in for it"),
-                (50, "ugv2 reports its place again, after 3.0 s"),
-            ],
-        ),
-        (
-            standing(range(1, 21)) + PLANNED,
-            60,
-            [(41, "ugv2 reports no place for 2.1 s: its plan stands in for it")],
-        ),
-        (
-            standing(range(1, 61)),
-            10,
-            [(31, "the UAV says nothing of itself for 2.1 s: landmarks alone tell its place")],
-        ),
+        (standing([*range(1, 21), *range(50, 61)]), 60, [(41, f"{SILENT}: nothing stands in for it"), BACK]),
+        (standing(range(1, 21)) + PLANNED, 60, [(41, f"{SILENT}: its plan stands in for it")]),
+        (standing(range(1, 61)), 10, [(31, f"{MUTE}: landmarks alone tell its place")]),
         ([(f, 1, 15.0 if 10 <= f < 20 else 5.0) for f in range(1, 61)], 60, [(10, LEAP), (20, LEAP)]),
     ],
     ids=["silent", "planned", "no telemetry", "leap"],

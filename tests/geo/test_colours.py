@@ -113,8 +113,8 @@ def picture(height: int = 120, width: int = 160) -> np.ndarray:
 def by_in_range(image: np.ndarray) -> np.ndarray:
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
     masks = [cv2.inRange(hsv, low, high) for low, high in zip(LOW, HIGH, strict=True)]
-    masks[0] = cv2.inRange(hsv, LOW[0], np.array([180.0, 255, 255])) | cv2.inRange(hsv, LOW[0] * (0, 1, 1), HIGH[0])
-    return np.stack(masks)
+    ends = cv2.inRange(hsv, LOW[0], np.array([180.0, 255, 255])), cv2.inRange(hsv, LOW[0] * (0, 1, 1), HIGH[0])
+    return np.stack([np.maximum(*ends), *masks[1:]])
 
 
 def test_masks_are_those_of_opencv_also_for_a_hue_that_goes_over_zero_and_empty_for_no_ranges_or_pixels(finder):

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import torchvision_dddas
 from torchvision_dddas import runtime
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import plane_homography
 from torchvision_dddas.people.onnx_scorer import OnnxScorer
-from torchvision_dddas.runtime import MANIFEST, SHIPPED, manifest, opened, seal, verified
+from torchvision_dddas.runtime import MANIFEST, SHIPPED, manifest, opened, seal
 from torchvision_dddas.types import LinearSvm
 
 NAME = "homography.onnx"
@@ -43,15 +42,12 @@ def refusal(folder: Path, name: str = NAME) -> str:
 
 def test_the_manifest_lists_every_shipped_graph_as_the_runtime_sees_it_and_as_it_was_compared_with_torch():
     held = manifest(SHIPPED)
-    assert held["package"] == torchvision_dddas.__version__
     assert set(held["graphs"]) == {path.name for path in SHIPPED.glob("*.onnx")}
     for name, entry in held["graphs"].items():
-        assert verified(SHIPPED, name) == (SHIPPED / name).read_bytes()
         session = opened(SHIPPED, name)
         for side, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
-            assert [(v.name, v.type, v.shape) for v in found] == [
-                (value, f"tensor({listed['type']})", listed["shape"]) for value, listed in entry[side].items()
-            ]
+            listed = [(value, f"tensor({one['type']})", one["shape"]) for value, one in entry[side].items()]
+            assert [(v.name, v.type, v.shape) for v in found] == listed
         assert entry["checks"] and all(check["off"] <= check["limit"] for check in entry["checks"])
         assert {"torch", "onnx", "onnxruntime"} == set(entry["versions"])
 
