@@ -17,7 +17,13 @@ from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import DetectionTable, Sightings
 
 WALKERS = np.array([[-1.0, 10.0], [2.0, 14.0]])
-NEAR = {"position_sigma_m": 0.1, "heading_sigma_rad": 0.005}
+
+
+def team_of_two():
+    near = {"position_sigma_m": 0.1, "heading_sigma_rad": 0.005}
+    return camera(**near), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **near)
+
+
 ORIGIN = (-110.95, 32.23)
 
 
@@ -53,7 +59,7 @@ def test_an_identity_twice_in_a_frame_is_refused_with_its_line():
 
 
 def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
-    south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
+    south, west = team_of_two()
     tables = [table(south), table(west, west.place, identity=(40, 30))]
     # The second camera's table has its people the other way round in one frame.
     order = [0, 1, 3, 2, 4, 5]
@@ -61,20 +67,15 @@ def test_two_cameras_are_one_team_whose_people_keep_their_numbers():
     looks = found(tables, [south, west])
     assert [look.positions.target.tolist() for look in looks] == [[1, 2]] * 3
     for look in looks:
-        assert (look.members >= 0).all()
+        assert (look.members >= 0).all() and look.vehicle.tolist() == [0, 0, 1, 1]
         assert np.allclose(look.positions.east_north_m, walked(look.frame), atol=1e-6)
         alone = look.sightings.covariance_m2[look.vehicle == 0]
         assert (np.linalg.det(look.positions.covariance_m2) < np.linalg.det(alone)).all()
-        assert look.vehicle.tolist() == [0, 0, 1, 1]
-
-
-def test_frames_that_lie_near_are_one_look_where_asked_for():
-    south, west = camera(**NEAR), camera(heading_rad=np.pi / 2, place=(-15.0, 12.0), **NEAR)
+    # Frames that are near are one look where asked for.
     tables = [table(south, frames=(1, 11)), table(west, west.place, frames=(3, 13))]
     assert [look.frame for look in found(tables, [south, west])] == [1, 3, 11, 13]
     looks = found(tables, [south, west], "ground.within_frames=2")
-    assert [look.frame for look in looks] == [1, 11]
-    assert all((look.members >= 0).all() for look in looks)
+    assert [look.frame for look in looks] == [1, 11] and all((look.members >= 0).all() for look in looks)
 
 
 def test_paper_mode_converts_by_111320_metres_a_degree():
@@ -92,15 +93,13 @@ def test_paper_mode_converts_by_111320_metres_a_degree():
 
 def test_a_second_camera_at_degrees_is_put_into_the_metres_of_the_first_and_one_in_metres_is_refused():
     there = tuple(lonlat(np.array([[-15.0, 12.0]]), ORIGIN)[0].tolist())
-    south = camera(place=ORIGIN, geographic=True, **NEAR)
-    west = camera(heading_rad=np.pi / 2, place=there, geographic=True, **NEAR)
+    south, west = (
+        replace(one, geographic=True, place=place) for one, place in zip(team_of_two(), (ORIGIN, there), strict=True)
+    )
     looks = found([table(south), table(west, (-15.0, 12.0))], [south, west])
     assert np.allclose(looks[0].positions.east_north_m, walked(1), atol=1e-3)
     with pytest.raises(InputError, match="give all in one kind"):
         found([table(south), table(south)], [camera(), south])
-
-
-# Fusion.
 
 
 def sightings(east_north_m, own=0.01, common=0.0):
@@ -131,10 +130,9 @@ def test_beliefs_worked_out_one_by_one_or_all_at_once_are_the_same(monkeypatch):
     rng = np.random.default_rng(4)
     people = rng.uniform(-4, 4, (7, 2))
     team = [sightings(people + rng.normal(0, 1, 2) + rng.normal(0, 0.2, (7, 2)), 0.05, 1.4) for _ in range(3)]
-    together_at_once = associate(team)
+    at_once = associate(team)
     monkeypatch.setattr(ground_locator, "_MATRICES", 1)
-    assert np.array_equal(associate(team), together_at_once)
-    assert (together_at_once >= 0).all(axis=1).sum() >= 5
+    assert np.array_equal(associate(team), at_once) and (at_once >= 0).all(axis=1).sum() >= 5
 
 
 def test_each_sighting_is_of_exactly_one_person_whatever_the_order_of_the_vehicles():

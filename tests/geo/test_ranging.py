@@ -155,7 +155,7 @@ def test_people_in_one_row_and_a_lens_that_shows_nothing_are_refused():
         calibrate_pose(crowd(), replace(camera(), k1=-10.0), 1.75, 0.05)
 
 
-def test_an_outlier_is_said_and_not_used():
+def test_an_outlier_is_named_and_not_used():
     height = np.array([180.0, 181.0, 179.0, 120.0, 180.0])
     found = calibrate_focal_length(np.full(5, 10.0), height, 1.8)
     assert found.outlier.tolist() == [False, False, False, True, False]
