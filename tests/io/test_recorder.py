@@ -104,7 +104,9 @@ def test_ctrl_c_leaves_the_files_of_a_whole_run_and_an_error_none_but_the_record
     assert run_json(tmp_path / "failed")["problems"] == ["frame 4 is no picture"]
 
 
-@pytest.mark.parametrize("make", {recorder[0] for recorder in RECORDERS.values()}, ids=lambda make: make.__name__)
+@pytest.mark.parametrize(
+    "make", dict.fromkeys(recorder[0] for recorder in RECORDERS.values()), ids=lambda make: make.__name__
+)
 def test_a_recorder_replaces_no_file_of_another_program(tmp_path, make):
     for name in (*make.files, "masks/000001.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
