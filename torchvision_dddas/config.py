@@ -250,7 +250,7 @@ class PaperParameters(Group):
     )
     weight: float = parameter(0.7, "share of location in the affinity if the rule is fixed", "-", 0, 1)
     lowest_dispersion: float = parameter(
-        0.65, "a feature with a larger dispersion tells targets apart: LL of III-D", "-", 0, 1
+        0.65, "a feature of larger dispersion distinguishes targets: LL of III-D", "-", 0, 1
     )
     location_cut: float = parameter(
         0.25, "dissimilarity at which location clusters end: normalised G; empirical", "-", 0, 1
@@ -415,7 +415,7 @@ class ConfirmParameters(Group):
 
 
 class LandmarkParameters(Group):
-    """How ground vehicles serve as landmarks: found by colour, told from targets, followed (appendix A, IV-A)."""
+    """How ground vehicles serve as landmarks: found by colour, separated from targets, tracked (appendix A, IV-A)."""
 
     differentiation: Literal["exact", "greedy"] = parameter(
         "exact", "assignment of blobs to landmarks: most pairs at the least distance, or greedy"
@@ -449,7 +449,7 @@ class LandmarkParameters(Group):
 
 
 class AerialParameters(Group):
-    """How the picture from the air is laid on the ground by landmarks and telemetry (appendix A, IV-B)."""
+    """How the picture from the air is georeferenced by landmarks and telemetry (appendix A, IV-B)."""
 
     mode: Literal["pose", "homography", "paper"] = parameter(
         "pose", "pose: from landmarks and telemetry; homography: landmarks only; paper: as printed, in degrees"

@@ -1,7 +1,7 @@
 """What computes: torch, or ONNX graphs, opened only where they are what the manifest of `dddas export` says.
 
 A folder of graphs has one manifest.json. It holds each file's SHA-256, inputs, outputs and parameters, the version of
-this package that made it, and a seal: the SHA-256 of everything else in it. This tells damage, edits and mixed-up
+this package that made it, and a seal: the SHA-256 of everything else in it. This reveals damage, edits and mixed-up
 versions from the graphs that were checked; it is no signature, which would need a key.
 """
 
@@ -92,7 +92,7 @@ def _checked(path: Path, text: bytes) -> dict[str, Any]:
 
 
 def seal(content: dict[str, Any]) -> str:
-    """The SHA-256 of a manifest without its seal, however it is laid out."""
+    """The SHA-256 of a manifest without its seal, independent of its layout."""
     rest = {name: value for name, value in content.items() if name != "seal"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
@@ -100,7 +100,7 @@ def seal(content: dict[str, Any]) -> str:
 def _again(folder: Path) -> str:
     """What to do."""
     if folder == SHIPPED:
-        return "install torchvision-dddas anew"
+        return "install torchvision-dddas again"
     return f"make the graphs again with `dddas export --out {folder}`"
 
 

@@ -67,7 +67,7 @@ def test_a_graph_of_which_one_bit_was_changed_is_refused_also_by_both_back_ends(
         plane_homography.open_graph.__wrapped__("homography")
     # The package's own graphs are not to be exported again.
     monkeypatch.setattr(runtime, "SHIPPED", folder)
-    assert "install torchvision-dddas anew" in refusal(folder)
+    assert "install torchvision-dddas again" in refusal(folder)
 
 
 def fit(held: dict[str, Any]) -> None:

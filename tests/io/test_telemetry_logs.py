@@ -245,7 +245,7 @@ BATTERY = ulog({"battery_status": (("float voltage",), [(0, 12.0)])})
         ("a.ulg", b"XX" + BATTERY, "does not begin as a PX4 log"),
         ("a.ulg", BATTERY[:12], "damaged from its beginning"),
         ("a.ulg", b"", "is empty"),
-        ("a.nmea", (sentence("GPGSV,1,1,00") + "\n").encode() * 3, "no NMEA sentence tells"),
+        ("a.nmea", (sentence("GPGSV,1,1,00") + "\n").encode() * 3, "no NMEA sentence gives"),
         ("a.bin", b"\x00\x00\x00\x20ftypisom" + bytes(90), "is a video"),
         ("a.bin", b"\xa3\x95\x80\x80" + bytes(90), "DataFlash"),
         ("a.bin", np.random.default_rng(0).bytes(500), "none of the kinds"),

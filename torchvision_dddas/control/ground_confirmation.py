@@ -54,7 +54,7 @@ class GroundConfirmation:
         place = np.array([camera.place], float)
         if positions.origin_deg is not None:
             place = geometry.east_north(place, positions.origin_deg)
-        # What is known from the air tells where to look, and how large people are there.
+        # Locations from the air give where to search, and how large people are there.
         regions = expected_regions(target_m, covariance, extent_m, camera, place[0], heading, settings.ground)
         (people,) = detect_people([picture.image], self._scorer, settings.people, [regions])
         n = len(people)

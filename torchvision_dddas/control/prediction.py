@@ -19,7 +19,7 @@ _KEPT_S, _HORIZON_S = 8.0, 3.0
 _RENAMED_M = 3.0
 # A target is given up below the first probability of being human, and taken up again above the second.
 _GIVEN_UP, _TAKEN_UP = 0.2, 0.5
-# Half of a target's width where no box tells it.
+# Half of a target's width where no box gives it.
 _RADIUS_M = 1.0
 
 

@@ -170,7 +170,7 @@ class AdjustmentLog:
             self._made.append(Adjustment(self.frame, parameter, float(now), float(new), cause))
 
     def know(self, parameter: str, value: float) -> None:
-        """A value that another line tells."""
+        """A value that another line reports."""
         self._values[parameter] = value
 
     def add(self, adjustments: tuple[Adjustment, ...]) -> None:

@@ -107,7 +107,7 @@ class UavSteering:
                     if row != seed and mount.centre(places[[*group, row]], highest)[1] >= _LEAST:
                         group.append(int(row))
                 groups.append(np.array(group))
-        # People who were recognized count more than what nobody has seen yet, and large crowds more than small ones.
+        # Recognized people count more than targets that no vehicle has seen yet, and large crowds more than small ones.
         weights = prediction.probability * np.maximum(prediction.radius_m, 0.5)
         members = [set(prediction.target[group].tolist()) for group in groups]
         held = max(len(self._group & group) for group in members)

@@ -165,7 +165,7 @@ class UgvTeam:
         return goals
 
     def _send(self, prediction: Prediction) -> None:
-        """Send vehicles to targets that nobody can see from the ring, and call back those that have seen enough."""
+        """Send vehicles to targets that cannot be seen from the ring, and call back those that have seen enough."""
         now_s, needs = self._now_s, _need(prediction)
         row_of = {target: row for row, target in enumerate(prediction.target.tolist())}
         for v, vehicle in self._known.items():
@@ -318,7 +318,7 @@ def _pass_by(places_m: np.ndarray, from_m: np.ndarray, prediction: Prediction) -
 
 
 def _need(prediction: Prediction) -> np.ndarray:
-    """(N,) how much a closer look would tell: 1 where nobody has looked, else up to 1/2, and 0 where sure."""
+    """(N,) what a closer look is worth: 1 for a target not yet seen, else up to 1/2, and 0 where sure."""
     return np.where(prediction.unseen, 1.0, 0.5 - np.abs(prediction.probability - 0.5))
 
 

@@ -171,7 +171,7 @@ def _options() -> onnxruntime.SessionOptions:
 
 
 def _strip(model: onnx.ModelProto, name: str) -> bytes:
-    """The model without what tells where and how it was made."""
+    """The model without records of where and how it was made."""
     graph = model.graph
     graph.name, model.doc_string, model.producer_name, model.producer_version = name, "", "", ""
     del model.metadata_props[:], graph.value_info[:], model.functions[:]

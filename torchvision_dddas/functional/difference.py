@@ -16,7 +16,7 @@ def exposure(
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
     Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
-    whose error is at most max(floor, 3.7 x the median error) and fits them anew. Without inside pixels, or on a frame
+    whose error is at most max(floor, 3.7 x the median error) and fits them again. Without inside pixels, or on a frame
     of one single grey, the gain stays 1 (and the offset is the difference of the means).
     """
     wanted, given = reference.flatten(1), warped.flatten(1)

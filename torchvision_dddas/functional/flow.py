@@ -37,7 +37,7 @@ def track(
     """The points' places in the second frame, and which were found.
 
     guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
-    anew up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
+    again up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
     texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the frame.
     """
     place = points if guess is None else guess

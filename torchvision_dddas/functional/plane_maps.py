@@ -193,7 +193,7 @@ def refit(
     gates_px: Sequence[float | Tensor],
     model: PlaneModel,
 ) -> Float[Tensor, "B 3 3"]:
-    """The guess, fitted anew once per gate to the valid pairs that miss it by less.
+    """The guess, fitted again once per gate to the valid pairs that miss it by less.
 
     A fit counts only if twice the minimal number of points support it.
     """

@@ -15,7 +15,7 @@ BODY_WIDTH_M = 0.5
 _LOWEST_SUN_RAD = math.radians(8.0)
 _J2000_S = 946_728_000.0  # 2000-01-01 12:00 UTC, in seconds since 1970
 # The velocity filter: acceleration of people and vehicles; standard deviation above which a velocity is unknown; that
-# of a new target; and the gap after which a target starts anew.
+# of a new target; and the gap after which a target starts again.
 _ACCELERATION_M_S2, _KNOWN_M_S, _FASTEST_M_S, _FORGET_S = 0.5, 1.0, 10.0, 5.0
 
 

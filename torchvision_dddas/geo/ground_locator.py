@@ -1,6 +1,6 @@
 """People seen by cameras on the ground to places, frame by frame; several cameras are fused.
 
-What is common to sightings is estimated with the places, not counted anew with each: a vehicle's position, heading,
+What is common to sightings is estimated with the places, not counted again with each: a vehicle's position, heading,
 pitch, camera height and focal length are common to all that it sees, a person's height to all that see the person. So
 two people seen by the same two vehicles tell how far the vehicles' GPS disagree, and each gains by the other. All is
 linear about the single sightings. Assumed independent: what is new in each sighting, and the vehicles from one another;
@@ -31,7 +31,7 @@ from torchvision_dddas.types import (
     Sightings,
 )
 
-# Rounds in which each vehicle's sightings are matched anew to the others'.
+# Rounds in which each vehicle's sightings are matched again to the others'.
 _ROUNDS = 3
 # Most pairs that are tried as hypotheses of a vehicle's common error.
 _BELIEFS = 60
@@ -237,7 +237,7 @@ def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.nda
     """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
 
     The vehicle that sees most begins; each other's are matched to what is known by then. Then each vehicle in turn is
-    matched anew to the others, whose disagreement is known better by then, until nothing changes.
+    matched again to the others, whose disagreement is known better by then, until nothing changes.
     """
     order = sorted(range(len(team)), key=lambda v: -len(team[v]))
     members = np.zeros((0, len(team)), np.int64)

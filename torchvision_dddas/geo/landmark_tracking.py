@@ -179,7 +179,7 @@ class _ColourTracker:
         return {int(i): int(rows[j]) for i, j in zip(*cheapest(cost), strict=True) if cost[i, j] < 100}
 
     def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:
-        """Which patch is the landmark: as before, unless it is lost or in doubt, or the question is put anew.
+        """Decide which patch is the landmark: as before, unless it is lost, in doubt, or to be decided again.
 
         expected_px: (2,) where it should be, NaN for unknown. usual_px: area of the landmarks' patches, inf: unknown.
         """
@@ -213,7 +213,7 @@ class LandmarkTracker:
     """Finds landmarks in successive pictures.
 
     Of each colour the patch counts that is large, is where the landmark was, and has something moving at it. Every
-    interval_frames landmarks are told from targets anew; between, a landmark's blob is the one where it is predicted.
+    interval_frames landmarks are separated from targets again; between, a landmark's blob is the predicted one.
     """
 
     def __init__(self, count: int, parameters: LandmarkParameters) -> None:
@@ -234,7 +234,7 @@ class LandmarkTracker:
         """The landmarks of the next frame.
 
         masks: (K, H, W) uint8 of the landmarks' colours. foreground: (H, W), i + 1 where detection i is, as in Scene.
-        now_from_before: (3, 3) how the background moved since the frame before; None: it did not, or nobody knows.
+        now_from_before: (3, 3) how the background moved since the frame before; None: it did not, or it is unknown.
         expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN:
         unknown.
         """
@@ -300,10 +300,10 @@ class LandmarkTracker:
     def _couple(
         self, centre: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
     ) -> np.ndarray:
-        """Which blob is each landmark's: matched anew, or the one at its prediction.
+        """Which blob is each landmark's: matched again, or the one at its prediction.
 
         near: (K, N) bool, the blobs at or beside its colour: others are people who walk near a vehicle that is not
-        seen to move. Where the colour is hidden any will do.
+        seen to move. Where the colour is hidden any blob serves.
         """
         if anew:
             match = separate(centre, blobs, self._parameters, near)

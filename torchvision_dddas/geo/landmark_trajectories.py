@@ -48,7 +48,7 @@ class LandmarkTrajectories:
     Between reports a landmark goes straight on. A gap between them that is unusually long is a dropout: there it
     takes its planned waypoints, shifted by how far its reports lay from them; without a plan it goes straight from
     report to report in a gap of up to gap_s, or on as it went for gap_s, its sigma growing by drift_m_s. After that it
-    is absent. A landmark's plan alone, without reports, will do.
+    is absent. A landmark's plan alone, without reports, suffices.
     """
 
     def __init__(self, landmarks: Landmarks, parameters: LandmarkParameters, rate_hz: float) -> None:

@@ -116,7 +116,9 @@ class LandmarkWatch:
         """The landmarks with their pixels, the scene without them, and by what each was found."""
         image, step = scene.frame.image, scene.camera_motion
         if image.ndim == 2:
-            raise InputError("the clip is grey: landmarks cannot be told by colour; give u_px,v_px in the landmarks")
+            raise InputError(
+                "the clip is grey: landmarks cannot be identified by colour; give u_px,v_px in the landmarks"
+            )
         colour = self._colour_of[marks.landmark]
         rows = np.flatnonzero(colour >= 0)
         colour = colour[rows]

@@ -7,7 +7,7 @@ the head, the distance ahead is
     camera height / feet             whatever the person's.
 With a level camera the first is the source's D = f H / h. Inverse distances, 1 / ahead, are linear in the pixels: so
 there the two are weighted by the inverse of their covariance. They share the foot row, the pitch and the focal length,
-and those correlations count. Where the two disagree beyond chance, as for a child or a body half hidden, nobody knows
+and those correlations count. Where the two disagree beyond chance, as for a child or a body half hidden, it is unknown
 which is right: then the covariance grows towards the other.
 
 What the source does not do: D is the depth along the optical axis, and the way over the ground D / cos(alpha).
@@ -45,7 +45,7 @@ def range_people(
 ) -> Sightings:
     """Distance, bearing and place of people, a row a box.
 
-    cut: the picture's border cuts the body, so its height tells nothing; the foot row still does where it is inside.
+    cut: the picture's border cuts the body, so its height is unknown; the foot row still does where it is inside.
     poses: where the camera looked, a row a box; its place is not read but given in local metres as east_north_m.
     Raises InputError where parameters.use asks for the foot row and the camera's height is not known.
     """

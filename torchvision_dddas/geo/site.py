@@ -184,7 +184,7 @@ def resolve_camera(
             )
         notes = []
         if math.isfinite(camera.height_m) and telemetry is None:
-            notes.append(f"where camera {camera.name} stands is not looked at from the air: give --telemetry")
+            notes.append(f"the place of camera {camera.name} is not used from the air: give --telemetry")
         if parameters.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         # A value set by hand overrides the file.

@@ -162,7 +162,7 @@ class ImageSource(_Clip):
 # --------------------------------------------------------------------------------------------------------------------
 # Videos through OpenCV.
 
-# FFmpeg draws any text file as an old terminal would; nobody means that.
+# FFmpeg draws any text file as an old terminal would, which is never wanted.
 _TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}
 # These containers count their frames; others guess from the duration, often one off.
 _EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}

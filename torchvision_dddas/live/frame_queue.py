@@ -96,7 +96,7 @@ class FrameQueue:
                 self._clock.wait(self.changed, left)
 
     def note(self, begun: bool = False, ended: bool = False, closed: bool = False) -> None:
-        """Note that frames are being taken, or are no more; who waits looks again."""
+        """Note whether frames are being taken, and wake whoever waits."""
         with self.changed:
             self.begun, self.ended, self.closed = self.begun or begun, self.ended or ended, self.closed or closed
             self.changed.notify_all()
@@ -157,5 +157,5 @@ class CaptureLog:
             self.restart(taken_s)
 
     def restart(self, since_s: float = float("nan")) -> None:
-        """Measure the rate anew from a time, or from the next picture."""
+        """Measure the rate again from a time, or from the next picture."""
         self._count, self._since_s = 0, since_s

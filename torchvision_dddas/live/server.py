@@ -147,12 +147,12 @@ class _Handler(BaseHTTPRequestHandler):
 # What is known of the health: by name, the title of its tile on the page, "" for none, and the help for Prometheus.
 _COUNTS = {
     "captured": ("pictures captured", "Pictures that the source gave."),
-    "dropped": ("dropped", "Pictures that were too late to be looked at."),
+    "dropped": ("dropped", "Pictures that came too late to be processed."),
     "late": ("late", "Results later than the deadline."),
     "undecoded": ("not decoded", "Pictures that could not be decoded."),
     "unreliable": ("without a conclusion", "Frames from which nothing could be concluded."),
     "reconnects": ("reconnected", "Times that the stream was opened again."),
-    "begun_anew": ("begun anew", "Times that the work failed and was begun anew."),
+    "begun_anew": ("begun anew", "Times that the work failed and was restarted."),
     "looked_at": ("", "Pictures that were looked at."),
     "results": ("", "Frames whose results were handed on."),
 }
@@ -237,7 +237,7 @@ def metrics(now: Snapshot, trouble: str, version: str, lost: Mapping[str, int]) 
         shares = zip(("0.5", "0.95", "0.99"), values, strict=True)
         add(f"{name}_seconds", "gauge", _HELP.get(name, name), {_labels(quantile=q): v for q, v in shares})
     if lost:
-        words = "Messages that nobody will get."
+        words = "Messages that were lost for good."
         add("lost_messages_total", "counter", words, {_labels(stream=s): n for s, n in lost.items()})
     return "\n".join(lines) + "\n"
 

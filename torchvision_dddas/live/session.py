@@ -144,7 +144,7 @@ def run_live(
 def build_path(
     ready: PreparedRun, source: LiveSource, people: bool, interval: int, backend: str, health: Health
 ) -> Callable[[Feed], Iterator[Result]]:
-    """The path from frames to results, which begins anew each time that it is called, and sheds load.
+    """The path from frames to results, which restarts each time that it is called, and sheds load.
 
     Raises InputError at once for pictures that are too small for people.
     """

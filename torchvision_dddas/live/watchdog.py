@@ -96,7 +96,7 @@ class Watchdog:
             self._reported = step[0]
             self._health.event("watchdog", f"{hung}: it counts as hung", step[0])
         if self._clock() - step[1] > 2 * self._hung_s:
-            self._abort(f"{hung}: ended, to be started anew (live.watchdog_s = {self._hung_s:g})")
+            self._abort(f"{hung}: ended, to be restarted (live.watchdog_s = {self._hung_s:g})")
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -1,6 +1,6 @@
 """The source's tracker: association of absolute positions and RGB histograms, without torch (appendix C).
 
-With every sampled frame, the last K frames are assigned anew; a target takes the identity of the older target that the
+With every sampled frame, the last K frames are assigned again; a target takes the identity of the older target that the
 newest link of that window names. What fails in it is kept: see the tests, and `score_tracker` for the improved one.
 
 Features are non-negative vectors, one row a target. Affinities have a dummy target at index 0 of each axis; axes and

@@ -60,7 +60,7 @@ def fit_colours(
     for a, b in find_overlaps(low, high):
         raise InputError(
             f"the colours of {names[a]} and {names[b]} come out overlapping: these pictures do not tell them apart; "
-            "paint one of them anew, or label more pictures"
+            "paint one of them differently, or label more pictures"
         )
     return Colours(tuple(names), low, high)
 

@@ -125,7 +125,7 @@ def stack_padded(
                     arrays[place] = np.pad(array, wider)
                 elif array.size:
                     arrays[place] = np.pad(array, wider, mode="edge")
-                else:  # there is nothing to repeat; any number will do, as no target is there
+                else:  # nothing to repeat; any value serves, because no target is there
                     arrays[place] = np.pad(array, wider, constant_values=1.0)
         batch[field.name] = torch.as_tensor(np.stack(arrays), device=device)
     return kind(**batch)

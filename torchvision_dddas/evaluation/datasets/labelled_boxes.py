@@ -28,7 +28,7 @@ class VisDrone(Reader):
         SPLIT/sequences/NAME/0000001.jpg   pictures, from 1
         SPLIT/annotations/NAME.txt         frame,id,left,top,width,height,counts,category,truncation,occlusion
 
-    Categories count from 1; 0 and 11 (others) are regions that nobody labelled.
+    Categories count from 1; 0 and 11 (others) are unlabelled regions.
     """
 
     kind = "visdrone"

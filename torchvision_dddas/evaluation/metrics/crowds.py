@@ -245,11 +245,11 @@ class Spread:
 class CrowdScore:
     """The measures of one run; shares in [0, 1], NaN where there is nothing to judge.
 
-    frames: that were looked at. crowd_frames: over them, crowds of which at least half of the people show. recall:
+    frames: the processed ones. crowd_frames: over them, crowds of which at least half of the people show. recall:
     share of those that a located target covers; detected: that any target covers; recall_moving: recall without crowds
     that stand, which do not move against their background.
     false_blobs: detections a frame that touch nothing that can move; false_targets: the same of targets with an
-    identity. landmark_blobs: detections a frame that hold a landmark and nobody else.
+    identity. landmark_blobs: detections a frame that hold a landmark alone.
     target_error_m: of each located target that holds people, from their mean place. crowd_error_m: of each crowd that
     located targets cover, from their mean, weighted by the areas of their boxes, to the mean of its visible people.
     inside: share of targets whose 95 % ellipse holds that place of their people.

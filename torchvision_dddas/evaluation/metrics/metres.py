@@ -21,7 +21,7 @@ FARTHEST_M = 10.0
 
 
 class GroundLocations(NamedTuple):
-    """True places in frames that were looked at, those that were told, and told places that are nobody's."""
+    """Counts of true places in processed frames, of reported places, and of reported places that match no target."""
 
     targets: int = 0
     told: int = 0
@@ -29,7 +29,7 @@ class GroundLocations(NamedTuple):
 
 
 def located_measures(counts: GroundLocations) -> dict[str, float]:
-    """Share of the true places that were told, and of the told ones that are somebody's."""
+    """Share of the true places that were reported, and of the reported ones that match a target."""
     return {
         "located": ratio(counts.told, counts.targets),
         "belongs": ratio(counts.told, counts.told + counts.strays),
@@ -49,9 +49,9 @@ def by_boxes(frame: np.ndarray, box_px: np.ndarray, truth: TrackTable) -> np.nda
 def by_places(
     frame: np.ndarray, place_m: np.ndarray, true_frame: np.ndarray, true_m: np.ndarray, farthest_m: float = FARTHEST_M
 ) -> np.ndarray:
-    """(N,) int64 the row of the true place that each told one is, one to one within `farthest_m`, -1 for none.
+    """(N,) int64 the row of the true place that matches each reported one, one to one within `farthest_m`; -1: none.
 
-    Places further off count as nobody's, so that errors are at most `farthest_m`.
+    Places further off match none, so that errors are at most `farthest_m`.
     """
     which = np.full(len(frame), -1)
     for number in np.intersect1d(frame, true_frame):

@@ -90,7 +90,7 @@ class Windows(NamedTuple):
 class TrackCounts(NamedTuple):
     """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are.
 
-    links_2, links_3: the source's accuracy ratio over two and three looks.
+    links_2, links_3: the source's accuracy ratio over two and three frames.
     """
 
     clear: Clear = Clear()
@@ -356,7 +356,7 @@ def mismatches(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray
 
 
 def link_ratios(clip: Paired, interval: int, size: int) -> dict[int, float]:
-    """AR_K by the newest frame, in order, of all windows of `size` looks, `interval` frames apart, with a target.
+    """AR_K by the newest frame, in order, of all windows of `size` frames, `interval` apart, with a target.
 
     A frame's targets are the true boxes that were found (IoU ≥ 0.5): the ratio is about links, not about boxes. Boxes
     of one found identity are linked; one that is absent from a look within the window is a bridge.

@@ -90,7 +90,7 @@ class Truth:
     length: frames of the clip, 0 where unknown. labels: of the masks. positions: None where unknown; fleet: those of
     the landmarks, with identities of their own. ignoring, others and regions are for `matching.counted`: what becomes
     of a found box on an ignored one; boxes that are neither true nor ignored but may take a found box; and regions
-    that nobody labelled, whose identities mean nothing.
+    that are unlabelled, whose identities mean nothing.
     """
 
     kind: Literal["masks", "one target", "boxes"]

@@ -24,7 +24,7 @@ from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.types import Adjustment, Source
 
 RUN_JSON = "run.json"
-NO_POSE = "nothing told where the camera was"
+NO_POSE = "the camera's pose is unknown"
 """The cause of a frame that is not located and says nothing of why."""
 _STEP = math.log(1.01)
 _NUMBER = re.compile(r"\d+(\.\d+)?")

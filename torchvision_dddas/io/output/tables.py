@@ -259,7 +259,7 @@ def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequenc
 
 
 class ConfirmedPositions(TableFiles[FrameResult]):
-    """confirmed.csv of targets located from the air; no file if no ground vehicle looked at any."""
+    """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
 
     def __init__(self, folder: Path, has_degrees: bool) -> None:
         self._path, self._is_written = folder / "confirmed.csv", False

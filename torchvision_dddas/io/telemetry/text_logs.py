@@ -217,7 +217,7 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     if bad:
         log.note(f"line {bad[0]}: not a whole sentence or its checksum is wrong; {len(bad)} lines are left out")
     if not log.samples:
-        raise log.refuse("no NMEA sentence tells a place or a heading together with a time")
+        raise log.refuse("no NMEA sentence gives a place or a heading together with a time")
     return build_record(log, clock_offset_s, utc_s)
 
 
