@@ -73,11 +73,8 @@ def test_a_full_disk_is_reported_once_and_gets_everything_later():
 
 
 def test_each_session_has_its_own_folder(tmp_path):
-    folders = [make_session_folder(tmp_path / "out", utc_s).name for utc_s in (0.0, 0.5, 60.0)]
+    folders = [make_session_folder(tmp_path, utc_s).name for utc_s in (0.0, 0.5, 60.0)]
     assert folders == ["1970-01-01T000000Z", "1970-01-01T000000Z-2", "1970-01-01T000100Z"]
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(InputError, match=r"cannot write into .*file.*--out"):
-        make_session_folder(tmp_path / "file")
 
 
 def test_a_session_is_valid_at_every_moment(tmp_path):
@@ -236,11 +233,6 @@ def test_silent_clients_and_a_page_that_fails_keep_nobody_from_the_others(server
         with pytest.raises((urllib.error.URLError, ConnectionError)):
             asked(server, "/failing")
         assert asked(server)[0] == 200
-
-
-def test_a_port_in_use_is_one_line(server):
-    with pytest.raises(InputError, match=r"cannot serve at 127\.0\.0\.1:\d+: address already in use; choose another"):
-        HealthServer(server.address, {})
 
 
 def test_a_closed_server_frees_its_port_and_leaves_no_thread():

@@ -12,8 +12,7 @@ from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Clip, Dataset, Source
 from torchvision_dddas.simulation.truth import COLUMNS
 
-SIZE = (32, 24)
-"""Of pictures and masks, px."""
+SIZE = (32, 24)  # of pictures and masks, px
 
 Box = tuple[int, int, int, int]
 CAR, MAN = (2, 2, 8, 8), (20, 10, 6, 10)
@@ -51,7 +50,6 @@ def write(path: Path, image: np.ndarray) -> None:
 
 def pictures(folder: Path, names: Iterable[str], size: tuple[int, int] = SIZE) -> None:
     """Pictures of these names, each with its own brightness."""
-    folder.mkdir(parents=True, exist_ok=True)
     for number, name in enumerate(names):
         depth = () if name.endswith(".pgm") else (3,)
         write(folder / name, np.full((size[1], size[0], *depth), 10 + number % 200, np.uint8))
@@ -71,7 +69,6 @@ def mask(path: Path, regions: Mapping[Box, int], size: tuple[int, int] = SIZE, g
 
 
 def text(path: Path, content: str) -> Path:
-    """A file of text."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(content, encoding="utf-8")
     return path
@@ -260,26 +257,14 @@ def simulated(home: Path, name: str) -> None:
         text(place / file, "x")
 
 
+# Each writes a clip of a name into the folder of a data set of its kind.
 MAKE: dict[str, Callable[[Path, str], None]] = {
-    "folder": folder,
-    "davis": davis,
-    "cdnet": cdnet,
-    "bms": bms,
-    "uav123": uav123,
-    "vivid": vivid,
-    "motchallenge": motchallenge,
-    "visdrone": visdrone,
-    "uavdt": uavdt,
-    "cvml": cvml,
-    "sdd": sdd,
-    "kitti": kitti,
-    "inria": inria,
-    "simulated": simulated,
-}
-"""Writes a clip of a name into the folder of a data set of the kind."""
+    make.__name__: make
+    for make in (
+        folder, davis, cdnet, bms, uav123, vivid, motchallenge, visdrone, uavdt, cvml, sdd, kitti, inria, simulated,
+    )
+}  # fmt: skip
 
-GOOD, BAD = (
-    {"cdnet": "PTZ-good", "sdd": "quad-good", "inria": "a"},
-    {"cdnet": "PTZ-bad", "sdd": "quad-bad", "inria": "b"},
-)
-"""Names of two clips, where a kind needs others than "good" and "bad"."""
+# Names of two clips, where a kind needs others than "good" and "bad".
+GOOD = {"cdnet": "PTZ-good", "sdd": "quad-good", "inria": "a"}
+BAD = {"cdnet": "PTZ-bad", "sdd": "quad-bad", "inria": "b"}
