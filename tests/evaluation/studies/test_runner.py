@@ -1,7 +1,6 @@
 """A whole study: what its file may say, what it plans, that it resumes, and what becomes of bad input."""
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,7 @@ from tests.evaluation.studies import world
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.studies import jobs
-from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
+from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.evaluation.studies.jobs import Workers
 from torchvision_dddas.evaluation.studies.records import Spec
 from torchvision_dddas.evaluation.studies.runner import plan_study, read_spec, run_jobs, run_study
@@ -112,8 +111,3 @@ def test_clips_are_picked_by_patterns_and_done_the_longest_first(study, tmp_path
     store = Cache(tmp_path / "cache")
     run_jobs(planned, Workers(1), store, lambda event: ended.append(event.job.clip.name) if event.done else None)
     assert ended == ["table", "masks"]
-
-
-def test_results_are_kept_in_the_user_s_cache_folder(monkeypatch, tmp_path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", os.fspath(tmp_path))
-    assert cache_folder() == tmp_path / "torchvision_dddas" / "studies"

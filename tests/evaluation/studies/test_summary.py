@@ -93,9 +93,8 @@ def test_costs_add_up(tmp_path):
     clip, found = masked(tmp_path / "a")
     more = replace(found, seconds={"find": 1.5, "read": 1.0}, peak_mb=300.0)
     other = replace(clip, name="b")
-    costs = summary.summarize_costs(study_of((clip, "motion", found, None, ""), (other, "motion", more, None, "")))[
-        "motion"
-    ]
+    study = study_of((clip, "motion", found, None, ""), (other, "motion", more, None, ""))
+    costs = summary.summarize_costs(study)["motion"]
     by_stage = {"find": 2000 / 24, "read": 1000 / 24}
     whole = {"frames": 24, "seconds": 3.0, "frames_per_s": 8.0, "peak_mb": 300.0, "ms_per_frame": by_stage}
     assert costs["all"] == whole
