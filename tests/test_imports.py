@@ -143,3 +143,12 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 def test_unknown_public_names_are_refused() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'absent'"):
         _ = torchvision_dddas.absent
+
+
+def test_the_onboard_detector_and_tracker_load_neither_scipy_nor_torch() -> None:
+    script = (
+        f"import sys; from {OWN} import MotionDetector, Tracker; "
+        "print(*{'torch', 'kornia', 'pandas', 'scipy.optimize'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == ""
