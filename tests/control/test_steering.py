@@ -140,13 +140,13 @@ class World:
             self.team[k] = step_to(self.team[k], order.goal, order.speed_m_s)
 
 
-def test_nothing_known_changes_nothing_and_without_a_place_on_the_ground_there_is_nothing_to_look_at():
-    one = steering()
-    for frame in range(1, 10):
-        assert one.update(located(frame, []), None, frame / RATE_HZ, team_at(SQUARE), None) == (Command(), ())
-    for frame in range(10, 30):
-        blind = replace(located(frame, [[1, 2]]), fix=Fix(frame, "", cause="nothing"))
-        command, _ = one.update(blind, None, frame / RATE_HZ + 1, team_at(SQUARE), None)
+def test_nothing_known_changes_nothing_and_without_a_view_of_the_ground_only_ground_vehicles_are_asked():
+    one, blind = steering(), steering()
+    for frame in range(1, 30):
+        now_s, team = frame / RATE_HZ, team_at(SQUARE)
+        assert one.update(located(frame, []), None, now_s, team, None) == (Command(), ())
+        unplaced = replace(located(frame, [[1, 2]]), fix=Fix(frame, "", cause="nothing"))
+        command, _ = blind.update(unplaced, None, now_s + 1, team, None)
     assert command.look_at is None and len(command.orders) == 4
 
 
@@ -258,6 +258,11 @@ def test_frames_are_left_out_by_height_and_speed_but_while_a_target_is_lost_or_t
     assert (made[0].new, made[0].cause) == (5.0, "altitude 50.0 m, speed 0.5 m/s")
     assert [change.cause for change in made if change.new == 1] == ["target 1 was lost"]
     assert set(sampled_by([], step=Registration(np.eye(3), 200, 40, 0.3, 0.2))[0]) == {1}
+
+
+def test_no_picture_is_wanted_of_what_is_out_of_reach():
+    w = World([[0, 0]], 0.0, ("unseen",), SQUARE * 3).run(3)
+    assert not any(order.picture for command in w.commands for order in command.orders)
 
 
 def test_each_part_can_be_left_as_planned():
