@@ -240,7 +240,7 @@ class Pipeline:
 
 
 def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """The settings with the camera's focal length if telemetry gives the size of targets, unless another is set."""
+    """Set gates.focal_px from the camera, given telemetry and an unchanged default. Returns settings and notes."""
     focal = locator.camera.focal_px[0]
     if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
         return settings, []

@@ -56,7 +56,7 @@ class CameraMount:
 
 
 def inside(points_m: np.ndarray, pose: CameraPose, camera: Camera) -> np.ndarray:
-    """(N,) how far within the picture from a pose places (N, 2) on the ground are, as in CameraMount.inside."""
+    """(N,) margin of ground points (N, 2) inside the picture: 1 at the centre, 0 at the border, negative outside."""
     points = np.asarray(points_m, float).reshape(-1, 2)
     # The lens's distortion is left out: it moves no border by more than the margins that are kept.
     right, down, depth = ((points - pose.place_m[:2]) @ pose.axes[:2] - pose.place_m[2] * pose.axes[2]).T

@@ -132,7 +132,7 @@ class Gates:
 
 @dataclass(frozen=True)
 class AltitudeSettings:
-    """What the altitude decides. altitude_m, gates: None without telemetry.
+    """Settings and size gates for the current altitude. altitude_m, gates: None without telemetry.
 
     settings: those of the user with `gates.min_area_px`, `small.on` and `morphology.close_px` chosen for the altitude.
     """

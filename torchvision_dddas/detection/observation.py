@@ -75,7 +75,7 @@ def observe(
 ) -> Observation:
     """The blobs of a window's reference frame and how each of them moves.
 
-    history: moved on to this frame; it gives the motions where the settings want no dense flow.
+    history: already aligned to this frame; used for motion where dense flow is off.
     """
     view, morphology, scale = window.reference, settings.morphology, evidence_scale(settings)
     threshold, peak = settings.difference.threshold * scale, settings.difference.peak * scale

@@ -193,7 +193,7 @@ def _register(earlier: View, later: View, parameters: RegistrationParameters) ->
 
 
 def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
-    """(N, 2) float32: the best pixel of every grid cell, by the smaller eigenvalue of the structure tensor.
+    """(N, 2) float32: the strongest corner of each grid cell, where it passes the quality threshold.
 
     halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
     """

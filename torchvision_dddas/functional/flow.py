@@ -70,7 +70,7 @@ def forward_backward(
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
     """As `track`; found only where tracking back returns to within limit_px of the start. settings: those of `track`.
 
-    The way back is predicted by the same displacement as the way there, so that the start itself is not given away.
+    The backward guess uses the predicted displacement, not the known start: otherwise the check would always pass.
     """
     there, found = track(points, pyramid_from, pyramid_to, guess, **settings)  # type: ignore[arg-type]
     back_guess = None if guess is None else there - (guess - points)

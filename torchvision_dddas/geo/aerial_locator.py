@@ -230,7 +230,7 @@ class AerialLocator:
         return locate_pixels(fix, self.camera, pixels, 0.0, 0.0, self._ground)[0]
 
     def ground_radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
-        """(N,) m, radii of circles as large as the ellipses within boxes (N, 4) on the ground; NaN where unknown."""
+        """(N,) m, radius of the circle with the ground area of the ellipse in each box (N, 4); NaN where unknown."""
         low, high = box_px[:, :2] - 0.5, box_px[:, :2] + box_px[:, 2:] - 0.5
         corners = low, np.c_[high[:, 0], low[:, 1]], np.c_[low[:, 0], high[:, 1]]
         start, right, below = np.split(self.ground_places(fix, np.concatenate(corners)), 3)

@@ -101,7 +101,7 @@ class BiasFilter:
     persistence: ErrorPersistence = ErrorPersistence()
 
     def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "BiasFilter":
-        """The filter at a later time, with new landmarks added, and without those not seen for too long."""
+        """Predict to time_s: decay the errors, add process noise and new landmarks, drop those long unseen."""
         correlation_s /= self.persistence.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0

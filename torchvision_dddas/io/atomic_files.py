@@ -61,7 +61,7 @@ def refuse_folder(path: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:
-    """The line a user reads when the disk refuses."""
+    """The InputError to raise for a failed write of a file."""
     place = path.with_name(_PART.sub(r"\1\2", path.name))
     return InputError(
         f"cannot write {place}: {error.strerror or error}. Nothing half-written was kept; "

@@ -119,7 +119,8 @@ class _Renumbering:
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
     """Yield the results of `begin(feed)`; after an error it is called again and goes on with the frames that follow.
 
-    Each error is an event. Raises RepeatedFailure after 25 errors without a result between them.
+    Each error is an event, but the 25th without a result between them raises RepeatedFailure. An InputError after the
+    feed ended ends the run.
     """
     renumbered, failures = _Renumbering(), 0
     while True:

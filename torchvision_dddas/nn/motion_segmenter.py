@@ -65,7 +65,7 @@ class Core(NamedTuple):
 
 @dataclass(frozen=True)
 class Regions:
-    """The connected regions of a hard core: 0 is none, else the number of the region, up to `count`.
+    """Label maps of the connected regions of a hard core: 0 is background, others 1 to `count`.
 
     near: the regions, and the pixels around them that may join them. filled: their hulls, or themselves.
     """

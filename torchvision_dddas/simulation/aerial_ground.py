@@ -213,7 +213,7 @@ class PixelPlaces(NamedTuple):
     """Where pixels lie: east_m, north_m (H, W) float32; pixel_m (H,) size of a row's pixels on the ground.
 
     rise_m: (H, W) float32, above the ground where something stands that is seen there, None where all is bare.
-    met: the same as a list of flat indices. haze: (H, W) float32, share of the air's light; None where it is clear.
+    met: the hits on standing objects, or None. haze: (H, W) float32, share of the air's light; None where it is clear.
     """
 
     east_m: np.ndarray

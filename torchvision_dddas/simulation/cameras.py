@@ -38,7 +38,7 @@ class View:
 
     @property
     def scale_px(self) -> float:
-        """Pixels of a length that is as long as its depth, by the first row of the projection."""
+        """Norm of the projection's first row, sqrt(f^2 + cx^2): about 1.13 times the focal length at 56 degrees."""
         return float(np.linalg.norm(self.image_from_world[0, :3]))
 
 

@@ -60,7 +60,7 @@ class SceneState:
     size: tuple[float, float] | None = None
 
     def agility(self, parameters: TrackParameters) -> float:
-        """Sd of the change of velocity in a frame, heights a frame: fast targets turn fast."""
+        """Standard deviation of the velocity change per frame, box heights per frame; grows with the scene's speed."""
         return parameters.agility * self.speed / USUAL_SPEED
 
 

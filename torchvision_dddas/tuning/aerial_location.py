@@ -271,7 +271,7 @@ def _tensor(array: np.ndarray) -> Tensor:
 
 
 def aerial_examples(clip: Clip, settings: Settings) -> Iterator[tuple[int, AerialView]]:
-    """The frames of a clip with landmarks in which the true position of a target is known.
+    """The frames of a clip with a known true position, whose landmarks and telemetry agree within noise.
 
     Raises InputError where the true positions are in other units than its landmarks.
     """

@@ -118,8 +118,8 @@ class Windows:
     similarity, alternative: of both features, location first, with a dummy first on both axes, as
     `source_tracker.affinity` and `source_tracker.best_alternatives` return them. now, before: whether a target is
     there. true: the true links. joined_at: of each two of P targets of the newer and of the older frame, as
-    `source_tracker.joined_at` returns it; there: whether a target is there. speaks: frames that count in the
-    dispersion. pictured: appearance is known.
+    `source_tracker.joined_at` returns it; there: whether a target is there. speaks: whether a frame counts in the
+    dispersion. pictured: whether its appearance is known.
     """
 
     similarity: Float[Tensor, "W 2 N1 M1"]

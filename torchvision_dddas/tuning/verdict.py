@@ -39,7 +39,7 @@ class Side:
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """As run.json has it."""
+        """The dictionary that run.json holds."""
         pairs = {name: dict(zip(TIMES, getattr(self, name), strict=True)) for name in ("pooled", "mean", "frame_ms")}
         return vars(self) | pairs
 
@@ -64,7 +64,7 @@ class Verdict:
         return lines
 
     def as_json(self) -> dict[str, Any]:
-        """As run.json has it."""
+        """The dictionary that run.json holds."""
         sides = {"tuned": self.tuned.as_json(), "held_out": None if self.held is None else self.held.as_json()}
         return {"measure": self.goal.name, "better": "less" if self.goal.minimize else "more", **sides}
 

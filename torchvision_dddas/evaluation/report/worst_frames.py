@@ -192,7 +192,7 @@ class Boxes(NamedTuple):
 
 
 def box_pair(picture: np.ndarray | None, size_px: Size, boxes: Boxes) -> Pair:
-    """A frame whose truth are boxes; without a picture they stand on grey. size_px: width and height of the frame."""
+    """Draw true and found boxes side by side, on grey without a picture. size_px: width and height of the frame."""
     left, right, scale = _sides(np.full((1, 1), _GREY, np.uint8) if picture is None else picture, size_px)
     for box, name in zip(boxes.true_px * scale, boxes.true_names, strict=True):
         _box(left, box, TRUE, name)

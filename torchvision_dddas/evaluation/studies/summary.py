@@ -233,7 +233,7 @@ def _samples_of(cases: Sequence[Scored]) -> dict[str, np.ndarray]:
 
 
 def rank(cases: Sequence[Scored], by_frame: bool = False) -> Ranking:
-    """All detections of cases that have scores, pooled; a unit a case, or a frame."""
+    """Pool the scored detections of all cases into one ranking, grouped by case, or by frame."""
     rows = np.concatenate([scored.ranked["boxes"] for scored in cases])
     unit: list[np.ndarray] = []
     true: list[np.ndarray] = []
@@ -375,7 +375,7 @@ def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
 
 
 def goal_value(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:
-    """The goal's value; if it has none NaN, and why. Raises InputError if no clip can have such a measure."""
+    """The goal's value and "", or NaN and the reason. Raises InputError if no clip can have such a measure."""
     scored: list[Scored] = []
     for case in sorted((case for case in cases if case.task == goal.task), key=lambda case: case.clip.name):
         if case.scored is None:  # without its worst clip any setting would look better

@@ -42,7 +42,7 @@ Measure = Callable[[Mapping[str, object]], Measured]
 class Axis:
     """A parameter and its values; without values the range from low to high, both included.
 
-    step: 0 for real numbers. log: even in the logarithm.
+    step: of whole numbers; 0: continuous. log: sample on a logarithmic scale.
     """
 
     parameter: str

@@ -153,7 +153,7 @@ def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.
 def ellipse_rows(tracks: GroundTracks, most: int = MOST_ELLIPSES) -> np.ndarray:
     """(K,) rows whose ellipses a map shows: the last of each target, and about one each second before it.
 
-    The intervals grow where there would be more than `most`; each target's last is always among them.
+    The intervals grow where there would be more than `most`; each target's last with a known covariance is among them.
     """
     times = [tracks.time_s[rows] for rows in tracks.of.values()]
     apart_s = max(1.0, sum(float(t[-1] - t[0]) for t in times if np.isfinite(t).all()) / most)
