@@ -53,21 +53,46 @@ def window(views: list[View], steps: list[np.ndarray], at: int, pairs: list[tupl
     return Window(views[at], neighbours, np.array(matrices), tuple(i - at for i in used), near, last, last)
 
 
-@pytest.mark.parametrize("size", SIZES, ids=["even", "odd"])
-def test_registrations_agree_to_half_a_pixel(engines, size) -> None:
-    images, steps = render(1, FRAMES, size).images, []
-    for engine in engines:
-        found = engine.register(list(pairwise([engine.prepare(image) for image in images])))
-        assert all(step.reliable for step in found), [step.cause for step in found]
-        steps.append([step.later_from_earlier for step in found])
-    assert max(corner_error(a, b, size) for a, b in zip(*steps, strict=True)) <= 0.5
-
-
 # Of the clip's middle, start and end: the frame, its pairs, and whether the last pair is the wide and small one.
-@pytest.mark.parametrize(
+every_window = pytest.mark.parametrize(
     ("at", "pairs", "far"),
     [(3, [(2, 4), (1, 5), (0, 6)], True), (0, [(1, 2), (2, 4)], False), (6, [(5, 4), (4, 2), (3, 1)], True)],
 )
+
+
+def registered(engine: Engine, images: list[np.ndarray]) -> tuple[list[View], list[np.ndarray]]:
+    """Views, and the reliable registrations of successive frames."""
+    views = [engine.prepare(image) for image in images]
+    steps = engine.register(list(pairwise(views)))
+    assert all(step.reliable for step in steps), [step.cause for step in steps]
+    return views, [step.later_from_earlier for step in steps]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=["even", "odd"])
+def test_registrations_agree_to_half_a_pixel(engines, size) -> None:
+    onboard, batched = (registered(engine, render(1, FRAMES, size).images)[1] for engine in engines)
+    assert max(corner_error(a, b, size) for a, b in zip(onboard, batched, strict=True)) <= 0.5
+
+
+@every_window
+@pytest.mark.parametrize("size", SIZES, ids=["even", "odd"])
+def test_foregrounds_agree_each_engine_on_its_own_registrations(engines, size, at, pairs, far) -> None:
+    images = render(1, FRAMES, size).images
+    onboard, batched = (
+        engine.foreground([window(*registered(engine, images), at, pairs, far)])[0] for engine in engines
+    )
+    a, b = onboard.core > 0, batched.core > 0
+    assert a.any() and (a & b).sum() / (a | b).sum() >= 0.95
+    for name in ("evidence", "wide", "texture"):
+        apart = np.abs(getattr(onboard, name).astype(int) - getattr(batched, name))
+        assert getattr(batched, name).dtype == np.uint8
+        assert np.percentile(apart, 99) <= 6, name
+    assert batched.offsets == onboard.offsets
+    for ours, theirs in zip(batched.warped, onboard.warped, strict=True):
+        assert np.percentile(np.abs(ours.astype(int) - theirs), 99) <= 3
+
+
+@every_window
 @pytest.mark.parametrize("size", SIZES, ids=["even", "odd"])
 def test_on_the_same_registrations_only_rounding_differs_even_where_the_gain_jumps(
     engines, size, at, pairs, far

@@ -1,5 +1,6 @@
 """The onboard engine against OpenCV and NumPy, and at half the resolution."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import cv2
@@ -8,7 +9,7 @@ import pytest
 
 from tests.synthetic_clip import flight, render
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.detection import detect_motion
+from torchvision_dddas.detection import Foreground, Window, detect_motion
 from torchvision_dddas.detection import opencv_engine as onboard_half
 from torchvision_dddas.detection import opencv_foreground as onboard_pixels
 from torchvision_dddas.detection.blobs import close_mask
@@ -123,3 +124,38 @@ def test_the_masked_median_is_numpys_above_its_minimum(seed: int) -> None:
     values = rng.integers(0, rng.integers(8, 80), (40, 51)).astype(np.uint8)
     mask = np.where(rng.random(values.shape) < 0.6, 255, 0).astype(np.uint8)
     assert onboard_pixels.median_above(values, mask, 16) == max(16, float(np.median(values[mask > 0])))
+
+
+def test_registration_at_half_the_size_has_the_whole_pictures_pixels(images: list[np.ndarray]) -> None:
+    ground = [view.image_from_ground for view in flight(1, 14, SIZE)]
+    truth = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(ground)]
+    engine = OpenCVEngine(load_config("half", ["registration.keypoints=300"]))
+    views = [engine.prepare(image) for image in images]
+    steps = [engine.register([pair])[0] for pair in pairwise(views)]
+    assert all(step.reliable for step in steps)
+    off = [corner_error(step.later_from_earlier, true, SIZE) for step, true in zip(steps, truth, strict=True)]
+    assert np.median(off) < 0.5
+    flow = [step.flow_px for step in OpenCVEngine(load_config("fast")).register(list(pairwise(views)))]
+    assert np.allclose([step.flow_px for step in steps], flow, atol=0.3)
+
+
+def test_half_maps_give_the_masks_of_doubled_maps(images: list[np.ndarray], monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = load_config("half", ["gates.min_area_px=60"])
+
+    def found() -> list[np.ndarray]:
+        frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
+        return [scene.mask for scene in detect_motion(frames, settings, OpenCVEngine(settings))]
+
+    def whole(engine: OpenCVEngine, windows: Sequence[Window]) -> list[Foreground]:
+        half = onboard_half.halve_settings(engine.parameters)
+        maps = [onboard_pixels.find_foreground(onboard_half.halve_window(window), half) for window in windows]
+        return [
+            onboard_half.double_maps(m, window.reference.size, False) for m, window in zip(maps, windows, strict=True)
+        ]
+
+    halves = found()
+    monkeypatch.setattr(OpenCVEngine, "foreground", whole)
+    wholes = found()
+    assert any(mask.any() for mask in halves)
+    for half, other in zip(halves, wholes, strict=True):
+        np.testing.assert_array_equal(half, other)

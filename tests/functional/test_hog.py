@@ -16,8 +16,14 @@ from torchvision_dddas.functional.hog import Layout
 LAYOUTS = {
     "default": Layout(),
     "signed": Layout(signed=True, bins=18),
+    "small cells": Layout((32, 64), 4, 8, 4),
+    "eight bins": Layout((32, 64), 4, 8, 4, bins=8),
+    "wide window": Layout((96, 48)),
+    "no gamma": Layout(gamma=False),
+    "one cell a block": Layout(block=8),
     "three cells a block": Layout((60, 120), 5, 15, 5),
-    "blocks apart": Layout((64, 112), stride=16, bins=7, gamma=False),
+    "blocks apart": Layout((64, 112), stride=16, bins=7),
+    "blocks every half cell": Layout((48, 96), stride=4),
 }
 
 
@@ -40,9 +46,11 @@ def opencv(layout: Layout, weights: np.ndarray | None = None, bias: float = 0.0)
 def opencv_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias: float) -> np.ndarray:
     hits = opencv(layout, weights, bias).detect(picture, -1e9, (layout.stride, layout.stride), (0, 0))
     places, found = (np.asarray(hit) for hit in hits)
-    column, row = places.T // layout.stride
-    wanted = np.full((row.max() + 1, column.max() + 1), np.nan)
-    wanted[row, column] = found.ravel()
+    down, across = (
+        (have - need) // layout.stride + 1 for have, need in zip(picture.shape[:2], layout.window[::-1], strict=True)
+    )
+    wanted = np.full((down, across), np.nan)
+    wanted[places[:, 1] // layout.stride, places[:, 0] // layout.stride] = found.ravel()
     assert not np.isnan(wanted).any()
     return wanted
 

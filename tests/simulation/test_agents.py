@@ -332,3 +332,15 @@ def test_a_gust_pushes_the_uav_at_about_its_own_speed():
     for size, fastest in ((10.0, pytest.approx(10.0, rel=0.4)), (0.0, pytest.approx(2.0, abs=2.0))):
         found = [np.linalg.norm(one.velocity_m_s[:2]) for one in faulty("gust", size=size) if is_on(one)]
         assert max(found) == fastest
+
+
+def test_nobody_is_run_over():
+    across = (CrowdPlan(people=12, start_m=(0.0, -20.0), heading_deg=0.0), CrowdPlan(people=8, behaviour="stand"))
+    agents = Agents(busy(crowd=across, car=(CarPlan(start_m=(-60.0, 0.0), speed_m_s=8.0),)), world_of())
+    for _ in range(100):
+        run(agents, 2)
+        bodies = agents.moment().bodies
+        car = np.flatnonzero(bodies.kind == "car")[0]
+        ahead = np.array([np.sin(bodies.facing_rad[car]), np.cos(bodies.facing_rad[car])])
+        to = bodies.place_m[bodies.kind == "person", :2] - bodies.place_m[car, :2]
+        assert ((np.abs(to @ ahead) > 2.2) | (np.abs(to @ (ahead[1], -ahead[0])) > 0.9)).all()

@@ -215,3 +215,19 @@ def test_bad_input_of_the_public_tracker_is_refused(given, message):
         Tracker(interval=0)
     with pytest.raises(InputError, match="size must"):
         Tracker(size=(3, -1))
+
+
+def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
+    scenes = []
+    for number in range(1, 13):
+        frame = Frame(number, number / 10, np.full((*SIZE[::-1], 3), 90, np.uint8))
+        boxes, unknown = np.array([box for _, box in walkers([number])]), np.full(2, np.nan)
+        scenes.append(scene_of(frame, Detections(boxes, np.full(2, 0.55), np.full(2, 480.0), unknown, unknown)))
+    tracked = [list(track_scenes(iter(scenes), SETTINGS, 1, SIZE, pictures=kept)) for kept in (True, False)]
+    for with_picture, without in zip(*tracked, strict=True):
+        assert with_picture.frame.image.any()
+        assert without.frame.image.shape == with_picture.frame.image.shape
+        assert without.frame.image.strides == (0, 0, 0) and without.frame.number == with_picture.frame.number
+        np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
+        np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
+    assert any(len(f.tracks) for f in tracked[1])
