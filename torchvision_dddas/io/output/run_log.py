@@ -222,7 +222,7 @@ class RunStory:
             identities = record.counts.get("identities", 0)
             counts = (("frames", record.frames), ("detections", record.targets), ("identities", identities))
             figures = [(name, f"{count}") for name, count in counts]
-            report = RunReport(f"Found and followed: {record.input_name}", record, complete, self.timeline, figures)
+            report = RunReport(f"Detected and tracked: {record.input_name}", record, complete, self.timeline, figures)
             self.extend(report)
             write_whole(self._folder / REPORT, report.html().encode())
         elif not self._is_located:
