@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
@@ -104,6 +104,7 @@ def test_every_windows_score_is_opencvs(colour, layout, channels):
     gamma=st.booleans(),
     seed=st.integers(0, 1000),
 )
+@example(cell=4, cells=1, every=1, blocks=(1, 2), bins=20, signed=True, gamma=False, seed=147)  # hats as differences
 def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins, signed, gamma, seed):
     block = cell * cells
     window = block + (blocks[0] - 1) * every, block + (blocks[1] - 1) * every
@@ -114,7 +115,7 @@ def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins,
     across, down = layout.blocks
     found = hog.blocks(bordered(picture), layout)[0].view(bins, cells, cells, down, across).permute(4, 3, 2, 1, 0)
     wanted = np.ravel(opencv(layout).compute(picture))
-    np.testing.assert_allclose(found.flatten().numpy(), wanted, atol=2e-5, rtol=0)
+    np.testing.assert_allclose(found.flatten().numpy(), wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("signed", [False, True])

@@ -131,10 +131,11 @@ def polar(graph: GraphBuilder, image: str, layout: hog.Layout) -> str:
 
 
 def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "") -> str:
-    """From `functional.hog.ramps` to the middle of `blocks`: (F, ny, nx), not yet normalised.
+    """From `functional.hog.hats` to the middle of `blocks`: (F, ny, nx), not yet normalised.
 
-    Ramps are a convolution of one pixel with the rectifier that follows it; pooling is one of each channel by itself,
-    over rows, then over columns; the hats and the order of a block's numbers are one of one pixel again.
+    The hats are sums of ramps relu(m (angle - k)): these are a convolution of one pixel with the rectifier that follows
+    it, which costs a digit of accuracy. Pooling is a convolution of each channel by itself, over rows, then over
+    columns; the hats and the order of a block's numbers are one of one pixel again.
     """
     at = hog.knots(layout.bins)[:-1]
     used = len(at) + 1
@@ -144,7 +145,7 @@ def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "
     ramps[1:used, 0, 0, 0] = [-(knot + 0.5) for knot in at]
     ramps[1:used, 1] = layout.bins / (2 * math.pi if layout.signed else math.pi)
     maps = graph("Relu", graph("Conv", polar, graph.constant(ramps), kernel_shape=[1, 1]))
-    hats = hog.hats(layout.bins).numpy().astype(np.float32)
+    hats = _hats_of_ramps(layout.bins).astype(np.float32)
     cells = layout.cells
     order = np.zeros((layout.bins, cells, cells, cells, cells, channels), np.float32)
     pooled = []
@@ -156,6 +157,15 @@ def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "
     kernel = graph.constant(order.reshape(layout.bins * cells**2, -1, 1, 1))
     found = graph("Conv", graph("Concat", *pooled, axis=1), kernel, kernel_shape=[1, 1])
     return graph("Squeeze", found, graph.whole(0), out=out)
+
+
+def _hats_of_ramps(bins: int) -> np.ndarray:
+    """(bins, K): each bin's hat as a sum of ramps, the second difference at its knots; the first column is m itself."""
+    rows = np.zeros((bins, bins + 4))
+    for place, knot in enumerate(hog.knots(bins)):
+        # Left of its knot the first hat is 1 - (t - k), plus what bends it to zero.
+        rows[knot % bins, place : place + 3] += [1.0, -2.0 if place else -1.0, 1.0]
+    return rows[:, : bins + 2]
 
 
 def pool(graph: GraphBuilder, maps: str, weights: np.ndarray, channels: int, stride: tuple[int, int]) -> str:

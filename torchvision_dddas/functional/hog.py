@@ -114,25 +114,20 @@ def knots(bins: int) -> list[int]:
     return list(range(-1, bins + 1))
 
 
-def ramps(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
-    """(B, K, H, W): magnitude m, then relu(m (angle - k)) for all knots k but the last.
+def hats(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
+    """(B, K, H, W): the share of each pixel's magnitude m at each knot k, relu(m - |m (angle - k)|).
 
-    The share of m that goes to a bin is a hat over the angle, thus a sum of ramps: `hats` says which, and as it is
-    linear it can wait until after the pooling, where there are 64 times fewer numbers.
+    Knots of the same bin are added after the pooling, where there are 64 times fewer numbers: see `bins_of_knots`.
     """
     magnitude = torch.sqrt((dx * dx + dy * dy).clamp(min=1e-30))
     turn = magnitude * angle(dx, dy, layout)
-    at = torch.tensor(knots(layout.bins)[:-1], dtype=dx.dtype, device=dx.device).view(1, -1, 1, 1)
-    return torch.cat([magnitude, (turn - magnitude * at).relu()], 1)
+    at = torch.tensor(knots(layout.bins), dtype=dx.dtype, device=dx.device).view(1, -1, 1, 1)
+    return (magnitude - (turn - magnitude * at).abs()).relu()
 
 
-def hats(bins: int) -> Tensor:
-    """(bins, K) float64: the hats of the bins as sums of ramps."""
-    rows = torch.zeros(bins, bins + 4, dtype=torch.float64)
-    for place, knot in enumerate(knots(bins)):
-        # Left of its knot the first hat is 1 - (t - k), plus what bends it to zero.
-        rows[knot % bins, place : place + 3] += torch.tensor([1.0, -2.0 if place else -1.0, 1.0])
-    return rows[:, : bins + 2]
+def bins_of_knots(bins: int) -> Tensor:
+    """(bins, K) float64: 1 where a knot is the centre of a bin."""
+    return torch.eye(bins, dtype=torch.float64)[:, [knot % bins for knot in knots(bins)]]
 
 
 def cell_weights(layout: Layout) -> Tensor:
@@ -166,10 +161,10 @@ def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tens
 
     bordered: as in `gradient`; its inside must hold a block. clip: a number in place of the layout's.
     """
-    maps = ramps(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
+    maps = hats(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
     down = _pooled(maps, layout)  # (B, K, cy, ny, W)
     both = _pooled(down.transpose(-1, -2), layout)  # (B, K, cy, W, ny) -> (B, K, cy, cx, nx, ny)
-    histogram = torch.matmul(hats(layout.bins).to(maps), both.flatten(2)).unflatten(
+    histogram = torch.matmul(bins_of_knots(layout.bins).to(maps), both.flatten(2)).unflatten(
         2, both.shape[2:]
     )  # (B, bins, cy, cx, nx, ny)
     histogram = histogram.transpose(-1, -2).flatten(1, 3)
