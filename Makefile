@@ -36,9 +36,14 @@ figures: $(STAMP)
 	$(BIN)/python eval/figures.py
 
 # Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
-# tracking measures TrackEval's? DATA may name a folder of MOTChallenge 2015 sequences to check them on as well.
+# tracking measures TrackEval's? With DATA, a folder of sequences with identities: on them as well, and how well do we
+# keep identities beside the other trackers? WRITE=docs/results/identities.json keeps that; what the peers got is kept in
+# the file KEEP and not measured again while tables and settings are the same.
 peers: $(STAMP) .venv-peers/.installed .venv-norfair/.installed
 	$(BIN)/python eval/peers/check.py $(DATA)
+ifdef DATA
+	$(BIN)/python eval/peers/identities.py $(DATA) $(if $(KEEP),--keep-peers $(KEEP)) $(if $(WRITE),--write $(WRITE))
+endif
 
 .venv-peers/.installed: eval/peers/requirements.txt
 .venv-norfair/.installed: eval/peers/requirements-norfair.txt

@@ -1,9 +1,9 @@
 """Are our tracking measures TrackEval's? `python eval/peers/check.py [DATA]`, run by `make peers`.
 
 Sets results of many kinds against the truth of made-up walkers, and of the sequences under DATA (folders with
-gt/gt.txt in MOTChallenge 2015 text), and compares every figure of every sequence and of all together with what
-TrackEval gives in its own environment: once as `dddas evaluate TRUTH RESULT` reads the files, and once as a study of
-whole data sets scores what it holds. Prints a table; ends with 1 if any figure differs by more than 1e-6.
+gt/gt.txt and det/det.txt in MOTChallenge 2015 text), and compares every figure of every sequence and of all together
+with what TrackEval gives in its own environment: once as `dddas evaluate TRUTH RESULT` reads the files, and once as a
+study of whole data sets scores what it holds. Prints a table; ends with 1 if any figure differs by more than 1e-6.
 """
 
 import argparse
@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jobs import PYTHON, Table, check_environments, run_peer
 
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.evaluate import evaluate
@@ -25,7 +26,6 @@ from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.summary import measures
 
 HERE = Path(__file__).resolve().parent
-PEERS = HERE.parents[1] / ".venv-peers/bin/python"
 MOST = 1e-6
 DISTRACTOR = 8
 
@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="?")
     parser.add_argument("--json", type=Path, help="write TrackEval's figures of the made-up walkers here")
     options = parser.parse_args()
+    check_environments()
     worst = 0.0
     print("| sequences | rows marked 0 | every | result | figures | largest difference |")
     print("| --- | --- | ---: | --- | ---: | ---: |")
@@ -61,26 +62,33 @@ def sets(data: Path | None) -> Iterator[tuple[str, Tables, Tables]]:
     """Truths by sequence, (N, 10) each, and the boxes that SORT gets."""
     made = {f"walkers-{seed}": walkers(seed) for seed in range(3)}
     yield "made up", made, {name: results(truth)["loose, missed"] for name, truth in made.items()}
-    if data is not None and (files := sorted(data.glob("*/gt/gt.txt"))):
-        real = {f.parents[1].name: np.loadtxt(f, delimiter=",") for f in files}
-        boxes = {name: np.loadtxt(data / name / "det/det.txt", delimiter=",") for name in real}
-        yield f"{len(files)} real", real, boxes
-    elif data is not None:
-        sys.exit(f"{data} holds no SEQUENCE/gt/gt.txt")
+    if data is None:
+        return
+    names = sorted(f.parents[1].name for f in data.glob("*/gt/gt.txt") if (f.parents[1] / "det/det.txt").is_file())
+    if not names:
+        print(f"{data} holds no SEQUENCE/gt/gt.txt with det/det.txt: checked on made-up walkers alone", file=sys.stderr)
+        return
+    real, boxes = (
+        {name: np.loadtxt(data / name / file, delimiter=",") for name in names} for file in ("gt/gt.txt", "det/det.txt")
+    )
+    yield f"{len(names)} real", real, boxes
 
 
 def sort(truths: Tables, boxes: Tables) -> Tables:
     """What SORT at its defaults makes of boxes."""
+    given = {name: table[table[:, 0] <= truths[name][:, 0].max()] for name, table in boxes.items()}
+    tables = []
     with tempfile.TemporaryDirectory() as folder:
-        jobs = []
-        for name, table in boxes.items():
-            given, out = Path(folder, f"{name}-boxes.txt"), Path(folder, f"{name}.txt")
-            write(given, table[table[:, 0] <= truths[name][:, 0].max()])
-            job = {"tracker": "SORT", "settings": {}, "boxes": str(given), "interval": 1, "out": str(out)}
-            jobs.append(job | {"length": int(truths[name][:, 0].max())})
-        Path(folder, "jobs.json").write_text(json.dumps(jobs))
-        subprocess.run([PEERS, HERE / "run_trackers.py", Path(folder, "jobs.json")], check=True, capture_output=True)
-        return {name: np.loadtxt(Path(folder, f"{name}.txt"), delimiter=",", ndmin=2) for name in boxes}
+        for name, table in given.items():
+            write(file := Path(folder, f"{name}-boxes.txt"), table)
+            tables.append(Table(file, 1, int(truths[name][:, 0].max())))
+        (found,) = run_peer("SORT", [{}], tables, Path(folder))
+    return {
+        name: np.c_[table[:, 0], identity, table[:, 2:6], np.ones(len(table)), np.full((len(table), 3), -1)][
+            identity > 0
+        ]
+        for (name, table), identity in zip(given.items(), found, strict=True)
+    }
 
 
 def walkers(seed: int, frames: int = 60, people: int = 8) -> np.ndarray:
@@ -143,7 +151,7 @@ def both(folder: Path, truths: Tables, found: dict[str, Tables], ignoring: str, 
             write(folder / "results" / result / "data" / f"{name}.txt", thinned(table, interval))
     (folder / "lengths.json").write_text(json.dumps({n: (f - 1) // interval + 1 for n, f in lengths.items()}))
     benchmark = "MOT17" if ignoring == "removed" else "MOT15"
-    words = [PEERS, HERE / "trackeval_figures.py", folder, folder / "theirs.json", benchmark]
+    words = [PYTHON, HERE / "trackeval_figures.py", folder, folder / "theirs.json", benchmark]
     subprocess.run([str(w) for w in words], check=True)
     theirs = json.loads((folder / "theirs.json").read_text())
     ours = {}

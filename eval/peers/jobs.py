@@ -47,7 +47,7 @@ def write_table(file: Path, table: TrackTable, score: np.ndarray) -> None:
 
 
 def run_peer(peer: str, tried: Sequence[Settings], tables: Sequence[Table], folder: Path) -> list[list[np.ndarray]]:
-    """By settings and table: the identity of each row, 0 for none, and processor seconds in `run_timed`."""
+    """By settings and table: the identity of each row, 0 for none."""
     return [[identity for identity, _ in of] for of in run_timed(peer, tried, tables, folder)]
 
 
