@@ -43,7 +43,7 @@ KINDS = ("motchallenge", "sdd", "cvml")
 INTERVALS = (1, 5, 15, 30)
 SHORT = ("true", "noisy")
 OTHERS = "others"
-AT_EVERY_FRAME = 3
+AT_EVERY_FRAME = 2
 """So many of a peer's settings, the defaults first, are tried at interval 1, where looks are many; ARC-SORT's first."""
 
 QUICK = {"minimum_consecutive_frames": 1}
