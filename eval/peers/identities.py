@@ -146,7 +146,7 @@ def run_peers(
             for tried, found in zip(settings, run_timed(peer, settings, tables, Path(place)), strict=True):
                 scores = [scored(given, *result) for given, result in zip(looks, found, strict=True)]
                 runs.append(Run(tried, dict(zip(sequences, scores, strict=True))))
-            kept.add(condition, interval, peer, key, runs, group(list(sequences)))
+            kept.add(condition, interval, peer, key, runs)
             bench.log(condition, interval, peer, *(f"{np.mean([s.idf1 for s in r.scores.values()]):.1f}" for r in runs))
 
 
@@ -186,7 +186,7 @@ def compare(options: bench.Options) -> tuple[str, Any]:
     check_environments()
     sequences = read(options.data)
     sets = group(list(sequences))
-    kept = KeptPeers(options.keep_peers, list(sequences))
+    kept = KeptPeers(options.keep_peers, sets)
     known_rate = list(dict.fromkeys(at_known_rate(condition) for condition in options.conditions))
     for interval in sorted(options.intervals, reverse=True):
         for condition in known_rate:

@@ -1,7 +1,8 @@
 """What the peers got on tables of detections, kept in a file so that they need not run again.
 
 By table and peer: the run at its defaults, and for each set of sequences the best run of all settings, and the best of
-those that do not know the times of looks. A row of scores is text, IDF1/switches/ms of each sequence, to keep it short.
+those that do not know the times of looks, if that is another. Scores are text to keep the file short: IDF1/switches/ms
+of each sequence.
 """
 
 import json
@@ -49,45 +50,41 @@ def checksum(looks: Iterable[Looks], settings: Sequence[Settings]) -> int:
 
 
 class KeptPeers:
-    """Runs of peers by condition, interval and peer, for the sequences of these names; written after every addition."""
+    """Runs of peers by condition, interval and peer, for these sets of sequences; written after every addition."""
 
-    def __init__(self, path: str | Path | None, names: Sequence[str]) -> None:
-        self.path, self.names = Path(path) if path else None, list(names)
+    def __init__(self, path: str | Path | None, sets: Mapping[str, Sequence[str]]) -> None:
+        self.path, self.sets = Path(path) if path else None, dict(sets)
+        self.names = [name for names in sets.values() for name in names]
         self.found: dict[str, dict[str, Any]] = {}
         if self.path and self.path.exists():
             figures = json.loads(self.path.read_text(encoding="utf-8"))["figures"]
-            self.found = figures["tables"] if figures["sequences"] == self.names else {}
+            self.found = figures["tables"] if figures["sets"] == self.sets else {}
 
     def has(self, condition: str, interval: int, peer: str, key: int) -> bool:
         """Whether these very runs are kept."""
         return self.found.get(table_name(condition, interval), {}).get(peer, {}).get("checksum") == key
 
-    def add(
-        self, condition: str, interval: int, peer: str, key: int, runs: Sequence[Run], sets: Mapping[str, Sequence[str]]
-    ) -> None:
+    def add(self, condition: str, interval: int, peer: str, key: int, runs: Sequence[Run]) -> None:
         """Keep the best of the runs of one peer, the first of which is at its defaults."""
-        entry: dict[str, Any] = {"checksum": key, "defaults": _packed(runs[0], self.names)}
+        entry: dict[str, Any] = {"checksum": key, "defaults": _packed(runs[0], self.names), "tuned": {}, "untimed": {}}
         untimed = [run for run in runs if "times" not in run.settings]
-        for label, choice in (("tuned", runs), ("untimed", untimed)):
-            best = {of: max(choice, key=lambda run, n=names: run.idf1(n).mean()) for of, names in sets.items()}
-            entry[label] = {of: _packed(run, self.names) for of, run in best.items()}
+        for of, names in self.sets.items():
+            best, second = (max(choice, key=lambda run, n=names: run.idf1(n).mean()) for choice in (runs, untimed))
+            entry["tuned"][of] = _packed(best, names)
+            if second is not best:
+                entry["untimed"][of] = _packed(second, names)
         self.found.setdefault(table_name(condition, interval), {})[peer] = entry
         if self.path:
-            bench.write_result(self.path, "", {"sequences": self.names, "tables": self.found})
+            bench.write_result(self.path, "", {"sets": self.sets, "tables": self.found})
 
     def defaults(self, condition: str, interval: int, peer: str) -> Run:
-        """The run at the peer's defaults."""
-        return self._unpacked(self.found[table_name(condition, interval)][peer]["defaults"])
+        """The run at the peer's defaults on all sequences."""
+        return _unpacked(self.found[table_name(condition, interval)][peer]["defaults"], self.names)
 
     def tuned(self, condition: str, interval: int, peer: str, of: str, times: bool) -> Run:
         """The best run on a set, among those that know the times of looks or among the others alone."""
         entry = self.found[table_name(condition, interval)][peer]
-        return self._unpacked(entry["tuned" if times else "untimed"][of])
-
-    def _unpacked(self, packed: Mapping[str, Any]) -> Run:
-        cells = [cell.split("/") for cell in packed["scores"].split()]
-        scores = [Score(float(idf1), int(switches), float(ms)) for idf1, switches, ms in cells]
-        return Run(packed["settings"], dict(zip(self.names, scores, strict=True)))
+        return _unpacked((not times and entry["untimed"].get(of)) or entry["tuned"][of], self.sets[of])
 
 
 def table_name(condition: str, interval: int) -> str:
@@ -98,3 +95,9 @@ def table_name(condition: str, interval: int) -> str:
 def _packed(run: Run, names: Sequence[str]) -> dict[str, Any]:
     scores = (run.scores[name] for name in names)
     return {"settings": run.settings, "scores": " ".join(f"{s.idf1:.2f}/{s.switches}/{s.ms:.2f}" for s in scores)}
+
+
+def _unpacked(packed: Mapping[str, Any], names: Sequence[str]) -> Run:
+    cells = [cell.split("/") for cell in packed["scores"].split()]
+    scores = [Score(float(idf1), int(switches), float(ms)) for idf1, switches, ms in cells]
+    return Run(packed["settings"], dict(zip(names, scores, strict=True)))

@@ -157,13 +157,14 @@ def test_runs_of_peers_are_read_again_until_tables_or_settings_change(study, tru
         for settings, a, b in (({}, 50.0, 60.0), ({"gate": 1}, 70.0, 40.0), ({"times": True}, 90.0, 80.0))
     ]
     path, sets = tmp_path / "kept.json", {"first": ["a"], "second": ["b"]}
-    kept.KeptPeers(path, ["a", "b"]).add("noisy", 5, "SORT", key, runs, sets)
-    again = kept.KeptPeers(path, ["a", "b"])
+    kept.KeptPeers(path, sets).add("noisy", 5, "SORT", key, runs)
+    again = kept.KeptPeers(path, sets)
     assert again.has("noisy", 5, "SORT", key) and not again.has("noisy", 5, "SORT", key + 1)
     assert not again.has("noisy", 15, "SORT", key)
     assert again.defaults("noisy", 5, "SORT") == runs[0]
-    assert again.tuned("noisy", 5, "SORT", "first", times=True) == runs[2]
-    assert again.tuned("noisy", 5, "SORT", "first", times=False) == runs[1]
-    assert again.tuned("noisy", 5, "SORT", "second", times=False) == runs[0]
-    assert not kept.KeptPeers(path, ["a"]).has("noisy", 5, "SORT", key)
-    assert json.loads(path.read_text())["figures"]["sequences"] == ["a", "b"]
+    best, untimed = (again.tuned("noisy", 5, "SORT", "first", times=times) for times in (True, False))
+    assert (best.settings, untimed.settings) == ({"times": True}, {"gate": 1})
+    assert (best.idf1(["a"]), untimed.idf1(["a"])) == (90.0, 70.0)
+    assert again.tuned("noisy", 5, "SORT", "second", times=False).idf1(["b"]) == 60.0
+    assert not kept.KeptPeers(path, {"first": ["a"]}).has("noisy", 5, "SORT", key)
+    assert json.loads(path.read_text())["figures"]["sets"] == sets
