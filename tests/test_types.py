@@ -37,9 +37,18 @@ def test_boxes_of_wrong_shapes_are_refused(xyxy, confidence, message):
 def test_arrays_of_several_columns_are_split_by_name():
     tracks = Tracks(3, np.array([7]), np.array([[1.0, 2, 3, 4]]), np.array([0.5]), np.array([0]))
     columns = tracks.to_columns()
-    assert list(columns) == ["identity", "x_px", "y_px", "width_px", "height_px", "score", "row"]
+    assert list(columns) == ["identity", "x_px", "y_px", "width_px", "height_px", "score", "row", "link"]
     assert columns["width_px"].tolist() == [3] and tracks.id.tolist() == [7] and tracks.xyxy.tolist() == [[1, 2, 4, 6]]
     assert {"east_m", "north_m", "var_north_m2"} <= set(Positions().to_columns())
+
+
+def test_the_confidence_of_a_link_is_unknown_unless_given_and_stays_with_its_row():
+    boxes = np.tile([1.0, 2, 3, 4], (3, 1))
+    known = Tracks(3, np.arange(3) + 1, boxes, np.ones(3), np.arange(3), np.array([np.nan, 0.25, 0.75]))
+    unknown = Tracks(3, np.arange(3) + 1, boxes, np.ones(3), np.arange(3))
+    assert len(Tracks(3).link) == 0 and np.isnan(unknown.link).all()
+    joined = Tracks.concat([known[1:], unknown[:1], known[[2, 1]]])
+    np.testing.assert_array_equal(joined.link, [0.25, 0.75, np.nan, 0.75, 0.25])
 
 
 def test_a_table_becomes_a_pandas_frame_of_its_columns(monkeypatch):

@@ -825,6 +825,8 @@ class Tracks(Boxes):
 
     identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
     row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
+    link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
+    could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
     """
 
     frame: int
@@ -832,6 +834,11 @@ class Tracks(Boxes):
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     score: np.ndarray = field(default_factory=lambda: np.zeros(0))
     row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    link: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if len(self.link) == 0 < len(self.identity):
+            object.__setattr__(self, "link", np.full(len(self.identity), np.nan))
 
     def __len__(self) -> int:
         return len(self.identity)

@@ -18,7 +18,8 @@ def tracked(number=1, targets=2, kind="moving", rate=10.0, **rest):
     area = np.full(seen + 1, 64.0)
     found = Detections(boxes[[*range(seen), targets]], np.full(seen + 1, 0.875), area, heading, speed, kind)
     rows = np.array([*range(seen), -1][:targets], np.int64)
-    tracks = Tracks(number, np.arange(1, targets + 1), boxes[:targets], np.full(targets, 0.875), rows)
+    link = np.where(rows >= 0, 0.75, np.nan)
+    tracks = Tracks(number, np.arange(1, targets + 1), boxes[:targets], np.full(targets, 0.875), rows, link)
     frame = Frame(number, (number - 1) / rate, np.zeros((4, 4), np.uint8), taken_s=rest.pop("taken_s", float("nan")))
     return TrackedFrame(number, frame, found, tracks, **rest)
 

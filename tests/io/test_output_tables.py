@@ -44,7 +44,7 @@ def test_boxes_are_written_to_a_hundredth_of_a_pixel_and_scores_to_six_digits(bo
 def test_every_detection_is_in_the_csv_with_its_line_and_what_became_of_it(tmp_path):
     boxes = np.array([[0, 0, 9, 9], [20, 0, 9, 9], [40, 0, 9, 9.0]])
     given = Detections(boxes[[2, 0]], np.array([0.5, 0.9]), np.zeros(0), np.zeros(0), np.zeros(0), "given")
-    tracks = Tracks(4, np.array([8, 5]), boxes[:2], np.array([0.9, 0.7]), np.array([1, -1]))
+    tracks = Tracks(4, np.array([8, 5]), boxes[:2], np.array([0.9, 0.7]), np.array([1, -1]), np.array([0.625, np.nan]))
     frame = TrackedFrame(4, None, given, tracks, lines=np.array([31, 17]))
     text, rows = written(track_tables(tmp_path), tmp_path, frame)
     assert [(r["identity"], r["kind"], r["row"], r["x_px"]) for r in rows] == [
@@ -53,6 +53,7 @@ def test_every_detection_is_in_the_csv_with_its_line_and_what_became_of_it(tmp_p
         ("", "untracked", "31", "40.00"),
     ]
     assert [(r["heading_deg"], r["speed_px_per_frame"]) for r in rows] == [("", "")] * 3
+    assert [r["link"] for r in rows] == ["0.625", "", ""]
     assert text.count("\n") == 2
 
 

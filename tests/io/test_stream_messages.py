@@ -75,12 +75,12 @@ def test_a_target_has_its_identity_its_box_and_its_place():
     fields = one(located(3), None)
     assert (fields["frame"], fields["time_s"], fields["utc"]) == (3, 0.2, "2020-09-13T12:26:40.450Z")
     first, bridge, loose = fields["targets"]
-    box = {"id": 1, "kind": "moving", "seen": True, "box_px": [10, 20, 30, 40], "score": 0.875}
+    box = {"id": 1, "kind": "moving", "seen": True, "box_px": [10, 20, 30, 40], "score": 0.875, "link": 0.75}
     motion = {"heading_deg": 0.0, "speed_px_per_frame": 1.5, "velocity_m_s": [3, 4]}
     place = {"east_north_m": [0, 0], "covariance_m2": [1, 0, 1], "lonlat_deg": [-110.95, 32.23]}
     assert first == {**box, **motion, **place, "confirmed": "human", "human": 0.75}
-    assert bridge == {"id": 2, "kind": "moving", "seen": False, "box_px": [20, 20, 30, 40], "score": 0.875}
-    assert (loose["id"], loose["heading_deg"], loose["seen"]) == (None, None, True)
+    assert bridge == {**box, "id": 2, "seen": False, "box_px": [20, 20, 30, 40], "link": None}
+    assert (loose["id"], loose["link"], loose["heading_deg"], loose["seen"]) == (None, None, None, True)
     assert [mark["name"] for mark in fields["ground"]["landmarks"]] == list(NAMES)
     assert "lonlat_deg" not in one(located(1, origin=None), None)["targets"][0]
 

@@ -50,6 +50,17 @@ def test_gaps_of_two_frames_are_filled_and_the_identity_survives_longer_ones(gap
         np.testing.assert_allclose(page.box_px, [box(0, k)] * len(page.row) if len(page) else np.zeros((0, 4)))
 
 
+def test_confidence_of_links_stays_with_its_box_and_filled_boxes_have_none():
+    smoother, given = FixedLagSmoother(2, True), [[np.nan, np.nan], [0.9, 0.5], [0.625], [0.25, 0.75], None]
+    for k, link in enumerate(given):
+        numbers = np.arange(2 if link is None else len(link))
+        boxes, scores = np.array([box(number, k) for number in numbers]), np.full(len(numbers), 0.8)
+        smoother.add(k + 1, numbers, boxes, scores, numbers, None, None if link is None else np.array(link))
+    found = [dict(zip(page.identity.tolist(), page.link.tolist(), strict=True)) for page in smoother.settle(True)]
+    wanted = [(np.nan, np.nan), (0.9, 0.5), (0.625, np.nan), (0.25, 0.75), (np.nan, np.nan)]
+    np.testing.assert_array_equal([(page[1], page[2]) for page in found], wanted)
+
+
 @pytest.mark.parametrize("score", [1.0, 0.8])
 def test_filled_boxes_account_for_the_camera(score):
     """The target stands still in the scene: each box is the first one, seen from where the camera then was."""

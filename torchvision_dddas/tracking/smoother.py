@@ -1,5 +1,6 @@
 """Fixed-lag smoothing: decisions are held back while later frames may confirm a track, fill a gap or move a box."""
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
@@ -17,13 +18,17 @@ _WIDTHS = np.array([[2.0], [5.0]])  # sd of the weights of places and of sizes, 
 
 @dataclass
 class _Observation:
-    """A box of a track. index: of the sampled frame, from 0. row: of the frame's detections, -1 in a filled gap."""
+    """A box of a track. index: of the sampled frame, from 0. row: of the frame's detections, -1 in a filled gap.
+
+    link: confidence that the box belongs to the track, NaN if unknown.
+    """
 
     frame: int
     index: int
     box_px: np.ndarray
     score: float
     row: int
+    link: float = math.nan
 
 
 @dataclass
@@ -65,15 +70,21 @@ class FixedLagSmoother:
         score: np.ndarray,
         row: np.ndarray,
         now_from_before: np.ndarray | None,
+        link: np.ndarray | None = None,
     ) -> None:
-        """Add a frame: numbers of tracks (N,), their boxes, scores and rows among the frame's detections."""
+        """Add a frame: numbers of tracks (N,), their boxes, scores and rows among the frame's detections.
+
+        link: (N,) as in Tracks; None: unknown.
+        """
+        links = np.full(len(tracks), np.nan) if link is None else link
         self.steps.append(now_from_before)
         self.has_moved |= now_from_before is not None
         pending = _Pending(frame, self.count)
         self.pending.append(pending)
         self.count += 1
-        for number, box, confidence, at in zip(tracks.tolist(), box_px, score.tolist(), row.tolist(), strict=True):
-            observation = _Observation(frame, pending.index, box, confidence, at)
+        columns = (tracks.tolist(), box_px, score.tolist(), row.tolist(), links.tolist())
+        for number, box, confidence, at, likely in zip(*columns, strict=True):
+            observation = _Observation(frame, pending.index, box, confidence, at, likely)
             self.counts[number] = self.counts.get(number, 0) + 1
             if self.counts[number] >= self.hits or confidence >= 1:
                 self.confirmed.add(number)
@@ -119,6 +130,7 @@ class FixedLagSmoother:
                     np.array([self._smoothed(*item) for item in confirmed.items()], float).reshape(-1, 4),
                     np.array([seen.score for seen in confirmed.values()], float),
                     np.array([seen.row for seen in confirmed.values()], np.int64),
+                    np.array([seen.link for seen in confirmed.values()], float),
                 )
             )
             # Drop what no pending frame can need.

@@ -41,10 +41,15 @@ from torchvision_dddas.types import (
     TrackedFrame,
 )
 
-TRACKS = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION)
+TRACKS = Schema(
+    "tracks",
+    *(FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION),
+    Column("link", ".3f", may_be_empty=True),
+)
 """tracks.csv. kind: `detection`, `bridge` for a box between two detections, `untracked` for one without identity.
 
 row: the detection's line in the file it comes from, or its number in the frame. Heading and speed are over the ground.
+link: as in Tracks, empty where unknown.
 """
 
 _FEET = (Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"))
@@ -113,6 +118,7 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
             "row": [*(lines[row] if row >= 0 else None for row in tracks.row), *(lines[row] for row in loose)],
             "heading_deg": [heading for heading, _ in moves],
             "speed_px_per_frame": [speed for _, speed in moves],
+            "link": [*tracks.link.tolist(), *[None] * len(loose)],
         }
 
     return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, rows)})

@@ -100,16 +100,17 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
 def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
     """The boxes that have an identity, then those that have none."""
     tracks, found = tracked.tracks, tracked.detections
-    columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score)
+    columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score, tracks.link)
     identified = zip(*(column.tolist() for column in columns), strict=True)
-    loose = ((None, row, found.box_px[row].tolist(), float(found.score[row])) for row in tracked.untracked)
-    for identity, row, box, score in [*identified, *loose]:
+    loose = ((None, row, found.box_px[row].tolist(), float(found.score[row]), math.nan) for row in tracked.untracked)
+    for identity, row, box, score, link in [*identified, *loose]:
         fields = {
             "id": identity,
             "kind": found.kind,
             "seen": row >= 0,
             "box_px": _numbers(box, 2),
             "score": _number(score, 4),
+            "link": _number(link, 3),
         }
         if row >= 0:
             heading = float(found.heading_rad[row])
