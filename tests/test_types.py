@@ -17,7 +17,32 @@ def test_boxes_of_another_detector_come_back_as_they_were():
     assert found.box_px.tolist() == [[10, 20, 30, 60], [0, 0, 5, 5]] and found.score.tolist() == [0.5, 0.9]
     assert (found.xyxy == CORNERS).all() and found.kind == "given" and np.isnan(found.heading_rad).all()
     assert Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=None)).score.tolist() == [1, 1]
-    assert len(Detections.from_supervision(SimpleNamespace(xyxy=np.zeros((0, 4)), confidence=np.zeros(0)))) == 0
+    empty = SimpleNamespace(xyxy=np.zeros((0, 4)), confidence=np.zeros(0), class_id=np.zeros(0, int), data={})
+    assert len(Detections.from_supervision(empty)) == len(Detections.from_supervision(empty).label) == 0
+
+
+@pytest.mark.parametrize(
+    ("classes", "label"),
+    [
+        ({}, ["", ""]),
+        ({"class_id": None, "data": {}}, ["", ""]),
+        ({"class_id": np.array([2, 0]), "data": {}}, ["2", "0"]),
+        ({"class_id": np.array([2, 0]), "data": {"class_name": np.array(["car", "person"])}}, ["car", "person"]),
+        ({"data": {"class_name": ["car", None]}}, ["car", ""]),
+    ],
+)
+def test_classes_of_another_detector_stay_with_their_rows(classes, label):
+    found = Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=None, **classes))
+    assert found.label.tolist() == label
+    assert found[::-1].label.tolist() == label[::-1] and found[np.array([False, True])].label.tolist() == label[1:]
+    assert Detections.concat([found, Detections(found.box_px, found.score)]).label.tolist() == [*label, "", ""]
+
+
+def test_classes_go_to_supervision_by_the_names_that_it_has_for_them(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=SimpleNamespace))
+    named = Detections(CORNERS, np.ones(2), label=np.array(["car", ""])).to_supervision()
+    assert named.data["class_name"].tolist() == ["car", ""]
+    assert Detections(CORNERS, np.ones(2)).to_supervision().data == {}
 
 
 @pytest.mark.parametrize(
@@ -34,6 +59,18 @@ def test_boxes_of_wrong_shapes_are_refused(xyxy, confidence, message):
         Detections.from_supervision(SimpleNamespace(xyxy=xyxy, confidence=confidence))
 
 
+@pytest.mark.parametrize(
+    ("classes", "message"),
+    [
+        ({"class_id": np.zeros(3, int)}, r"class_id must have the shape \(2,\), got \(3,\)"),
+        ({"data": {"class_name": ["car"]}}, r"data\['class_name'\] must have the shape \(2,\), got \(1,\)"),
+    ],
+)
+def test_classes_of_wrong_shapes_are_refused(classes, message):
+    with pytest.raises(InputError, match=message):
+        Detections.from_supervision(SimpleNamespace(xyxy=CORNERS, confidence=None, **classes))
+
+
 def test_arrays_of_several_columns_are_split_by_name():
     tracks = Tracks(3, np.array([7]), np.array([[1.0, 2, 3, 4]]), np.array([0.5]), np.array([0]))
     columns = tracks.to_columns()
@@ -47,7 +84,7 @@ def test_the_confidence_of_a_link_is_unknown_unless_given_and_stays_with_its_row
     known = Tracks(3, np.arange(3) + 1, boxes, np.ones(3), np.arange(3), np.array([np.nan, 0.25, 0.75]))
     unknown = Tracks(3, np.arange(3) + 1, boxes, np.ones(3), np.arange(3))
     assert len(Tracks(3).link) == 0 and np.isnan(unknown.link).all()
-    joined = Tracks.concat([known[1:], unknown[:1], known[[2, 1]]])
+    joined = Tracks.concat([known[1:], unknown[:1], known[np.array([2, 1])]])
     np.testing.assert_array_equal(joined.link, [0.25, 0.75, np.nan, 0.75, 0.25])
 
 

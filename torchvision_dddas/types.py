@@ -84,8 +84,9 @@ class Boxes(Table):
             import supervision
         except ImportError:
             raise InputError("to_supervision needs supervision: pip install supervision") from None
-        identity = getattr(self, "identity", None)
-        return supervision.Detections(xyxy=self.xyxy, confidence=self.score, tracker_id=identity)
+        identity, label = getattr(self, "identity", None), getattr(self, "label", None)
+        data = {"class_name": label.astype(str)} if label is not None and any(label.tolist()) else {}
+        return supervision.Detections(xyxy=self.xyxy, confidence=self.score, tracker_id=identity, data=data)
 
 
 def _columns(table: Any) -> dict[str, np.ndarray]:
@@ -303,7 +304,8 @@ class Detections(Boxes):
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
-    middle_px: (N, 2) u, v of the foreground's centroid. Unknown values are NaN.
+    middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. Other unknown
+    values are NaN.
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -313,10 +315,14 @@ class Detections(Boxes):
     speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
     kind: str = "moving"
     middle_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
 
     def __post_init__(self) -> None:
         if len(self.middle_px) == 0 < len(self.box_px):
             object.__setattr__(self, "middle_px", np.full((len(self.box_px), 2), np.nan))
+        if len(self.label) == 0 < len(self.box_px):
+            # Of objects, because one long word would widen each row of an array of characters.
+            object.__setattr__(self, "label", np.full(len(self.box_px), "", object))
 
     def __len__(self) -> int:
         return len(self.box_px)
@@ -325,6 +331,7 @@ class Detections(Boxes):
     def from_supervision(cls, detections: Any) -> Self:
         """Detections of another detector: an object with `xyxy` (N, 4) and `confidence` (N,) or None, in pixels.
 
+        Classes are those of `data["class_name"]` (N,), else of `class_id` (N,), else unknown.
         Raises InputError for other shapes and for boxes without width or height.
         """
         corners = np.asarray(getattr(detections, "xyxy", None), np.float64)
@@ -339,8 +346,15 @@ class Detections(Boxes):
         score = np.ones(len(box_px)) if confidence is None else np.asarray(confidence, np.float64)
         if score.shape != (len(box_px),):
             raise InputError(f"detections.confidence must have the shape ({len(box_px)},), got {score.shape}")
+        name, classes = "data['class_name']", (getattr(detections, "data", None) or {}).get("class_name")
+        if classes is None:
+            name, classes = "class_id", getattr(detections, "class_id", None)
+        label = np.asarray([""] * len(box_px) if classes is None else classes, object)
+        if label.shape != (len(box_px),):
+            raise InputError(f"detections.{name} must have the shape ({len(box_px)},), got {label.shape}")
+        words = np.array(["" if one is None else str(one) for one in label], object)
         unknown = np.full(len(box_px), np.nan)
-        return cls(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
+        return cls(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given", label=words)
 
 
 # How many boxes may lie beyond the extent of a table, and from how many rows on the extent is estimated.
@@ -355,6 +369,7 @@ class DetectionTable:
     line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
     cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
     own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
+    label: (N,) str, the class, empty if unknown; None if not given.
     """
 
     path: str
@@ -367,6 +382,7 @@ class DetectionTable:
     cut: np.ndarray | None = None
     feet_px: np.ndarray | None = None
     ours: bool = False
+    label: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -432,7 +448,9 @@ class DetectionTable:
         here = self.rows(frame)
         box_px = self.box_px[here]
         unknown = np.full(len(box_px), np.nan)
-        return Detections(box_px, self.score[here], box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
+        label = np.zeros(0, object) if self.label is None else self.label[here]
+        area_px = box_px[:, 2] * box_px[:, 3]
+        return Detections(box_px, self.score[here], area_px, unknown, unknown, kind="given", label=label)
 
 
 @dataclass(frozen=True)

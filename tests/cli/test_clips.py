@@ -273,6 +273,15 @@ def test_scores_of_a_table_decide_what_is_tracked_and_are_kept(
     assert (tmp_path / "out/tracks.csv").read_text().count("untracked") == text.count("0.05")
 
 
+def test_classes_of_a_table_are_kept(dddas, file, tmp_path):
+    lines = [f"{n},{4 + n},10,8,24,{'person' if n < 4 else 'cyclist'}\n" for n in (1, 2, 4, 5, 6)]
+    path = file("det.csv", "frame,x_px,y_px,width_px,height_px,class\n" + "".join(lines))
+    dddas("track", "--detections", path, "--out", tmp_path / "out")
+    found = [(row["identity"], row["kind"], row["class"]) for row in rows(tmp_path / "out/tracks.csv")]
+    person, cyclist = ("1", "detection", "person"), ("1", "detection", "cyclist")
+    assert found == [person, person, ("1", "bridge", "person"), cyclist, cyclist, cyclist]
+
+
 def test_the_record_of_a_table_that_begins_late_names_its_first_and_last_frame(dddas, table, tmp_path):
     text = walker(range(501, 560), x=0) + walker(range(502, 560), x=40)
     dddas("track", "--detections", table(text), "--interval", 2, "--out", tmp_path / "out", "--quiet")

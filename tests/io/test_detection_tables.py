@@ -52,6 +52,22 @@ def test_commas_blanks_and_named_columns_mean_the_same(read, text):
     assert (table.frame.tolist(), table.box_px.tolist(), table.score.tolist()) == ([3], [[10, 20, 30, 40]], [0.5])
 
 
+@pytest.mark.parametrize("name", ["class", "class_name", "label"])
+def test_classes_stay_with_their_rows_in_the_order_of_frames(read, name):
+    table = read(f"{NAMED},{name}\n2,1,2,3,4,person\n1,5,6,7,8,\n1,6,6,7,8,car")
+    assert (table.at(1).label.tolist(), table.at(2).label.tolist(), len(table.at(3).label)) == (
+        ["", "car"],
+        ["person"],
+        0,
+    )
+
+
+def test_a_table_without_classes_has_empty_ones(read):
+    assert (
+        read("1,-1,2,3,4,5,0.5,person").at(1).label.tolist() == read(f"{NAMED}\n1,2,3,4,5").at(1).label.tolist() == [""]
+    )
+
+
 @pytest.mark.parametrize("text", ["1,-1,2,3,4,5", "1,-1,2,3,4,5,", f"{NAMED}\n1,2,3,4,5"])
 def test_a_missing_score_is_one_and_motion_is_unknown(read, text):
     found = read(text).at(1)

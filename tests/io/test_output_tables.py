@@ -1,5 +1,7 @@
 """The tables of tracks and people that runs write."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -55,6 +57,21 @@ def test_every_detection_is_in_the_csv_with_its_line_and_what_became_of_it(tmp_p
     assert [(r["heading_deg"], r["speed_px_per_frame"]) for r in rows] == [("", "")] * 3
     assert [r["link"] for r in rows] == ["0.625", "", ""]
     assert text.count("\n") == 2
+
+
+def test_a_bridge_has_the_class_of_the_box_before(tmp_path):
+    boxes = np.array([[0, 0, 9, 9], [20, 0, 9, 9], [40, 0, 9, 9.0]])
+    found = Detections(boxes, np.ones(3), kind="given", label=np.array(["car", "red, large", "dog"]))
+    tracks = Tracks(1, np.array([5, 8]), boxes[:2], np.ones(2), np.array([1, 0]))
+    first = TrackedFrame(1, None, found, tracks)
+    last = TrackedFrame(2, None, Detections(), replace(tracks, row=np.full(2, -1)))
+    _, rows = written(track_tables(tmp_path), tmp_path, first, last)
+    assert [(r["identity"], r["class"]) for r in rows] == [
+        *(("5", "red, large"), ("8", "car"), ("", "dog")),
+        *(("5", "red, large"), ("8", "car")),
+    ]
+    again = read_detections(tmp_path / "tracks.csv")
+    assert again.label is not None and again.at(2).label.tolist() == ["red, large", "car"]
 
 
 def test_heading_and_speed_are_over_the_ground_and_a_frame(tmp_path):

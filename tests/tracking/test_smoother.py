@@ -54,7 +54,7 @@ def test_confidence_of_links_stays_with_its_box_and_filled_boxes_have_none():
     smoother, given = FixedLagSmoother(2, True), [[np.nan, np.nan], [0.9, 0.5], [0.625], [0.25, 0.75], None]
     for k, link in enumerate(given):
         numbers = np.arange(2 if link is None else len(link))
-        boxes, scores = np.array([box(number, k) for number in numbers]), np.full(len(numbers), 0.8)
+        boxes, scores = np.array([box(number, k) for number in numbers.tolist()]), np.full(len(numbers), 0.8)
         smoother.add(k + 1, numbers, boxes, scores, numbers, None, None if link is None else np.array(link))
     found = [dict(zip(page.identity.tolist(), page.link.tolist(), strict=True)) for page in smoother.settle(True)]
     wanted = [(np.nan, np.nan), (0.9, 0.5), (0.625, np.nan), (0.25, 0.75), (np.nan, np.nan)]

@@ -25,6 +25,9 @@ MOT_NAMES = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "scor
 FEET = ("feet_u_px", "feet_v_px")
 """Columns of the point between the feet, from the first pixel's centre."""
 
+CLASS = ("class", "class_name", "label")
+"""Names that the column of classes may have; the first that is there counts."""
+
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
 
@@ -39,15 +42,16 @@ SCHEMA = Schema(
     Column("kind"),
     Column("cut", "d", 0, 1, is_whole=True, may_be_empty=True, wanted="1 where the border cuts it, else 0"),
     *(Column(name, ".2f", -FARTHEST, FARTHEST, may_be_empty=True, wanted="pixels") for name in FEET),
+    *map(Column, CLASS),
 )
 
 
 def read_detections(path: str | Path) -> DetectionTable:
     """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
 
-    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut` and FEET may be there;
-    any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped. A table
-    without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
+    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET and CLASS may be
+    there; any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped.
+    A table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
     range, a few scores outside [0, 1] (see FEW_SHARE).
     """
@@ -71,6 +75,7 @@ def read_detections(path: str | Path) -> DetectionTable:
     identity = parse_numbers(table.columns.get("identity", [""] * len(table)))
     is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
     kinds = set(table.columns.get("kind", ()))
+    label = next((table.columns[name] for name in CLASS if name in table), None)
     order = np.argsort(table["frame"], kind="stable")
     return DetectionTable(
         str(path),
@@ -83,6 +88,7 @@ def read_detections(path: str | Path) -> DetectionTable:
         cut=table["cut"][order] > 0 if "cut" in table else None,
         feet_px=table.stack(*FEET)[order] if set(FEET) <= table.columns.keys() else None,
         ours=kinds == {"moving"} or {"identity", "kind", "row", "speed_px_per_frame"} <= set(table.header),
+        label=None if label is None else np.array(label, object)[order],
     )
 
 

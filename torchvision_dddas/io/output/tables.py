@@ -44,12 +44,12 @@ from torchvision_dddas.types import (
 TRACKS = Schema(
     "tracks",
     *(FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION),
-    Column("link", ".3f", may_be_empty=True),
+    *(Column("link", ".3f", may_be_empty=True), Column("class")),
 )
 """tracks.csv. kind: `detection`, `bridge` for a box between two detections, `untracked` for one without identity.
 
 row: the detection's line in the file it comes from, or its number in the frame. Heading and speed are over the ground.
-link: as in Tracks, empty where unknown.
+link: as in Tracks, empty where unknown. class: of the detection, for a bridge of the identity's box before.
 """
 
 _FEET = (Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"))
@@ -96,6 +96,7 @@ _AERIAL = (
 def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
     """tracks.txt and tracks.csv, with heading and speed since the box before for identities that have one."""
     trails = Trails(length=2)
+    known: dict[int, str] = {}  # class of the latest detection by identity
 
     def motion(identity: int) -> tuple[float, float]:
         trail = trails.places[identity]
@@ -108,6 +109,11 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
         trails.add(tracked)
         tracks, given, loose = tracked.tracks, tracked.detections, tracked.untracked
         lines = tracked.lines if len(tracked.lines) else np.arange(1, len(given) + 1)
+        labels = given.label.tolist()
+        seen = zip(tracks.identity.tolist(), tracks.row.tolist(), strict=True)
+        known.update({identity: labels[row] for identity, row in seen if row >= 0})
+        for identity in known.keys() - trails.places.keys():
+            del known[identity]
         moves = [motion(identity) for identity in tracks.identity.tolist()] + [(math.nan, math.nan)] * len(loose)
         return {
             **_named(BOX, np.concatenate([tracks.box_px, given.box_px[loose]])),
@@ -119,6 +125,7 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
             "heading_deg": [heading for heading, _ in moves],
             "speed_px_per_frame": [speed for _, speed in moves],
             "link": [*tracks.link.tolist(), *[None] * len(loose)],
+            "class": [*(known.get(identity, "") for identity in tracks.identity.tolist()), *(labels[k] for k in loose)],
         }
 
     return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, rows)})
