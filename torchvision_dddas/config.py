@@ -211,32 +211,37 @@ class TrackParameters(Group):
     appearance: Literal["always", "ambiguous", "never"] = parameter(
         "ambiguous", "compare appearance: always, only where locations are ambiguous, or never"
     )
-    min_score: float = parameter(0.7, "detections of a lower score are not tracked", "-", 0, 1)
-    birth_score: float = parameter(0.95, "smallest score of a detection that may start a track", "-", 0, 1)
+    doubt: float = parameter(
+        8.0,
+        "a detection is tracked if its doubt, 1 / score - 1, is at most this many times the usual one",
+        "-",
+        0,
+        1000,
+    )
+    birth_doubt: float = parameter(3.0, "the same of a detection that may start a track", "-", 0, 1000)
     hits: int = parameter(3, "detections that confirm a track; a single one of score 1 is enough", "frames", 1, 60)
     smooth: bool = parameter(True, "move boxes with a score below 1 to the smoothed track")
     memory_frames: int = parameter(125, "how long an unseen track is kept", "frames", 1, 10_000)
     memory_outside_frames: int = parameter(10, "how long a track that left the picture is kept", "frames", 1, 10_000)
-    speed: float = parameter(0.07, "typical speed at the start; adapts to the scene", "heights/frame", 1e-4, 10)
-    agility: float = parameter(0.009, "change of velocity per frame at that speed", "heights/frame", 1e-5, 1)
+    wander: float = parameter(0.45, "change of velocity between looks, as a share of the usual step", "-", 1e-3, 10)
     scatter: float = parameter(0.06, "standard deviation of a detection's centre", "heights", 1e-3, 1)
     size_scatter: float = parameter(0.1, "standard deviation of the logarithm of a detection's height", "-", 1e-3, 10)
-    prior: float = parameter(4.0, "score of any link before comparison; a larger value widens the gate", "-", -20, 20)
     tail: float = parameter(
         4.0, "degrees of freedom of the distance's distribution: few tolerate sharp turns and stops", "-", 0.1, 100
     )
     upright: float = parameter(0.6, "vertical distances of standing targets are divided by this", "-", 0.1, 2)
-    rest_drift: float = parameter(0.03, "drift per frame of an unseen target that may stand still", "heights", 1e-4, 1)
+    crossing: float = parameter(
+        0.2, "share of the targets at the picture's border that come or go in a look", "-", 0, 1
+    )
+    hiding: float = parameter(
+        0.75, "chance that a target that was not detected stays so at the next look", "-", 0.01, 1
+    )
+    rest_drift: float = parameter(0.03, "drift per look of an unseen target that may stand still", "heights", 1e-4, 1)
     rest_price: float = parameter(1.0, "cost of assuming that a lost target stood still", "-", 0, 20)
-    missed: float = parameter(0.5, "cost of a gap in a track", "-", 0, 20)
-    border: float = parameter(4.0, "cost of a return after a gap at the picture's border", "-", 0, 20)
-    left: float = parameter(2.0, "cost of a return after a gap of a target last seen at the border", "-", 0, 20)
-    births: float = parameter(2.0, "cost of a return after a gap where new targets keep appearing", "-", 0, 10)
     own_scatter: float = parameter(0.2, "`scatter` for moving targets that dddas detected", "heights", 1e-3, 1)
     own_size_scatter: float = parameter(
         1.0, "`size_scatter` for moving targets that dddas detected, which split and merge", "-", 1e-3, 10
     )
-    own_births: float = parameter(0.0, "`births` for targets that dddas detected: most are parts of others", "-", 0, 10)
     appearance_weight: float = parameter(10.0, "weight of the similarity of appearance", "-", 0, 100)
     appearance_offset: float = parameter(0.86, "similarity of appearance that is neutral for a link", "-", 0, 1)
 

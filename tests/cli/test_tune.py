@@ -215,7 +215,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         ("--knobs difference.absent", "difference.threshold (0.1 to"),
         ("--knobs registration.keypoints", "is no parameter that can be tuned"),
         ("--knobs=", "names no parameter"),
-        (f"--knobs {THRESHOLD},track.speed", "several families"),
+        (f"--knobs {THRESHOLD},track.wander", "several families"),
         ("--steps 0", "steps must be 1 or more, got 0"),
         ("--pull -1", "pull must be 0 or more, got -1"),
         ("--holdout none*", "fits no clip"),

@@ -65,7 +65,7 @@ TEXT: dict[str, tuple[str, ...]] = {
     ),
     "settings": (
         ('[registration]\nmodel = "affine"\nkeypoints = 300\nquality = 0.02\n[interval]\nminimum_frames = 1\n[small]\n'
-        "on = true\n[live]\npace = 2.0\n[people]\nwindow_width_px = 64\nbins = 9\n[track]\nbirth_score = 0.9\n"),
+        "on = true\n[live]\npace = 2.0\n[people]\nwindow_width_px = 64\nbins = 9\n[track]\nbirth_doubt = 4.0\n"),
     ),
     "overrides": ("registration.keypoints=500", "small.on=true", "registration.model=affine"),
     "scenario": (
@@ -118,7 +118,7 @@ TEXT: dict[str, tuple[str, ...]] = {
         '"interval_frames": 2, "last_frame": 9, "versions": {"torchvision_dddas": "0.1.0"}}'),
     ),
     "studies": (
-        ('name = "all"\ntasks = ["motion", "tracking"]\nconfig = "fast"\nset = ["track.birth_score=0.5"]\n'
+        ('name = "all"\ntasks = ["motion", "tracking"]\nconfig = "fast"\nset = ["track.birth_doubt=4"]\n'
         'backend = "onboard"\ninterval = 2\n[[dataset]]\nkind = "bms"\nfolder = "a"\nclips = ["bms_*"]\n'
         '[[dataset]]\nkind = "kitti"\nfolder = "../kitti"\nclasses = ["Car"]\n'),
     ),

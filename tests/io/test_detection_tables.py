@@ -9,7 +9,6 @@ import pytest
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.detection_tables import (
     MOT_NAMES,
-    check_birth_score,
     check_table,
     read_detections,
     read_header,
@@ -211,10 +210,3 @@ def test_a_table_of_another_clip_or_interval_is_refused():
         check_table(rows_on([1, 5, 6, 9]), 1, clip(5))
     with pytest.raises(InputError, match=r"no row on frames 1, 6, 11, .* --interval 5 .* first is on frame 5"):
         check_table(rows_on([5, 10, 15]), 5)
-
-
-def test_scores_too_low_for_any_track_are_noted_and_others_are_not():
-    (note,) = check_birth_score(rows_on([1, 2], score=0.8), 0.95)
-    assert "det.txt reaches track.birth_score = 0.95" in note
-    for table in (rows_on([1, 2], score=0.95), OWN, rows_on([])):
-        assert check_birth_score(table, 0.95) == []

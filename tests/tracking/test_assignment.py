@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking import assignment
-from torchvision_dddas.tracking.assignment import choose_links, choose_triplets, plausible_links
+from torchvision_dddas.tracking.assignment import choose_links, choose_triplets, link_confidences, plausible_links
 from torchvision_dddas.tracking.dual_ascent import assign_triplets
 
 
@@ -137,6 +137,66 @@ POOR, BRIDGE, BIRTH = {(0, 0): [-5.0, -5.0]}, [[3.0, -5.0]], [[-5.0, 3.0]]
 )
 def test_the_next_frame_decides_between_links_births_and_bridges(links, more, wanted):
     assert chosen(links, **more) == wanted
+
+
+def window(seed):
+    """The arguments of choose_links for up to five targets that walk on, come and go within one look's reach."""
+    random = np.random.default_rng(seed)
+    before = random.uniform(0, 3, (random.integers(1, 6), 2))
+    velocity = random.normal(0, 0.5, before.shape)
+    now = random.permutation(before + velocity + random.normal(0, 0.2, before.shape))[: random.integers(1, 6)]
+    later = (before + 2 * velocity + random.normal(0, 0.2, before.shape))[: random.integers(1, 6)]
+
+    def score(a, b, most):
+        return most - 4 * ((a[:, None] - b) ** 2).sum(axis=2)
+
+    links = score(before, now, 4)
+    tracks, detections = plausible_links(links)
+    onward = score(2 * now[detections] - before[tracks], later, 5)
+    value = links[tracks, detections]
+    return value, tracks, detections, onward, score(now, later, 3), score(before, later, 2)
+
+
+def worth(kept, value, tracks, now, onward, born, bridging):
+    """Scores of the links kept, and of the best pairs with the next frame that follow."""
+    free_now, free_track = np.ones(len(born), bool), np.ones(len(bridging), bool)
+    free_now[now[kept]] = free_track[tracks[kept]] = False
+    further = assignment._NEXT_WEIGHT * np.concatenate([onward[kept], born[free_now], bridging[free_track]])
+    return value[kept].sum() + further[tuple(best_pairs(further).T)].sum()
+
+
+def test_links_are_worth_the_most_of_all_choices_in_nearly_all_windows():
+    shares = []
+    for seed in range(150):
+        arguments = window(seed)
+        _, tracks, now, *_ = arguments
+        choices = [np.zeros(len(tracks), bool)]
+        for link in range(len(tracks)):
+            choices += [
+                np.where(np.arange(len(tracks)) == link, True, kept)
+                for kept in choices
+                if not np.isin(tracks[link], tracks[kept]) and not np.isin(now[link], now[kept])
+            ]
+        best = max(worth(kept, *arguments) for kept in choices)
+        shares.append(worth(choose_links(*arguments), *arguments) / best if best > 0 else 1.0)
+    # The prices close no gap where targets only pair up across three frames.
+    assert np.mean(np.array(shares) > 1 - 1e-6) >= 0.97 and np.min(shares) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("score", "wanted"),
+    [
+        ([[9.0, -40], [-40, 9.0]], [1, 1]),  # far apart
+        ([[9.0, 9], [9, 9]], [0.5, 0.5]),  # crossing: an exchange is as likely
+        ([[9.0, 8], [-40, 9]], [1, 1]),  # the exchange as a whole is unlikely
+        ([[0.0, -40], [-40, 9]], [0.5, 1]),  # no link is as likely
+        ([[9.0, -40, 9], [-40, 9, -40]], [0.5, 1]),  # a free detection is as likely
+        ([[9.0, -40], [-40, 9], [-40, 9]], [1, 0.5]),  # a free track is as likely
+    ],
+)
+def test_a_link_is_as_sure_as_it_is_likelier_than_its_alternatives(score, wanted):
+    np.testing.assert_allclose(link_confidences(np.array(score), np.arange(2), np.arange(2)), wanted, atol=1e-3)
+    assert link_confidences(np.zeros((2, 0)), np.zeros(0, int), np.zeros(0, int)).shape == (0,)
 
 
 def assert_each_target_once(found, shape):

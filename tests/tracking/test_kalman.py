@@ -11,8 +11,8 @@ from torchvision_dddas.tracking.kalman import GG, GROWTH, HEIGHT, PP, PV, SEEN, 
 
 FOCAL = 800.0
 PEOPLE = np.array([[-2.0, 1.5, 12.0], [1.0, 1.6, 20.0], [3.0, 1.4, 9.0]])  # metres: right, down, ahead
-STEPS = np.array([[0.05, 0.0, -0.1], [-0.08, 0.0, 0.06], [0.06, 0.01, 0.0]])  # metres a frame
-AGILITY, SCATTER = 0.009, 0.06
+STEPS = np.array([[0.05, 0.0, -0.1], [-0.08, 0.0, 0.06], [0.06, 0.01, 0.0]])  # metres a look
+WANDER, SCATTER = 0.009, 0.06
 
 
 def filmed(frame: float) -> np.ndarray:
@@ -48,7 +48,7 @@ def assert_possible(state: np.ndarray) -> None:
 
 @pytest.mark.parametrize("gap", [1, 5, 15, 40])
 def test_a_straight_walk_before_a_pinhole_camera_is_predicted_exactly(gap):
-    later = kalman.predict(known(3), 3 + gap, AGILITY)
+    later = kalman.predict(known(3), 3 + gap, WANDER)
     np.testing.assert_allclose(later[:, [X, Y]], centres(filmed(3 + gap)), rtol=0, atol=1e-4)
     np.testing.assert_allclose(later[:, [WIDTH, HEIGHT]], filmed(3 + gap)[:, 2:], rtol=1e-9)
 
@@ -56,8 +56,8 @@ def test_a_straight_walk_before_a_pinhole_camera_is_predicted_exactly(gap):
 def test_velocity_and_growth_are_learned_from_boxes_alone():
     state = kalman.start(filmed(0), 0, SCATTER, 0.07)
     for frame in range(1, 60):
-        state = kalman.update(kalman.predict(state, frame, AGILITY), filmed(frame), frame, SCATTER)
-    ahead = centres(boxes_of(kalman.predict(state, 64, AGILITY))) - centres(filmed(64))
+        state = kalman.update(kalman.predict(state, frame, WANDER), filmed(frame), frame, SCATTER)
+    ahead = centres(boxes_of(kalman.predict(state, 64, WANDER))) - centres(filmed(64))
     stays = centres(filmed(59)) - centres(filmed(64))
     assert (np.hypot(*ahead.T) < 0.15 * np.hypot(*stays.T)).all()
     np.testing.assert_allclose(state[:, GROWTH], known(59)[:, GROWTH], atol=2e-3)
@@ -69,12 +69,12 @@ def test_velocity_and_growth_are_learned_from_boxes_alone():
     st.lists(st.integers(1, 60), min_size=1, max_size=12),
     *(st.floats(1e-4, 0.1), st.floats(1e-3, 1.0), st.floats(1e-3, 10.0)),
 )
-def test_covariances_stay_positive_semidefinite(seed, gaps, agility, scatter, speed):
+def test_covariances_stay_positive_semidefinite(seed, gaps, wander, scatter, speed):
     """Also where the velocity's gain is cut off, so that the usual shrinking of the variance would take too much."""
     random = np.random.default_rng(seed)
     state = kalman.start(filmed(0), 0, scatter, speed)
     for frame in np.cumsum(gaps).tolist():
-        state = kalman.predict(state, frame, agility)
+        state = kalman.predict(state, frame, wander)
         assert_possible(state)
         state = kalman.update(state, boxes_of(state) * np.exp(random.normal(0, 0.2, (3, 4))), frame, scatter)
         assert_possible(state)

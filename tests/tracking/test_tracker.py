@@ -170,7 +170,14 @@ def test_a_table_of_own_detections_is_tracked_like_the_detections_with_and_witho
     alone = list(track_table(table, SETTINGS, 1))
     assert all(sorted(f.tracks.identity.tolist()) == [1, 2] for f in alone)
     assert all(f.tracks.score.tolist() == [0.55, 0.55] for f in alone)
-    assert not found(f.tracks for f in track_table(replace(table, own=False), SETTINGS, 1))
+
+
+@pytest.mark.parametrize("score", [0.8, 0.3, 0.0])
+def test_detections_that_all_have_the_same_score_get_identities_whatever_it_is(score):
+    table = replace(walkers_table(30), score=np.full(60, score))
+    frames = list(track_table(table, SETTINGS, 1))
+    assert_one_identity_a_lane(frames)
+    assert all(sorted(f.tracks.identity.tolist()) == [1, 2] and set(f.tracks.score) == {score} for f in frames)
 
 
 def test_the_public_tracker_equals_the_tracks_of_the_same_table():

@@ -54,7 +54,7 @@ def track(
     from torchvision_dddas.config import load_config
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.detection_tables import check_birth_score, check_table, read_detections
+    from torchvision_dddas.io.detection_tables import check_table, read_detections
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
     from torchvision_dddas.types import is_sampled
 
@@ -71,8 +71,6 @@ def track(
         table = read_detections(detections) if detections is not None else None
         source = open_video(clip, rate_hz=rate) if clip is not None else None
         notes = check_table(table, interval, source) if table is not None else []
-        if table is not None and settings.track.mode == "default":
-            notes += check_birth_score(table, settings.track.birth_score)
         engine = load_engine(backend.value, settings) if source is not None else None
         facts = {
             "input": clip,

@@ -175,11 +175,3 @@ def check_within_clip(table: DetectionTable, source: Source) -> None:
             f"{source.name} ends after frame {source.count} ({is_beyond.sum()} of {len(table)} rows lie beyond); is it "
             "the table of this clip?"
         )
-
-
-def check_birth_score(table: DetectionTable, birth_score: float) -> list[str]:
-    """A note where no row's score is high enough to begin a track."""
-    if not len(table) or table.certain or float(table.score.max()) >= birth_score:
-        return []
-    note = f"no score of {table.path} reaches track.birth_score = {birth_score:g}, so no track begins: lower it with "
-    return [note + "--set, or give the detections.csv if dddas detect wrote them"]

@@ -19,6 +19,7 @@ _LEAST_SCORE = -2.0  # a link of a lower score is not made even if the next fram
 _NEXT_WEIGHT = 0.8  # of the next frame's scores: at 1, a sharp turn is taken for an exchange of identities
 _RIVALS = 6  # links of a track or a detection that are weighed against each other: only stacked boxes have more
 _TIE_BREAK = 1e-6
+_ROUNDS, _CLOSE = 12, 1e-4  # of prices; share of the best choice that it may be below the bound
 _MOST_BRANCHES = 50  # of HiGHS; only stacked boxes need more, and there one choice is as good as another
 # A group with no more columns is searched first, and given to HiGHS after so many steps: with fewer, HiGHS, whose call
 # alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
@@ -49,23 +50,79 @@ def choose_links(
     detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
     leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
+    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
 
-    def likely(further: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rows, columns and weighted scores of the links to the next frame that are worth a column."""
-        further = _without_ties(further)
-        row, k = np.nonzero((further > 0) & _is_leading(further))
-        return row, k, _NEXT_WEIGHT * further[row, k]
+    n, m = len(bridging), len(born)
+    if not len(value):
+        return np.zeros(0, bool)
+    onward, born, bridging = (np.maximum(_NEXT_WEIGHT * further, 0.0) for further in (onward, born, bridging))
+    price = np.zeros(onward.shape[1])
+    best, answer = -np.inf, np.zeros(len(value), bool)
+    place = np.full((n, m), -1)
+    place[tracks, now] = np.arange(len(value))
+    worth = np.zeros((n, m))
+    for _ in range(_ROUNDS):
+        # The next frame's detections cost their price; what they are worth then is added to this frame's links.
+        (ahead, to), (fresh, born_to), (bridged, bridge_to) = (
+            _dearest(rows, price) for rows in (onward, born, bridging)
+        )
+        worth[tracks, now] = np.maximum(value + ahead - fresh[now] - bridged[tracks], 0.0)
+        row, column = linear_sum_assignment(worth, maximize=True)
+        keep = worth[row, column] > 0
+        row, column = row[keep], column[keep]
+        bound = float(worth[row, column].sum() + fresh.sum() + bridged.sum() + price.sum())
+        chosen = place[row, column]
+        free_now, free_track = np.ones(m, bool), np.ones(n, bool)
+        free_now[column], free_track[row] = False, False
+        rows = np.concatenate([onward[chosen], born[free_now], bridging[free_track]])
+        at, k = linear_sum_assignment(rows, maximize=True)
+        found = float(value[chosen].sum() + rows[at, k].sum())
+        if found > best:
+            best, answer = found, np.zeros(len(value), bool)
+            answer[chosen] = True
+        wanted = np.concatenate([to[chosen], born_to[free_now], bridge_to[free_track]])
+        excess = np.bincount(wanted[wanted >= 0], minlength=len(price)) - 1
+        excess[(excess < 0) & (price <= 0)] = 0
+        if bound - best < _CLOSE * max(1.0, best) or not excess.any():
+            break
+        price = np.maximum(price + (bound - best) / float((excess**2).sum()) * excess, 0.0)
+    return answer
 
-    (p, k, later), (j, m, fresh), (i, n, bridged) = map(likely, (onward, born, bridging))
-    parts: list[Any] = [(tracks, now, -1), (tracks[p], now[p], k), (-1, j, m), (i, -1, n)]
-    columns = np.concatenate([np.stack(np.broadcast_arrays(*part), axis=1) for part in parts])
-    score = np.concatenate([value, value[p] + later, fresh, bridged])
-    best, _ = choose_triplets(columns, score, _MOST_BRANCHES)
-    # Each column of a link, alone or with a next detection, stands for that link.
-    links = np.concatenate([np.arange(len(value)), p])
-    chosen = np.zeros(len(value), bool)
-    chosen[links[best[best < len(links)]]] = True
-    return chosen
+
+def link_confidences(
+    score: Float[np.ndarray, "N M"], tracks: Int[np.ndarray, "K"], detections: Int[np.ndarray, "K"]
+) -> Float[np.ndarray, "K"]:
+    """(K,) confidences in [0, 1] of chosen links: .5 where an alternative is as likely.
+
+    score: association scores. The alternatives of a link are no link, another free detection or track, and an exchange
+    of detections with another link.
+    """
+    if not len(tracks):
+        return np.zeros(0)
+    chosen = score[tracks, detections]
+    lead = chosen.copy()
+    free_tracks, free_detections = np.ones(score.shape[0], bool), np.ones(score.shape[1], bool)
+    free_tracks[tracks], free_detections[detections] = False, False
+    if free_detections.any():
+        lead = np.minimum(lead, chosen - score[np.ix_(tracks, free_detections)].max(axis=1))
+    if free_tracks.any():
+        lead = np.minimum(lead, chosen - score[np.ix_(free_tracks, detections)].max(axis=0))
+    if len(tracks) > 1:
+        crossed = score[np.ix_(tracks, detections)]
+        loss = chosen[:, None] + chosen - crossed - crossed.T
+        np.fill_diagonal(loss, np.inf)
+        lead = np.minimum(lead, loss.min(axis=1))
+    return 1 / (1 + np.exp(-np.clip(lead, -50.0, 50.0)))
+
+
+def _dearest(worth: np.ndarray, price: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) the largest worth over price of each row, at least 0, and its column, -1 for none."""
+    if not worth.shape[1]:
+        return np.zeros(len(worth)), np.full(len(worth), -1)
+    left = worth - price
+    column = left.argmax(axis=1)
+    most = left[np.arange(len(left)), column]
+    return np.maximum(most, 0.0), np.where(most > 0, column, -1)
 
 
 def _without_ties(score: np.ndarray) -> np.ndarray:

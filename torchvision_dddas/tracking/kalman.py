@@ -1,10 +1,10 @@
 """Kalman filter of many targets at once: position, velocity, size and growth, at constant velocity.
 
 The velocity is constant in the world, not in the picture: a target that comes nearer grows, and moves faster the larger
-it is. With a growth of γ a frame, after g frames a height h is h / (1 − γ g) and the displacement is v g / (1 − γ g),
+it is. With a growth of γ a look, after g looks a height h is h / (1 − γ g) and the displacement is v g / (1 − γ g),
 exactly for a straight walk at constant speed towards a pinhole camera, or past a camera that drives.
 
-States are (N, COLUMNS) float64 arrays, one row a target, in pixels and frames, or tensors with axes before N. The
+States are (N, COLUMNS) float64 arrays, one row a target, in pixels and looks, or tensors with axes before N. The
 position's variances hold for each of the two axes, which are independent, in squares of the target's height: near
 targets move as far in their own heights as distant ones. The size's are of the logarithm of the height.
 """
@@ -18,12 +18,10 @@ PP, PV, VV = 8, 9, 10  # position, velocity: variances and covariance
 SS, SG, GG = 11, 12, 13  # logarithm of the height, growth
 COLUMNS = 14
 
-USUAL_SPEED = 0.07
-"""Heights a frame; the noise below holds at this speed and scales with it."""
 SIZE_SCATTER = 0.1
 """Default sd of the logarithm of a detection's height."""
-_GROWTH = 0.03  # sd of the growth of a new target, per frame
-_GROWTH_CHANGE = 0.01  # sd of its change in one frame
+_GROWTH = 0.15  # sd of the growth of a new target from look to look, as a share of its usual step
+_GROWTH_CHANGE = 0.4  # sd of the growth's change, as a share of the velocity's
 _WIDTH_GAIN = 0.5
 _FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: no target is predicted nearer than half its distance
 
@@ -32,12 +30,12 @@ Variances = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def start(
-    box_px: np.ndarray, frame: int, scatter: float, speed: float, size_scatter: float = SIZE_SCATTER
+    box_px: np.ndarray, time: float, scatter: float, speed: float, size_scatter: float = SIZE_SCATTER
 ) -> np.ndarray:
     """States of new targets, at rest.
 
     box_px: (N, 4) x, y, width, height. scatter: sd of the centre, in heights. speed: sd of the velocity, in heights a
-    frame. size_scatter: sd of the logarithm of the height.
+    look. size_scatter: sd of the logarithm of the height.
     """
     nothing = 0 * box_px[..., 0]
     return _table(
@@ -45,15 +43,15 @@ def start(
         0 * box_px[..., :2],
         box_px[..., 2:],
         nothing,
-        nothing + frame,
+        nothing + time,
         (nothing + scatter**2, nothing, nothing + speed**2),
-        (nothing + size_scatter**2, nothing, nothing + (_GROWTH * speed / USUAL_SPEED) ** 2),
+        (nothing + size_scatter**2, nothing, nothing + (_GROWTH * speed) ** 2),
     )
 
 
-def predict(state: np.ndarray, frame: int, agility: float) -> np.ndarray:
-    """States at a later frame. agility: sd of the change of velocity in one frame, heights a frame."""
-    gap = frame - state[..., SEEN]
+def predict(state: np.ndarray, time: float, wander: float) -> np.ndarray:
+    """States at a later time. wander: sd of the change of velocity in one look, heights a look."""
+    gap = time - state[..., SEEN]
     stretch = 1 / (1 - namespace(state).clip(gap * state[..., GROWTH], _FARTHEST, _NEAREST))
     return _table(
         state[..., X : Y + 1] + (gap * stretch)[..., None] * state[..., VX : VY + 1],
@@ -61,13 +59,13 @@ def predict(state: np.ndarray, frame: int, agility: float) -> np.ndarray:
         state[..., WIDTH : HEIGHT + 1] * stretch[..., None],
         state[..., GROWTH] * stretch,
         state[..., SEEN],
-        _spread(state, PP, gap, agility**2),
-        _spread(state, SS, gap, (_GROWTH_CHANGE / 0.009 * agility) ** 2),
+        _spread(state, PP, gap, wander**2),
+        _spread(state, SS, gap, (_GROWTH_CHANGE * wander) ** 2),
     )
 
 
 def _spread(state: np.ndarray, first: int, gap: np.ndarray, power: float) -> Variances:
-    """Variances after a gap (N,) of frames, the rate being a random walk of this power."""
+    """Variances after a gap (N,) of looks, the rate being a random walk of this power."""
     place, both, rate = state[..., first], state[..., first + 1], state[..., first + 2]
     return (
         place + gap * (2 * both + gap * (rate + power / 3 * gap)),
@@ -77,14 +75,14 @@ def _spread(state: np.ndarray, first: int, gap: np.ndarray, power: float) -> Var
 
 
 def update(
-    later: np.ndarray, box_px: np.ndarray, frame: int, scatter: float, size_scatter: float = SIZE_SCATTER
+    later: np.ndarray, box_px: np.ndarray, time: float, scatter: float, size_scatter: float = SIZE_SCATTER
 ) -> np.ndarray:
     """Predicted states corrected by their boxes (N, 4).
 
     The velocity's gain is at most two over the gap: one innovation after a long gap says little of the present speed.
     """
     functions = namespace(later)
-    gap = functions.clip(frame - later[..., SEEN], 1, None)
+    gap = functions.clip(time - later[..., SEEN], 1e-3, None)
     (gain, rate_gain), place_variances = _gains(later, PP, scatter**2, 2 / gap)
     innovation = box_px[..., :2] + box_px[..., 2:] / 2 - later[..., : Y + 1]
     (size_gain, growth_gain), size_variances = _gains(later, SS, size_scatter**2, None)
@@ -95,7 +93,7 @@ def update(
         later[..., VX : VY + 1] + rate_gain[..., None] * innovation,
         functions.stack([width, later[..., HEIGHT] * functions.exp(size_gain * size_innovation)], -1),
         later[..., GROWTH] + growth_gain * size_innovation,
-        0 * later[..., SEEN] + frame,
+        0 * later[..., SEEN] + time,
         place_variances,
         size_variances,
     )

@@ -1,30 +1,35 @@
 """The default tracker: association by scores, each frame decided in view of the next one."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from torchvision_dddas.config import Settings
-from torchvision_dddas.geometry import best_pairs
+from torchvision_dddas.config import Settings, TrackParameters
+from torchvision_dddas.geometry import best_pairs, namespace
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.assignment import choose_links, plausible_links
-from torchvision_dddas.tracking.kalman import SEEN, transform_boxes
-from torchvision_dddas.tracking.scores import (
-    SceneState,
-    SpeedPrior,
+from torchvision_dddas.tracking.appearance import (
     appearance_scores,
-    association_scores,
-    birth_rate,
     blend_histograms,
     is_ambiguous,
-    is_near_border,
-    is_remembered,
     similarity,
     visible_shares,
 )
+from torchvision_dddas.tracking.assignment import choose_links, link_confidences, plausible_links
+from torchvision_dddas.tracking.box_motion import FEWEST, believed_shift, candidate_shifts
+from torchvision_dddas.tracking.kalman import HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
+from torchvision_dddas.tracking.scene import Scene
+from torchvision_dddas.tracking.scores import association_scores, common_velocity, is_near_border, newborn_scores
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
 from torchvision_dddas.types import Detections, Table, Tracks
+
+_RECENT = 3  # looks in which a track must have been seen to show how targets move
+_LEAVING_FRAMES, _LEAVING_LOOKS = 15, 3  # for which a target is predicted to go on; later it may have stopped or turned
+_DOUBTS = 500  # detections that the usual doubt is taken of
+_LEAST_DOUBT, _LEAST_SCORE = 0.01, 1e-3
+_LONE_LOOKS = 2  # after which a detection that was not continued stays alone
+_LONE_SHARE = 0.01  # of detections that stay alone, from which a single one confirms no track
 
 
 @dataclass(frozen=True)
@@ -32,15 +37,14 @@ class TrackStates(Table):
     """The tracks that are remembered, one row a track.
 
     state: (N, kalman.COLUMNS) as last seen. signature: (N, D) histograms, zeros where unknown; D is 0 until one is
-    known. at_border: whether last seen at the picture's border. number: of the track, among all that were ever begun.
-    hits: detections so far.
+    known. number: of the track, among all that were ever begun. hits: detections so far. look: when last seen.
     """
 
     state: np.ndarray = field(default_factory=lambda: np.zeros((0, kalman.COLUMNS)))
     signature: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    at_border: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     number: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     hits: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    look: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __len__(self) -> int:
         return len(self.number)
@@ -62,17 +66,19 @@ def _widen(signature: np.ndarray, width: int) -> np.ndarray:
 class _Sample:
     """A frame and those of its detections that count. row: of the frame's detections. step: motion from the one before.
 
-    appearance: gives the (M, D) histograms. interval: frames from the sampled frame before. signature: the histograms,
-    (M, 0) until needed. visible: share of each box.
+    begins: (M,) which may begin a track. appearance: gives the (M, D) histograms. time: in looks. look: its number.
+    signature: the histograms, (M, 0) until needed. visible: share of each box.
     """
 
     frame: int
     box_px: np.ndarray
     score: np.ndarray
     row: np.ndarray
+    begins: np.ndarray
     step: np.ndarray | None
     appearance: Callable[[], np.ndarray] | None
-    interval: int
+    time: float
+    look: int
 
     def __post_init__(self) -> None:
         self.signature, self.visible = np.zeros((len(self.row), 0), np.float32), np.ones(len(self.row))
@@ -84,23 +90,52 @@ class _Sample:
         self.appearance = None
 
 
+class DoubtRule:
+    """Which detections count: those whose doubt is not far above the usual one of the last detections.
+
+    Doubt is 1 / score - 1: the odds that a detection is false, if scores are probabilities.
+    """
+
+    def __init__(self, parameters: TrackParameters) -> None:
+        self.parameters = parameters
+        self._recent: deque[float] = deque(maxlen=_DOUBTS)
+
+    def apply(self, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(M,) which detections of the next look are tracked, and (M,) which may begin a track."""
+        doubt = 1 / np.clip(score, _LEAST_SCORE, 1.0) - 1
+        self._recent.extend(doubt.tolist())
+        # The lower median: if half of the detections are unlikely, the mean of the middle two is nobody's doubt.
+        usual = max(sorted(self._recent)[(len(self._recent) - 1) // 2] if self._recent else 0.0, _LEAST_DOUBT)
+        return doubt <= self.parameters.doubt * usual, doubt <= self.parameters.birth_doubt * usual
+
+
 class ScoreTracker:
     """The state of a run. Feed it frames in order; each call returns the frames that are settled by it, in order.
 
     A frame is settled at most `track.hits` + 2 sampled frames later.
     """
 
-    def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None = None) -> None:
-        """interval: usual distance of the frames fed. size: (width, height) of the picture, None if unknown."""
+    def __init__(
+        self, settings: Settings, interval: int, size: tuple[float, float] | None = None, confirmed: bool = False
+    ) -> None:
+        """interval: usual distance of the frames fed. size: (width, height) of the picture, None if unknown.
+
+        confirmed: whether the detector has confirmed its detections over several frames.
+        """
         self.parameters, self.interval, self.size = settings.track, interval, size
-        self.speed_prior = SpeedPrior(self.parameters.speed)
+        self.scene = Scene(size)
         self.tracks = TrackStates()
+        self.flow = self.tracks.state  # tracks that show how targets move
         self.smoother = FixedLagSmoother(self.parameters.hits, self.parameters.smooth, interval)
-        self.begun = 0
+        self.begun = self._looks = 0
         self._before: _Sample | None = None
         self._waiting: _Sample | None = None
-        # Detections, those of them that are not certain, and tracks begun inside the picture.
-        self.seen = self.doubtful = self.births = 0
+        self._doubts = DoubtRule(settings.track)
+        self._confirmed, self._seen, self._lone = (
+            confirmed,
+            0,
+            0,
+        )  # detections, and those that began no track that lasts
 
     def feed(
         self,
@@ -114,13 +149,14 @@ class ScoreTracker:
 
         now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
         appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, maybe with the
-        next frame. interval: frames from the frame before, where that is not the usual distance.
+        next frame.
         """
-        row = np.flatnonzero(detections.score >= self.parameters.min_score)
+        counts, begins = self._doubts.apply(detections.score)
+        row = np.flatnonzero(counts)
         wanted = None if self.parameters.appearance == "never" else appearance
         box, score = detections.box_px[row], detections.score[row]
-        usual = self.interval if interval is None else interval
-        sample = _Sample(frame, box, score, row, now_from_before, wanted, usual)
+        time, self._looks = frame / self.interval, self._looks + 1
+        sample = _Sample(frame, box, score, row, begins[row], now_from_before, wanted, time, self._looks)
         if self.parameters.appearance == "always":
             sample.examine()
         if not self.parameters.look_ahead:
@@ -141,13 +177,7 @@ class ScoreTracker:
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
         """Link a frame's detections to the tracks, in view of the next frame where there is one."""
         box, parameters = now.box_px, self.parameters
-        if now.step is not None:
-            self.tracks = replace(self.tracks, state=kalman.transform(self.tracks.state, now.step))
-        if self._before is not None:
-            before = self._before.box_px if now.step is None else transform_boxes(self._before.box_px, now.step)
-            self.speed_prior.add(before, box, now.frame - self._before.frame)
-        self.seen += len(now.score)
-        self.doubtful += int((now.score < 1).sum())
+        self._follow_camera(now)
         score = self._scores(self.tracks, now, box)
         unexamined = [near for near in (now, ahead) if near is not None and near.appearance is not None]
         if unexamined and is_ambiguous(score, self.tracks.signature):
@@ -157,10 +187,12 @@ class ScoreTracker:
         tracks, detections = plausible_links(score)
         at_border = is_near_border(box, self.size)
         # Tracks that would begin with each detection, without numbers yet, and those that would go on by each link.
-        state = kalman.start(box, now.frame, parameters.scatter, self.speed_prior.speed, parameters.size_scatter)
+        state = kalman.start(box, now.time, parameters.scatter, self.scene.step, parameters.size_scatter)
+        state[:, VX : VY + 1] = common_velocity(self.flow)
         count = len(box)
-        born = TrackStates(state, now.signature, at_border, np.full(count, -1), np.ones(count, np.int64))
-        continued = self._update(now, tracks, detections, at_border[detections])
+        once, look = np.ones(count, np.int64), np.full(count, now.look)
+        born = TrackStates(state, now.signature, np.full(count, -1), once, look)
+        continued = self._update(now, tracks, detections)
         if ahead is not None and len(ahead.row):
             there = ahead.box_px
             if ahead.step is not None:  # in the coordinates of this frame
@@ -171,53 +203,138 @@ class ScoreTracker:
         else:
             best = best_pairs(score)
             chosen = np.isin(tracks * count + detections, best[:, 0] * count + best[:, 1])
-        self._commit(now, tracks[chosen], detections[chosen], continued[chosen], born)
+        link = link_confidences(score, tracks[chosen], detections[chosen])
+        self._commit(now, tracks[chosen], detections[chosen], continued[chosen], link, born, at_border)
         self._before = now
 
-    def _scene(self, sample: _Sample) -> SceneState:
-        doubt = self.doubtful / max(self.seen, 1)
-        births = birth_rate(self.births, self.seen, doubt, self.interval)
-        return SceneState(sample.frame, sample.interval, self.speed_prior.speed, births, doubt, self.size)
+    def _follow_camera(self, now: _Sample) -> None:
+        """Bring the tracks into the coordinates of a frame, and learn from its boxes."""
+        before = None if self._before is None else self._before.box_px
+        if now.step is not None:
+            self.tracks = replace(self.tracks, state=kalman.transform(self.tracks.state, now.step))
+            before = None if before is None else transform_boxes(before, now.step)
+        known = (self.tracks.hits > 1) & (self.tracks.look >= now.look - _RECENT)
+        self.flow = self.tracks.state[known]
+        if now.step is None and (shift := self._shift(now)) is not None:
+            self.tracks = replace(self.tracks, state=_moved(self.tracks.state, shift))
+            self.flow = _moved(self.flow, shift)
+        self.scene.add_look(before, now.box_px, 1.0 if self._before is None else now.time - self._before.time)
+
+    @property
+    def _trusts_single(self) -> bool:
+        """Whether a single certain detection confirms a track: not where many of these were followed by nothing."""
+        return self._confirmed or self._lone <= _LONE_SHARE * (self._seen + _DOUBTS)
+
+    def _shift(self, now: _Sample) -> np.ndarray | None:
+        """The camera's step that the boxes show beside the tracks' velocities, in pixels; None for none."""
+        recent = self.tracks.look == now.look - 1
+        known = recent & (self.tracks.hits > 1)
+        newborn = bool(known.sum() < FEWEST)
+        tracks, box = self.tracks[recent if newborn else known], now.box_px
+        later = kalman.predict(tracks.state, now.time, 0.0)
+        shifts = candidate_shifts(later[:, : Y + 1], later[:, HEIGHT], box[:, :2] + box[:, 2:] / 2, box[:, 3])
+
+        def scores(shift: np.ndarray) -> np.ndarray:
+            return self._scores(replace(tracks, state=_moved(tracks.state, shift)), now, box)
+
+        return believed_shift(shifts, scores, len(tracks), newborn)
 
     def _scores(self, tracks: TrackStates, sample: _Sample, box_px: np.ndarray) -> np.ndarray:
         """(N, M) scores of tracks and a frame's detections, whose boxes are given in the tracks' coordinates."""
-        score = association_scores(tracks.state, tracks.at_border, box_px, self._scene(sample), self.parameters)
+        score = np.zeros((len(tracks), len(box_px)))
+        if not score.size:
+            return score
+        scene, missed = self.scene.state(sample.time), sample.look - tracks.look - 1
+        old, new = tracks.hits > 1, tracks.hits == 1
+        if old.any():
+            score[old] = association_scores(tracks.state[old], missed[old], box_px, scene, self.parameters)
+        if new.any():
+            score[new] = newborn_scores(tracks.state[new], missed[new], box_px, scene, self.parameters, self.flow)
         if tracks.signature.shape[1] and sample.signature.shape[1]:
             alike = similarity(tracks.signature, sample.signature)
             score += appearance_scores(alike, sample.visible, self.parameters)
         return score
 
-    def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, at_border: np.ndarray) -> TrackStates:
-        """The tracks (K,) after a detection (K,) each, which may be at the border."""
+    def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray) -> TrackStates:
+        """The tracks (K,) after a detection (K,) each."""
         old, box, parameters = self.tracks, now.box_px[detections], self.parameters
-        later = kalman.predict(old.state[tracks], now.frame, self._scene(now).agility(parameters))
-        state = kalman.update(later, box, now.frame, parameters.scatter, parameters.size_scatter)
+        later = kalman.predict(old.state[tracks], now.time, parameters.wander * self.scene.step)
+        state = kalman.update(later, box, now.time, parameters.scatter, parameters.size_scatter)
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], now.signature.shape[1])
         signature, seen = _widen(old.signature, width)[tracks], _widen(now.signature, width)[detections]
         if width:
             signature = blend_histograms(signature, seen, now.visible[detections], hits)
-        return TrackStates(state, signature, at_border, old.number[tracks], hits)
+        return TrackStates(state, signature, old.number[tracks], hits, np.full(len(tracks), now.look))
 
     def _commit(
-        self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, continued: TrackStates, born: TrackStates
+        self,
+        now: _Sample,
+        tracks: np.ndarray,
+        detections: np.ndarray,
+        continued: TrackStates,
+        link: np.ndarray,
+        born: TrackStates,
+        at_border: np.ndarray,
     ) -> None:
         """Give these tracks (K,), now `continued`, these detections (K,); begin new tracks; drop old ones."""
-        new = np.flatnonzero(now.score >= self.parameters.birth_score)
-        new = new[~np.isin(new, detections)]
+        is_free = np.ones(len(now.row), bool)
+        is_free[detections] = False
+        new = np.flatnonzero(is_free & now.begins)
         begun = replace(born[new], number=self.begun + np.arange(len(new)))
         self.begun += len(begun)
-        if self._before is not None:
-            self.births += int((~begun.at_border).sum())
+        births = 0 if self._before is None else int((~at_border[new]).sum())
+        self.scene.add_links(now.look - self.tracks.look[tracks] - 1, births)
         unseen = np.ones(len(self.tracks), bool)
         unseen[tracks] = False
         self.tracks = _join(self.tracks[unseen], continued, begun)
         number, at = np.concatenate([continued.number, begun.number]), np.concatenate([detections, new])
-        self.smoother.add(now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step)
-        keep = is_remembered(self.tracks.state, now.frame, now.interval, self.size, self.parameters)
-        late = now.frame - self.tracks.state[:, SEEN] > (FILLED + 1) * now.interval
+        link = np.concatenate([link, np.full(len(new), np.nan)])
+        self.smoother.add(
+            now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step, link, self._trusts_single
+        )
+        looks = now.look - self.tracks.look
+        self._seen += len(now.row)
+        left_alone = (self.tracks.hits == 1) & (looks == _LONE_LOOKS)
+        place = self.tracks.state[left_alone]
+        sides = place[:, WIDTH : HEIGHT + 1]
+        boxes = np.concatenate([place[:, : Y + 1] - sides / 2, sides], axis=1)
+        self._lone += int((~is_near_border(boxes, self.size)).sum())
+        keep = is_remembered(self.tracks.state, now.time, looks, self.interval, self.size, self.parameters)
+        late = looks > FILLED + 1
         if late.any():  # those that were seen too seldom to be confirmed
             keep &= ~late | self.smoother.are_confirmed(self.tracks.number)
         if not keep.all():
             self.smoother.forget(self.tracks.number[~keep])
             self.tracks = self.tracks[keep]
+
+
+def is_remembered(
+    state: np.ndarray,
+    time: float,
+    looks: np.ndarray,
+    interval: int,
+    size: tuple[float, float] | None,
+    parameters: TrackParameters,
+) -> np.ndarray:
+    """(N,) which tracks are kept after a look; those that have left the picture go earlier.
+
+    state: (N, kalman.COLUMNS) as last seen. time: of the look. looks: (N,) since each was seen. interval: frames a
+    look. Arrays or tensors.
+    """
+    age = time - state[..., SEEN]
+    frames = age * interval
+    keep = frames <= parameters.memory_frames
+    if size is None:
+        return keep
+    going = namespace(state).clip(age, None, max(_LEAVING_FRAMES / interval, _LEAVING_LOOKS))
+    x, y = state[..., X] + going * state[..., VX], state[..., Y] + going * state[..., VY]
+    outside = (x < 0) | (x > size[0]) | (y < 0) | (y > size[1])
+    return keep & (~outside | (frames <= parameters.memory_outside_frames) | (looks <= 1))
+
+
+def _moved(state: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
+    """States at places shifted by (2,) pixels."""
+    state = state.copy()
+    state[:, : Y + 1] += shift_px
+    return state

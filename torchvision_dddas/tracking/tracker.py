@@ -10,9 +10,9 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
+from torchvision_dddas.tracking.appearance import strip_histograms
 from torchvision_dddas.tracking.camera_motion import CameraMotion, Registrar
 from torchvision_dddas.tracking.score_tracker import ScoreTracker
-from torchvision_dddas.tracking.scores import strip_histograms
 from torchvision_dddas.tracking.source_tracker import SourceTracker, rgb_histograms
 from torchvision_dddas.types import (
     Adjustment,
@@ -98,10 +98,12 @@ class Tracker:
             if self._motion is None:
                 self._motion = detections.kind == MOTION
             if self._motion:  # blobs come in parts, with shadows, and joined
-                own = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter, "births": track.own_births}
+                own = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter}
                 settings = settings.model_copy(update={"track": track.model_copy(update=own)})
-            tracker = SourceTracker if track.mode == "paper" else ScoreTracker
-            self._tracker = tracker(settings, self.interval, self.size)
+            if track.mode == "paper":
+                self._tracker = SourceTracker(settings, self.interval, self.size)
+            else:
+                self._tracker = ScoreTracker(settings, self.interval, self.size, confirmed=self._motion)
         self._scores.append(detections.score)
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))

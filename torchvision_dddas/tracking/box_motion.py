@@ -1,0 +1,80 @@
+"""The camera's motion between looks, from the boxes alone: the shift that most tracks have in common.
+
+Tracks learn the camera's motion with their velocities. What remains is its change, and its motion at the first looks,
+when no velocity is known yet. Shifts for which many tracks would land on detections are candidates; one is believed
+only if the links under it are so much likelier than without it. Without that, rows of vehicles alias: each takes the
+place of the next.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
+_MOST = 3  # candidates
+FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
+_LARGEST_SIZE_CHANGE = 0.35
+_FAR_PRICE = 0.02  # votes lost a height, for each track
+_GAIN, _GAIN_EACH, _GAIN_EACH_NEWBORN = 3.0, 1.0, 1.5  # of the links' scores, at least, and for each track
+
+
+def candidate_shifts(
+    place_px: np.ndarray, height_px: np.ndarray, centre_px: np.ndarray, box_height_px: np.ndarray
+) -> list[np.ndarray]:
+    """Shifts (2,) in pixels that bring many predicted places onto detections, the most votes first.
+
+    place_px: (N, 2), height_px: (N,) of the tracks. centre_px: (M, 2), box_height_px: (M,) of the detections.
+    """
+    if len(place_px) < FEWEST or len(centre_px) < FEWEST:
+        return []
+    unit = float(np.median(height_px))
+    offset = (centre_px - place_px[:, None]) / unit
+    alike = np.abs(np.log(box_height_px / height_px[:, None])) < _LARGEST_SIZE_CHANGE
+    track, detection = np.nonzero(alike & (np.abs(offset).max(axis=2) < REACH))
+    votes = offset[track, detection]
+    half = int(np.ceil(REACH / _CELL)) + 1
+    side = 2 * half + 1
+    # A vote counts for its cell and those around it; a track votes once for a cell.
+    around = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
+    cell = np.round(votes / _CELL).astype(int)[:, None] + half + around
+    keys = np.unique((track[:, None] * side + cell[..., 0]) * side + cell[..., 1])
+    count = np.bincount(keys % side**2, minlength=side**2).reshape(side, side)
+    axis = (np.arange(side) - half) * _CELL
+    left = count - _FAR_PRICE * len(place_px) * np.hypot(axis[:, None], axis)
+    found = []
+    for _ in range(_MOST):
+        row, column = np.unravel_index(left.argmax(), left.shape)
+        if count[row, column] < max(FEWEST, _SHARE * len(place_px)):
+            break
+        shift = np.array([axis[row], axis[column]])
+        for width in (1.5 * _CELL, _CELL, _CELL):
+            close = np.abs(votes - shift).max(axis=1) < width
+            if close.sum() >= FEWEST:
+                shift = np.median(votes[close], axis=0)
+        found.append(shift * unit)
+        left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -1.0
+    return found
+
+
+def believed_shift(
+    shifts: list[np.ndarray], scores: Callable[[np.ndarray], np.ndarray], tracks: int, newborn: bool
+) -> np.ndarray | None:
+    """The shift (2,) of these that makes the links so much likelier that it is believed; None if none does.
+
+    scores: (N, M) association scores of the tracks under a shift. tracks: their number N. newborn: whether none has a
+    velocity yet: then rows of vehicles alias most easily.
+    """
+    if not shifts:
+        return None
+    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+
+    least_each = _GAIN_EACH_NEWBORN if newborn else _GAIN_EACH
+
+    def worth(shift: np.ndarray) -> float:
+        score = np.maximum(scores(shift), 0.0)
+        return float(score[linear_sum_assignment(score, maximize=True)].sum())
+
+    still = worth(np.zeros(2))
+    gains = [worth(shift) - still for shift in shifts]
+    best = int(np.argmax(gains))
+    return shifts[best] if gains[best] > _GAIN + least_each * tracks else None

@@ -1,0 +1,100 @@
+"""What a tracker learns of its scene: how far targets move between looks, how many there are, come, and are missed.
+
+Times are in looks, not in frames or seconds, so that nothing depends on a frame rate: at one look a second as at
+thirty, targets move some share of their height from one look to the next, and that share is estimated.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+_STEPS, _PRIOR_STEPS, _LEAST_STEPS = 60, 10, 5  # steps remembered, what the prior is worth, before steps count
+_START_STEP, _LEAST_STEP = 0.3, 0.01  # heights a look
+_NOISE = 1.23  # 75th percentile of a step that is noise alone, by the median change of the log height
+_LEAST_SHARE = 0.25  # of the step as seen, which is never taken for noise alone
+_LOOKS = 30  # over which targets are counted
+_START_MISSING, _PRIOR_LINKS, _FADE = 0.03, 20, 0.99  # how fast older looks fade
+_SHORT = 3  # looks: longer gaps are hidden targets, not misses of the detector
+_PRIOR_DETECTIONS = 30
+_TURNOVER = (0.01, 0.2)
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """What the scores depend on, beside tracks and detections. Numbers, or tensors in tuning.
+
+    time: of the look, in looks. step: usual displacement between looks, in heights. density: targets a square pixel.
+    missing: share of looks at which a target that is there is not detected. turnover: targets that come or go away from
+    the border, a look and target. size: (width, height) of the picture in pixels, None if unknown.
+    """
+
+    time: Any
+    step: Any
+    density: Any
+    missing: Any
+    turnover: Any
+    size: tuple[Any, Any] | None = None
+
+
+class Scene:
+    """Learns what a `SceneState` holds."""
+
+    def __init__(self, size: tuple[float, float] | None) -> None:
+        self.size = size
+        self.step = _START_STEP
+        self._steps: deque[float] = deque(maxlen=_STEPS)
+        self._changes: deque[float] = deque(maxlen=_STEPS)  # of log heights
+        self._counts: deque[int] = deque(maxlen=_LOOKS)
+        self._near, self._far = np.full(2, np.inf), np.full(2, -np.inf)  # corners of all boxes so far
+        self._missed = self._links = 0.0
+        self._births = self._seen = 0
+
+    def add_look(self, before_px: np.ndarray | None, now_px: np.ndarray, gap: float) -> None:
+        """Learn from the boxes (N, 4), (M, 4) of two successive looks, in the same coordinates, `gap` looks apart.
+
+        A step is the distance of mutual nearest neighbours. It needs no identities, so that a wrong estimate cannot
+        confirm itself.
+        """
+        self._counts.append(len(now_px))
+        self._seen += len(now_px)
+        if not len(now_px):
+            return
+        self._near = np.minimum(self._near, now_px[:, :2].min(axis=0))
+        self._far = np.maximum(self._far, (now_px[:, :2] + now_px[:, 2:]).max(axis=0))
+        if before_px is None or not len(before_px):
+            return
+        centre, other = before_px[:, :2] + before_px[:, 2:] / 2, now_px[:, :2] + now_px[:, 2:] / 2
+        distance = np.hypot(centre[:, None, 0] - other[None, :, 0], centre[:, None, 1] - other[None, :, 1])
+        nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
+        mutual = np.flatnonzero(back[nearest] == np.arange(len(before_px)))
+        partner = nearest[mutual]
+        self._steps.extend((distance[mutual, partner] / (before_px[mutual, 3] * gap)).tolist())
+        self._changes.extend(np.abs(np.log(now_px[partner, 3] / before_px[mutual, 3])).tolist())
+        if (known := len(self._steps)) >= _LEAST_STEPS:
+            # Boxes that are not exact change in size as they seem to move: that part is no step.
+            seen, noise = sorted(self._steps)[(3 * known) // 4], _NOISE * float(np.median(self._changes))
+            usual = max(1.25 * math.sqrt(max(seen**2 - noise**2, (_LEAST_SHARE * seen) ** 2)), _LEAST_STEP)
+            share = known / (known + _PRIOR_STEPS)
+            self.step = _START_STEP ** (1 - share) * usual**share
+
+    def add_links(self, missed: np.ndarray, births: int) -> None:
+        """Learn from a look's decisions. missed: (K,) looks without a detection before each link.
+
+        births: tracks that were begun away from the border.
+        """
+        missed = missed[missed <= _SHORT]
+        self._links = _FADE * self._links + len(missed)
+        self._missed = _FADE * self._missed + missed.sum()
+        self._births += births
+
+    def state(self, time: float) -> SceneState:
+        """The state at a time, in looks."""
+        width, height = self._far - self._near if self.size is None else self.size
+        count = float(np.mean(self._counts)) if self._counts else 1.0
+        density = max(count, 0.5) / (width * height) if width > 0 and height > 0 else 1.0
+        missing = (_START_MISSING * _PRIOR_LINKS + self._missed) / (_PRIOR_LINKS + self._missed + self._links)
+        turnover = float(np.clip(self._births / (self._seen + _PRIOR_DETECTIONS), *_TURNOVER))
+        return SceneState(time, self.step, density, missing, turnover, self.size)
