@@ -164,16 +164,15 @@ def measure_f(clip: Clip, settings: Settings) -> float:
 TRACKING = tuple(
     f"track.{name}"
     for name in (
-        "speed",
-        "agility",
+        "wander",
+        "scatter",
+        "size_scatter",
         "tail",
         "upright",
+        "crossing",
+        "hiding",
         "rest_drift",
         "rest_price",
-        "missed",
-        "births",
-        "border",
-        "left",
     )
 )
 PAPER = tuple(f"paper.{name}" for name in ("threshold", "lowest_dispersion", "location_cut", "appearance_cut"))

@@ -36,8 +36,8 @@ class Case:
     change: Callable[[Family], Family] = lambda family: family
 
 
-# Without pictures, births, and whoever hides, these tracking parameters have no effect.
-IDLE_SCORES = "appearance_weight appearance_offset births left border rest_drift rest_price missed"
+# Without pictures, and whoever hides, these tracking parameters have no effect.
+IDLE_SCORES = "appearance_weight appearance_offset rest_drift rest_price hiding"
 IDLE = frozenset(f"track.{name}" for name in IDLE_SCORES.split())
 IDLE_POSITIONS = "aerial.focal_sigma aerial.own_sigma ground.body_height_sigma_m ground.height_sigma ground.feet_sigma"
 CASES = {

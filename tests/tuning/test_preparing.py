@@ -34,7 +34,7 @@ def test_examples_are_of_the_clips_that_are_not_held_out(clips) -> None:
     ("names", "chosen", "line"),
     [
         (["difference.threshold"], ["boxes"], "boxes"),
-        (["difference.threshold", "track.speed"], (), r"motion: difference\.threshold; tracking: track\.speed"),
+        (["difference.threshold", "track.wander"], (), r"motion: difference\.threshold; tracking: track\.wander"),
     ],
 )
 def test_clips_without_truth_and_parameters_of_several_families_are_refused(clips, names, chosen, line) -> None:

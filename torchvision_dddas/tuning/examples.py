@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
+from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.matching import EPSILON, LEAST, pair
 from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth, labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.types import DetectionTable
+from torchvision_dddas.tracking.score_tracker import DoubtRule
+from torchvision_dddas.types import DetectionTable, is_sampled
 
 
 def check_masks(clips: Sequence[Clip], still: bool = False) -> None:
@@ -65,21 +67,22 @@ def boxed_frames(
 class OwnedBoxes(NamedTuple):
     """Boxes with their true identities, ordered by frame; each false alarm has an identity of its own below 0.
 
-    score: (N,), 1 for a certain box. size: (width, height) that holds nearly all boxes, None where there are too few.
-    own: whether they are moving targets that `dddas detect` found.
+    score: (N,), 1 for a certain box. begins: (N,) which may begin a track. size: (width, height) that holds nearly all
+    boxes, None where there are too few. own: whether they are moving targets that `dddas detect` found.
     """
 
     table: TrackTable
     score: np.ndarray
+    begins: np.ndarray
     size: tuple[float, float] | None
     own: bool = False
 
 
-def match_owners(found: DetectionTable, truth: Truth, interval: int, min_score: float) -> OwnedBoxes:
+def match_owners(found: DetectionTable, truth: Truth, interval: int, parameters: TrackParameters) -> OwnedBoxes:
     """Match the detections of frames 1, 1 + interval, ... with the truth as the measures do, by IoU of 0.5 or more.
 
-    min_score: detections below it are left out, where scores are probabilities. Targets that the measures ignore own
-    boxes too. Raises InputError if an identity occurs twice in a frame.
+    Detections that are too doubtful for the tracker are left out. Targets that the measures ignore own boxes too.
+    Raises InputError if an identity occurs twice in a frame.
     """
     assert truth.tracks is not None
     parts = [truth.tracks]
@@ -93,7 +96,11 @@ def match_owners(found: DetectionTable, truth: Truth, interval: int, min_score: 
     named = np.unique(tracks.identity)
 
     score = np.ones(len(found)) if found.certain else found.score
-    rows = np.flatnonzero(((found.frame - 1) % interval == 0) & (score >= min_score))
+    counts, begins, rule = np.zeros(len(found), bool), np.zeros(len(found), bool), DoubtRule(parameters)
+    for number in np.unique(found.frame[is_sampled(found.frame, interval)]).tolist():
+        at = found.rows(number)
+        counts[at], begins[at] = rule.apply(score[at])
+    rows = np.flatnonzero(counts)
     boxes = TrackTable(found.frame[rows], np.arange(len(rows)), found.box_px[rows])
     owner = -1 - np.arange(len(rows))
     for true, here, overlap in pair(tracks, boxes).frames:
@@ -101,7 +108,7 @@ def match_owners(found: DetectionTable, truth: Truth, interval: int, min_score: 
         i, j = linear_sum_assignment(overlap, maximize=True)
         sure = overlap[i, j] > 0
         owner[here[j[sure]]] = named[true[i[sure]]]
-    return OwnedBoxes(boxes._replace(identity=owner), score[rows], found.extent, found.own)
+    return OwnedBoxes(boxes._replace(identity=owner), score[rows], begins[rows], found.extent, found.own)
 
 
 _Record = TypeVar("_Record")

@@ -18,21 +18,17 @@ from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import CameraMotion, kalman
-from torchvision_dddas.tracking.kalman import transform_boxes
-from torchvision_dddas.tracking.scores import (
-    SceneState,
-    SpeedPrior,
+from torchvision_dddas.tracking.appearance import (
     appearance_scores,
-    association_scores,
-    birth_rate,
     blend_histograms,
-    blend_speed,
-    is_near_border,
-    is_remembered,
     similarity,
     strip_histograms,
     visible_shares,
 )
+from torchvision_dddas.tracking.kalman import transform_boxes
+from torchvision_dddas.tracking.scene import Scene, SceneState
+from torchvision_dddas.tracking.score_tracker import is_remembered
+from torchvision_dddas.tracking.scores import association_scores, is_near_border, newborn_scores
 from torchvision_dddas.tracking.smoother import FILLED
 from torchvision_dddas.tuning.examples import OwnedBoxes, boxed_frames, match_owners, stack_padded, true_tracks
 from torchvision_dddas.tuning.family import Example, Family
@@ -82,7 +78,7 @@ class TrackingFamily(Family):
         for start in range(0, len(frames), FRAMES):
             piece = frames[start : start + FRAMES]
             if len(piece) > 1:
-                yield piece[0]["frame"], _stack_frames(piece, settings.track.birth_score)
+                yield piece[0]["frame"], _stack_frames(piece)
 
     def _boxes(self, clip: Clip, settings: Settings) -> OwnedBoxes:
         """The boxes to track. Raises InputError where detections are wanted and the clip has none."""
@@ -91,18 +87,18 @@ class TrackingFamily(Family):
             certain = np.ones(len(table.frame))
             box_px = np.asarray(table.box_px, float)
             extent = DetectionTable("", table.frame, box_px, certain, np.arange(len(certain))).extent
-            return OwnedBoxes(table, certain, extent)
+            return OwnedBoxes(table, certain, certain > 0, extent)
         if clip.given is None:
             raise InputError(
                 f"{clip.name} has no public detections, which tuning for the task 'tracking' needs; leave it out, or "
                 "tune for true boxes: --measure association.tracks.idf1"
             )
         assert clip.truth is not None
-        found = match_owners(read_detections(clip.given), clip.truth, self.interval, settings.track.min_score)
+        found = match_owners(read_detections(clip.given), clip.truth, self.interval, settings.track)
         if not len(found.score):
             raise InputError(
-                f"{clip.given} has no box of score {settings.track.min_score:g} or more on frames 1, "
-                f"{1 + self.interval}, {1 + 2 * self.interval}, ...; lower track.min_score, or leave {clip.name} out"
+                f"{clip.given} has no box that track.doubt = {settings.track.doubt:g} admits on frames 1, "
+                f"{1 + self.interval}, {1 + 2 * self.interval}, ...; raise track.doubt, or leave {clip.name} out"
             )
         return found
 
@@ -111,108 +107,101 @@ class TrackingFamily(Family):
         track = with_tensors(batch[0].settings.track, "track", parameters)
         device = next(iter(parameters.values())).device
         stretches = stack_padded(Stretches, [example.content for example in batch], device, pad="edge")
-        return link_nll(track, stretches, softness, self.missed)
+        return link_nll(track, stretches, self.interval, softness, self.missed)
 
 
 @dataclass(frozen=True)
 class Stretches:
     """Stretches of clips, T frames each, in which box n is always target n; float64 and bool.
 
-    frame: numbers. interval: usual distance of the frames. size: width and height of the picture. usual, known: of the
-    speed prior. births, doubt: as in `SceneState`. box_px: x, y, width, height, any where no target is there. there:
-    whether a target is seen. certain: with the score 1. begins: with a score that may begin a track. step: homographies
-    from the frame before. likeness: of tracks (rows) and boxes, NaN where unknown. visible: shares of the boxes. own:
-    whether the boxes are moving targets that `dddas detect` found.
+    time, step, density, missing, turnover: as in `SceneState`. size: width and height of the picture. box_px: x, y,
+    width, height, any where no target is there. there: whether a target is seen. certain: with the score 1. begins:
+    with a score that may begin a track. motion: homographies from the frame before. likeness: of tracks (rows) and
+    boxes, NaN where unknown. visible: shares of the boxes. own: whether the boxes are moving targets that `dddas
+    detect` found.
     """
 
-    frame: Float[Tensor, "B T"]
-    interval: Float[Tensor, "B"]
+    time: Float[Tensor, "B T"]
+    step: Float[Tensor, "B T"]
+    density: Float[Tensor, "B T"]
+    missing: Float[Tensor, "B T"]
+    turnover: Float[Tensor, "B T"]
     size: Float[Tensor, "B 2"]
-    usual: Float[Tensor, "B T"]
-    known: Float[Tensor, "B T"]
-    births: Float[Tensor, "B T"]
-    doubt: Float[Tensor, "B T"]
     box_px: Float[Tensor, "B T N 4"]
     there: Bool[Tensor, "B T N"]
     certain: Bool[Tensor, "B T N"]
     begins: Bool[Tensor, "B T N"]
-    step: Float[Tensor, "B T 3 3"]
+    motion: Float[Tensor, "B T 3 3"]
     likeness: Float[Tensor, "B T N N"]
     visible: Float[Tensor, "B T N"]
     own: Bool[Tensor, "B"]
 
 
+_OF_BOXES = ("box_px", "there", "certain", "begins", "visible")
+_LEARNED = ("time", "step", "density", "missing", "turnover")
+
+
 def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval: int) -> Iterator[dict[str, Any]]:
-    """The boxes of each frame, and what the tracker knows by then."""
-    speed_prior, before = SpeedPrior(settings.track.speed), None
-    camera = CameraMotion(load_engine("onboard", settings))
-    size = open_clip(clip).size if clip.pictures else boxes.size or (1e6, 1e6)
-    seen, doubtful, births, known = 0, 0, 0, set[int]()
+    """The boxes of each frame, and what the tracker knows of the scene by then if it has followed all targets."""
+    size = open_clip(clip).size if clip.pictures else boxes.size
+    scene, camera = Scene(size), CameraMotion(load_engine("onboard", settings))
+    before: tuple[float, np.ndarray] | None = None
+    seen: dict[int, float] = {}  # when each target that has a track was last seen
     for number, identity, box_px, image in boxed_frames(clip, boxes.table, interval):
-        step = signature = None
+        motion = signature = None
         if image is not None:
-            step, _ = camera.update(image)
+            motion, _ = camera.update(image)
             signature = strip_histograms(image, box_px) if settings.track.appearance != "never" else None
-        score = boxes.score[boxes.table.frame == number]
-        if before is not None:
-            speed_prior.add(before if step is None else transform_boxes(before, step), box_px, interval)
-        seen += len(box_px)
-        doubtful += int((score < 1).sum())
-        doubt = doubtful / max(seen, 1)
+        rows, time = boxes.table.frame == number, number / interval
+        begins = boxes.begins[rows]
+        gap, last = (1.0, None) if before is None else (time - before[0], before[1])
+        scene.add_look(last if last is None or motion is None else transform_boxes(last, motion), box_px, gap)
         yield {
+            **vars(scene.state(time)),
             "frame": number,
             "identity": identity,
             "box_px": box_px,
-            "score": score,
-            "step": np.eye(3) if step is None else step,
+            "certain": boxes.score[rows] >= 1,
+            "begins": begins,
+            "there": True,
+            "visible": visible_shares(box_px),
+            "motion": np.eye(3) if motion is None else motion,
             "signature": signature,
-            "interval": float(interval),
-            "size": np.array(size, float),
-            "usual": speed_prior.usual,
-            "known": float(speed_prior.known),
-            "births": birth_rate(births, seen, doubt, interval),
-            "doubt": doubt,
+            "size": size or (1e6, 1e6),  # unknown: no border on the right and below
             "own": boxes.own,
         }
-        begun = (score >= settings.track.birth_score) & ~np.isin(identity, list(known))
-        births += int((begun & ~is_near_border(box_px, size)).sum()) if before is not None else 0
-        known |= set(identity[begun].tolist())
-        before = box_px
+        followed = np.array([who in seen for who in identity.tolist()], bool)
+        missed = np.array([round(time - seen[who]) - 1 for who in identity[followed].tolist()])
+        births = (begins & ~followed & ~is_near_border(box_px, size)).sum() if before is not None else 0
+        scene.add_links(missed, int(births))
+        seen |= dict.fromkeys(identity[begins | followed].tolist(), time)
+        before = time, box_px
 
 
-def _stack_frames(frames: Sequence[Mapping[str, Any]], birth_score: float) -> dict[str, np.ndarray]:
-    """The fields of `Stretches`. birth_score: of a box that may begin a track."""
+def _stack_frames(frames: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """The fields of `Stretches`."""
     names = np.unique(np.concatenate([frame["identity"] for frame in frames]))
     shape = (len(frames), len(names))
-    box_px, visible, score = np.ones((*shape, 4)), np.ones(shape), np.full(shape, -1.0)
-    likeness = np.full((*shape, len(names)), np.nan)
+    found = {name: np.zeros(shape, bool) for name in _OF_BOXES} | {"box_px": np.ones((*shape, 4))}
+    found |= {"visible": np.ones(shape), "likeness": np.full((*shape, len(names)), np.nan)}
     signature, hits = None, np.zeros(len(names), np.int64)
     for t, frame in enumerate(frames):
         here, seen = np.searchsorted(names, frame["identity"]), frame["signature"]
-        box_px[t, here], score[t, here] = frame["box_px"], frame["score"]
-        visible[t, here] = visible_shares(frame["box_px"])
+        for name in _OF_BOXES:
+            found[name][t, here] = frame[name]
         if seen is not None and len(here):
             if signature is None:
                 signature = np.zeros((len(names), seen.shape[1]))
-            likeness[t][:, here] = similarity(signature, seen)
+            found["likeness"][t][:, here] = similarity(signature, seen)
             hits[here] += 1
-            signature[here] = blend_histograms(signature[here], seen, visible[t, here], hits[here])
-    by_frame = ("frame", "step", "usual", "known", "births", "doubt")
-    return {
-        **{name: np.stack([np.asarray(frame[name], float) for frame in frames]) for name in by_frame},
-        **{name: np.asarray(frames[0][name]) for name in ("interval", "size", "own")},
-        "box_px": box_px,
-        "there": score >= 0,
-        "certain": score >= 1,
-        "begins": (score >= 0) & (score >= birth_score),
-        "likeness": likeness,
-        "visible": visible,
-    }
+            signature[here] = blend_histograms(signature[here], seen, frame["visible"], hits[here])
+    found |= {name: np.stack([np.asarray(frame[name], float) for frame in frames]) for name in (*_LEARNED, "motion")}
+    return found | {"size": np.asarray(frames[0]["size"], float), "own": np.asarray(frames[0]["own"])}
 
 
 @dataclass
 class _Tracks:
-    """The state of all targets. alive: has a track. sure: is no false alarm. left: was last seen at the border.
+    """The state of all targets. alive: has a track. sure: is no false alarm.
 
     All are tensors, which the tracker's formulas take though they are annotated for arrays.
     """
@@ -221,53 +210,63 @@ class _Tracks:
     alive: Any
     hits: Any
     sure: Any
-    left: Any
 
 
 def link_nll(
-    parameters: TrackParameters, stretches: Stretches, softness: float, missed: float = 0.0, wrong: float = 0.0
+    parameters: TrackParameters, stretches: Stretches, interval: int, softness: float, missed: float = 0.0
 ) -> Float[Tensor, "B"]:
     """(B,) negative log-likelihood of the true links, per box that could be linked; in nats at softness 1.
 
-    parameters: numbers or tensors. softness: temperature of the assignment, above 0. missed, wrong: margins, in the
-    unit of scores: an assignment has to be worse than the true one by `missed` for each true link that it lacks and by
-    `wrong` for each other link that it has. Links that are that much better already cost almost nothing, so that the
-    doubtful ones count. Source: Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
+    parameters: numbers or tensors. interval: frames between looks. softness: temperature of the assignment, above 0.
+    missed: margin, in the unit of scores: an assignment has to be worse than the true one by it for each true link that
+    it lacks. Links that are that much better already cost almost nothing, so that the doubtful ones count. Source:
+    Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
+    Unlike in the tracker, neighbours do not tell how a target with a single detection moves.
     """
     mine = _with_own(parameters, stretches.own)
     # The tracker's formulas are annotated for arrays.
     data: Any = stretches
-    has_motion = not bool(torch.equal(data.step, torch.eye(3).to(data.step).expand_as(data.step)))
+    has_motion = not bool(torch.equal(data.motion, torch.eye(3).to(data.motion).expand_as(data.motion)))
     has_likeness = not bool(data.likeness.isnan().all())
+    size = (data.size[:, :1], data.size[:, 1:])
     no = torch.zeros_like(data.there[:, 0])
     tracks: _Tracks | None = None
     scores: list[Tensor] = []
-    true_sum, boxes = (data.frame.new_zeros(len(data.frame)) for _ in range(2))
-    for t in range(data.frame.shape[1]):
+    true_sum, boxes = (data.time.new_zeros(len(data.time)) for _ in range(2))
+    for t in range(data.time.shape[1]):
         box, there = data.box_px[:, t], data.there[:, t]
-        frame, usual, known, doubt = (x[:, t, None] for x in (data.frame, data.usual, data.known, data.doubt))
-        speed = blend_speed(parameters.speed, usual, known)
-        size = (data.size[:, :1], data.size[:, 1:])
-        scene = SceneState(frame, data.interval[:, None], speed, data.births[:, t, None, None], doubt, size)
-        begun: Any = kalman.start(box, frame, mine.scatter, speed, mine.size_scatter)
+        scene = SceneState(**{name: getattr(data, name)[:, t, None] for name in _LEARNED}, size=size)
+        begun: Any = kalman.start(box, scene.time, mine.scatter, scene.step, mine.size_scatter)
         if tracks is None:
-            tracks = _Tracks(begun, no, no.long(), no, no)
+            tracks = _Tracks(begun, no, no.long(), no)
         elif has_motion:
-            tracks.state = kalman.transform(tracks.state, data.step[:, t])
+            tracks.state = kalman.transform(tracks.state, data.motion[:, t])
         if tracks.alive.any():
-            score: Any = association_scores(tracks.state, tracks.left, box, scene, mine)
+            score = _link_scores(tracks, box, scene, mine)
             if has_likeness:
                 score = score + appearance_scores(data.likeness[:, t], data.visible[:, t], parameters)
-            margin = wrong - (wrong + missed) * torch.eye(score.shape[-1]).to(score)
-            scores.append((score + margin).masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf))
+            score = score - missed * torch.eye(score.shape[-1]).to(score)
+            scores.append(score.masked_fill(~(tracks.alive[:, :, None] & there[:, None]), -torch.inf))
             true = tracks.alive & there
-            true_sum = true_sum + torch.where(true, score.diagonal(dim1=1, dim2=2) - missed, 0.0).sum(1)
+            true_sum = true_sum + torch.where(true, score.diagonal(dim1=1, dim2=2), 0.0).sum(1)
             boxes = boxes + torch.where(tracks.alive.any(1), there.sum(1), 0)
-        tracks = _update_tracks(tracks, begun, data, t, scene, mine)
+        tracks = _update_tracks(tracks, begun, data, t, scene, interval, mine)
     if not scores:
         return true_sum
     possible = _drop_empty_rows(_drop_empty_rows(torch.stack(scores, 1)).transpose(-1, -2))
     return (log_partition(possible, softness, _ROUNDS).sum(1) - true_sum) / boxes.clamp(min=1)
+
+
+def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: TrackParameters) -> Any:
+    """(B, N, N) scores of tracks and boxes, without appearance."""
+    given = tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters
+    scores: Any = newborn_scores(*given, flow=tracks.state[0, :0]), association_scores(*given)
+    return torch.where((tracks.hits == 1)[..., None], *scores)
+
+
+def _looks_since(state: Any, scene: SceneState) -> Any:
+    """(B, N) looks since the targets were seen."""
+    return (scene.time - state[..., kalman.SEEN].detach()).round()
 
 
 def _drop_empty_rows(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"]:
@@ -278,30 +277,28 @@ def _drop_empty_rows(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"
 
 
 def _update_tracks(
-    tracks: _Tracks, begun: Any, data: Any, t: int, scene: SceneState, parameters: TrackParameters
+    tracks: _Tracks, begun: Any, data: Any, t: int, scene: SceneState, interval: int, parameters: TrackParameters
 ) -> _Tracks:
-    """The tracks after a frame, each with its own box: `Tracker._commit` on the true links."""
+    """The tracks after a frame, each with its own box: `ScoreTracker._commit` on the true links."""
     box, there, certain = data.box_px[:, t], data.there[:, t], data.certain[:, t]
     linked = there & tracks.alive
     new = there & ~tracks.alive & data.begins[:, t]
-    predicted: Any = kalman.predict(tracks.state, scene.frame, scene.agility(parameters))
-    updated: Any = kalman.update(predicted, box, scene.frame, parameters.scatter, parameters.size_scatter)
+    predicted: Any = kalman.predict(tracks.state, scene.time, parameters.wander * scene.step)
+    updated: Any = kalman.update(predicted, box, scene.time, parameters.scatter, parameters.size_scatter)
     state = torch.where(linked[..., None], updated, torch.where(new[..., None], begun, tracks.state))
     hits = torch.where(new, 1, tracks.hits + linked.long())
     sure = (tracks.sure & ~new) | ((linked | new) & certain) | (hits >= parameters.hits)
+    looks = _looks_since(state, scene)
     last: Any = state.detach()
-    kept: Any = is_remembered(last, scene.frame, scene.interval, scene.size, parameters)
-    late = scene.frame - state[..., kalman.SEEN] > (FILLED + 1) * scene.interval
-    at_border: Any = is_near_border(box, scene.size)
-    left = torch.where(linked | new, at_border, tracks.left)
-    return _Tracks(state, (tracks.alive | new) & kept & (sure | ~late), hits, sure, left)
+    kept: Any = is_remembered(last, scene.time, looks, interval, scene.size, parameters)
+    return _Tracks(state, (tracks.alive | new) & kept & (sure | (looks <= FILLED + 1)), hits, sure)
 
 
 def _with_own(parameters: TrackParameters, own: Bool[Tensor, "B"]) -> TrackParameters:
-    """Scatter (B, 1) and births (B, 1, 1) by whether a stretch's boxes are own targets."""
+    """Scatter (B, 1) by whether a stretch's boxes are own targets."""
     chosen = {}
-    for name in ("scatter", "size_scatter", "births"):
+    for name in ("scatter", "size_scatter"):
         pair = (getattr(parameters, key) for key in (f"own_{name}", name))
         other, usual = (torch.as_tensor(value, dtype=torch.float64, device=own.device) for value in pair)
         chosen[name] = torch.where(own[:, None], other, usual)
-    return TrackParameters.model_construct(**{**dict(parameters), **chosen, "births": chosen["births"][..., None]})
+    return TrackParameters.model_construct(**{**dict(parameters), **chosen})
