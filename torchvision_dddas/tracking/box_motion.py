@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
+_STILL, _STILL_SHARE = 0.15, 0.7  # median heights; share of tracks so near to a detection that no shift is sought
 _MOST = 3  # candidates
 FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
 _LARGEST_SIZE_CHANGE = 0.35
@@ -30,7 +31,10 @@ def candidate_shifts(
     unit = float(np.median(height_px))
     offset = (centre_px - place_px[:, None]) / unit
     alike = np.abs(np.log(box_height_px / height_px[:, None])) < _LARGEST_SIZE_CHANGE
-    track, detection = np.nonzero(alike & (np.abs(offset).max(axis=2) < REACH))
+    away = np.where(alike, np.abs(offset).max(axis=2), np.inf)
+    if (away.min(axis=1) < _STILL).mean() > _STILL_SHARE:
+        return []
+    track, detection = np.nonzero(away < REACH)
     votes = offset[track, detection]
     half = int(np.ceil(REACH / _CELL)) + 1
     side = 2 * half + 1

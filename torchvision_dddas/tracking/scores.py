@@ -77,26 +77,24 @@ def newborn_scores(
     functions = namespace(state)
     gap = scene.time - state[..., SEEN]
     step, noise = scene.step * gap, 2 * parameters.scatter**2
-    parts = []
-
-    def add(weight: float, velocity: Any, deviation: float) -> None:
-        place = state[..., :2] + velocity * gap[..., None]
-        density = _place_density(state, place, noise + (deviation * step) ** 2, box_px, parameters)
-        parts.append(math.log(weight) + density)
-
     common = common_velocity(flow)
     count = min(_NEIGHBOURS, len(flow))
     share = _AS_NEIGHBOURS[0] * count / (count + 2)  # few neighbours say little
     other = (1 - share) / (_AT_REST[0] + _ANYHOW[0])
-    add(other * _AT_REST[0], common, _AT_REST[1])
-    add(other * _ANYHOW[0], common, _ANYHOW[1])
+    # Ways to move: weights, velocities, and standard deviations in steps.
+    ways = [(other * _AT_REST[0], common, _AT_REST[1]), (other * _ANYHOW[0], common, _ANYHOW[1])]
     if count:
         away = np.hypot(flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1])
         nearest = np.argsort(away, axis=1, kind="stable")[:, :count]
-        for neighbour in nearest.T:
-            add(share / count, flow[neighbour, VX : VY + 1], _AS_NEIGHBOURS[1])
-    score = parts[0]
-    for part in parts[1:]:
+        ways += [(share / count, flow[other_one, VX : VY + 1], _AS_NEIGHBOURS[1]) for other_one in nearest.T]
+    place = functions.concatenate([state[..., :2] + velocity * gap[..., None] for _, velocity, _ in ways], -2)
+    variance = functions.concatenate([noise + (deviation * step) ** 2 for *_, deviation in ways], -1)
+    repeated = functions.concatenate([state] * len(ways), -2)
+    density = _place_density(repeated, place, variance, box_px, parameters)
+    rows = state.shape[-2]
+    score = math.log(ways[0][0]) + density[..., :rows, :]
+    for way in range(1, len(ways)):
+        part = math.log(ways[way][0]) + density[..., way * rows : (way + 1) * rows, :]
         score = functions.logaddexp(score, part)
     later = kalman.predict(state, scene.time, parameters.wander * scene.step)
     score = score - _size_penalty(later, box_px, parameters.size_scatter)
