@@ -131,11 +131,8 @@ class ScoreTracker:
         self._before: _Sample | None = None
         self._waiting: _Sample | None = None
         self._doubts = DoubtRule(settings.track)
-        self._confirmed, self._seen, self._lone = (
-            confirmed,
-            0,
-            0,
-        )  # detections, and those that began no track that lasts
+        self._confirmed = confirmed
+        self._seen = self._lone = 0  # detections, and those of them that were followed by nothing
 
     def feed(
         self,
@@ -143,7 +140,6 @@ class ScoreTracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
-        interval: int | None = None,
     ) -> list[Tracks]:
         """Add the detections of a frame, whose number is above the last one's.
 

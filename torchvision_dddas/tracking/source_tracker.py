@@ -308,11 +308,10 @@ class SourceTracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
-        interval: int | None = None,
     ) -> list[Tracks]:
         """Add the detections of a frame, and give them identities at once.
 
-        now_from_before, interval: not used. appearance: gives (N, 768) histograms of the boxes. It is called at most
+        now_from_before: not used. appearance: gives (N, 768) histograms of the boxes. It is called at most
         once, where the dispersion of the locations requires it, maybe while one of the next frames is fed.
         """
         self.window.appendleft(Features(detections.box_px, appearance))

@@ -108,7 +108,7 @@ class Tracker:
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))
         appearance = None if image is None else self._histograms(image, detections.box_px)
-        return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance, interval))
+        return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
         """The frames that are not settled yet, at the end of a run."""
