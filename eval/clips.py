@@ -124,6 +124,7 @@ def frames_of(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
 def identified_clips(data: Path, kinds: Iterable[str]) -> list[Clip]:
     """Clips with true identities of several targets, each name once, of the kind that is named first."""
     found: dict[str, Clip] = {}
+    data = data.resolve()  # a relative path would be read as one inside itself
     for kind in kinds:
         for clip in read(Source(kind, data), data).clips:
             if clip.truth is not None and clip.truth.tracks is not None:
