@@ -1,8 +1,9 @@
-"""Assignment over the triplets that a gate left: track, detection now, detection in the next frame.
+"""Assignment over three layers: tracks, detections now, detections in the next frame.
 
-A column (i, j, k) names a node of each of three layers, -1 for none. Columns that share no node, not even through
-others, fall into groups that are solved one by one: small ones by branch and bound; all large ones at once by linear
-programming, and where that leaves fractions by integer programming (HiGHS).
+The default tracker chooses its links by prices of the next frame's detections (`choose_links`). The source's triplets
+are chosen exactly (`choose_triplets`): a column (i, j, k) names a node of each of three layers, -1 for none. Columns
+that share no node, not even through others, fall into groups that are solved one by one: small ones by branch and
+bound; all large ones at once by linear programming, and where that leaves fractions by integer programming (HiGHS).
 """
 
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Bool, Float, Int
 
 if TYPE_CHECKING:
@@ -20,7 +22,6 @@ _NEXT_WEIGHT = 0.8  # of the next frame's scores: at 1, a sharp turn is taken fo
 _RIVALS = 6  # links of a track or a detection that are weighed against each other: only stacked boxes have more
 _TIE_BREAK = 1e-6
 _ROUNDS, _CLOSE = 12, 1e-4  # of prices; share of the best choice that it may be below the bound
-_MOST_BRANCHES = 50  # of HiGHS; only stacked boxes need more, and there one choice is as good as another
 # A group with no more columns is searched first, and given to HiGHS after so many steps: with fewer, HiGHS, whose call
 # alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
 _SEARCH_COLUMNS, _SEARCH_STEPS = 200, 1000
@@ -43,15 +44,17 @@ def choose_links(
     born: Float[np.ndarray, "M L"],
     bridging: Float[np.ndarray, "N L"],
 ) -> Bool[np.ndarray, "P"]:
-    """Which links belong to the disjoint triplets with the largest sum of scores (K = 3, one frame of delay).
+    """Which links belong to disjoint triplets with a large sum of scores (K = 3, one frame of delay).
+
+    Prices of the next frame's detections (Lagrange multipliers of "each at most once") leave a two-frame assignment,
+    which is solved in a few rounds. The best choice so far is returned: the largest sum in nearly all windows, as the
+    prices' bound shows, but not always.
 
     value, tracks, now: scores, tracks and detections of the plausible links of this frame. Scores to the L detections
     of the next frame: onward, of the tracks after these links; born, of tracks that would begin with each of the M
     detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
     leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
-    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
-
     n, m = len(bridging), len(born)
     if not len(value):
         return np.zeros(0, bool)
@@ -67,15 +70,13 @@ def choose_links(
             _dearest(rows, price) for rows in (onward, born, bridging)
         )
         worth[tracks, now] = np.maximum(value + ahead - fresh[now] - bridged[tracks], 0.0)
-        row, column = linear_sum_assignment(worth, maximize=True)
-        keep = worth[row, column] > 0
-        row, column = row[keep], column[keep]
+        row, column = best_pairs(worth).T
         bound = float(worth[row, column].sum() + fresh.sum() + bridged.sum() + price.sum())
         chosen = place[row, column]
         free_now, free_track = np.ones(m, bool), np.ones(n, bool)
         free_now[column], free_track[row] = False, False
         rows = np.concatenate([onward[chosen], born[free_now], bridging[free_track]])
-        at, k = linear_sum_assignment(rows, maximize=True)
+        at, k = best_pairs(rows).T
         found = float(value[chosen].sum() + rows[at, k].sum())
         if found > best:
             best, answer = found, np.zeros(len(value), bool)

@@ -10,7 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
+from torchvision_dddas.geometry import best_pairs
+
+_REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
 _STILL, _STILL_SHARE = 0.15, 0.7  # median heights; share of tracks so near to a detection that no shift is sought
 _MOST = 3  # candidates
 FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
@@ -34,9 +36,9 @@ def candidate_shifts(
     away = np.where(alike, np.abs(offset).max(axis=2), np.inf)
     if (away.min(axis=1) < _STILL).mean() > _STILL_SHARE:
         return []
-    track, detection = np.nonzero(away < REACH)
+    track, detection = np.nonzero(away < _REACH)
     votes = offset[track, detection]
-    half = int(np.ceil(REACH / _CELL)) + 1
+    half = int(np.ceil(_REACH / _CELL)) + 1
     side = 2 * half + 1
     # A vote counts for its cell and those around it; a track votes once for a cell.
     around = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
@@ -70,13 +72,11 @@ def believed_shift(
     """
     if not shifts:
         return None
-    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
-
     least_each = _GAIN_EACH_NEWBORN if newborn else _GAIN_EACH
 
     def worth(shift: np.ndarray) -> float:
-        score = np.maximum(scores(shift), 0.0)
-        return float(score[linear_sum_assignment(score, maximize=True)].sum())
+        score = scores(shift)
+        return float(score[tuple(best_pairs(score).T)].sum())
 
     still = worth(np.zeros(2))
     gains = [worth(shift) - still for shift in shifts]

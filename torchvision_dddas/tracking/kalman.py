@@ -75,11 +75,18 @@ def _spread(state: np.ndarray, first: int, gap: np.ndarray, power: float) -> Var
 
 
 def update(
-    later: np.ndarray, box_px: np.ndarray, time: float, scatter: float, size_scatter: float = SIZE_SCATTER
+    later: np.ndarray,
+    box_px: np.ndarray,
+    time: float,
+    scatter: float,
+    size_scatter: float = SIZE_SCATTER,
+    is_cut: np.ndarray | bool = False,
 ) -> np.ndarray:
     """Predicted states corrected by their boxes (N, 4).
 
     The velocity's gain is at most two over the gap: one innovation after a long gap says little of the present speed.
+    is_cut: (N,) whether the picture's border may cut the box. As such a target crosses the border it grows or shrinks
+    in the picture, but comes no nearer: it keeps no growth.
     """
     functions = namespace(later)
     gap = functions.clip(time - later[..., SEEN], 1e-3, None)
@@ -92,7 +99,7 @@ def update(
         later[..., : Y + 1] + gain[..., None] * innovation,
         later[..., VX : VY + 1] + rate_gain[..., None] * innovation,
         functions.stack([width, later[..., HEIGHT] * functions.exp(size_gain * size_innovation)], -1),
-        later[..., GROWTH] + growth_gain * size_innovation,
+        (later[..., GROWTH] + growth_gain * size_innovation) * (1.0 - 1.0 * is_cut),
         0 * later[..., SEEN] + time,
         place_variances,
         size_variances,

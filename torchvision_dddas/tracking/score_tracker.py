@@ -18,7 +18,7 @@ from torchvision_dddas.tracking.appearance import (
 )
 from torchvision_dddas.tracking.assignment import choose_links, link_confidences, plausible_links
 from torchvision_dddas.tracking.box_motion import FEWEST, believed_shift, candidate_shifts
-from torchvision_dddas.tracking.kalman import GROWTH, HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
+from torchvision_dddas.tracking.kalman import HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
 from torchvision_dddas.tracking.scene import Scene
 from torchvision_dddas.tracking.scores import association_scores, common_velocity, is_near_border, newborn_scores
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
@@ -255,9 +255,9 @@ class ScoreTracker:
         """The tracks (K,) after a detection (K,) each."""
         old, box, parameters = self.tracks, now.box_px[detections], self.parameters
         later = kalman.predict(old.state[tracks], now.time, parameters.wander * self.scene.step)
-        state = kalman.update(later, box, now.time, parameters.scatter, parameters.size_scatter)
-        # The border cuts boxes: as targets cross it, they grow or shrink in the picture, but come no nearer.
-        state[is_near_border(box, self.size), GROWTH] = 0.0
+        state = kalman.update(
+            later, box, now.time, parameters.scatter, parameters.size_scatter, is_near_border(box, self.size)
+        )
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], now.signature.shape[1])
         signature, seen = _widen(old.signature, width)[tracks], _widen(now.signature, width)[detections]

@@ -86,7 +86,7 @@ def newborn_scores(
     if count:
         away = np.hypot(flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1])
         nearest = np.argsort(away, axis=1, kind="stable")[:, :count]
-        ways += [(share / count, flow[other_one, VX : VY + 1], _AS_NEIGHBOURS[1]) for other_one in nearest.T]
+        ways += [(share / count, flow[neighbour, VX : VY + 1], _AS_NEIGHBOURS[1]) for neighbour in nearest.T]
     place = functions.concatenate([state[..., :2] + velocity * gap[..., None] for _, velocity, _ in ways], -2)
     variance = functions.concatenate([noise + (deviation * step) ** 2 for *_, deviation in ways], -1)
     repeated = functions.concatenate([state] * len(ways), -2)

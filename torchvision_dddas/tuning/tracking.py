@@ -284,7 +284,8 @@ def _update_tracks(
     linked = there & tracks.alive
     new = there & ~tracks.alive & data.begins[:, t]
     predicted: Any = kalman.predict(tracks.state, scene.time, parameters.wander * scene.step)
-    updated: Any = kalman.update(predicted, box, scene.time, parameters.scatter, parameters.size_scatter)
+    is_cut: Any = is_near_border(box, scene.size)
+    updated: Any = kalman.update(predicted, box, scene.time, parameters.scatter, parameters.size_scatter, is_cut)
     state = torch.where(linked[..., None], updated, torch.where(new[..., None], begun, tracks.state))
     hits = torch.where(new, 1, tracks.hits + linked.long())
     sure = (tracks.sure & ~new) | ((linked | new) & certain) | (hits >= parameters.hits)
