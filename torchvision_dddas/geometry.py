@@ -222,7 +222,7 @@ def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[
     # much as the rest of a run onboard: it is loaded when two rows have the same best column.
     tall = cost.shape[0] > cost.shape[1]
     best = (cost.T if tall else cost).argmin(axis=1) if cost.size else np.zeros(0, np.int64)
-    if len(np.unique(best)) == len(best):
+    if len(set(best.tolist())) == len(best):
         if not tall:
             return np.arange(len(best)), best
         order = np.argsort(best)
@@ -241,12 +241,13 @@ def best_pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.nd
     score = np.asarray(score, float)
     if score.ndim != 2:
         raise InputError(f"best_pairs needs a matrix of scores (N, M); got shape {score.shape}. Give one row a target.")
-    if np.isnan(score).any() or np.isposinf(score).any():
+    if score.size and not score.max() < np.inf:  # a NaN is not either
         raise InputError("best_pairs needs scores below infinity; got NaN or +inf. Forbid a pair with -inf.")
     # A forbidden pair counts as unpaired, so that a full matching always exists.
-    gain = np.where(score > max(least, 0.0), score, 0.0)
+    fits = score > max(least, 0.0)
+    gain = np.where(fits, score, 0.0)
     # Rows and columns that fit nothing are left out: this spares SciPy in most calls.
-    rows, columns = np.flatnonzero((gain > 0).any(axis=1)), np.flatnonzero((gain > 0).any(axis=0))
+    rows, columns = np.flatnonzero(fits.any(axis=1)), np.flatnonzero(fits.any(axis=0))
     row, column = cheapest(-gain[np.ix_(rows, columns)])
     row, column = rows[row], columns[column]
     used = gain[row, column] > 0

@@ -5,7 +5,7 @@ import pytest
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.box_motion import believed_shift, candidate_shifts
+from torchvision_dddas.tracking.box_motion import candidate_shifts, likelier_shift
 from torchvision_dddas.tracking.kalman import HEIGHT, X, Y
 from torchvision_dddas.tracking.scene import SceneState
 from torchvision_dddas.tracking.scores import association_scores, newborn_scores
@@ -28,17 +28,18 @@ def found(before: np.ndarray, now: np.ndarray, newborn: bool = False) -> np.ndar
     state = kalman.start(boxes(before), -1, KNOBS.scatter, SCENE.step)
     if not newborn:
         state = kalman.update(kalman.predict(state, 0, KNOBS.wander * SCENE.step), boxes(before), 0, KNOBS.scatter)
-    flow = np.zeros((0, kalman.COLUMNS))
+    at_rest = np.zeros((1, len(state), 2))
 
     def scores(shift: np.ndarray) -> np.ndarray:
         moved = state.copy()
         moved[:, : Y + 1] += shift
         if newborn:
-            return newborn_scores(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS, flow)
+            return newborn_scores(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS, at_rest)
         return association_scores(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS)
 
     shifts = candidate_shifts(state[:, [X, Y]], state[:, HEIGHT], now, np.full(len(now), 80.0))
-    return believed_shift(shifts, scores, len(state), newborn)
+    chosen = likelier_shift(scores(np.zeros(2)), [scores(shift) for shift in shifts], newborn) if shifts else None
+    return None if chosen is None else shifts[chosen]
 
 
 @pytest.mark.parametrize("newborn", [False, True])

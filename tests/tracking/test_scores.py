@@ -12,7 +12,13 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import HEIGHT, VX, VY, WIDTH, X, Y
 from torchvision_dddas.tracking.scene import SceneState
-from torchvision_dddas.tracking.scores import association_scores, common_velocity, is_near_border, newborn_scores
+from torchvision_dddas.tracking.scores import (
+    association_scores,
+    common_velocity,
+    is_near_border,
+    likely_velocities,
+    newborn_scores,
+)
 
 KNOBS = Settings().track
 SCENE = SceneState(time=5, step=0.1, density=5 / 1e6, missing=0.1, turnover=0.02, size=(1250.0, 800.0))
@@ -38,8 +44,12 @@ def scored(boxes, state=None, scene=SCENE, missed=0) -> list[float]:
 def first(boxes, flow=None, scene=SCENE, missed=0, box=PERSON) -> list[float]:
     """The scores of links of a track with one detection."""
     state = kalman.start(box[None], scene.time - 1 - missed, KNOBS.scatter, scene.step)
-    flow = np.zeros((0, kalman.COLUMNS)) if flow is None else flow
-    return newborn_scores(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS, flow)[0].tolist()
+    velocities = ways(state, np.zeros((0, kalman.COLUMNS)) if flow is None else flow)
+    return newborn_scores(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS, velocities)[0].tolist()
+
+
+def ways(state: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    return likely_velocities(state, flow, common_velocity(flow))
 
 
 def moved(*steps: tuple[float, float], box: np.ndarray = PERSON) -> np.ndarray:
@@ -79,7 +89,7 @@ def test_no_tracks_or_no_boxes_give_an_empty_table(tracks, boxes):
     state, boxes_px = np.repeat(track(), tracks, axis=0), np.tile(PERSON, (boxes, 1))
     none = np.zeros(tracks)
     assert association_scores(state, none, boxes_px, SCENE, KNOBS).shape == (tracks, boxes)
-    assert newborn_scores(state, none, boxes_px, SCENE, KNOBS, track()).shape == (tracks, boxes)
+    assert newborn_scores(state, none, boxes_px, SCENE, KNOBS, ways(state, track())).shape == (tracks, boxes)
 
 
 def test_a_walker_may_have_stopped_only_during_a_gap():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from torchvision_dddas.tracking.kalman import transform_boxes
-from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother, smooth_box
+from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother, smooth_boxes
 from torchvision_dddas.types import Tracks
 
 PAN = np.array([[1.0, 0, 7], [0, 1, -3], [0, 0, 1]])
@@ -130,4 +130,5 @@ def test_a_straight_walk_is_hardly_changed_whatever_is_missing(seen, at, growth)
     steps = np.array(sorted(seen), float)
     near = np.clip(at, steps[0], steps[-1])
     # The tolerance is for the faint pull to no slope, where the steps are few and all on one side.
-    np.testing.assert_allclose(smooth_box(walk(steps, growth), steps, near), walk([near], growth)[0], atol=0.6)
+    found = smooth_boxes(walk(steps, growth), steps - near, np.array([0]))
+    np.testing.assert_allclose(found, walk([near], growth), atol=0.6)

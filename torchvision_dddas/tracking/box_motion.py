@@ -6,7 +6,7 @@ only if the links under it are so much likelier than without it. Without that, r
 place of the next.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -57,28 +57,19 @@ def candidate_shifts(
             close = np.abs(votes - shift).max(axis=1) < width
             if close.sum() >= FEWEST:
                 shift = np.median(votes[close], axis=0)
-        found.append(shift * unit)
+        if np.abs(shift).max() > _STILL:
+            found.append(shift * unit)
         left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -1.0
     return found
 
 
-def believed_shift(
-    shifts: list[np.ndarray], scores: Callable[[np.ndarray], np.ndarray], tracks: int, newborn: bool
-) -> np.ndarray | None:
-    """The shift (2,) of these that makes the links so much likelier that it is believed; None if none does.
+def likelier_shift(still: np.ndarray, moved: Sequence[np.ndarray], newborn: bool) -> int | None:
+    """Which of one or more shifts makes the links so much likelier that it is believed; None if none does.
 
-    scores: (N, M) association scores of the tracks under a shift. tracks: their number N. newborn: whether none has a
+    still: (N, M) association scores without a shift. moved: the scores under each. newborn: whether no track has a
     velocity yet: then rows of vehicles alias most easily.
     """
-    if not shifts:
-        return None
+    before, *after = (float(score[tuple(best_pairs(score).T)].sum()) for score in (still, *moved))
+    best = int(np.argmax(after))
     least_each = _GAIN_EACH_NEWBORN if newborn else _GAIN_EACH
-
-    def worth(shift: np.ndarray) -> float:
-        score = scores(shift)
-        return float(score[tuple(best_pairs(score).T)].sum())
-
-    still = worth(np.zeros(2))
-    gains = [worth(shift) - still for shift in shifts]
-    best = int(np.argmax(gains))
-    return shifts[best] if gains[best] > _GAIN + least_each * tracks else None
+    return best if after[best] - before > _GAIN + least_each * len(still) else None

@@ -9,6 +9,8 @@ position's variances hold for each of the two axes, which are independent, in sq
 targets move as far in their own heights as distant ones. The size's are of the logarithm of the height.
 """
 
+from typing import Any
+
 import numpy as np
 
 from torchvision_dddas.geometry import namespace
@@ -119,7 +121,7 @@ def _gains(
 
 
 def _table(
-    centre: np.ndarray,
+    centre: Any,
     velocity: np.ndarray,
     size: np.ndarray,
     growth: np.ndarray,
@@ -128,9 +130,15 @@ def _table(
     size_variances: Variances,
 ) -> np.ndarray:
     """States (N, COLUMNS) of their parts: (N, 2) the first three, (N,) the others."""
+    rest = (growth, seen, *place_variances, *size_variances)
+    if isinstance(centre, np.ndarray):  # much faster than joining
+        state = np.empty((*centre.shape[:-1], COLUMNS))
+        state[..., X : Y + 1], state[..., VX : VY + 1], state[..., WIDTH : HEIGHT + 1] = centre, velocity, size
+        for column, values in enumerate(rest, GROWTH):
+            state[..., column] = values
+        return state
     functions = namespace(centre)
-    rest = functions.stack([growth, seen, *place_variances, *size_variances], -1)
-    return functions.concatenate([centre, velocity, size, rest], -1)
+    return functions.concatenate([centre, velocity, size, functions.stack(rest, -1)], -1)
 
 
 def transform(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ class Scene:
         self._changes.extend(np.abs(np.log(now_px[partner, 3] / before_px[mutual, 3])).tolist())
         if (known := len(self._steps)) >= _LEAST_STEPS:
             # Boxes that are not exact change in size as they seem to move: that part is no step.
-            seen, noise = sorted(self._steps)[(3 * known) // 4], _NOISE * float(np.median(self._changes))
+            seen, noise = sorted(self._steps)[(3 * known) // 4], _NOISE * sorted(self._changes)[known // 2]
             usual = max(1.25 * math.sqrt(max(seen**2 - noise**2, (_LEAST_SHARE * seen) ** 2)), _LEAST_STEP)
             share = known / (known + _PRIOR_STEPS)
             self.step = _START_STEP ** (1 - share) * usual**share
@@ -93,8 +93,8 @@ class Scene:
     def state(self, time: float) -> SceneState:
         """The state at a time, in looks."""
         width, height = self._far - self._near if self.size is None else self.size
-        count = float(np.mean(self._counts)) if self._counts else 1.0
+        count = sum(self._counts) / len(self._counts) if self._counts else 1.0
         density = max(count, 0.5) / (width * height) if width > 0 and height > 0 else 1.0
         missing = (_START_MISSING * _PRIOR_LINKS + self._missed) / (_PRIOR_LINKS + self._missed + self._links)
-        turnover = float(np.clip(self._births / (self._seen + _PRIOR_DETECTIONS), *_TURNOVER))
+        turnover = min(max(self._births / (self._seen + _PRIOR_DETECTIONS), _TURNOVER[0]), _TURNOVER[1])
         return SceneState(time, self.step, density, missing, turnover, self.size)

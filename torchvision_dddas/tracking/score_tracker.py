@@ -17,10 +17,16 @@ from torchvision_dddas.tracking.appearance import (
     visible_shares,
 )
 from torchvision_dddas.tracking.assignment import choose_links, link_confidences, plausible_links
-from torchvision_dddas.tracking.box_motion import FEWEST, believed_shift, candidate_shifts
+from torchvision_dddas.tracking.box_motion import FEWEST, candidate_shifts, likelier_shift
 from torchvision_dddas.tracking.kalman import HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
 from torchvision_dddas.tracking.scene import Scene
-from torchvision_dddas.tracking.scores import association_scores, common_velocity, is_near_border, newborn_scores
+from torchvision_dddas.tracking.scores import (
+    association_scores,
+    common_velocity,
+    is_near_border,
+    likely_velocities,
+    newborn_scores,
+)
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
 from torchvision_dddas.types import Detections, Table, Tracks
 
@@ -126,6 +132,7 @@ class ScoreTracker:
         self.scene = Scene(size)
         self.tracks = TrackStates()
         self.flow = self.tracks.state  # tracks that show how targets move
+        self.common_velocity = np.zeros(2)  # of them, in pixels a look
         self.smoother = FixedLagSmoother(self.parameters.hits, self.parameters.smooth, interval)
         self.begun = self._looks = 0
         self._before: _Sample | None = None
@@ -184,7 +191,7 @@ class ScoreTracker:
         at_border = is_near_border(box, self.size)
         # Tracks that would begin with each detection, without numbers yet, and those that would go on by each link.
         state = kalman.start(box, now.time, parameters.scatter, self.scene.step, parameters.size_scatter)
-        state[:, VX : VY + 1] = common_velocity(self.flow)
+        state[:, VX : VY + 1] = self.common_velocity
         count = len(box)
         once, look = np.ones(count, np.int64), np.full(count, now.look)
         born = TrackStates(state, now.signature, np.full(count, -1), once, look)
@@ -209,12 +216,15 @@ class ScoreTracker:
         if now.step is not None:
             self.tracks = replace(self.tracks, state=kalman.transform(self.tracks.state, now.step))
             before = None if before is None else transform_boxes(before, now.step)
-        known = (self.tracks.hits > 1) & (self.tracks.look >= now.look - _RECENT)
-        self.flow = self.tracks.state[known]
+        self._set_flow(now)
         if now.step is None and (shift := self._shift(now)) is not None:
             self.tracks = replace(self.tracks, state=_moved(self.tracks.state, shift))
-            self.flow = _moved(self.flow, shift)
+            self._set_flow(now)
         self.scene.add_look(before, now.box_px, 1.0 if self._before is None else now.time - self._before.time)
+
+    def _set_flow(self, now: _Sample) -> None:
+        self.flow = self.tracks.state[(self.tracks.hits > 1) & (self.tracks.look >= now.look - _RECENT)]
+        self.common_velocity = common_velocity(self.flow)
 
     @property
     def _trusts_single(self) -> bool:
@@ -229,11 +239,14 @@ class ScoreTracker:
         tracks, box = self.tracks[recent if newborn else known], now.box_px
         later = kalman.predict(tracks.state, now.time, 0.0)
         shifts = candidate_shifts(later[:, : Y + 1], later[:, HEIGHT], box[:, :2] + box[:, 2:] / 2, box[:, 3])
-
-        def scores(shift: np.ndarray) -> np.ndarray:
-            return self._scores(replace(tracks, state=_moved(tracks.state, shift)), now, box)
-
-        return believed_shift(shifts, scores, len(tracks), newborn)
+        if not shifts:
+            return None
+        still, *moved = (
+            self._scores(replace(tracks, state=_moved(tracks.state, shift)), now, box)
+            for shift in (np.zeros(2), *shifts)
+        )
+        chosen = likelier_shift(still, moved, newborn)
+        return None if chosen is None else shifts[chosen]
 
     def _scores(self, tracks: TrackStates, sample: _Sample, box_px: np.ndarray) -> np.ndarray:
         """(N, M) scores of tracks and a frame's detections, whose boxes are given in the tracks' coordinates."""
@@ -245,7 +258,9 @@ class ScoreTracker:
         if old.any():
             score[old] = association_scores(tracks.state[old], missed[old], box_px, scene, self.parameters)
         if new.any():
-            score[new] = newborn_scores(tracks.state[new], missed[new], box_px, scene, self.parameters, self.flow)
+            state = tracks.state[new]
+            velocities = likely_velocities(state, self.flow, self.common_velocity)
+            score[new] = newborn_scores(state, missed[new], box_px, scene, self.parameters, velocities)
         if tracks.signature.shape[1] and sample.signature.shape[1]:
             alike = similarity(tracks.signature, sample.signature)
             score += appearance_scores(alike, sample.visible, self.parameters)

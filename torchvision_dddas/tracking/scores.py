@@ -11,6 +11,7 @@ dummies an affinity of their own, and its optimum is then to link nothing).
 """
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import HEIGHT, PP, SEEN, SS, VX, VY, WIDTH, X, Y
 from torchvision_dddas.tracking.scene import SceneState
 
+_LEAST_SCORE = -4.0  # of a pair that is near enough to be looked at
 _LARGEST_SIZE_PENALTY = 8.0
 _LARGEST_GONE = 0.95
 _BORDER = 0.3  # heights: a target this near to the border may cross it even at rest
@@ -46,20 +48,25 @@ def association_scores(
     """(N, M) scores of tracks with a known velocity and the detections of a look, without appearance.
 
     state: (N, kalman.COLUMNS) as last seen. missed: (N,) looks without a detection since. box_px: (M, 4). Arrays, or
-    tensors with a gradient in the parameters.
+    tensors with a gradient in the parameters. In arrays, pairs that are too far apart for a link score -inf.
     """
     functions = namespace(state)
     later = kalman.predict(state, scene.time, parameters.wander * scene.step)
-    score = _place_density(later, later[..., :2], later[..., PP] + parameters.scatter**2, box_px, parameters)
-    score = score - _size_penalty(later, box_px, parameters.size_scatter)
-    if (missed > 0).any():
+    place, variance = later[None, ..., :2], (later[..., PP] + parameters.scatter**2)[None]
+    if is_lost := (missed > 0).any():
         # A lost target may have stood still behind an obstacle: then its last place is a better prediction.
-        gap = scene.time - state[..., SEEN]
-        spread = parameters.scatter**2 + parameters.rest_drift**2 * gap
-        rest = _place_density(state, state[..., :2], spread, box_px, parameters)
-        rest = rest - _size_penalty(state, box_px, parameters.size_scatter) - parameters.rest_price
-        score = functions.where((missed > 0)[..., None], functions.maximum(score, rest), score)
-    return score + _arrival(box_px, scene, parameters) + _survival(later, missed, scene, parameters)[..., None]
+        spread = parameters.scatter**2 + parameters.rest_drift**2 * (scene.time - state[..., SEEN])
+        place = functions.stack([later[..., :2], state[..., :2]])
+        variance = functions.stack([variance[0], spread])
+    arrival, survival = _arrival(box_px, scene, parameters), _survival(later, missed, scene, parameters)
+    pairs = _pairs(later, place, variance, box_px, arrival, survival, parameters)
+    score = _place_density(pairs, later, place[0], variance[0], box_px, parameters)
+    score = score - _size_penalty(pairs, later, box_px, parameters.size_scatter)
+    if is_lost:
+        rest = _place_density(pairs, state, place[1], variance[1], box_px, parameters)
+        rest = rest - _size_penalty(pairs, state, box_px, parameters.size_scatter) - parameters.rest_price
+        score = functions.where(pairs.of_tracks(missed) > 0, functions.maximum(score, rest), score)
+    return pairs.matrix(score + pairs.of_boxes(arrival) + pairs.of_tracks(survival))
 
 
 def newborn_scores(
@@ -68,81 +75,153 @@ def newborn_scores(
     box_px: np.ndarray,
     scene: SceneState,
     parameters: TrackParameters,
-    flow: np.ndarray,
+    velocities: np.ndarray,
 ) -> np.ndarray:
     """(N, M) scores, as `association_scores`, of tracks with a single detection.
 
-    flow: (K, kalman.COLUMNS) other tracks, which show how targets move here; with tensors, none (0, kalman.COLUMNS).
+    velocities: (W, N, 2) from `likely_velocities`.
     """
     functions = namespace(state)
     gap = scene.time - state[..., SEEN]
     step, noise = scene.step * gap, 2 * parameters.scatter**2
-    common = common_velocity(flow)
-    count = min(_NEIGHBOURS, len(flow))
+    count = len(velocities) - 1
     share = _AS_NEIGHBOURS[0] * count / (count + 2)  # few neighbours say little
     other = (1 - share) / (_AT_REST[0] + _ANYHOW[0])
-    # Ways to move: weights, velocities, and standard deviations in steps.
-    ways = [(other * _AT_REST[0], common, _AT_REST[1]), (other * _ANYHOW[0], common, _ANYHOW[1])]
-    if count:
-        away = np.hypot(flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1])
-        nearest = np.argsort(away, axis=1, kind="stable")[:, :count]
-        ways += [(share / count, flow[neighbour, VX : VY + 1], _AS_NEIGHBOURS[1]) for neighbour in nearest.T]
-    place = functions.concatenate([state[..., :2] + velocity * gap[..., None] for _, velocity, _ in ways], -2)
-    variance = functions.concatenate([noise + (deviation * step) ** 2 for *_, deviation in ways], -1)
-    repeated = functions.concatenate([state] * len(ways), -2)
-    density = _place_density(repeated, place, variance, box_px, parameters)
-    rows = state.shape[-2]
-    score = math.log(ways[0][0]) + density[..., :rows, :]
-    for way in range(1, len(ways)):
-        part = math.log(ways[way][0]) + density[..., way * rows : (way + 1) * rows, :]
-        score = functions.logaddexp(score, part)
+    # Ways to move: weights, which velocities, and standard deviations in steps.
+    ways = [(other * _AT_REST[0], 0, _AT_REST[1]), (other * _ANYHOW[0], 0, _ANYHOW[1])]
+    ways += [(share / count, 1 + neighbour, _AS_NEIGHBOURS[1]) for neighbour in range(count)]
+    weight = functions.stack([way[0] + 0 * gap for way in ways])
+    place = state[..., :2] + velocities[[way[1] for way in ways]] * gap[..., None]
+    variance = functions.stack([noise + (way[2] * step) ** 2 for way in ways])
     later = kalman.predict(state, scene.time, parameters.wander * scene.step)
-    score = score - _size_penalty(later, box_px, parameters.size_scatter)
-    return score + _arrival(box_px, scene, parameters) + _survival(later, missed, scene, parameters)[..., None]
+    arrival, survival = _arrival(box_px, scene, parameters), _survival(later, missed, scene, parameters)
+    pairs = _pairs(state, place, variance, box_px, arrival, survival, parameters)
+    density = functions.exp(_place_density(pairs, state, place, variance, box_px, parameters))
+    score = functions.log((pairs.of_tracks(weight) * density).sum(0))
+    score = score - _size_penalty(pairs, later, box_px, parameters.size_scatter)
+    return pairs.matrix(score + pairs.of_boxes(arrival) + pairs.of_tracks(survival))
+
+
+def likely_velocities(state: np.ndarray, flow: np.ndarray, common: np.ndarray) -> np.ndarray:
+    """(W, N, 2) velocities, in pixels a look, of targets that were detected once: the common one; their neighbours'.
+
+    state: (N, kalman.COLUMNS). flow: (K, kalman.COLUMNS) other tracks, which show how targets move here. common: (2,)
+    their common velocity.
+    """
+    away = np.hypot(flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1])
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEIGHBOURS]
+    found = np.empty((1 + nearest.shape[1], len(state), 2))
+    found[0], found[1:] = common, np.swapaxes(flow[nearest, VX : VY + 1], 0, 1)
+    return found
 
 
 def common_velocity(flow: np.ndarray) -> np.ndarray:
     """(2,) the velocity, in pixels a look, that tracks (K, kalman.COLUMNS) have in common; 0 of too few."""
-    velocity: np.ndarray = flow[:, VX : VY + 1]
-    return np.median(velocity, axis=0) if len(flow) >= _FEWEST else velocity[:0].sum(0)
+    return np.median(flow[:, VX : VY + 1], axis=0) if len(flow) >= _FEWEST else np.zeros(2)
+
+
+@dataclass(frozen=True)
+class _Near:
+    """Those pairs of N tracks and M boxes that are near enough to be linked, for arrays. row, column: (P,)."""
+
+    row: np.ndarray
+    column: np.ndarray
+    shape: tuple[int, int]
+
+    def of_tracks(self, values: np.ndarray) -> np.ndarray:
+        return values[..., self.row]
+
+    def of_boxes(self, values: np.ndarray) -> np.ndarray:
+        return values[..., self.column]
+
+    def matrix(self, values: np.ndarray) -> np.ndarray:
+        found = np.full(self.shape, -np.inf)
+        found[self.row, self.column] = values
+        return found
+
+
+class _All:
+    """All pairs, for tensors, which may have axes before those of the tracks and the boxes."""
+
+    @staticmethod
+    def of_tracks(values: Any) -> Any:
+        return values[..., :, None]
+
+    @staticmethod
+    def of_boxes(values: Any) -> Any:
+        return values[..., None, :]
+
+    @staticmethod
+    def matrix(values: Any) -> Any:
+        return values
+
+
+def _pairs(
+    state: Any,
+    place_px: np.ndarray,
+    variance: np.ndarray,
+    box_px: np.ndarray,
+    arrival: np.ndarray,
+    survival: np.ndarray,
+    parameters: TrackParameters,
+) -> _Near | _All:
+    """The pairs whose scores are computed: those in a circle around all places where a target may be.
+
+    place_px: (W, N, 2), variance: (W, N) in squared heights.
+    """
+    if not isinstance(state, np.ndarray):
+        return _All()
+    unit = state[:, HEIGHT] ** 2 * variance
+    # Where the density has fallen to what makes the score the least of interest if all else fits.
+    least = _LEAST_SCORE - arrival.max(initial=-np.inf) - survival
+    fall = (-np.log(2 * math.pi * parameters.upright * unit) - least) / (1 + parameters.tail / 2)
+    reach = np.sqrt(parameters.tail * unit * np.expm1(np.clip(fall, 0, 50))) * max(1.0, parameters.upright)
+    x, y = place_px[..., 0], place_px[..., 1]
+    radius = (reach + np.hypot(x - x[0], y - y[0])).max(axis=0)
+    across, along = box_px[:, 0] + box_px[:, 2] / 2 - x[0, :, None], box_px[:, 1] + box_px[:, 3] / 2 - y[0, :, None]
+    row, column = np.nonzero(across * across + along * along < (radius * radius)[:, None])
+    return _Near(row, column, (len(state), len(box_px)))
 
 
 def _place_density(
-    state: np.ndarray, place_px: np.ndarray, variance: np.ndarray, box_px: np.ndarray, parameters: TrackParameters
+    pairs: _Near | _All,
+    state: np.ndarray,
+    place_px: np.ndarray,
+    variance: np.ndarray,
+    box_px: np.ndarray,
+    parameters: TrackParameters,
 ) -> np.ndarray:
-    """(N, M) log density, a square pixel, of the boxes' centres around places (N, 2): Student's t in two dimensions.
+    """Log density, a square pixel, of the boxes' centres around places (..., N, 2): Student's t in two dimensions.
 
-    variance: (N,) in squared heights of the tracks.
+    variance: (..., N) in squared heights of the tracks.
     """
     functions = namespace(state)
     # Standing people move less up and down in the picture than across it.
     level = functions.ones_like(variance)
     upright = functions.where(state[..., HEIGHT] > state[..., WIDTH], parameters.upright * level, level)
     unit = state[..., HEIGHT] ** 2 * variance
-    centre = box_px[..., :2] + box_px[..., 2:] / 2
-    across = centre[..., None, :, 0] - place_px[..., :1]
-    along = (centre[..., None, :, 1] - place_px[..., 1:]) / upright[..., None]
-    away = (across * across + along * along) / unit[..., None]
     peak = -functions.log(2 * math.pi * unit * upright)
-    return peak[..., None] - (1 + parameters.tail / 2) * functions.log1p(away / parameters.tail)
+    across = pairs.of_boxes(box_px[..., 0] + box_px[..., 2] / 2) - pairs.of_tracks(place_px[..., 0])
+    along = pairs.of_boxes(box_px[..., 1] + box_px[..., 3] / 2) - pairs.of_tracks(place_px[..., 1])
+    along = along / pairs.of_tracks(upright)
+    away = (across * across + along * along) / pairs.of_tracks(parameters.tail * unit)
+    return pairs.of_tracks(peak) - (1 + parameters.tail / 2) * functions.log1p(away)
 
 
-def _size_penalty(state: np.ndarray, box_px: np.ndarray, scatter: Any) -> np.ndarray:
-    """(N, M) penalty for a height other than predicted."""
+def _size_penalty(pairs: _Near | _All, state: np.ndarray, box_px: np.ndarray, scatter: Any) -> np.ndarray:
+    """Penalty for a height other than predicted."""
     functions = namespace(state)
     variance = scatter**2 + state[..., SS]
-    change = functions.log(box_px[..., 3])[..., None, :] - functions.log(state[..., HEIGHT : HEIGHT + 1])
-    wrong = functions.clip(0.5 * change**2 / variance[..., None], None, _LARGEST_SIZE_PENALTY)
-    return wrong + 0.5 * functions.log(variance / scatter**2)[..., None]
+    change = pairs.of_boxes(functions.log(box_px[..., 3])) - pairs.of_tracks(functions.log(state[..., HEIGHT]))
+    wrong = functions.clip(0.5 * change**2 / pairs.of_tracks(variance), None, _LARGEST_SIZE_PENALTY)
+    return wrong + pairs.of_tracks(0.5 * functions.log(variance / scatter**2))
 
 
 def _arrival(box_px: np.ndarray, scene: SceneState, parameters: TrackParameters) -> np.ndarray:
-    """(1, M) minus the logarithm of the density of new targets, a square pixel, at each detection."""
-    functions = namespace(box_px)
+    """(M,) minus the logarithm of the density of new targets, a square pixel, at each detection."""
     centre = box_px[..., :2] + box_px[..., 2:] / 2
     crossing = _crossing(centre, box_px[..., 3], scene, parameters)
-    density = scene.density * functions.ones_like(crossing)
-    return -functions.log(density * (scene.turnover + crossing))[..., None, :]
+    return -namespace(box_px).log(scene.density * (scene.turnover + crossing))
 
 
 def _survival(later: np.ndarray, missed: np.ndarray, scene: SceneState, parameters: TrackParameters) -> np.ndarray:

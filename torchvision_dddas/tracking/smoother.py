@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from functools import lru_cache, reduce
+from functools import reduce
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from torchvision_dddas.types import Tracks
 FILLED = 2
 """Sampled frames that a gap may last to be filled."""
 _BEFORE = 8  # earlier boxes of a track that may smooth a box
-_WIDTHS = np.array([[2.0], [5.0]])  # sd of the weights of places and of sizes, which change more slowly
+_WIDTHS = np.array([2.0, 5.0])  # sd of the weights of places and of sizes, which change more slowly
 
 
 @dataclass
@@ -102,7 +102,7 @@ class FixedLagSmoother:
         for gap in self.pending:
             if before.index < gap.index < after.index:
                 part = (gap.frame - before.frame) / (after.frame - before.frame)
-                start, end = self._box_at(before, gap.index), self._box_at(after, gap.index)
+                start, end = (self._boxes_at(seen.box_px[None], seen.index, gap.index)[0] for seen in (before, after))
                 score = before.score + part * (after.score - before.score)
                 gap.tracks[number] = _Observation(gap.frame, gap.index, start + part * (end - start), score, -1)
 
@@ -130,7 +130,7 @@ class FixedLagSmoother:
                 Tracks(
                     pending.frame,
                     np.array([self.identities[number] for number in confirmed], np.int64),
-                    np.array([self._smoothed(*item) for item in confirmed.items()], float).reshape(-1, 4),
+                    self._smoothed(confirmed, pending),
                     np.array([seen.score for seen in confirmed.values()], float),
                     np.array([seen.row for seen in confirmed.values()], np.int64),
                     np.array([seen.link for seen in confirmed.values()], float),
@@ -146,46 +146,59 @@ class FixedLagSmoother:
                 del self.observations[number]
         return done
 
-    def _smoothed(self, number: int, seen: _Observation) -> np.ndarray:
-        if not self.smooth or seen.score >= 1:
-            return seen.box_px
-        near = [s for s in self.observations.get(number, ()) if s.index > self.count - len(self.steps)]
-        if len(near) < 2:
-            return seen.box_px
-        boxes = np.array([self._box_at(s, seen.index) for s in near])
-        return smooth_box(boxes, np.array([s.frame / self.interval for s in near]), seen.frame / self.interval)
+    def _smoothed(self, confirmed: dict[int, _Observation], at: _Pending) -> np.ndarray:
+        """(K, 4) the boxes of confirmed tracks in a frame, those with a score below 1 smoothed along their tracks."""
+        given = np.array([seen.box_px for seen in confirmed.values()], float).reshape(-1, 4)
+        oldest = self.count - len(self.steps)
+        near: list[_Observation] = []
+        starts, smoothed = [], []
+        for place, (number, seen) in enumerate(confirmed.items()):
+            past = self.observations.get(number, ()) if self.smooth and seen.score < 1 else ()
+            of_track = [s for s in past if s.index > oldest]
+            if len(of_track) > 1:
+                smoothed.append(place)
+                starts.append(len(near))
+                near += of_track
+        if not near:
+            return given
+        box, index = np.array([s.box_px for s in near]), np.array([s.index for s in near])
+        if self.has_moved:
+            for there in np.unique(index).tolist():
+                box[index == there] = self._boxes_at(box[index == there], there, at.index)
+        since = (np.array([s.frame for s in near]) - at.frame) / self.interval
+        given[smoothed] = smooth_boxes(box, since, np.array(starts))
+        return given
 
-    def _box_at(self, seen: _Observation, here: int) -> np.ndarray:
-        """An observed box in the coordinates of another sampled frame."""
-        low, high = sorted((seen.index, here))
+    def _boxes_at(self, box_px: np.ndarray, there: int, here: int) -> np.ndarray:
+        """Boxes (N, 4) observed in a sampled frame, in the coordinates of another one."""
+        low, high = sorted((there, here))
         oldest = self.count - len(self.steps)
         between = range(low + 1, high + 1) if self.has_moved else ()
         steps = [step for index in between if (step := self.steps[index - oldest]) is not None]
         if not steps:
-            return seen.box_px
+            return box_px
         high_from_low = reduce(lambda before, step: step @ before, steps)
-        here_from_there = high_from_low if seen.index < here else np.linalg.inv(high_from_low)
-        return transform_boxes(seen.box_px[None], here_from_there)[0]
+        here_from_there = high_from_low if there < here else np.linalg.inv(high_from_low)
+        return transform_boxes(box_px, here_from_there)
 
 
-def smooth_box(box_px: np.ndarray, times: np.ndarray, at: float) -> np.ndarray:
-    """The box (4,) at a time, by straight lines fitted to boxes (N, 4) around it; sides by their logarithm.
+def smooth_boxes(box_px: np.ndarray, since: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """(K, 4) boxes at time 0, each by straight lines fitted to boxes around it; sides by their logarithm.
 
-    times: (N,) of the boxes, in intervals. Weights are Gaussian, so that the fit is local; a slight pull towards no
-    slope decides where the times do not.
+    box_px: (N, 4) the boxes of all tracks, one track after another. since: (N,) their times, in intervals. starts: (K,)
+    where each track begins. Weights are Gaussian, so that the fit is local; a slight pull towards no slope decides
+    where the times do not.
     """
-    place, size = _weights(tuple((times - at).tolist()))
-    centre = place @ (box_px[:, :2] + box_px[:, 2:] / 2)
-    side = np.exp(size @ np.log(box_px[:, 2:]))
-    return np.concatenate([centre - side / 2, side])
-
-
-@lru_cache(maxsize=1024)
-def _weights(since: tuple[float, ...]) -> np.ndarray:
-    """(2, N) weights of boxes for the place and for the size. Few patterns of times recur again and again."""
-    time = np.array(since)
-    weight = np.exp(-0.5 * (time / _WIDTHS) ** 2)
-    total = weight.sum(axis=1, keepdims=True)
-    once = (weight @ time)[:, None]
-    twice = (weight @ time**2)[:, None] + 1e-3 * _WIDTHS**2
-    return (twice - once * time) * weight / (total * twice - once**2)
+    weight = np.exp(-0.5 * (since[:, None] / _WIDTHS) ** 2)  # (N, 2), of places and of sizes
+    value = np.stack([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)  # (N, 2, 2)
+    time = since[:, None]
+    parts = [weight, weight * time, weight * time**2]
+    parts += [*np.moveaxis(weight[..., None] * value, 2, 0), *np.moveaxis((weight * time)[..., None] * value, 2, 0)]
+    total, once, twice, *sums = np.add.reduceat(np.stack(parts), starts, axis=1)
+    twice = twice + 1e-3 * _WIDTHS**2
+    x, y = (
+        (twice * plain - once * by_time) / (total * twice - once**2)
+        for plain, by_time in zip(sums[:2], sums[2:], strict=True)
+    )
+    centre, side = np.stack([x[:, 0], y[:, 0]], axis=1), np.exp(np.stack([x[:, 1], y[:, 1]], axis=1))
+    return np.concatenate([centre - side / 2, side], axis=1)

@@ -260,7 +260,8 @@ def link_nll(
 def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: TrackParameters) -> Any:
     """(B, N, N) scores of tracks and boxes, without appearance."""
     given = tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters
-    scores: Any = newborn_scores(*given, flow=tracks.state[0, :0]), association_scores(*given)
+    at_rest: Any = torch.zeros_like(tracks.state[None, ..., :2])
+    scores: Any = newborn_scores(*given, velocities=at_rest), association_scores(*given)
     return torch.where((tracks.hits == 1)[..., None], *scores)
 
 
