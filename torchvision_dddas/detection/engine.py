@@ -29,6 +29,8 @@ _MIN_DIFFERENCE = 2.0
 # A gain and an offset must leave at most this share of the difference; otherwise it is the content that has changed.
 _MAX_LEFT = 0.5
 _MIN_LEVELS = 8
+# Pixels that the exposure of a warped picture is fitted to.
+_EXPOSURE_PIXELS = 5000
 
 
 def evidence_scale(settings: Settings) -> float:
@@ -121,6 +123,11 @@ class Engine(Protocol):
 def cell_side(width: int, height: int, parameters: RegistrationParameters) -> int:
     """Side in pixels of the cells with one keypoint each that keeps their number within the budget."""
     return max(parameters.cell_px, math.ceil(math.sqrt(width * height / parameters.keypoints)))
+
+
+def exposure_step(shape: tuple[int, ...]) -> int:
+    """Every so many-th row and column of a picture, (H, W), shows the exposure well enough: some 5,000 pixels."""
+    return max(math.isqrt(shape[0] * shape[1] // _EXPOSURE_PIXELS), 1)
 
 
 def match_exposure(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,6 @@
 """The foreground of a window on OpenCV, in as few passes over 8-bit memory as possible."""
 
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,18 +15,18 @@ from torchvision_dddas.detection.engine import (
     Window,
     evidence_scale,
     exposure_between,
+    exposure_step,
 )
 from torchvision_dddas.geometry import transfer
 
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
 # round places to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
-_MOST_TILES = 16
+_MOST_TILES = 8
 _STRIP_ROWS = 64
-# The least median distance between grey levels that exposures are trimmed by; times 3.7 it is 3 levels.
-_LEAST_DISTANCE = 3 / 3.7
+# An exposure is found when no grey level moves by more than this.
+_SETTLED_LEVELS = 0.1
 _LEVELS = np.arange(256)
-_ROWS = 257 * _LEVELS
 
 
 def find_foreground(window: Window, settings: Settings) -> Foreground:
@@ -130,17 +129,16 @@ class _Neighbours:
 def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     """The picture as the reference sees it, bilinear, (H, W) uint8; border pixels are repeated outside.
 
-    `cv2.warpPerspective` divides for every pixel; one affine map a tile takes half its time and stays within the
-    1/32 px to which both round places.
+    `cv2.warpPerspective` takes twice as long as one affine map a tile, which stays within the 1/32 px to which both
+    round places. Where that needs many tiles, maps of all places are as quick.
     """
     height, width = picture.shape
-    settings: dict[str, Any] = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
     # The error falls with the square of the number of tiles across: that of a single one gives the number needed.
     tiles = np.array([[0, 0, width - 1, height - 1]])
     maps, error = _affine_maps(picture_from_reference, tiles)
     count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
     if not 0 <= count <= _MOST_TILES:
-        return cv2.warpPerspective(picture, picture_from_reference, (width, height), **settings)
+        return _warp_by_maps(picture, picture_from_reference)
     if count > 1:
         ends = (sorted({i * side // int(count) for i in range(int(count) + 1)}) for side in (width, height))
         columns, rows = ([(low, high - 1) for low, high in pairwise(side)] for side in ends)
@@ -149,7 +147,25 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
     warped = np.empty_like(picture)
     for (left, top, right, bottom), affine in zip(tiles.tolist(), maps, strict=True):
         tile, size = warped[top : bottom + 1, left : right + 1], (right - left + 1, bottom - top + 1)
-        cv2.warpAffine(picture, affine, size, dst=tile, **settings)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        cv2.warpAffine(picture, affine, size, dst=tile, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return warped
+
+
+def _warp_by_maps(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
+    """As `warp`, by the place of every pixel, in strips whose maps stay in the cache."""
+    height, width = picture.shape
+    by_column = np.outer(picture_from_reference[:, 0], np.arange(width))
+    by_row = np.outer(picture_from_reference[:, 1], np.arange(height)) + picture_from_reference[:, 2:]
+    across, down = by_column.astype(np.float32)[:, None], by_row.astype(np.float32)[:, :, None]
+    warped = np.empty_like(picture)
+    for top in range(0, height, _STRIP_ROWS):
+        strip = slice(top, top + _STRIP_ROWS)
+        u, v, depth = (a + b for a, b in zip(across, down[:, strip], strict=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u /= depth
+            v /= depth
+        cv2.remap(picture, u, v, cv2.INTER_LINEAR, dst=warped[strip], borderMode=cv2.BORDER_REPLICATE)
     return warped
 
 
@@ -213,31 +229,34 @@ def measure_texture(grey: np.ndarray) -> np.ndarray:
 
 
 def match_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The warped picture in the reference's exposure: gain and offset by trimmed least squares on every 4th pixel.
+    """The warped picture in the reference's exposure: gain and offset by trimmed least squares on a sparse grid.
 
     seen: 255 where the warped picture may be compared. All are (H, W) uint8.
     """
-    samples = [warped[::4, ::4], reference[::4, ::4]]
-    # The fit needs only how often each pair of grey levels occurs.
-    pairs = _GreyPairs(cv2.calcHist(samples, [0, 1], seen[::4, ::4], [256, 256], [0, 256, 0, 256]))
-    if pairs.count < 100:
+    step = exposure_step(reference.shape)
+    inside = seen[::step, ::step] > 0
+    x, y = (picture[::step, ::step][inside].astype(np.float32) for picture in (warped, reference))
+    if len(x) < 100:
         return warped
-    x = np.arange(256.0)
-    gain, offset = 1.0, pairs.median_offset()
+    gain, offset = 1.0, _lower_median(y - x)
     for _ in range(4):
         before = gain, offset
-        middle = gain * x + offset
-        low, high = pairs.band(middle, pairs.trimming(middle))
-        n = pairs.below.take(high) - pairs.below.take(low)
-        y = pairs.sum_below.take(high) - pairs.sum_below.take(low)
-        total = n.sum()
-        mean_x, mean_y = n @ x / total, y.sum() / total
-        spread = n @ (x - mean_x) ** 2 / total
-        gain = float((x - mean_x) @ y / total / spread) if spread > 1e-3 else 1.0
-        offset = float(mean_y - gain * mean_x)
-        if abs(gain - before[0]) < 1e-5 and abs(offset - before[1]) < 1e-3:
+        away = np.abs(y - (np.float32(gain) * x + np.float32(offset)))
+        kept = away <= max(3.7 * _lower_median(away), 3.0)
+        given, wanted = x[kept], y[kept]
+        mean = float(given.mean())
+        deviation = given - np.float32(mean)
+        spread = float(deviation @ deviation)
+        gain = float(deviation @ wanted) / spread if spread > 1e-3 * len(given) else 1.0
+        offset = float(wanted.mean()) - gain * mean
+        if 255 * abs(gain - before[0]) + abs(offset - before[1]) < _SETTLED_LEVELS:
             break
     return apply_light(reference, warped, gain, offset)
+
+
+def _lower_median(values: np.ndarray) -> float:
+    middle = (len(values) - 1) // 2
+    return float(np.partition(values, middle)[middle])
 
 
 def apply_light(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
@@ -251,49 +270,6 @@ def apply_light(reference: np.ndarray, warped: np.ndarray, gain: float, offset: 
         cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
         cv2.copyTo(cv2.max(through, reference), cut, through)
     return through
-
-
-class _GreyPairs:
-    """How often grey levels x and y meet in two pictures, summed along y: a band of y takes two look-ups."""
-
-    def __init__(self, times: np.ndarray) -> None:
-        """times: (256, 256), x down, y across."""
-        # (256, 257) float64 sums of all values to the left: five times as quick as `np.cumsum`.
-        self.below, self.sum_below = (
-            np.diff(cv2.integral(values, sdepth=cv2.CV_64F), axis=0)
-            for values in (times, times * np.arange(256, dtype=np.float32))
-        )
-        self.count = float(self.below[:, -1].sum())
-
-    def band(self, middle: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        """(256,) for each x: where the sums of the y within `reach` of `middle` begin and end, as flat indices."""
-        low = np.clip(np.ceil(middle - reach), 0, 256)
-        high = np.maximum(np.clip(np.floor(middle + reach) + 1, 0, 256), low)
-        return _ROWS + low.astype(np.intp), _ROWS + high.astype(np.intp)
-
-    def median_offset(self) -> float:
-        """The median of y - x."""
-        low, high = -255, 255
-        while low < high:
-            middle = (low + high) // 2
-            if 2 * self.below.take(_ROWS + np.clip(_LEVELS + middle + 1, 0, 256)).sum() >= self.count:
-                high = middle
-            else:
-                low = middle + 1
-        return float(low)
-
-    def trimming(self, middle: np.ndarray) -> float:
-        """How far y may lie from `middle`: 3.7 times the median distance, at least 3 levels."""
-        near, held = _LEAST_DISTANCE, 0.0
-        while True:
-            low, high = self.band(middle, near)
-            share = float(self.below.take(high).sum() - self.below.take(low).sum()) / self.count
-            if share >= 0.5:
-                break
-            near, held = 1.25 * near, share
-        if near == _LEAST_DISTANCE:
-            return 3.7 * near
-        return 3.7 * float(np.interp(0.5, [held, share], [near / 1.25, near]))
 
 
 def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int = 500) -> float:

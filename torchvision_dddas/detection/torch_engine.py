@@ -25,6 +25,7 @@ from torchvision_dddas.detection.engine import (
     cell_side,
     evidence_scale,
     exposure_between,
+    exposure_step,
     judge_points,
     match_exposure,
 )
@@ -235,10 +236,11 @@ def _close_masks(mask: Tensor, side: int) -> Tensor:
 
 def _match_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
     """The warped pictures in their references' exposure, in whole levels."""
-    first, last = (edge[:, ::4, None] for edge in seen)
-    columns = torch.arange(0, reference.shape[-1], 4, device=reference.device)
+    step = exposure_step(reference.shape[-2:])
+    first, last = (edge[:, ::step, None] for edge in seen)
+    columns = torch.arange(0, reference.shape[-1], step, device=reference.device)
     inside = (columns >= first) & (columns <= last)
-    wanted, given = (picture[..., ::4, ::4] / LEVEL for picture in (reference, warped))
+    wanted, given = (picture[..., ::step, ::step] / LEVEL for picture in (reference, warped))
     gain, offset = difference.exposure(wanted, given, inside[:, None])
     enough = inside.sum((1, 2)) >= 100
     return _apply_light(reference, warped, torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0))
