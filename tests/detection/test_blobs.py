@@ -62,15 +62,24 @@ def test_neighbours_with_like_motion_are_fragments_of_one_target(other):
 def test_smoothing_spreads_over_a_flat_region_and_stops_at_its_edge():
     evidence, guide = np.zeros((31, 41, 1), np.float32), np.zeros((31, 41, 3), np.uint8)
     evidence[15, 10], guide[:, 20:] = 1, 200
-    after = smooth_along_edges(evidence, guide, 30, 80)[..., 0]
+    after = smooth_along_edges([evidence], [guide], 30, 80)[0][..., 0]
     assert after[15, 19] > 20 * after[15, 20]
     assert after[15, 19] > 0
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 1)])
 def test_smoothing_works_on_one_row_or_column(shape):
-    after = smooth_along_edges(np.ones((*shape, 1), np.float32), np.zeros(shape, np.uint8), 10, 80)
+    (after,) = smooth_along_edges([np.ones((*shape, 1), np.float32)], [np.zeros(shape, np.uint8)], 10, 80)
     np.testing.assert_allclose(after, 1, atol=1e-6)
+
+
+def test_pictures_smoothed_together_equal_those_smoothed_alone():
+    rng = np.random.default_rng(0)
+    shapes = [(20, 31), (7, 40), (33, 5)]
+    values = [rng.random((*shape, 2)).astype(np.float32) for shape in shapes]
+    guides = [rng.integers(0, 256, (*shape, 3)).astype(np.uint8) for shape in shapes]
+    for value, guide, together in zip(values, guides, smooth_along_edges(values, guides, 30, 80), strict=True):
+        np.testing.assert_array_equal(together, smooth_along_edges([value], [guide], 30, 80)[0])
 
 
 GROUND = np.random.default_rng(3).integers(140, 180, (80, 120, 3)).astype(np.uint8)

@@ -24,7 +24,7 @@ from torchvision_dddas.detection.blobs import (
 )
 from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, View, Window, evidence_scale
 from torchvision_dddas.detection.motion_history import MotionHistory, split_by_trail
-from torchvision_dddas.detection.persistence import Sighting, find_persistent
+from torchvision_dddas.detection.persistence import Links, Sighting, find_persistent
 from torchvision_dddas.geometry import connected_parts
 from torchvision_dddas.types import Detections
 
@@ -61,13 +61,17 @@ class Target:
 
 @dataclass
 class Observation:
-    """What one frame shows, before its targets are chosen. Window and foreground are dropped once they are drawn."""
+    """What one frame shows, before its targets are chosen. Window and foreground are dropped once they are drawn.
+
+    links: of its blobs to those of the frames beside it, as far as they are known.
+    """
 
     window: Window | None = None
     foreground: Foreground | None = None
     blobs: list[Blob] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)
+    links: Links = field(default_factory=dict)
 
 
 def observe(
@@ -114,15 +118,20 @@ def draw_targets(
     view = window.reference
     kept = [True] * len(here.blobs)
     if settings.persistence.on:
-        sightings = [Sighting(o.blobs, o.motions, step) for o, step in zip(observations, steps, strict=True)]
+        sightings = [Sighting(o.blobs, o.motions, step, o.links) for o, step in zip(observations, steps, strict=True)]
         kept = find_persistent(sightings, index, view.size, settings.persistence)
+    chosen = np.flatnonzero(kept).tolist()
+    refined: list[np.ndarray] = []
+    if here.motions and settings.refine.on:
+        moving = [(here.blobs[i], here.motions[i]) for i in chosen]
+        refined = refine_outlines(moving, view, foreground, settings)
     targets = []
-    for i in np.flatnonzero(kept):
+    for k, i in enumerate(chosen):
         blob, mask, velocity_px = here.blobs[i], here.blobs[i].mask, np.full(2, np.nan)
         if here.motions:
             velocity_px = here.motions[i].velocity_px
             if settings.refine.on:
-                mask = refine_outline(blob, here.motions[i], view, foreground, settings)
+                mask = refined[k]
                 # From the air, where targets are small and shadows as large; beside a car they are thin and dark as
                 # its tyres.
                 if window.wide is not None and blob.area_px <= settings.refine.shadow_share * view.grey.size:
@@ -178,11 +187,43 @@ def build_detections(targets: Sequence[Target], size: tuple[int, int]) -> tuple[
     return detections, mask, core
 
 
-def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foreground, settings: Settings) -> np.ndarray:
-    """The refined mask inside the blob's box, (height, width) bool; never outside the blob's own mask.
+def refine_outlines(
+    moving: Sequence[tuple[Blob, Motion]], view: View, foreground: Foreground, settings: Settings
+) -> list[np.ndarray]:
+    """The refined masks inside the blobs' boxes, (height, width) bool; never outside the blobs' own masks.
 
-    view: the reference frame. foreground: its maps; `motion.affine` describes the motion to its warped neighbours.
+    view: the reference frame. foreground: its maps; `Motion.affine` describes the motion to its warped neighbours.
     """
+    seeds, guides = [], []
+    for blob, motion in moving:
+        left, top, width, height = _surroundings(blob.box, view.size)
+        here: np.ndarray = np.zeros((height, width, 2), np.float32)
+        here[..., 1] = 1
+        here[box_slices(blob.box, left, top)] = np.dstack(_explain_pixels(blob, motion, view, foreground, settings))
+        half = max(width // 2, 1), max(height // 2, 1)
+        image = view.image[box_slices((left, top, width, height))]
+        guides.append(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
+        seeds.append(cv2.resize(here, half, interpolation=cv2.INTER_AREA))
+    weights = smooth_along_edges(seeds, guides, settings.refine.spatial_px / 2, settings.refine.colour_levels)
+    masks = []
+    for (blob, _), weight in zip(moving, weights, strict=True):
+        left, top, width, height = _surroundings(blob.box, view.size)
+        share = cv2.resize(weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6), (width, height))
+        masks.append((share[box_slices(blob.box, left, top)] > settings.refine.share) & blob.mask)
+    return masks
+
+
+def _surroundings(box: Box, size: tuple[int, int]) -> Box:
+    """The box of the picture (width, height) in which a blob's evidence spreads."""
+    x, y, width, height = box
+    left, top = max(x - _PAD, 0), max(y - _PAD, 0)
+    return left, top, min(x + width + _PAD, size[0]) - left, min(y + height + _PAD, size[1]) - top
+
+
+def _explain_pixels(
+    blob: Blob, motion: Motion, view: View, foreground: Foreground, settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """How surely the pixels of a blob's box are target and background, (height, width) float32 each."""
     x, y, width, height = blob.box
     box, own = box_slices(blob.box), view.grey[box_slices(blob.box)]
     slope = foreground.texture[box].astype(np.float32) / 4
@@ -213,52 +254,65 @@ def refine_outline(blob: Blob, motion: Motion, view: View, foreground: Foregroun
     background = np.clip(slope / 8, 0, 1) * np.clip(1 - near / 2, 0, 1) * np.clip(0.5 + (moving - still) / 2, 0, 1)
     background *= np.clip(1 - far / 3, 0, 1)
     background[~blob.mask] = 1
-
-    left, top = max(x - _PAD, 0), max(y - _PAD, 0)
-    right, bottom = min(x + width + _PAD, view.size[0]), min(y + height + _PAD, view.size[1])
-    inside = box_slices(blob.box, left, top)
-    seeds: np.ndarray = np.zeros((bottom - top, right - left, 2), np.float32)
-    seeds[..., 1] = 1
-    seeds[inside] = np.dstack([certain, background])
-    half = max((right - left) // 2, 1), max((bottom - top) // 2, 1)
-    guide = cv2.resize(view.image[top:bottom, left:right], half, interpolation=cv2.INTER_AREA)
-    seeds = cv2.resize(seeds, half, interpolation=cv2.INTER_AREA)
-    weight = smooth_along_edges(seeds, guide, settings.refine.spatial_px / 2, settings.refine.colour_levels)
-    share = cv2.resize(weight[..., 0] / (weight[..., 0] + weight[..., 1] + 1e-6), (right - left, bottom - top))
-    return (share[inside] > settings.refine.share) & blob.mask
+    return certain, background
 
 
 def smooth_along_edges(
-    values: np.ndarray, guide: np.ndarray, spatial_px: float, colour_levels: float, rounds: int = 2
-) -> np.ndarray:
-    """Smooth (H, W, K) values along the flat regions of a picture, without crossing its edges.
+    values: Sequence[np.ndarray],
+    guides: Sequence[np.ndarray],
+    spatial_px: float,
+    colour_levels: float,
+    rounds: int = 2,
+) -> list[np.ndarray]:
+    """Smooth (H, W, K) values along the flat regions of pictures, without crossing their edges.
 
-    guide: (H, W, 3) or (H, W) uint8. spatial_px: reach where the colour does not change. colour_levels: change of
+    guides: (H, W, 3) or (H, W) uint8. spatial_px: reach where the colour does not change. colour_levels: change of
     colour, summed over the channels, that counts as much as that reach.
     Source: the recursive domain transform, Gastal and Oliveira 2011.
     """
-    colours = np.atleast_3d(guide).astype(np.float32)
-    colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
-    across, down = (1 + spatial_px / colour_levels * np.abs(np.diff(colours, axis=axis)).sum(axis=2) for axis in (1, 0))
-
-    def filter_both_ways(lines: np.ndarray, keep: np.ndarray) -> None:
-        """Over the first axis and back: each line takes the share `keep` from the line before it."""
-        keep = np.ascontiguousarray(keep)[:, :, None]
-        for i in range(1, len(lines)):
-            lines[i] += keep[i - 1] * (lines[i - 1] - lines[i])
-        for i in range(len(lines) - 2, -1, -1):
-            lines[i] += keep[i] * (lines[i + 1] - lines[i])
-
-    # Rows are made contiguous for either direction: each step then works on whole rows.
-    rows = np.ascontiguousarray(values, np.float32)
+    distances: list[list[np.ndarray]] = [[], []]  # along columns, along rows
+    for guide in guides:
+        colours = np.atleast_3d(guide).astype(np.float32)
+        colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
+        for axis in (0, 1):
+            change = np.abs(np.diff(colours, axis=axis)).sum(axis=2)
+            distances[axis].append(1 + spatial_px / colour_levels * change)
     for i in range(rounds):
         sigma = spatial_px * np.sqrt(3) * 2 ** (rounds - i - 1) / np.sqrt(4**rounds - 1)
         decay = np.log(np.float32(np.exp(-np.sqrt(2) / sigma)))
-        columns = np.ascontiguousarray(rows.transpose(1, 0, 2))
-        filter_both_ways(columns, np.exp(decay * across).T)
-        rows = np.ascontiguousarray(columns.transpose(1, 0, 2))
-        filter_both_ways(rows, np.exp(decay * down))
-    return rows
+        for axis in (1, 0):
+            values = _smooth_lines(values, [np.exp(decay * distance) for distance in distances[axis]], axis)
+    return list(values)
+
+
+def _smooth_lines(values: Sequence[np.ndarray], keeps: Sequence[np.ndarray], axis: int) -> list[np.ndarray]:
+    """Along an axis and back: each line takes the share `keep` from the line before it.
+
+    All values lie side by side, so that a step takes one line of each. values: (H, W, K) each.
+    """
+    moved = [np.moveaxis(value, axis, 0) for value in values]
+    widths = [value[0].size for value in moved]
+    ends = np.cumsum([0, *widths]).tolist()
+    lines = np.zeros((max(map(len, moved), default=0), ends[-1]), np.float32)
+    shares = np.zeros((max(len(lines) - 1, 0), ends[-1]), np.float32)  # nothing comes from beyond the last line
+    for value, keep, left, right in zip(moved, keeps, ends, ends[1:], strict=False):
+        lines[: len(value), left:right] = value.reshape(len(value), -1)
+        keep = np.moveaxis(keep, axis, 0)
+        shares[: len(keep), left:right] = np.repeat(keep, value.shape[2], axis=1)
+    each, share, change = list(lines), list(shares), np.empty(ends[-1], np.float32)
+    steps = [*zip(each, each[1:], share, strict=False)]
+    for before, after, kept in steps:
+        np.subtract(before, after, out=change)
+        change *= kept
+        after += change
+    for before, after, kept in reversed(steps):
+        np.subtract(after, before, out=change)
+        change *= kept
+        before += change
+    parts = (
+        lines[: len(v), left:right].reshape(v.shape) for v, left, right in zip(moved, ends, ends[1:], strict=False)
+    )
+    return [np.moveaxis(part, 0, axis) for part in parts]
 
 
 def remove_shadow(

@@ -27,13 +27,21 @@ _MEMORY_FRAMES = 30
 _LENGTHS, _LENGTHS_EACH = 0.25, 0.005
 
 
+Links = dict[tuple[int, int], int | None]
+"""The blob that continues blob i in the next (1) or last (-1) frame, by (i, 1) or (i, -1); None: there is none."""
+
+
 @dataclass(frozen=True)
 class Sighting:
-    """The blobs of one frame and their motions. next_from_this: (3, 3) to the following frame, None at a cut."""
+    """The blobs of one frame and their motions. next_from_this: (3, 3) to the following frame, None at a cut.
+
+    links: those found so far; every frame is judged beside up to four others, and looks for the same ones each time.
+    """
 
     blobs: Sequence[Blob]
     motions: Sequence[Motion]
     next_from_this: np.ndarray | None
+    links: Links = field(default_factory=dict)
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -59,17 +67,17 @@ def find_persistent(
     crowded = np.median([sum(not blob.weak for blob in s.blobs) for s in sightings]) > parameters.trusted_blobs
     possible = min(index, 2) + 1 + min(len(sightings) - 1 - index, 2)
     verdicts = []
-    for blob, motion in zip(sightings[index].blobs, sightings[index].motions, strict=True):
+    for i, (blob, motion) in enumerate(zip(sightings[index].blobs, sightings[index].motions, strict=True)):
         # The frames in which it is seen, and those of them in which it moves steadily.
         links, passes = 1, int(motion.steady > parameters.flow_share)
         for direction in (1, -1):
-            seen = blob, motion
+            seen = i
             for at in (index, index + direction):
-                if (following := _follow(*seen, sightings, at, direction)) is None:
+                if (following := _follow(seen, sightings, at, direction)) is None:
                     break
                 seen = following
                 links += 1
-                passes += seen[1].steady > parameters.flow_share
+                passes += sightings[at + direction].motions[seen].steady > parameters.flow_share
         if blob.weak:
             verdicts.append(links >= parameters.weak_links and passes >= parameters.weak_passes)
             continue
@@ -83,15 +91,21 @@ def find_persistent(
     return verdicts
 
 
-def _follow(
-    blob: Blob, motion: Motion, sightings: Sequence[Sighting], at: int, direction: int
-) -> tuple[Blob, Motion] | None:
-    """The blob one frame on (or back) that continues this one, if any."""
+def _follow(i: int, sightings: Sequence[Sighting], at: int, direction: int) -> int | None:
+    """The blob one frame on (or back) that continues blob i of `sightings[at]`, if any."""
     if not 0 <= at + direction < len(sightings):
         return None
-    step, there = sightings[at if direction > 0 else at - 1].next_from_this, sightings[at + direction]
+    links = sightings[at].links
+    if (i, direction) not in links:
+        step = sightings[at if direction > 0 else at - 1].next_from_this
+        links[i, direction] = _find_link(i, sightings[at], sightings[at + direction], step, direction)
+    return links[i, direction]
+
+
+def _find_link(i: int, here: Sighting, there: Sighting, step: np.ndarray | None, direction: int) -> int | None:
     if step is None or not there.blobs:
         return None
+    blob, motion = here.blobs[i], here.motions[i]
     there_from_here = step if direction > 0 else np.linalg.inv(step)
     areas, centres, sizes, velocities = there.columns
     size, velocity = np.array(blob.box[2:]), np.nan_to_num(motion.velocity_px)
@@ -105,7 +119,7 @@ def _follow(
     ratio = areas / max(blob.area_px, 1)
     fits = (ratio > 1 / _SIZE_RATIO) & (ratio < _SIZE_RATIO) & ((overlap >= _LEAST_IOU) | near)
     best = int(np.argmax(np.where(fits, overlap, -1.0)))
-    return (there.blobs[best], there.motions[best]) if fits[best] else None
+    return best if fits[best] else None
 
 
 @dataclass
