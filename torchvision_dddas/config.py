@@ -68,8 +68,9 @@ class RegistrationParameters(Group):
     ransac_px: float = parameter(2.0, "a point this close to the model's prediction is an inlier", "px", 0.1, 20)
     hypotheses: int = parameter(128, "number of models that RANSAC draws", "models", 8, 4096)
     redetect_frames: int = parameter(
-        1, "detect keypoints every so many frames, and track the inliers in between (onboard)", "frames", 1, 60
+        5, "detect keypoints every so many frames, and track the inliers in between (onboard)", "frames", 1, 60
     )
+    halved_corners: bool = parameter(False, "detect keypoints at half resolution: faster, less accurate")
     halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
     min_inlier_share: float = parameter(0.4, "with a smaller share of inliers registration is unreliable", "-", 0, 1)

@@ -19,7 +19,8 @@ from torchvision_dddas.geometry import transfer
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, RegistrationFamily, TrackedPoints, refit_motion
 
-SETTINGS = Settings()
+# Every pair for itself, as the loss sees them.
+SETTINGS = with_parameters(Settings(), {"registration.redetect_frames": 1})
 
 
 def number(value: float) -> torch.Tensor:

@@ -111,7 +111,8 @@ def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int
 def fit_robust_affine(u: np.ndarray, v: np.ndarray, flow_px: np.ndarray, rounds: int = 5) -> np.ndarray:
     """(3, 2) affine motion of (N,) places and (N, 2) displacements, by iteratively reweighted least squares."""
     columns = np.stack([np.ones(len(u)), u, v], axis=1)
-    median = np.median(flow_px, axis=0)
+    middle = len(flow_px) // 2
+    median = np.partition(flow_px, middle, axis=0)[middle]
     weight = 1 / (1 + ((flow_px - median) ** 2).sum(axis=1) / max(1.0, 0.1 * float(median @ median)))
     fit = np.zeros((3, 2))
     for _ in range(rounds):
@@ -153,27 +154,30 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
     row, column = np.nonzero(core)
     if len(row) < 40:
         return None
-    sample = slice(None, None, max(1, len(row) // 1000))
     scale = max(float(np.ptp(row)), float(np.ptp(column)), 1.0)
     u, v = (column - column.mean()) / scale, (row - row.mean()) / scale
-    flow = velocity_px[row, column]
-    columns = np.c_[np.ones(len(u)), u, v]
+    columns, flow = np.stack([np.ones(len(u)), u, v], axis=1), velocity_px[row, column]
+    # The two motions are sought in a sample.
+    sample = slice(None, None, max(1, len(row) // 1000))
+    some, some_flow = columns[sample], flow[sample]
 
     def fit(which: np.ndarray) -> np.ndarray:
-        chosen = np.flatnonzero(which)[sample]
-        return fit_robust_affine(u[chosen], v[chosen], flow[chosen])
+        return fit_robust_affine(some[which, 1], some[which, 2], some_flow[which])
 
     # Plain least squares as well: the robust fit hardly follows a body that turns or grows.
-    for one in (fit(np.ones(len(u), bool)), np.linalg.lstsq(columns[sample], flow[sample], rcond=None)[0]):
-        miss = np.linalg.norm(flow - columns @ one, axis=1)
-        if (miss > max(_CLEARLY_PX / 2, _CLEARLY / 2 * float(np.linalg.norm(one[0])))).mean() < _MIN_SHARE:
+    for one in (fit(np.ones(len(some), bool)), np.linalg.lstsq(some, some_flow, rcond=None)[0]):
+        limit = max(_CLEARLY_PX / 2, _CLEARLY / 2 * float(np.linalg.norm(one[0])))
+        if (_miss(some, some_flow, one) > limit).mean() < _MIN_SHARE:
             return None
-    second = _find_second_cluster(flow)
+    second = _find_second_cluster(some_flow)
     for _ in range(_ROUNDS):
         if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
             return None
-        misses = [np.linalg.norm(flow - columns @ one, axis=1) for one in (fit(~second), fit(second))]
-        second = misses[1] < misses[0]
+        fits = fit(~second), fit(second)
+        first_miss, second_miss = (_miss(some, some_flow, one) for one in fits)
+        second = second_miss < first_miss
+    misses = [_miss(columns, flow, one) for one in fits]
+    second = misses[1] < misses[0]
     if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
         return None
     a, b = np.median(flow[~second], axis=0), np.median(flow[second], axis=0)
@@ -190,6 +194,12 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
         if (miss[chosen] < difference / 2).mean() < _EXPLAINED or largest < _ONE_PIECE:
             return None
     return part
+
+
+def _miss(columns: np.ndarray, flow_px: np.ndarray, affine: np.ndarray) -> np.ndarray:
+    """(N,) by how much an affine motion misses each displacement."""
+    across, down = (flow_px - columns @ affine).T
+    return np.hypot(across, down)
 
 
 def _find_second_cluster(flow_px: np.ndarray) -> np.ndarray:

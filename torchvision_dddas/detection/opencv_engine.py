@@ -168,14 +168,15 @@ def _register(earlier: View, later: View, parameters: RegistrationParameters) ->
     carrying = parameters.redetect_frames > 1
 
     def detect(step: np.ndarray | None) -> _Carried:
-        points = detect_keypoints(earlier.grey, parameters, halved=carrying and not parameters.halved)
+        points = detect_keypoints(earlier.grey, parameters, halved=parameters.halved_corners and not parameters.halved)
         return _Carried(points, step, 0, len(points), _cover(points, earlier.size))
 
     carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
     if carried is not None:
-        # Anew where the points carried on are too old, too few or too much in one place.
+        # Anew where the points carried on are too old, too few, too much in one place, or more than are now allowed.
         if (
             carried.age >= parameters.redetect_frames
+            or len(carried.points) > parameters.keypoints
             or len(carried.points) < _LEAST_LEFT * carried.count
             or _cover(carried.points, earlier.size) < _LEAST_COVER * carried.cover
         ):

@@ -314,12 +314,12 @@ class _PairRegistration:
         return found
 
     def _detect(self, view: View) -> None:
-        """Detect keypoints, at half the resolution where the onboard engine does so, at a quarter of the cost."""
+        """Detect keypoints, at half the resolution if that is set, at a quarter of the cost."""
         if "points" in view.kept:
             return
         parameters = self.parameters
         levels, cell, step = _levels_of(view, self.device), cell_side(*view.size, parameters), 1
-        if parameters.redetect_frames > 1 and min(view.size) > 1:
+        if parameters.halved_corners and min(view.size) > 1:
             # Half a pixel to the left and top of where the corner stands: a search window does not mind.
             levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
         least = 1e-7 * LEVEL**2

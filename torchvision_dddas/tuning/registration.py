@@ -96,7 +96,7 @@ def track_points(engine: Engine, earlier: np.ndarray, later: np.ndarray, labels:
     # All points, whatever their distance on the way back: its limit is tuned.
     unchecked = parameters.model_copy(update={"forward_backward_px": np.inf})
     views = engine.prepare(earlier), engine.prepare(later)
-    start = detect_keypoints(views[0].grey, parameters, halved=parameters.redetect_frames > 1)
+    start = detect_keypoints(views[0].grey, parameters, halved=parameters.halved_corners)
     end, found, missed_px = start, np.zeros(0, bool), np.zeros(0)
     if len(start):
         end, found, missed_px = track_both_ways(*match_exposure(*views), start, unchecked)
