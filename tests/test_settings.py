@@ -81,6 +81,11 @@ def test_a_whole_number_serves_where_a_fraction_may_stand() -> None:
     assert load_config(None, ["registration.ransac_px=2"]).registration.ransac_px == 2.0
 
 
+@pytest.mark.parametrize(("text", "number"), [(".5", 0.5), ("1.", 1.0), ("+.25", 0.25)])
+def test_numbers_may_begin_or_end_with_their_point(text: str, number: float) -> None:
+    assert load_config(None, [f"track.hiding={text}"]).track.hiding == number
+
+
 @pytest.mark.parametrize(
     ("override", "wanted"),
     [

@@ -749,7 +749,10 @@ def parse_override(text: str) -> tuple[str, object]:
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
     except (ValueError, RecursionError):  # the latter for brackets without end, which no parameter takes
-        return name, value  # a bare word: a choice such as affine
+        try:
+            return name, float(value)  # TOML takes 0.3, but not .3
+        except ValueError:
+            return name, value  # a bare word: a choice such as affine
 
 
 def nearest(name: str, known: list[str], where: str = "`dddas settings` lists them all") -> str:

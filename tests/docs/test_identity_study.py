@@ -140,6 +140,14 @@ def test_sequences_of_one_name_are_a_set_and_the_others_one_more(study) -> None:
     assert study("identities").group(names) == {"others": ["A-1", "A-2", "B-1", "D"], "C": ["C-1", "C-2", "C-3"]}
 
 
+def test_a_sequence_has_no_part_in_choosing_its_own_setting(study) -> None:
+    # The second setting is best on the first sequence alone, and so much that it is the best in the mean as well.
+    score = np.array([[50.0, 60, 60], [100.0, 55, 55]])
+    choose = study("left_out").choose_without_each
+    assert choose(score, np.ones(3)).tolist() == [0, 1, 1]
+    assert choose(score, np.array([0.01, 1, 1])).tolist() == [0, 0, 0]
+
+
 def test_every_condition_has_a_twin_of_known_rate(study) -> None:
     at_known_rate = study("identities").at_known_rate
     assert at_known_rate("noisy, unknown rate") == "noisy" == at_known_rate("noisy")

@@ -42,7 +42,7 @@ def test_exact_data_give_the_exact_pose_whatever_the_telemetry_leaves_out(known,
     seen = look(1, n=5, tilt_deg=tilt_deg, errors=0)
     found = solved(seen, replace(seen.flight, **known))
     same(found, seen.pose)
-    assert found.covariance[6, 6] <= PARAMETERS.focal_sigma**2
+    assert found.covariance[6, 6] <= PARAMETERS.focal_sigma**2 * (1 + 1e-9)
 
 
 def test_a_bent_lens_is_allowed_for():
