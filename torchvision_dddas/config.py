@@ -224,13 +224,13 @@ class TrackParameters(Group):
     smooth: bool = parameter(True, "move boxes with a score below 1 to the smoothed track")
     memory_frames: int = parameter(125, "how long an unseen track is kept", "frames", 1, 10_000)
     memory_outside_frames: int = parameter(10, "how long a track that left the picture is kept", "frames", 1, 10_000)
-    wander: float = parameter(0.45, "change of velocity between looks, as a share of the usual step", "-", 1e-3, 10)
+    wander: float = parameter(0.3, "change of velocity between looks, as a share of the usual step", "-", 1e-3, 10)
     scatter: float = parameter(0.06, "standard deviation of a detection's centre", "heights", 1e-3, 1)
     size_scatter: float = parameter(0.1, "standard deviation of the logarithm of a detection's height", "-", 1e-3, 10)
     tail: float = parameter(
         4.0, "degrees of freedom of the distance's distribution: few tolerate sharp turns and stops", "-", 0.1, 100
     )
-    upright: float = parameter(0.6, "vertical distances of standing targets are divided by this", "-", 0.1, 2)
+    upright: float = parameter(0.6, "standing targets move this much less up and down than across", "-", 0.1, 2)
     crossing: float = parameter(
         0.2, "share of the targets at the picture's border that come or go in a look", "-", 0, 1
     )

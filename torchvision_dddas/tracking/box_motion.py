@@ -18,7 +18,7 @@ _MOST = 3  # candidates
 FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
 _LARGEST_SIZE_CHANGE = 0.35
 _FAR_PRICE = 0.02  # votes lost a height, for each track
-_GAIN, _GAIN_EACH, _GAIN_EACH_NEWBORN = 3.0, 1.0, 1.5  # of the links' scores, at least, and for each track
+_GAIN, _GAIN_EACH, _GAIN_EACH_NEWBORN = 3.0, 2.0, 1.5  # of the links' scores, at least, and for each track
 
 
 def candidate_shifts(

@@ -25,6 +25,7 @@ from torchvision_dddas.tracking.scene import SceneState
 _LEAST_SCORE = -4.0  # of a pair that is near enough to be looked at
 _LARGEST_SIZE_PENALTY = 8.0
 _LARGEST_GONE = 0.95
+_NOISE_SHARE, _MOST_NOISE = 1.5, 0.95  # variance of places from errors, in `scatter` squared, and its largest share
 _BORDER = 0.3  # heights: a target this near to the border may cross it even at rest
 
 # A target that was detected once moves as one of its neighbours does, or stands still, or moves anyhow: the weights,
@@ -174,7 +175,8 @@ def _pairs(
     unit = state[:, HEIGHT] ** 2 * variance
     # Where the density has fallen to what makes the score the least of interest if all else fits.
     least = _LEAST_SCORE - arrival.max(initial=-np.inf) - survival
-    fall = (-np.log(2 * math.pi * parameters.upright * unit) - least) / (1 + parameters.tail / 2)
+    least_unit = unit * min(1.0, parameters.upright**2) * np.minimum(state[:, WIDTH] / state[:, HEIGHT], 1.0)
+    fall = (-np.log(2 * math.pi * least_unit) - least) / (1 + parameters.tail / 2)
     reach = np.sqrt(parameters.tail * unit * np.expm1(np.clip(fall, 0, 50))) * max(1.0, parameters.upright)
     x, y = place_px[..., 0], place_px[..., 1]
     radius = (reach + np.hypot(x - x[0], y - y[0])).max(axis=0)
@@ -196,16 +198,20 @@ def _place_density(
     variance: (..., N) in squared heights of the tracks.
     """
     functions = namespace(state)
-    # Standing people move less up and down in the picture than across it.
+    width, height = state[..., WIDTH], state[..., HEIGHT]
     level = functions.ones_like(variance)
-    upright = functions.where(state[..., HEIGHT] > state[..., WIDTH], parameters.upright * level, level)
-    unit = state[..., HEIGHT] ** 2 * variance
-    peak = -functions.log(2 * math.pi * unit * upright)
+    # Errors of detection grow with the sides of a box. Motion goes with the height; standing people move less up and
+    # down in the picture than across it.
+    noise = functions.minimum(_NOISE_SHARE * parameters.scatter**2 * level, _MOST_NOISE * variance)
+    motion = variance - noise
+    upright = functions.where(height > width, parameters.upright * level, level)
+    narrow = functions.minimum(width / height, level)
+    unit_x, unit_y = height**2 * (motion + noise * narrow**2), height**2 * (motion * upright**2 + noise)
+    peak = -0.5 * functions.log((2 * math.pi) ** 2 * unit_x * unit_y)
     across = pairs.of_boxes(box_px[..., 0] + box_px[..., 2] / 2) - pairs.of_tracks(place_px[..., 0])
     along = pairs.of_boxes(box_px[..., 1] + box_px[..., 3] / 2) - pairs.of_tracks(place_px[..., 1])
-    along = along / pairs.of_tracks(upright)
-    away = (across * across + along * along) / pairs.of_tracks(parameters.tail * unit)
-    return pairs.of_tracks(peak) - (1 + parameters.tail / 2) * functions.log1p(away)
+    away = across * across / pairs.of_tracks(unit_x) + along * along / pairs.of_tracks(unit_y)
+    return pairs.of_tracks(peak) - (1 + parameters.tail / 2) * functions.log1p(away / parameters.tail)
 
 
 def _size_penalty(pairs: _Near | _All, state: np.ndarray, box_px: np.ndarray, scatter: Any) -> np.ndarray:
