@@ -22,13 +22,13 @@ import cv2
 import numpy as np
 import torch
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.matching import pair
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
-from torchvision_dddas.functional import affinity
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking import CameraMotion, FrameTracker, rgb_histograms
 from torchvision_dddas.tracking.source_tracker import (
@@ -197,7 +197,7 @@ def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1)
         for number, which in rows.items():
             padded[number, : len(which)] = feature[which]
         tables = [torch.from_numpy(part)[torch.from_numpy(c)] for part in (padded, valid) for c in frames.T]
-        found = (affinity.pairs(*tables) if count == 2 else affinity.triplets(*tables)).numpy()
+        found = (F.pair_affinity(*tables) if count == 2 else F.triplet_affinity(*tables)).numpy()
         parts.append(
             [np.pad(one[tuple(map(slice, size))], ((1, 0),) * count) for one, size in zip(found, sizes, strict=True)]
         )

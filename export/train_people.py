@@ -33,7 +33,7 @@ import torch
 from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import hog
+from torchvision_dddas.functional import hog_svm
 from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, remove, temporary, write_whole
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.people.pyramid import everywhere, levels
@@ -241,7 +241,7 @@ def descriptors(windows: np.ndarray, parameters: PeopleParameters) -> np.ndarray
     for begin in range(0, len(windows), BATCH):
         batch = torch.from_numpy(np.ascontiguousarray(windows[begin : begin + BATCH])).permute(0, 3, 1, 2).float()
         with torch.inference_mode():
-            blocks = hog.blocks(batch, layout)  # (B, bins x cells down x cells across, ny, nx)
+            blocks = hog_svm.hog(batch, layout)  # (B, bins x cells down x cells across, ny, nx)
         blocks = blocks.view(-1, layout.bins, cells, cells, down, across).permute(0, 5, 4, 3, 2, 1)
         found.append(blocks.reshape(len(batch), -1).numpy())
     return np.concatenate(found)

@@ -18,7 +18,7 @@ from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import people_graphs as people
 from torchvision_dddas.export.graph_files import refuse_failed, write_graphs
-from torchvision_dddas.functional import hog
+from torchvision_dddas.functional import hog_svm
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.people.onnx_scorer import OnnxScorer
@@ -26,11 +26,11 @@ from torchvision_dddas.runtime import SHIPPED
 from torchvision_dddas.types import LinearSvm, Part
 
 LAYOUTS = {
-    "default": hog.Layout(),
-    "small": hog.Layout((32, 64), 4, 8, 4, 8),
-    "signed, no gamma": hog.Layout((64, 64), 8, 16, 8, 18, signed=True, gamma=False),
-    "blocks of nine cells, apart": hog.Layout((60, 90), 5, 15, 15),
-    "one cell a block": hog.Layout((48, 48), block=8),
+    "default": hog_svm.Layout(),
+    "small": hog_svm.Layout((32, 64), 4, 8, 4, 8),
+    "signed, no gamma": hog_svm.Layout((64, 64), 8, 16, 8, 18, signed=True, gamma=False),
+    "blocks of nine cells, apart": hog_svm.Layout((60, 90), 5, 15, 15),
+    "one cell a block": hog_svm.Layout((48, 48), block=8),
 }
 
 
@@ -40,13 +40,13 @@ def test_graphs_of_any_layout_score_as_torch_does(layout):
 
 
 def test_the_same_layout_gives_the_same_bytes():
-    first, again = (people.build_graphs(hog.Layout()) for _ in range(2))
+    first, again = (people.build_graphs(hog_svm.Layout()) for _ in range(2))
     assert first == again and set(first) == {"people.onnx", "people_histograms.onnx", "people_scores.onnx"}
 
 
 def test_the_shipped_graphs_are_those_that_are_made_now():
     """Node by node: the bytes may differ with the versions of onnx."""
-    for name, content in people.build_graphs(hog.Layout()).items():
+    for name, content in people.build_graphs(hog_svm.Layout()).items():
         shipped, made = onnx.load(SHIPPED / name), onnx.load_from_string(content)
         assert list(shipped.graph.node) == list(made.graph.node)
         for one, other in zip(shipped.graph.initializer, made.graph.initializer, strict=True):
@@ -70,7 +70,7 @@ def test_the_whole_graph_scores_a_picture_as_opencv_does():
 def whole_scores(image: np.ndarray, weights: np.ndarray, bias: float) -> np.ndarray:
     bordered = np.atleast_3d(cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REFLECT_101))
     session = onnxruntime.InferenceSession(str(SHIPPED / "people.onnx"), providers=["CPUExecutionProvider"])
-    arranged = hog.arranged(torch.from_numpy(weights), hog.Layout()).numpy()
+    arranged = hog_svm.arrange_weights(torch.from_numpy(weights), hog_svm.Layout()).numpy()
     numbers = {"bias": np.array(bias, np.float32), "clip": np.array(0.2, np.float32)}
     return session.run(None, {"image": bordered, "weights": arranged} | numbers)[0]
 
@@ -90,8 +90,8 @@ def test_graphs_of_ones_own_serve_the_onboard_back_end(tmp_path: Path):
 
 
 def test_graphs_that_are_off_are_refused(monkeypatch):
-    monkeypatch.setattr(hog, "SOFT_FIRST", 0.2)
-    made = people.build_graphs(hog.Layout())
+    monkeypatch.setattr(hog_svm, "SOFT_FIRST", 0.2)
+    made = people.build_graphs(hog_svm.Layout())
     monkeypatch.undo()
     monkeypatch.setattr(people, "build_graphs", lambda _: made)
     with pytest.raises(InputError, match=r"people.onnx does not agree with functional.hog: .* score, 5e-05"):

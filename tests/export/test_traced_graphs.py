@@ -16,11 +16,11 @@ pytest.importorskip("torch")
 import onnx
 import torch
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export import traced_graphs as traced
 from torchvision_dddas.export.graph_files import OPSET, ExportedGraph, open_session, refuse_failed
-from torchvision_dddas.functional import plane_maps
 from torchvision_dddas.runtime import SHIPPED
 
 SIZE, STEP_SIZE = (96, 80), (128, 96)
@@ -174,5 +174,5 @@ def test_the_horizon_of_the_homography_graph_is_that_of_torch(planes, tilt: floa
     image = corners / (1 + corners @ (tilt, 0))[..., None]
     given = {"ground": corners, "image": image, "weight": np.ones((1, 4))}
     _, valid = open_session(planes["homography.onnx"].content).run(None, given)
-    torch_valid = plane_maps.fit_homography(*(torch.from_numpy(array) for array in given.values()))[1]
+    torch_valid = F.find_homography_dlt(*(torch.from_numpy(array) for array in given.values()))[1]
     assert valid.item() == torch_valid.item() == is_seen

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import PaperParameters
-from torchvision_dddas.functional import affinity
 from torchvision_dddas.tracking import source_tracker
 
 Features = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -26,14 +26,14 @@ def masks(*tables: torch.Tensor) -> list[torch.Tensor]:
 
 def test_a_triplet_by_hand():
     frames = [torch.tensor([[row]]) for row in ([4.0, 1.0], [2.0, 3.0], [1.0, 5.0])]
-    found = affinity.triplets(frames[0], frames[1], frames[2], *masks(*frames))
+    found = F.triplet_affinity(frames[0], frames[1], frames[2], *masks(*frames))
     torch.testing.assert_close(found, torch.full((1, 1, 1, 1), (2 + 1 + 1 + 3) / (4 + 3 + 2 + 5)))
 
 
 @pytest.mark.parametrize("size", [2, 768])
 def test_the_torch_free_twin_agrees(size):
     a, b, c = features(size=size, dtype=torch.float32)
-    pairs, triplets = affinity.pairs(a, b, *masks(a, b)), affinity.triplets(a, b, c, *masks(a, b, c))
+    pairs, triplets = F.pair_affinity(a, b, *masks(a, b)), F.triplet_affinity(a, b, c, *masks(a, b, c))
     for w in range(2):
         frames = [t[w].double().numpy() for t in (a, b, c)]
         of_two, of_three = (source_tracker.affinity(frames[:count], PaperParameters()) for count in (2, 3))
@@ -45,16 +45,16 @@ def test_padding_changes_no_affinity_and_has_none():
     a, b, c = features()
     known = masks(a, b, c)
     known[1][0, 2] = False
-    without = affinity.triplets(a[:1], b[:1, :2], c[:1], *masks(a[:1], b[:1, :2], c[:1]))
+    without = F.triplet_affinity(a[:1], b[:1, :2], c[:1], *masks(a[:1], b[:1, :2], c[:1]))
     b[0, 2] = 1e6
-    padded = affinity.triplets(a, b, c, *known)
+    padded = F.triplet_affinity(a, b, c, *known)
     torch.testing.assert_close(padded[:1, :, :2], without)
-    assert not padded[0, :, 2].any() and not affinity.pairs(a, b, known[0], known[1])[0, :, 2].any()
+    assert not padded[0, :, 2].any() and not F.pair_affinity(a, b, known[0], known[1])[0, :, 2].any()
 
 
 def test_no_gradient_is_nan_where_vectors_are_zero_or_equal():
     a = torch.zeros(1, 2, 4, requires_grad=True)
-    affinity.pairs(a, a, *masks(a, a)).sum().backward()
+    F.pair_affinity(a, a, *masks(a, a)).sum().backward()
     assert a.grad is not None
     assert a.grad.isfinite().all()
 

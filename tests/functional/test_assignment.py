@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.functional.assignment import dispersion, log_partition
+from torchvision_dddas.functional import dispersion, log_partition
 from torchvision_dddas.geometry import best_pairs
 
 

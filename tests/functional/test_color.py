@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.functional import color
+import torchvision_dddas.functional as F
 from torchvision_dddas.tracking import rgb_histograms
 
 
@@ -18,7 +18,7 @@ def every_colour(step: int = 5) -> np.ndarray:
 
 
 def converted(image: np.ndarray) -> torch.Tensor:
-    return color.bgr_to_hsv(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255)
+    return F.bgr_to_hsv(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255)
 
 
 def test_every_colour_is_within_one_unit_of_opencv():
@@ -36,7 +36,7 @@ RANGES = (
 
 def test_hard_ranges_are_those_of_opencv_but_for_colours_that_it_rounds_across_a_bound():
     image = every_colour(3)
-    of_opencv, found = cv2.cvtColor(image, cv2.COLOR_BGR2HSV), color.within_ranges(converted(image), *RANGES)[0].numpy()
+    of_opencv, found = cv2.cvtColor(image, cv2.COLOR_BGR2HSV), F.within_ranges(converted(image), *RANGES)[0].numpy()
     assert set(np.unique(found)) == {0, 1}
     for mask, low, high in zip(found, *(bound.numpy() for bound in RANGES), strict=True):
         if low[0] <= high[0]:
@@ -50,9 +50,9 @@ def test_hard_ranges_are_those_of_opencv_but_for_colours_that_it_rounds_across_a
 
 def test_gradients_of_grey_and_black_are_finite_and_no_ranges_give_no_masks():
     picture = torch.tensor([0.0, 0.5, 1.0]).repeat(3, 1).reshape(1, 3, 1, 3).requires_grad_()
-    color.within_ranges(color.bgr_to_hsv(picture), *RANGES, softness=20.0).sum().backward()
+    F.within_ranges(F.bgr_to_hsv(picture), *RANGES, softness=20.0).sum().backward()
     assert picture.grad is not None and torch.isfinite(picture.grad).all()
-    assert color.within_ranges(picture, torch.zeros(0, 3), torch.zeros(0, 3)).shape == (1, 0, 1, 3)
+    assert F.within_ranges(picture, torch.zeros(0, 3), torch.zeros(0, 3)).shape == (1, 0, 1, 3)
 
 
 def picture(seed: int = 0, batch: int = 2, height: int = 24, width: int = 32) -> torch.Tensor:
@@ -72,7 +72,7 @@ def test_four_pixels_by_hand():
     image = torch.zeros(1, 3, 2, 2)
     image[0, :, 0, 0] = torch.tensor([255, 10, 0]) / 255
     image[0, :, 0, 1] = torch.tensor([255, 20, 0]) / 255
-    found, valid = color.rgb_histogram(image, boxes((0, 0, 2, 1)), torch.tensor([[True]]))
+    found, valid = F.rgb_histogram(image, boxes((0, 0, 2, 1)), torch.tensor([[True]]))
     red, green, blue = found[0, 0].view(3, 256)
     assert valid.all()
     assert (red[255], green[10], green[20], blue[0]) == (1, 0.5, 0.5, 1)
@@ -82,7 +82,7 @@ def test_four_pixels_by_hand():
 def test_counts_are_those_of_opencv_and_of_the_torch_free_twin():
     image = picture()
     box_px = boxes((3, 2, 10, 12), (-4.6, 5.5, 9.2, 30), (20, 18, 40, 40), (0, 0, 32, 24)).repeat(2, 1, 1)
-    found, _ = color.rgb_histogram(image, box_px, given_as_valid(box_px), normalize=False)
+    found, _ = F.rgb_histogram(image, box_px, given_as_valid(box_px), normalize=False)
     for picked in range(2):
         bgr = np.ascontiguousarray((image[picked] * 255).round().byte().permute(1, 2, 0).numpy()[..., ::-1])
         np.testing.assert_array_equal(found[picked].numpy(), rgb_histograms(bgr, box_px[picked].numpy()))
@@ -93,15 +93,15 @@ def test_counts_are_those_of_opencv_and_of_the_torch_free_twin():
 
 def test_reading_no_more_than_the_largest_box_changes_nothing_and_a_larger_box_is_refused():
     image, box_px = picture(), boxes((3, 2, 10, 12), (30, 20, 10, 12), (0, 0, 11, 5)).repeat(2, 1, 1)
-    whole, _ = color.rgb_histogram(image, box_px, given_as_valid(box_px))
-    small, valid = color.rgb_histogram(image, box_px, given_as_valid(box_px), largest=(12, 10))
+    whole, _ = F.rgb_histogram(image, box_px, given_as_valid(box_px))
+    small, valid = F.rgb_histogram(image, box_px, given_as_valid(box_px), largest=(12, 10))
     assert valid.tolist() == [[True, True, False]] * 2
     assert torch.equal(small[:, :2], whole[:, :2]) and not small[:, 2].any()
 
 
 @pytest.mark.parametrize("box", [(5, 5, 9, 0.4), (5, 5, -3, 9), (40, 5, 9, 9), (-9, 5, 9, 9), (math.nan, 5, 9, 9)])
 def test_a_box_without_a_pixel_is_zeros_and_not_valid(box):
-    found, valid = color.rgb_histogram(picture(batch=1), boxes(box, (5, 5, 9, 9)), torch.tensor([[True, True]]))
+    found, valid = F.rgb_histogram(picture(batch=1), boxes(box, (5, 5, 9, 9)), torch.tensor([[True, True]]))
     assert valid.tolist() == [[False, True]]
     assert not found[0, 0].any()
     assert found[0, 1].sum() == pytest.approx(3, abs=1e-5)

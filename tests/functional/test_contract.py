@@ -10,20 +10,8 @@ import jaxtyping
 import pytest
 import torch
 
-from torchvision_dddas.functional import (
-    affinity,
-    assignment,
-    color,
-    difference,
-    filters,
-    flow,
-    hog,
-    keypoints,
-    morphology,
-    plane_maps,
-    soft,
-    warp,
-)
+import torchvision_dddas.functional as F
+from torchvision_dddas.functional import plane_maps
 
 BATCH, POINTS = 2, 9
 
@@ -41,40 +29,38 @@ EYES = torch.eye(3).expand(BATCH, 3, 3)
 HSV = P[:, :3].reshape(BATCH, 3, 1, 2)
 RANGES = P[0, :5].repeat(1, 2)[:, :3]
 BOXES = torch.tensor([[3.0, 2, 10, 12], [8, 5, 20, 9]]).expand(BATCH, 2, 4)
-LAYOUT = hog.Layout((16, 24), 4, 8, 4)
+LAYOUT = F.Layout((16, 24), 4, 8, 4)
 CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
-    plane_maps.fit_affine: (P, Q, ONES),
+    F.find_affine: (P, Q, ONES),
     plane_maps.three_point: (P[:, :3], Q[:, :3]),
-    affinity.pairs: (P, Q[:, :4], ONES.bool(), ONES[:, :4].bool()),
-    affinity.triplets: (P, Q[:, :4], P[:, :3], ONES.bool(), ONES[:, :4].bool(), ONES[:, :3].bool()),
-    color.bgr_to_hsv: (HSV / 30,),
-    color.within_ranges: (HSV, RANGES, RANGES),
-    color.rgb_histogram: (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool), 1.0),
-    assignment.log_partition: (P[:, :4, :], 1.0),
-    plane_maps.transfer: (EYES, P),
-    plane_maps.transfer_error: (EYES, P, Q),
-    difference.exposure: (GREY, GREY * 0.9 + 0.01, MASK),
-    difference.gradient: ((GREY * 255).round(),),
-    filters.gaussian: (COLOUR, 5),
-    filters.box_sum: (GREY, 5),
-    flow.track: (P, [GREY], [GREY.roll(1, -1)]),
-    flow.forward_backward: (P, [GREY], [GREY.roll(1, -1)]),
-    plane_maps.fit_homography: (P, Q, ONES),
-    plane_maps.fit_raw: (P, Q),
+    F.pair_affinity: (P, Q[:, :4], ONES.bool(), ONES[:, :4].bool()),
+    F.triplet_affinity: (P, Q[:, :4], P[:, :3], ONES.bool(), ONES[:, :4].bool(), ONES[:, :3].bool()),
+    F.bgr_to_hsv: (HSV / 30,),
+    F.within_ranges: (HSV, RANGES, RANGES),
+    F.rgb_histogram: (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool), 1.0),
+    F.log_partition: (P[:, :4, :], 1.0),
+    F.fit_exposure: (GREY, GREY * 0.9 + 0.01, MASK),
+    F.mean_gradient: ((GREY * 255).round(),),
+    F.gaussian_blur2d: (COLOUR, 5),
+    F.box_sum: (GREY, 5),
+    F.lucas_kanade: (P, [GREY], [GREY.roll(1, -1)]),
+    F.forward_backward: (P, [GREY], [GREY.roll(1, -1)]),
+    F.find_homography_dlt: (P, Q, ONES),
+    F.find_homography_raw: (P, Q),
     plane_maps.four_point: (P[:, :4], Q[:, :4]),
-    plane_maps.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
-    plane_maps.solve_linear: (EYES, P[:, :3]),
-    keypoints.grid_features: (GREY, 16),
-    keypoints.min_eigenvalue: (GREY,),
-    morphology.dilate: (MASK, 3),
-    morphology.erode: (GREY, (3, 5), "ellipse"),
-    morphology.opening: (MASK, 3),
-    morphology.closing: (GREY, 5, "ellipse", 0.1),
-    soft.step: (GREY, 0.1),
-    warp.resize: (COLOUR * 255, (20, 57)),
-    warp.sample: (GREY, EYES),
+    F.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
+    F.solve_linear: (EYES, P[:, :3]),
+    F.grid_features: (GREY, 16),
+    F.corner_min_eigenvalue: (GREY,),
+    F.dilation: (MASK, torch.ones(3, 3)),
+    F.erosion: (GREY, F.structuring_element("ellipse", (3, 5))),
+    F.opening: (MASK, torch.ones(3, 3)),
+    F.closing: (GREY, F.structuring_element("ellipse", 5), 0.1),
+    F.step: (GREY, 0.1),
+    F.resize: (COLOUR * 255, (20, 57)),
+    F.warp_perspective: (GREY, EYES, (37, 53)),
 }
-NO_SHAPES = {hog.blocks: (COLOUR * 255, LAYOUT)}
+NO_SHAPES = {F.hog: (COLOUR * 255, LAYOUT)}
 
 
 def label(function: Callable[..., object]) -> str:
@@ -149,56 +135,56 @@ BOX, THERE_ARE = torch.tensor([[[0.0, 1, 3, 3], [2, 0, 9, 2]]]).double(), torch.
 LOW, HIGH = torch.tensor([[10.0, 80, 60], [170, 100, 0]]).double(), torch.tensor([[25.0, 255, 255], [8, 255, 255]])
 # Smooth functions of the tensors at which their gradient is compared with finite differences.
 GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] = {
-    "plane_maps.fit_affine": (lambda p, q: plane_maps.fit_affine(p, q, FIVE_WEIGHTS)[0], (FIVE, THERE)),
-    "affinity.pairs": (lambda a, b: affinity.pairs(a, b, *KNOWN[:2]), (double(2, 4, 3), double(2, 3, 3, seed=1))),
-    "affinity.triplets": (
-        lambda a, b, c: affinity.triplets(a, b, c, *KNOWN),
+    "F.find_affine": (lambda p, q: F.find_affine(p, q, FIVE_WEIGHTS)[0], (FIVE, THERE)),
+    "F.pair_affinity": (lambda a, b: F.pair_affinity(a, b, *KNOWN[:2]), (double(2, 4, 3), double(2, 3, 3, seed=1))),
+    "F.triplet_affinity": (
+        lambda a, b, c: F.triplet_affinity(a, b, c, *KNOWN),
         (double(2, 4, 3), double(2, 3, 3, seed=1), double(2, 5, 3, seed=2)),
     ),
-    "color.within_ranges": (
-        lambda picture, low, high: color.within_ranges(color.bgr_to_hsv(picture), low, high, 20.0),
+    "F.within_ranges": (
+        lambda picture, low, high: F.within_ranges(F.bgr_to_hsv(picture), low, high, 20.0),
         (0.1 + 0.8 * double(1, 3, 2, 3, seed=1), LOW, HIGH.double()),
     ),
     **{
-        f"color.rgb_histogram {softness}": (
-            lambda x, softness=softness: color.rgb_histogram(x, BOX, THERE_ARE, softness)[0] @ double(768, seed=3),
+        f"F.rgb_histogram {softness}": (
+            lambda x, softness=softness: F.rgb_histogram(x, BOX, THERE_ARE, softness)[0] @ double(768, seed=3),
             (0.9 * double(1, 3, 4, 5, seed=2),),
         )
         for softness in (1.0, 0.5)
     },
     # A floor above all errors: trimming, which has no gradient, does not take part.
-    "difference.exposure": (
-        lambda a, b: torch.stack(difference.exposure(a, b, INSIDE, floor=9.0)),
+    "F.fit_exposure": (
+        lambda a, b: torch.stack(F.fit_exposure(a, b, INSIDE, floor=9.0)),
         (double(1, 1, 4, 5), double(1, 1, 4, 5, seed=1)),
     ),
-    "filters.gaussian": (lambda x: filters.gaussian(x, 3), (double(1, 1, 5, 6),)),
-    "plane_maps.solve_linear": (
-        lambda a, b: plane_maps.solve_linear(a, b)[0],
+    "F.gaussian_blur2d": (lambda x: F.gaussian_blur2d(x, 3), (double(1, 1, 5, 6),)),
+    "F.solve_linear": (
+        lambda a, b: F.solve_linear(a, b)[0],
         (double(2, 4, 4) - 0.5, double(2, 4, 2, seed=1)),
     ),
     "plane_maps.four_point": (
         lambda p, q: plane_maps.four_point(p, q)[0],
         (QUAD, QUAD + 5 * double(1, 4, 2)),
     ),
-    "plane_maps.fit_homography": (lambda *x: plane_maps.fit_homography(*x)[0], (SIX, SEEN, SIX_WEIGHTS)),
+    "F.find_homography_dlt": (lambda *x: F.find_homography_dlt(*x)[0], (SIX, SEEN, SIX_WEIGHTS)),
     **{
-        f"plane_maps.fit_raw {n}": (lambda *x: plane_maps.fit_raw(*x)[0], (SIX[:, :n] / 300, SEEN[:, :n] / 300))
+        f"F.find_homography_raw {n}": (lambda *x: F.find_homography_raw(*x)[0], (SIX[:, :n] / 300, SEEN[:, :n] / 300))
         for n in (4, 6)
     },
-    "keypoints.min_eigenvalue": (keypoints.min_eigenvalue, (double(1, 1, 6, 7),)),
+    "F.corner_min_eigenvalue": (F.corner_min_eigenvalue, (double(1, 1, 6, 7),)),
     **{
         f"morphology.{operation.__name__}": (
-            lambda x, operation=operation: operation(x, (3, 4), "ellipse", 0.3),
+            lambda x, operation=operation: operation(x, F.structuring_element("ellipse", (3, 4)), 0.3),
             (double(1, 1, 6, 7),),
         )
-        for operation in (morphology.dilate, morphology.erode)
+        for operation in (F.dilation, F.erosion)
     },
-    "soft.step": (lambda x: soft.step(x, 0.2), (torch.linspace(-1, 1, 7).double(),)),
-    "soft.gate_regions": (
-        lambda m, e, a, p: soft.gate_regions(m, e, LABELS, 2, a, p, 0.3),
+    "F.step": (lambda x: F.step(x, 0.2), (torch.linspace(-1, 1, 7).double(),)),
+    "F.gate_regions": (
+        lambda m, e, a, p: F.gate_regions(m, e, LABELS, 2, a, p, 0.3),
         (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), number(1.5), number(6.0)),
     ),
-    "warp.resize": (lambda x: warp.resize(x, (9, 4), rounded=False), (255 * double(1, 2, 6, 7),)),
+    "F.resize": (lambda x: F.resize(x, (9, 4), rounded=False), (255 * double(1, 2, 6, 7),)),
 }
 
 
@@ -211,18 +197,18 @@ def test_gradients_are_those_of_finite_differences(name):
 
 TWO, SPOTS = torch.ones(BATCH, 2, dtype=torch.bool), (LABELS > 0).float()
 SOFT: dict[str, Callable[[float], torch.Tensor]] = {
-    "soft.step": lambda s: soft.step(torch.tensor([-0.3, -0.01, 0.01, 0.3]), s),
-    "soft.gate_regions": lambda s: soft.gate_regions(SPOTS, 8 * GREY[:1, :, :3, :4], LABELS, 2, 2.5, 4.0, s),
-    "color.within_ranges": lambda s: color.within_ranges(color.bgr_to_hsv(COLOUR), LOW.float(), HIGH.float(), s),
-    "color.rgb_histogram": lambda s: color.rgb_histogram(COLOUR, BOXES, TWO, s, normalize=False)[0],
+    "F.step": lambda s: F.step(torch.tensor([-0.3, -0.01, 0.01, 0.3]), s),
+    "F.gate_regions": lambda s: F.gate_regions(SPOTS, 8 * GREY[:1, :, :3, :4], LABELS, 2, 2.5, 4.0, s),
+    "F.within_ranges": lambda s: F.within_ranges(F.bgr_to_hsv(COLOUR), LOW.float(), HIGH.float(), s),
+    "F.rgb_histogram": lambda s: F.rgb_histogram(COLOUR, BOXES, TWO, s, normalize=False)[0],
     **{
         f"morphology.{operation.__name__} {size} {shape}": partial(
-            lambda s, operation, size, shape: operation(4 * GREY - 2, size, shape, s),
+            lambda s, operation, size, shape: operation(4 * GREY - 2, F.structuring_element(shape, size), s),
             operation=operation,
             size=size,
             shape=shape,
         )
-        for operation in (morphology.dilate, morphology.erode, morphology.closing, morphology.opening)
+        for operation in (F.dilation, F.erosion, F.closing, F.opening)
         for size, shape in (((1, 1), "ellipse"), ((4, 7), "rectangle"), ((25, 25), "ellipse"))
     },
 }

@@ -7,16 +7,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchvision_dddas.functional import difference, filters, keypoints, warp
-from torchvision_dddas.functional.filters import reflect_index
-from torchvision_dddas.functional.warp import resize
+import torchvision_dddas.functional as F
+from torchvision_dddas.functional import reflect_index, resize
 
 
 @pytest.mark.parametrize(("size", "sigma"), [(1, None), (3, None), (7, None), (9, None), (5, 1.3), (31, 4.0)])
 def test_smoothing_agrees_with_opencv_to_a_thousandth_of_a_grey_level(texture, tensor, size, sigma):
     picture = tensor(texture(0, 37, 53))
     wanted = cv2.GaussianBlur(picture[0, 0].numpy(), (size, size), sigma or 0)
-    assert (filters.gaussian(picture, size, sigma)[0, 0] - torch.from_numpy(wanted)).abs().max() < 1e-3 / 255
+    found = F.gaussian_blur2d(picture, size, sigma and (sigma, sigma))[0, 0]
+    assert (found - torch.from_numpy(wanted)).abs().max() < 1e-3 / 255
 
 
 @pytest.mark.parametrize("shape", [(61, 87), (2, 3), (1, 1)])
@@ -24,7 +24,7 @@ def test_smoothing_agrees_with_opencv_to_a_thousandth_of_a_grey_level(texture, t
 def test_smoothed_levels_are_opencvs_wide_ones_to_a_level(texture, size, shape):
     picture = texture(0, 120, 160)[: shape[0], : shape[1]].copy()
     picture[: shape[0] // 2] = 255  # the largest sum there is
-    smoothed = filters.gaussian_levels(torch.from_numpy(picture)[None, None], size)[0, 0].numpy()
+    smoothed = (F.gaussian_blur2d(batch(picture), size)[0, 0] + 0.5).byte().numpy()
     apart = np.abs(smoothed.astype(int) - cv2.GaussianBlur(picture, (size, size), 0))
     assert apart.max() <= (size > 9)
 
@@ -48,8 +48,10 @@ def test_sampled_levels_are_opencvs_up_to_ties(texture, shape):
     picture = texture(1, *shape)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     wanted = cv2.warpPerspective(picture, CAMERA, shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    sampled = warp.sample(batch(picture), torch.from_numpy(CAMERA)[None]).add(0.5).byte()[0, 0].numpy()
-    differs = np.abs(sampled.astype(int) - wanted)
+    sampled = F.warp_perspective(
+        batch(picture), torch.from_numpy(CAMERA)[None], shape, padding_mode="border", inverse_map=True, subpixels=32
+    )
+    differs = np.abs(sampled.add(0.5).byte()[0, 0].numpy().astype(int) - wanted)
     assert (differs > 0).mean() < 0.01 and differs.max() <= 1
 
 
@@ -60,8 +62,8 @@ def test_the_columns_seen_are_those_of_a_warped_mask(matrix, border):
     inset = np.zeros(size, np.uint8)
     inset[border : height - border, border : width - border] = 255
     wanted = cv2.warpPerspective(inset, matrix, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP) > 0
-    first, last = warp.seen_columns(torch.from_numpy(matrix)[None], size, size, border)
-    np.testing.assert_array_equal(warp.between(first, last, width)[0, 0].numpy(), wanted)
+    first, last = F.seen_columns(torch.from_numpy(matrix)[None], size, size, border)
+    np.testing.assert_array_equal(F.columns_between(first, last, width)[0, 0].numpy(), wanted)
 
 
 @settings(max_examples=150, deadline=None)
@@ -90,14 +92,14 @@ def test_exposure_recovers_a_change_of_light_despite_movers(texture, tensor, gai
     reference = tensor(texture(0, 240, 320)) * 0.8 + 0.05
     warped = (reference - offset) / gain
     warped[..., 50:110, 80:160] = tensor(texture(1, 60, 80))
-    found = difference.exposure(reference, warped, torch.ones(1, 1, 240, 320, dtype=torch.bool))
+    found = F.fit_exposure(reference, warped, torch.ones(1, 1, 240, 320, dtype=torch.bool))
     assert abs(found[0].item() - gain) < 0.01 and abs(found[1].item() - offset) < 0.005
 
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_exposure_of_a_blank_frame_or_of_nothing_seen_keeps_the_gain(seen):
     blank = torch.full((1, 1, 37, 53), 0.5)
-    gain, offset = difference.exposure(blank, blank * 0.8, torch.full_like(blank, seen).bool())
+    gain, offset = F.fit_exposure(blank, blank * 0.8, torch.full_like(blank, seen).bool())
     assert gain.item() == 1.0 and offset.item() == pytest.approx(0.1 if seen else 0.0, abs=1e-6)
 
 
@@ -105,27 +107,27 @@ def test_the_gradient_is_opencvs(texture):
     picture = texture(2, 61, 87)
     across, down = (cv2.Sobel(picture, cv2.CV_32F, *axis, scale=0.5) for axis in ((1, 0), (0, 1)))
     wanted = cv2.blur(cv2.convertScaleAbs(cv2.magnitude(across, down)), (5, 5))
-    np.testing.assert_array_equal(difference.gradient(batch(picture))[0, 0].numpy().astype(np.uint8), wanted)
+    np.testing.assert_array_equal(F.mean_gradient(batch(picture))[0, 0].numpy().astype(np.uint8), wanted)
 
 
 @pytest.mark.parametrize("block", [2, 3, 5, 7])
 def test_min_eigenvalue_is_opencvs_to_a_millionth_of_its_maximum(texture, tensor, block):
     picture = texture(0, 37, 53)
     wanted = torch.from_numpy(cv2.cornerMinEigenVal(picture, block))
-    found = keypoints.min_eigenvalue(tensor(picture), block)[0, 0]
+    found = F.corner_min_eigenvalue(tensor(picture), block)[0, 0]
     assert (found - wanted).abs().max() < 2e-6 * wanted.max()
 
 
 @pytest.mark.parametrize("shape", [(37, 53), (3, 3), (2, 5), (1, 1)])
 def test_a_blank_picture_of_any_size_has_no_keypoints(shape):
-    points, score, valid = keypoints.grid_features(torch.full((2, 1, *shape), 0.5), 16)
+    points, score, valid = F.grid_features(torch.full((2, 1, *shape), 0.5), 16)
     assert not valid.any() and torch.isfinite(points).all() and (score == 0).all()
 
 
 def test_grid_features_are_the_best_pixel_of_every_whole_cell(texture, tensor):
     picture = tensor(texture(2, 37, 53))
-    eigen = keypoints.min_eigenvalue(picture)[0, 0]
-    points, score, valid = keypoints.grid_features(picture, 16, quality=0.0)
+    eigen = F.corner_min_eigenvalue(picture)[0, 0]
+    points, score, valid = F.grid_features(picture, 16, quality=0.0)
     assert points.shape == (1, 2 * 3, 2) and valid.all()
     for number, (u, v) in enumerate(points[0].long().tolist()):
         row, column = divmod(number, 3)
@@ -137,5 +139,5 @@ def test_grid_features_are_the_best_pixel_of_every_whole_cell(texture, tensor):
 def test_a_cell_below_the_quality_yields_nothing(texture, tensor):
     picture = texture(2, 64, 64)
     picture[:38, :38] = picture[:38, :38] // 16 + 100
-    _, score, valid = keypoints.grid_features(tensor(picture), 32, quality=0.2)
+    _, score, valid = F.grid_features(tensor(picture), 32, quality=0.2)
     assert valid.tolist() == [[False, True, True, True]] and score[0, 0] == 0

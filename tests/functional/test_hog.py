@@ -9,9 +9,9 @@ import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import hog
-from torchvision_dddas.functional.hog import Layout
+from torchvision_dddas.functional import Layout
 
 LAYOUTS = {
     "default": Layout(),
@@ -56,8 +56,8 @@ def opencv_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias
 
 
 def own_scores(picture: np.ndarray, layout: Layout, weights: np.ndarray, bias: float) -> np.ndarray:
-    arranged = hog.arranged(torch.from_numpy(weights), layout)
-    return hog.scores(hog.blocks(bordered(picture), layout), arranged, torch.tensor(bias))[0].numpy()
+    arranged = F.arrange_weights(torch.from_numpy(weights), layout)
+    return F.svm_scores(F.hog(bordered(picture), layout), arranged, torch.tensor(bias))[0].numpy()
 
 
 def random_svm(layout: Layout, seed: int = 0) -> tuple[np.ndarray, float]:
@@ -80,7 +80,7 @@ def test_a_vertical_edge_by_hand():
     share = pooled / (math.sqrt(2) * pooled + 0.9)
     wanted = torch.zeros(9)
     wanted[0] = wanted[8] = share / (math.sqrt(2) * share + 1e-3)
-    torch.testing.assert_close(hog.blocks(edge, layout).flatten(), wanted, atol=1e-5, rtol=0)
+    torch.testing.assert_close(F.hog(edge, layout).flatten(), wanted, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
@@ -113,7 +113,7 @@ def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins,
     layout = Layout(window, cell, block, every, bins, signed, gamma=gamma)
     picture = np.random.default_rng(seed).integers(0, 256, (window[1], window[0], 3), np.uint8)
     across, down = layout.blocks
-    found = hog.blocks(bordered(picture), layout)[0].view(bins, cells, cells, down, across).permute(4, 3, 2, 1, 0)
+    found = F.hog(bordered(picture), layout)[0].view(bins, cells, cells, down, across).permute(4, 3, 2, 1, 0)
     wanted = np.ravel(opencv(layout).compute(picture))
     np.testing.assert_allclose(found.flatten().numpy(), wanted, atol=1e-5, rtol=0)
 
@@ -123,10 +123,12 @@ def test_a_descriptor_of_any_layout_is_opencvs(cell, cells, every, blocks, bins,
 def test_gradients_are_those_of_finite_differences(channels, signed):
     layout, generator = Layout((16, 24), 4, 8, 4, signed=signed), torch.Generator().manual_seed(0)
     levels = torch.rand(1, channels, 28, 22, generator=generator, dtype=torch.float64) * 250 + 2
-    weights = hog.arranged(torch.randn(layout.features, generator=generator, dtype=torch.float64), layout)
+    weights = F.arrange_weights(torch.randn(layout.features, generator=generator, dtype=torch.float64), layout)
     inputs = [given.requires_grad_() for given in (levels, weights.clone(), torch.zeros((), dtype=torch.float64))]
     assert torch.autograd.gradcheck(
-        lambda levels, weights, bias: hog.scores(hog.blocks(levels, layout), weights, bias), inputs, fast_mode=True
+        lambda levels, weights, bias: F.svm_scores(F.hog(levels, layout), weights, bias),
+        inputs,
+        fast_mode=True,
     )
 
 
@@ -140,7 +142,7 @@ def test_gradients_stay_finite_where_the_picture_is_flat_black_or_straight(shape
     layout = Layout((16, 24), 4, 8, 4, gamma=gamma)
     picture = PICTURES[shape].expand(1, 3, 28, 22).clone().requires_grad_()
     weights = torch.randn(layout.features, generator=torch.Generator().manual_seed(0))
-    scored = hog.scores(hog.blocks(picture, layout), hog.arranged(weights, layout), torch.tensor(0.0))
+    scored = F.svm_scores(F.hog(picture, layout), F.arrange_weights(weights, layout), torch.tensor(0.0))
     (slope,) = torch.autograd.grad(scored.sum(), picture)
     assert slope.isfinite().all()
     assert bool((slope != 0).any()) == (shape in ("edge", "diagonal"))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import plane_maps
-from torchvision_dddas.functional.plane_maps import MODELS, fit_homography, ransac
+from torchvision_dddas.functional import MODELS, find_homography_dlt, ransac
 
 PROJECTIVE = torch.tensor(
     [
@@ -28,14 +28,18 @@ def model(request):
 
 
 def corner_error(found: torch.Tensor, wanted: torch.Tensor) -> float:
-    return plane_maps.transfer_error(found, CORNERS, plane_maps.transfer(wanted, CORNERS)).max().item()
+    one, other = (
+        F.transform_points(matrix, CORNERS.expand(len(matrix), 4, 2))
+        for matrix in (found.reshape(-1, 3, 3), wanted.reshape(-1, 3, 3))
+    )
+    return (one - other).norm(dim=-1).max().item()
 
 
 def pairs(count: int = 200, noise: float = 0.0, wrong: float = 0.0, seed: int = 0, true=PROJECTIVE):
     """Points of two clips, where the true maps take them, and which of the pairs are right."""
     generator = torch.Generator().manual_seed(seed)
     p = torch.rand(2, count, 2, generator=generator) * torch.tensor([640.0, 480.0])
-    q = plane_maps.transfer(true, p) + noise * torch.randn(2, count, 2, generator=generator)
+    q = F.transform_points(true, p) + noise * torch.randn(2, count, 2, generator=generator)
     right = torch.rand(2, count, generator=generator) >= wrong
     return p, torch.where(right[..., None], q, torch.rand(2, count, 2, generator=generator) * 500), right
 
@@ -45,7 +49,7 @@ def line(count: int = 30) -> torch.Tensor:
 
 
 def samples(count: int, points: int, size: int = 4, clips: int = 2) -> torch.Tensor:
-    return plane_maps.draw_samples(torch.Generator().manual_seed(1), clips, count, points, size=size)
+    return F.draw_samples(torch.Generator().manual_seed(1), clips, count, points, size=size)
 
 
 def test_agrees_with_lapack_on_random_systems_and_is_valid_in_any_unit():
@@ -53,16 +57,16 @@ def test_agrees_with_lapack_on_random_systems_and_is_valid_in_any_unit():
     matrix = torch.randn(50, 8, 8, generator=generator, dtype=torch.float64)
     matrix[0, 0, 0] = 0  # rows have to be exchanged
     right = torch.randn(50, 8, 3, generator=generator, dtype=torch.float64)
-    x, valid = plane_maps.solve_linear(matrix, right)
+    x, valid = F.solve_linear(matrix, right)
     assert valid.all()
     torch.testing.assert_close(x, torch.linalg.solve(matrix, right), rtol=1e-8, atol=1e-8)
     for unit in (1e-12, 1e12):
-        assert plane_maps.solve_linear(torch.eye(3)[None] * unit, torch.ones(1, 3, 1))[1].all()
+        assert F.solve_linear(torch.eye(3)[None] * unit, torch.ones(1, 3, 1))[1].all()
 
 
 def test_a_singular_member_is_marked_and_leaves_the_others_alone():
     matrix = torch.stack([torch.eye(3), torch.ones(3, 3), torch.zeros(3, 3)])
-    x, valid = plane_maps.solve_linear(matrix, torch.arange(9.0).reshape(3, 3, 1))
+    x, valid = F.solve_linear(matrix, torch.arange(9.0).reshape(3, 3, 1))
     assert valid.tolist() == [True, False, False]
     assert x.squeeze(-1).tolist() == [[0, 1, 2], [0, 0, 0], [0, 0, 0]]
 
@@ -76,8 +80,8 @@ def test_the_fewest_points_give_what_opencv_gives(model):
     for clip, number in np.argwhere(valid.numpy()):
         wanted = torch.eye(3)
         wanted[: size - 1] = torch.from_numpy(by_opencv(p[clip, number].numpy(), q[clip, number].numpy()))
-        there = plane_maps.transfer(wanted, p[clip, number])
-        torch.testing.assert_close(plane_maps.transfer(found[clip, number], p[clip, number]), there, atol=2e-2, rtol=0)
+        there = F.transform_points(wanted, p[clip, number])
+        torch.testing.assert_close(F.transform_points(found[clip, number], p[clip, number]), there, atol=2e-2, rtol=0)
     assert valid.float().mean() > 0.9
 
 
@@ -99,7 +103,7 @@ def test_points_that_fix_no_map_are_marked_and_finite(name, bad):
 
 def test_an_affine_fit_is_the_least_squares_solution():
     p, q, _ = pairs(noise=2.0, true=AFFINE)
-    found, valid = plane_maps.fit_affine(p, q, torch.ones(2, 200))
+    found, valid = F.find_affine(p, q, torch.ones(2, 200))
     rows = torch.cat([p, torch.ones(2, 200, 1)], -1).double()
     wanted = torch.linalg.lstsq(rows, q.double()).solution.mT.float()
     assert valid.all()
@@ -108,7 +112,7 @@ def test_an_affine_fit_is_the_least_squares_solution():
 
 def test_a_homography_fit_is_opencvs_and_the_normalized_dlt():
     p, q, _ = pairs(noise=0.5)
-    found, _ = fit_homography(p, q, torch.ones(2, 200))
+    found, _ = find_homography_dlt(p, q, torch.ones(2, 200))
     for clip in range(2):
         wanted, _ = cv2.findHomography(p[clip].numpy(), q[clip].numpy(), 0)
         assert corner_error(found[clip], torch.from_numpy(wanted).float()) < 0.1
@@ -134,11 +138,11 @@ def normalized_dlt(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
 
 def test_a_fit_leaves_out_pairs_of_weight_zero_even_where_they_hold_no_numbers():
     p, q, right = pairs(wrong=0.3)
-    wanted, _ = fit_homography(p, q, right.float())
+    wanted, _ = find_homography_dlt(p, q, right.float())
     assert corner_error(wanted, PROJECTIVE) < 2e-3
     for nonsense in (q + 100, torch.full_like(q, torch.nan), torch.full_like(q, torch.inf)):
         other = torch.where(right[..., None], q, nonsense)
-        found, valid = fit_homography(torch.where(right[..., None], p, nonsense), other, right.float())
+        found, valid = find_homography_dlt(torch.where(right[..., None], p, nonsense), other, right.float())
         assert valid.all()
         torch.testing.assert_close(found, wanted)
 
@@ -155,7 +159,7 @@ def test_a_fit_of_too_few_points_or_of_a_line_is_marked(model):
 def test_fit_with_a_point_behind_the_horizon_is_marked():
     p = torch.tensor([[[0.0, 0], [1, 0], [1, 1], [0, 1]]], dtype=torch.float64)
     for tilt, seen in ((-0.999, True), (-1.001, False)):
-        assert fit_homography(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
+        assert find_homography_dlt(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
 
 
 @pytest.mark.parametrize("count", [4, 16])
@@ -166,25 +170,25 @@ def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
     there = p[:, :2] + 3  # of pixels, as the matrix itself has entries of all sizes there
     inputs = (p.requires_grad_(), q.requires_grad_(), weight.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: plane_maps.transfer(fit_homography(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
+        lambda *x: F.transform_points(find_homography_dlt(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
     )
 
 
 def test_the_source_as_printed_agrees_with_least_squares_about_the_origin_and_not_far_from_it():
     p, _, _ = pairs(count=6)
-    p, q = p[:1].double() / 100, plane_maps.transfer(PROJECTIVE[:1].double(), p[:1].double()) / 100
+    p, q = p[:1].double() / 100, F.transform_points(PROJECTIVE[:1].double(), p[:1].double()) / 100
     for count, away, low, high in ((6, 0, 0, 1e-8), (6, 100, 1e-3, torch.inf), (4, 100, 0, 1e-3)):
         ground = p[:, :count] if not away else p[:, :count] / 1e4 + away
-        found, valid = plane_maps.fit_raw(ground, q[:, :count])
+        found, valid = F.find_homography_raw(ground, q[:, :count])
         assert valid.all()
-        assert low <= plane_maps.transfer_error(found, ground, q[:, :count]).max() < high
+        assert low <= F.oneway_transfer_error(ground, q[:, :count], found, squared=False).max() < high
 
 
 def test_the_source_as_printed_refuses_only_what_is_exactly_singular():
     same = torch.ones(1, 4, 2, dtype=torch.float64)
-    found, valid = plane_maps.fit_raw(same, same)
+    found, valid = F.find_homography_raw(same, same)
     assert not valid.any() and torch.equal(found[0], torch.eye(3, dtype=torch.float64))
-    assert not plane_maps.fit_raw(same[:, :3], same[:, :3])[1].any()
+    assert not F.find_homography_raw(same[:, :3], same[:, :3])[1].any()
 
 
 def test_ransac_finds_the_map_among_half_wrong_pairs(model):
@@ -230,4 +234,4 @@ def test_samples_repeat_with_the_seed_and_never_draw_a_point_twice():
 
 def test_a_point_on_the_horizon_stays_finite():
     matrix = torch.tensor([[[1.0, 0, 0], [0, 1, 0], [-0.01, 0, 1]]])
-    assert torch.isfinite(plane_maps.transfer(matrix, torch.tensor([[[100.0, 5.0]]]))).all()
+    assert torch.isfinite(F.transform_points(matrix, torch.tensor([[[100.0, 5.0]]]))).all()

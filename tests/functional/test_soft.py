@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from torchvision_dddas.functional import morphology
-from torchvision_dddas.functional.filters import gaussian
-from torchvision_dddas.functional.soft import (
+import torchvision_dddas.functional as F
+from torchvision_dddas.functional import (
     blend_sizes,
     gate_regions,
     gates_of_pixels,
@@ -33,12 +32,12 @@ def test_rounding_is_numpys_and_passes_every_gradient() -> None:
 def test_between_two_sizes_results_are_blended_by_nearness_and_a_size_that_is_taken_is_not() -> None:
     x = torch.rand(1, 1, 20, 20)
     for size in (5.5, torch.tensor(5.5, dtype=torch.float64)):
-        found = blend_sizes(size, lambda k: gaussian(x, k), pitch=2)
-        torch.testing.assert_close(found, 0.75 * gaussian(x, 5) + 0.25 * gaussian(x, 7))
+        found = blend_sizes(size, lambda k: F.gaussian_blur2d(x, k), pitch=2)
+        torch.testing.assert_close(found, 0.75 * F.gaussian_blur2d(x, 5) + 0.25 * F.gaussian_blur2d(x, 7))
     for side in (1, 3, 4):
-        wanted = morphology.erode(x, side, "ellipse")
+        wanted = F.erosion(x, F.structuring_element("ellipse", side))
         for size in (float(side), torch.tensor(float(side))):
-            assert torch.equal(blend_sizes(size, lambda k: morphology.erode(x, k, "ellipse")), wanted)
+            assert torch.equal(blend_sizes(size, lambda k: F.erosion(x, F.structuring_element("ellipse", k))), wanted)
 
 
 LABELS = torch.zeros(2, 1, 6, 8, dtype=torch.int64)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
+from torchvision_dddas.functional import bgr_to_hsv, within_ranges
 from torchvision_dddas.geo.colours import mask_colours
 from torchvision_dddas.tuning.colours import SoftColours, fit_colours, start_ranges
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import RegistrationParameters, Settings
 from torchvision_dddas.detection.engine import (
     EVIDENCE_CAP,
@@ -29,8 +30,6 @@ from torchvision_dddas.detection.engine import (
     judge_points,
     match_exposure,
 )
-from torchvision_dddas.functional import difference, filters, flow, keypoints, plane_maps, warp
-from torchvision_dddas.functional import morphology as morph
 from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
@@ -92,8 +91,11 @@ class TorchEngine(Engine):
         for k in range(len(one.neighbours)):
             neighbours = _join([_levels_of(window.neighbours[k], self.device) for window in windows])
             frame_size = neighbours.shape[-2], neighbours.shape[-1]
-            sampled = warp.sample(neighbours, matrices[:, k], (height, width)).add_(0.5).floor_()
-            run = warp.seen_columns(matrices[:, k], (height, width), frame_size, parameters.border_px)
+            sampled = F.warp_perspective(
+                neighbours, matrices[:, k], (height, width), padding_mode="border", inverse_map=True, subpixels=32
+            )
+            sampled = sampled.add_(0.5).floor_()
+            run = F.seen_columns(matrices[:, k], (height, width), frame_size, parameters.border_px)
             if parameters.kind == "normalized":
                 sampled = _match_light(levels, sampled, run)
             elif parameters.kind == "to_reference":
@@ -104,7 +106,7 @@ class TorchEngine(Engine):
             seen.append(run)
         # Needed for neither otherwise.
         wanted = parameters.kind == "normalized" or self.parameters.refine.on
-        texture = difference.gradient(levels) if wanted else torch.zeros_like(levels)
+        texture = F.mean_gradient(levels) if wanted else torch.zeros_like(levels)
         return WarpedWindows(grey, warped, seen, texture, parameters.kind == "between_later")
 
     def _foreground(self, windows: list[Window]) -> list[Foreground]:
@@ -112,17 +114,17 @@ class TorchEngine(Engine):
         views = self.warp_neighbours(windows)
         normalized = parameters.kind == "normalized"
         if normalized:
-            weight = difference.noise_weight(views.texture, parameters.noise_levels, parameters.gradient_share)
+            weight = F.noise_weight(views.texture, parameters.noise_levels, parameters.gradient_share)
             weight = weight.mul_(EVIDENCE_SCALE)
 
         def evidence(pair: tuple[int, int]) -> Tensor:
             both, least = views.both(pair), views.least(pair)
             if not normalized:
-                return filters.gaussian_levels(least, parameters.blur_px) * both
+                return _blur_levels(least, parameters.blur_px) * both
             z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
-            z = filters.gaussian_levels(z, parameters.blur_px)
+            z = _blur_levels(z, parameters.blur_px)
             # Divided by its median over textured pixels, where that is above one noise unit.
-            units = difference.noise_units(z, views.textured & both, EVIDENCE_SCALE)
+            units = F.noise_units(z, views.textured & both, EVIDENCE_SCALE)
             if bool((units == 1.0).all()):
                 return z
             return z.float().mul_(units.reciprocal().to(torch.float32).reshape(-1, 1, 1, 1)).round_().to(torch.uint8)
@@ -132,11 +134,11 @@ class TorchEngine(Engine):
             near = torch.maximum(near, evidence(pair))
         wide = near if one.wide is None else evidence(one.wide)
         core = (near > int(parameters.threshold * evidence_scale(settings))).to(torch.uint8) * 255
-        core = morph.erode(core, settings.morphology.erode_px, "ellipse")
+        core = F.erosion(core, F.structuring_element("ellipse", settings.morphology.erode_px))
         core = _close_masks(core, one.close_px or settings.morphology.close_px)
         smalls: list[Any] = [None] * len(windows)
         if one.small is not None:
-            least = filters.gaussian_levels(views.smaller(one.small), 5) * views.both(one.small)
+            least = _blur_levels(views.smaller(one.small), 5) * views.both(one.small)
             mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
             level = (settings.small.noise_ratio * mean).clamp(min=settings.small.threshold).floor()
             small = _close_masks((least > level).to(torch.uint8) * 255, settings.small.close_px)
@@ -184,7 +186,7 @@ class WarpedWindows:
     """A batch of references and what their neighbours show of them.
 
     grey: (B, 1, H, W) uint8; warped: the same for each neighbour; seen: for each the first and last column of every row
-    that it shows (see `warp.seen_columns`); texture: (B, 1, H, W) float, 4 x grey levels a pixel. between_later:
+    that it shows (see `F.seen_columns`); texture: (B, 1, H, W) float, 4 x grey levels a pixel. between_later:
     compare the neighbours of a pair with each other, not with the reference.
     """
 
@@ -202,26 +204,36 @@ class WarpedWindows:
 
     def both(self, pair: tuple[int, int]) -> Tensor:
         """Where both neighbours of a pair are seen."""
-        return warp.seen_by_both(self.seen[pair[0]], self.seen[pair[1]], self.grey.shape[-1])
+        return F.seen_by_both(self.seen[pair[0]], self.seen[pair[1]], self.grey.shape[-1])
 
     def least(self, pair: tuple[int, int]) -> Tensor:
         """What the settings compare of a pair, a new tensor."""
         if self.between_later:
-            return difference.absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
+            return _absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
         return self.smaller(pair)
 
     def smaller(self, pair: tuple[int, int]) -> Tensor:
         """The difference from the reference that both neighbours of a pair show, a new tensor."""
         for k in pair:
             if k not in self._distance:
-                self._distance[k] = difference.absolute_difference(self.grey, self.warped[k])
+                self._distance[k] = _absolute_difference(self.grey, self.warped[k])
         return torch.minimum(self._distance[pair[0]], self._distance[pair[1]])
+
+
+def _absolute_difference(a: Tensor, b: Tensor) -> Tensor:
+    """|a - b| of unsigned bytes."""
+    return torch.maximum(a, b).sub_(torch.minimum(a, b))
+
+
+def _blur_levels(levels: Tensor, kernel_size: int) -> Tensor:
+    """Bytes, smoothed by OpenCV's Gaussian, halves rounded up."""
+    return F.gaussian_blur2d(levels.float(), kernel_size).add_(0.5).to(torch.uint8)
 
 
 def _close_masks(mask: Tensor, side: int) -> Tensor:
     """The mask closed with an ellipse; on a CPU only around where it is set at all in any of the pictures."""
     if mask.device.type != "cpu":
-        return morph.closing(mask, side, "ellipse")
+        return F.closing(mask, F.structuring_element("ellipse", side))
     spans = []
     for dim in (-1, -2):
         places = mask.amax((0, 1, dim)).nonzero()
@@ -230,7 +242,7 @@ def _close_masks(mask: Tensor, side: int) -> Tensor:
         # A pixel's closing depends on what lies less than 2 x side away.
         spans.append(slice(max(int(places[0]) - 2 * side, 0), int(places[-1]) + 2 * side + 1))
     out = torch.zeros_like(mask)
-    out[..., spans[0], spans[1]] = morph.closing(mask[..., spans[0], spans[1]], side, "ellipse")
+    out[..., spans[0], spans[1]] = F.closing(mask[..., spans[0], spans[1]], F.structuring_element("ellipse", side))
     return out
 
 
@@ -241,7 +253,7 @@ def _match_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor])
     columns = torch.arange(0, reference.shape[-1], step, device=reference.device)
     inside = (columns >= first) & (columns <= last)
     wanted, given = (picture[..., ::step, ::step] / LEVEL for picture in (reference, warped))
-    gain, offset = difference.exposure(wanted, given, inside[:, None])
+    gain, offset = F.fit_exposure(wanted, given, inside[:, None])
     enough = inside.sum((1, 2)) >= 100
     return _apply_light(reference, warped, torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0))
 
@@ -284,7 +296,7 @@ class _PairRegistration:
 
     def __init__(self, parameters: RegistrationParameters, device: torch.device) -> None:
         self.parameters, self.device = parameters, device
-        self.model = plane_maps.MODELS[parameters.model]
+        self.model = F.MODELS[parameters.model]
 
     def __call__(self, pairs: list[tuple[View, View]]) -> list[Registration]:
         """The background's motion from the first to the second frame of each pair."""
@@ -323,7 +335,7 @@ class _PairRegistration:
             # Half a pixel to the left and top of where the corner stands: a search window does not mind.
             levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
         least = 1e-7 * LEVEL**2
-        points, _, valid = keypoints.grid_features(levels, cell, parameters.quality, parameters.block_px, least=least)
+        points, _, valid = F.grid_features(levels, cell, parameters.quality, parameters.block_px, least=least)
         view.kept["points"], view.kept["valid"] = step * points, valid
 
     def _build_pyramids(self, views: list[View]) -> None:
@@ -335,7 +347,7 @@ class _PairRegistration:
         # OpenCV's rule: a level that Lucas-Kanade's window does not fit into is left out.
         while levels <= self.parameters.levels and smaller_side / 2**levels > self.parameters.window_px:
             levels += 1
-        pictures = flow.pyramid(_join([_levels_of(view, self.device) for view in missing]), levels)
+        pictures = F.build_pyramid(_join([_levels_of(view, self.device) for view in missing]), levels)
         for number, view in enumerate(missing):
             view.kept["pyramid"] = [level[number : number + 1] for level in pictures]
 
@@ -350,13 +362,13 @@ class _PairRegistration:
             return points, valid, torch.eye(3).expand(len(points), 3, 3)
         if points.shape[1] < 2 * _SCOUTS:
             return self._search_everywhere(batch)
-        scouts = plane_maps.spread(valid, _SCOUTS)
+        scouts = F.spread_ranks(valid, _SCOUTS)
         start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
         # A scout that has not arrived after a few steps does not count.
-        ahead, found = flow.track(start, batch.earlier, batch.later, rounds=2, **self._search(most_steps=8))
+        ahead, found = F.lucas_kanade(start, batch.earlier, batch.later, rounds=2, **self._search(most_steps=8))
         found = found & valid.gather(1, scouts)
         motion = self._ransac(start.double(), ahead.double(), found, parameters.hypotheses // 2, (1.5, 1.0)).float()
-        near = found & (plane_maps.transfer_error(motion, start, ahead) < parameters.ransac_px)
+        near = found & (F.oneway_transfer_error(start, ahead, motion, squared=False) < parameters.ransac_px)
         agreed = near.sum(1) >= (0.6 * valid.gather(1, scouts).sum(1)).clamp(min=12)
         end, kept, motion = torch.zeros_like(points), torch.zeros_like(valid), motion.double()
         for choice, search in ((agreed, self._search_near), (~agreed, self._search_everywhere)):
@@ -376,17 +388,17 @@ class _PairRegistration:
     def _search_near(self, batch: _Batch, motion: Tensor) -> Tracked:
         """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
         finest = batch._replace(earlier=batch.earlier[:1], later=batch.later[:1])
-        guess = plane_maps.transfer(motion.float(), batch.points)
+        guess = F.transform_points(motion.float(), batch.points)
         end, found = self._track(finest, guess, self._search(most_steps=10) | {"reach_px": 3})
         gates_px = tuple(share * self.parameters.ransac_px for share in _REFITS)
         start, valid, model = batch.points.double(), batch.valid & found, self.model
-        return end, found, plane_maps.refit(start, end.double(), valid, motion, gates_px, model)
+        return end, found, F.refit_map(start, end.double(), valid, motion, gates_px, model)
 
     def _track(self, batch: _Batch, guess: Tensor | None, settings: dict[str, Any]) -> tuple[Tensor, Tensor]:
         pictures, limit_px = (batch.points, batch.earlier, batch.later), self.parameters.forward_backward_px
         if limit_px > 0:
-            return flow.forward_backward(*pictures, guess, limit_px=limit_px, **settings)
-        return flow.track(*pictures, guess, **settings)
+            return F.forward_backward(*pictures, guess, limit_px=limit_px, **settings)
+        return F.lucas_kanade(*pictures, guess, **settings)
 
     def _search(self, most_steps: int = 1000) -> dict[str, Any]:
         """Settings of the search for points."""
@@ -406,8 +418,8 @@ class _PairRegistration:
             return torch.eye(3, dtype=start.dtype, device=start.device).expand(batch, 3, 3)
         # The same numbers for every pair and call: what one pair gives does not depend on its company.
         generator = torch.Generator().manual_seed(0)
-        samples = plane_maps.draw_samples(generator, 1, hypotheses, count, model.size)
+        samples = F.draw_samples(generator, 1, hypotheses, count, model.size)
         samples = samples.to(start.device).expand(batch, -1, -1)
         tolerance_px = self.parameters.ransac_px
         refits = tuple(share * tolerance_px for share in shares)
-        return plane_maps.ransac(start, end, tracked, samples, model, tolerance_px, refits)[0]
+        return F.ransac(start, end, tracked, samples, model, tolerance_px, refits)[0]

@@ -7,7 +7,7 @@
 
 The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
 tiles together, and has OpenCV take the gradient, which makes it several times quicker (`eval/speed.py people`). Any SVM
-of the same cells, blocks and bins runs on them, with windows of any size: `functional.hog.arranged` gives `weights`.
+of the same cells, blocks and bins runs on them, with windows of any size: `functional.arrange_weights` gives `weights`.
 
 Traced graphs of `functional.hog` are right too, but take 160 ns a pixel on one core at 640x480 where people.onnx takes
 110 and people_histograms.onnx 14 (cv2.HOGDescriptor in all 54): ONNX Runtime has quick convolutions and slow copies.
@@ -23,7 +23,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.export.graph_files import OPSET, Check, ExportedGraph, open_session
-from torchvision_dddas.functional import hog
+from torchvision_dddas.functional import hog_svm
 from torchvision_dddas.people.onnx_scorer import BAKED
 from torchvision_dddas.people.torch_scorer import layout
 
@@ -91,8 +91,8 @@ class GraphBuilder:
         return made.SerializeToString(deterministic=True)
 
 
-def polar(graph: GraphBuilder, image: str, layout: hog.Layout) -> str:
-    """`functional.hog.gradient` and `angle`: (1, 2, H, W)."""
+def polar(graph: GraphBuilder, image: str, layout: hog_svm.Layout) -> str:
+    """`functional.hog_svm.gradient` and `angle`: (1, 2, H, W)."""
     levels = graph("Transpose", graph("Expand", image, graph.whole(1, 1, 3)), perm=[2, 0, 1])
     levels = graph("Cast", levels, to=TensorProto.FLOAT)
     if layout.gamma:
@@ -111,9 +111,9 @@ def polar(graph: GraphBuilder, image: str, layout: hog.Layout) -> str:
         largest = graph("Max", here, largest)
     magnitude = graph("Sqrt", largest)
     x, y = graph("Abs", dx), graph("Abs", dy)
-    ratio = graph("Div", graph("Min", x, y), graph("Add", graph("Max", x, y), graph.number(hog.TINY)))
+    ratio = graph("Div", graph("Min", x, y), graph("Add", graph("Max", x, y), graph.number(hog_svm.TINY)))
     squared = graph("Mul", ratio, ratio)
-    arc = [math.radians(power) for power in hog.ARC]
+    arc = [math.radians(power) for power in hog_svm.ARC]
     angle = graph("Add", graph("Mul", squared, graph.number(arc[3])), graph.number(arc[2]))
     for power in (arc[1], arc[0]):
         angle = graph("Add", graph("Mul", angle, squared), graph.number(power))
@@ -130,14 +130,14 @@ def polar(graph: GraphBuilder, image: str, layout: hog.Layout) -> str:
     return graph("Unsqueeze", both, graph.whole(0))
 
 
-def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "") -> str:
-    """From `functional.hog.hats` to the middle of `blocks`: (F, ny, nx), not yet normalised.
+def histograms(graph: GraphBuilder, polar: str, layout: hog_svm.Layout, out: str = "") -> str:
+    """From `functional.hog_svm.hats` to the middle of `blocks`: (F, ny, nx), not yet normalised.
 
     The hats are sums of ramps relu(m (angle - k)): these are a convolution of one pixel with the rectifier that follows
     it, which costs a digit of accuracy. Pooling is a convolution of each channel by itself, over rows, then over
     columns; the hats and the order of a block's numbers are one of one pixel again.
     """
-    at = hog.knots(layout.bins)[:-1]
+    at = hog_svm.knots(layout.bins)[:-1]
     used = len(at) + 1
     channels = -(-used // CHANNELS) * CHANNELS
     ramps = np.zeros((channels, 2, 1, 1), np.float32)
@@ -149,9 +149,9 @@ def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "
     cells = layout.cells
     order = np.zeros((layout.bins, cells, cells, cells, cells, channels), np.float32)
     pooled = []
-    for cy, rows in enumerate(hog.cell_weights(layout).numpy().astype(np.float32)):
+    for cy, rows in enumerate(hog_svm.cell_weights(layout).numpy().astype(np.float32)):
         over_rows = pool(graph, maps, rows[:, None], channels, (layout.stride, 1))
-        for cx, columns in enumerate(hog.cell_weights(layout).numpy().astype(np.float32)):
+        for cx, columns in enumerate(hog_svm.cell_weights(layout).numpy().astype(np.float32)):
             pooled.append(pool(graph, over_rows, columns[None], channels, (1, layout.stride)))
             order[:, cy, cx, cy, cx, :used] = hats
     kernel = graph.constant(order.reshape(layout.bins * cells**2, -1, 1, 1))
@@ -162,7 +162,7 @@ def histograms(graph: GraphBuilder, polar: str, layout: hog.Layout, out: str = "
 def _hats_of_ramps(bins: int) -> np.ndarray:
     """(bins, K): each bin's hat as a sum of ramps, the second difference at its knots; the first column is m itself."""
     rows = np.zeros((bins, bins + 4))
-    for place, knot in enumerate(hog.knots(bins)):
+    for place, knot in enumerate(hog_svm.knots(bins)):
         # Left of its knot the first hat is 1 - (t - k), plus what bends it to zero.
         rows[knot % bins, place : place + 3] += [1.0, -2.0 if place else -1.0, 1.0]
     return rows[:, : bins + 2]
@@ -174,8 +174,8 @@ def pool(graph: GraphBuilder, maps: str, weights: np.ndarray, channels: int, str
     return graph("Conv", maps, kernel, kernel_shape=list(weights.shape), strides=list(stride), group=channels)
 
 
-def scores(graph: GraphBuilder, histograms: str, layout: hog.Layout, out: str) -> str:
-    """The end of `functional.hog.blocks`, and `scores`: (ny - down + 1, nx - across + 1)."""
+def scores(graph: GraphBuilder, histograms: str, layout: hog_svm.Layout, out: str) -> str:
+    """The end of `functional.hog`, and `scores`: (ny - down + 1, nx - across + 1)."""
     size = layout.bins * layout.cells**2
     flat = graph("Reshape", histograms, graph.whole(size, -1))
     # Sums over a block's numbers as products with ones: ONNX Runtime is slow at sums over the first axis.
@@ -185,8 +185,8 @@ def scores(graph: GraphBuilder, histograms: str, layout: hog.Layout, out: str) -
         square = graph("MatMul", ones, graph("Mul", numbers, numbers))
         return graph("Add", graph("Sqrt", square), graph.number(soft))
 
-    clipped = graph("Min", graph("Div", flat, norm(flat, size * hog.SOFT_FIRST)), "clip")
-    blocks = graph("Div", clipped, norm(clipped, hog.SOFT_SECOND))
+    clipped = graph("Min", graph("Div", flat, norm(flat, size * hog_svm.SOFT_FIRST)), "clip")
+    blocks = graph("Div", clipped, norm(clipped, hog_svm.SOFT_SECOND))
 
     def length(name: str, axis: int) -> str:
         return graph("Shape", name, start=axis, end=axis + 1)
@@ -199,7 +199,7 @@ def scores(graph: GraphBuilder, histograms: str, layout: hog.Layout, out: str) -
     places = graph("Mul", ny, nx)
     weights = graph("Reshape", "weights", graph.whole(-1, size))
     part = graph("MatMul", weights, blocks)
-    # Sums over a window's blocks: see `functional.hog.scores`.
+    # Sums over a window's blocks: see `functional.svm_scores`.
     part = graph("Pad", graph("Reshape", part, joined(down, rest)), joined(graph.whole(0, 0, 0), across))
     part = graph("ReduceSum", graph("Reshape", part, joined(down, across, rest)), one, keepdims=0)
     more = graph("Mul", down, nx)
@@ -210,7 +210,7 @@ def scores(graph: GraphBuilder, histograms: str, layout: hog.Layout, out: str) -
     return graph("Add", graph("Slice", part, graph.whole(0, 0), ends, graph.whole(0, 1)), "bias", out=out)
 
 
-def build_graphs(layout: hog.Layout) -> dict[str, bytes]:
+def build_graphs(layout: hog_svm.Layout) -> dict[str, bytes]:
     """Files by their names."""
     size = layout.bins * layout.cells**2
     number: tuple[int, list] = (TensorProto.FLOAT, [])
@@ -231,13 +231,13 @@ def build_graphs(layout: hog.Layout) -> dict[str, bytes]:
     }
 
 
-def baked(layout: hog.Layout) -> dict[str, int]:
+def baked(layout: hog_svm.Layout) -> dict[str, int]:
     """The parameters that a graph is made for."""
     values = layout.cell, layout.block, layout.stride, layout.bins, int(layout.signed), int(layout.gamma)
     return dict(zip(BAKED, values, strict=True))
 
 
-def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
+def example(layout: hog_svm.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
     """Inputs of a picture that is so many pixels larger than the window: patches with noise."""
     rng = np.random.default_rng(seed)
     width, height = (length + more + 2 for length, more in zip(layout.window, spare, strict=True))
@@ -253,7 +253,7 @@ def example(layout: hog.Layout, spare: tuple[int, int], channels: int, seed: int
     }
 
 
-def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
+def largest_difference(files: dict[str, bytes], layout: hog_svm.Layout) -> float:
     """Between the graphs' scores and torch's, over pictures and windows of several sizes."""
     sessions = {name: open_session(content) for name, content in files.items()}
 
@@ -266,16 +266,16 @@ def largest_difference(files: dict[str, bytes], layout: hog.Layout) -> float:
     cases = ((0, 0), 0, 3), ((1, 3 * step), 0, 1), ((5 * step, 2), 1, 3), ((87, 190), 2, 3)
     for seed, (spare, wider, channels) in enumerate(cases, 1):
         window = (layout.window[0] + wider * step, layout.window[1])
-        other = hog.Layout(window, *tuple(vars(layout).values())[1:])
+        other = hog_svm.Layout(window, *tuple(vars(layout).values())[1:])
         given = example(other, spare, channels, seed)
         bordered = torch.from_numpy(given["image"]).permute(2, 0, 1)[None].float()
-        dx, dy = hog.gradient(bordered, layout.gamma)
+        dx, dy = hog_svm.gradient(bordered, layout.gamma)
         magnitude = torch.sqrt(dx * dx + dy * dy)
         turn = 2 * math.pi if layout.signed else math.pi
-        angle = (hog.angle(dx, dy, layout) + 0.5) * (turn / layout.bins)
+        angle = (hog_svm.angle(dx, dy, layout) + 0.5) * (turn / layout.bins)
         given["polar"] = torch.cat([magnitude, magnitude * angle], 1).numpy()
         weights, bias = torch.from_numpy(given["weights"]), torch.from_numpy(given["bias"])
-        wanted = hog.scores(hog.blocks(bordered, other), weights, bias)[0].numpy()
+        wanted = hog_svm.svm_scores(hog_svm.hog(bordered, other), weights, bias)[0].numpy()
         given["histograms"] = run("people_histograms.onnx", given)
         for name in ("people_scores.onnx", "people.onnx"):
             found = run(name, given)

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import cell_side
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph, open_session, trace_graph
-from torchvision_dddas.functional import plane_maps
 from torchvision_dddas.nn import PlaneHomography, RawPlaneHomography, Step, WarpDifference
 
 TOLERANCE_PX = 1e-6
@@ -139,13 +139,13 @@ def homography_difference_px(files: dict[str, bytes]) -> float:
         # The source's own system is compared where it has digits to compare: about the origin, in units of 10 m.
         near = {"ground": (given["ground"] - given["ground"][:, :1]) / 10, "image": given["image"] / 500 - 1}
         fit, fit_raw = ([torch.from_numpy(array) for array in held.values()] for held in (given, near))
-        results = plane_maps.fit_homography(*fit), plane_maps.fit_raw(*fit_raw)
+        results = F.find_homography_dlt(*fit), F.find_homography_raw(*fit_raw)
         for session, held, (wanted, valid), unit in zip(sessions, (given, near), results, (1, 500), strict=True):
             matrix, found_valid = session.run(None, held)
             if not (found_valid.all() and valid.all()):
                 return float("inf")
             points = torch.from_numpy(held["ground"])
-            there = plane_maps.transfer(torch.from_numpy(matrix), points) - plane_maps.transfer(wanted, points)
+            there = F.transform_points(torch.from_numpy(matrix), points) - F.transform_points(wanted, points)
             worst = max(worst, unit * there.abs().max().item())
     return worst
 
@@ -160,7 +160,9 @@ def corner_error(found: np.ndarray, wanted: np.ndarray, shape: tuple[int, ...]) 
     """The largest distance, over matrices (K, 3, 3), between where the corners of a picture (height, width) go."""
     bottom, right = shape[0] - 1.0, shape[1] - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]], dtype=torch.float64)
-    one, other = (plane_maps.transfer(torch.from_numpy(matrix), corners) for matrix in (found, wanted))
+    one, other = (
+        F.transform_points(torch.from_numpy(matrix), corners.expand(len(matrix), 4, 2)) for matrix in (found, wanted)
+    )
     return float((one - other).norm(dim=-1).max())
 
 
@@ -202,7 +204,7 @@ def example_pictures(name: str, settings: Settings, size: tuple[int, int], seed:
     generator, count = torch.Generator().manual_seed(seed), (width // cell) * (height // cell)
     return {
         **seen,
-        "samples": plane_maps.draw_samples(generator, 1, HYPOTHESES, count)[0],
+        "samples": F.draw_samples(generator, 1, HYPOTHESES, count)[0],
         "tolerance_px": torch.tensor(settings.registration.ransac_px, dtype=torch.float64),
         "threshold": threshold,
     }

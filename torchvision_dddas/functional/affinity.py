@@ -10,14 +10,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def pairs(
+def pair_affinity(
     a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"], a_valid: Bool[Tensor, "B N"], b_valid: Bool[Tensor, "B M"]
 ) -> Float[Tensor, "B N M"]:
     """S = Σ min / Σ max in [0, 1]."""
     return _divide(*_sums(a, b), a_valid[..., :, None] & b_valid[..., None, :])
 
 
-def triplets(
+def triplet_affinity(
     a: Float[Tensor, "B N D"],
     b: Float[Tensor, "B M D"],
     c: Float[Tensor, "B L D"],

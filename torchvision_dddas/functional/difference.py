@@ -4,10 +4,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from torchvision_dddas.functional.filters import box_sum, pad_reflect
 
-
-def exposure(
+def fit_exposure(
     reference: Float[Tensor, "B C H W"],
     warped: Float[Tensor, "B C H W"],
     inside: Bool[Tensor, "B 1 H W"],
@@ -57,7 +55,7 @@ def noise_weight(
 ) -> Float[Tensor, "B 1 H W"]:
     """One over the noise expected of a pixel, in grey levels: that of a flat region, and a share of the gradient.
 
-    texture: 4 x grey levels a pixel, as `gradient` gives it.
+    texture: 4 x grey levels a pixel, as `mean_gradient` gives it.
     """
     # In place where that keeps the gradient of the parameters.
     return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()
@@ -76,17 +74,3 @@ def noise_units(
         median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > least else 0.0
         units.append(max(1.0, median / scale))
     return torch.tensor(units, dtype=torch.float64, device=z.device)
-
-
-def gradient(levels: Float[Tensor, "B 1 H W"], block: int = 5) -> Float[Tensor, "B 1 H W"]:
-    """Mean gradient magnitude over block x block pixels, 4 x grey levels a pixel, for pictures in whole grey levels.
-
-    Rounded to whole numbers and cut off at 255 before and after the mean, as OpenCV's 8-bit pictures are.
-    """
-    padded = pad_reflect(levels, 1, 1)
-    steep = padded[..., 2:, :] - padded[..., :-2, :]
-    smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
-    across = smooth[..., 2:] - smooth[..., :-2]
-    down = torch.add(steep[..., 2:] + steep[..., :-2], steep[..., 1:-1], alpha=2.0)
-    magnitude = across.square_().addcmul_(down, down).sqrt_().mul_(0.5).round_().clamp_(max=255.0)
-    return (box_sum(magnitude, block) / block**2).round()

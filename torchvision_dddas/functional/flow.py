@@ -14,15 +14,21 @@ from torchvision_dddas.functional.filters import pad_reflect, reflect_index
 Pyramid = list[Tensor]
 
 
-def pyramid(gray: Float[Tensor, "B 1 H W"], levels: int) -> Pyramid:
-    """`levels` pictures, full size first, each half the one before: cv2.buildOpticalFlowPyramid (5-tap binomial)."""
-    pictures = [gray]
-    for _ in range(levels - 1):
+def build_pyramid(
+    input: Float[Tensor, "B C H W"],  # noqa: A002 (Kornia's name)
+    max_level: int,
+) -> Pyramid:
+    """`max_level` pictures, full size first, each half the one before: cv2.buildOpticalFlowPyramid (5-tap binomial).
+
+    kornia.geometry.build_pyramid smooths alike, then interpolates between pixels; here every other pixel is taken.
+    """
+    pictures = [input]
+    for _ in range(max_level - 1):
         pictures.append(_halved(pictures[-1]))
     return pictures
 
 
-def track(
+def lucas_kanade(
     points: Float[Tensor, "B N 2"],
     pyramid_from: Pyramid,
     pyramid_to: Pyramid,
@@ -68,13 +74,13 @@ def forward_backward(
     limit_px: float = 1.0,
     **settings: float,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """As `track`; found only where tracking back returns to within limit_px of the start. settings: those of `track`.
+    """As `lucas_kanade`, with its settings; found only where tracking back returns to within limit_px of the start.
 
     The backward guess uses the predicted displacement, not the known start: otherwise the check would always pass.
     """
-    there, found = track(points, pyramid_from, pyramid_to, guess, **settings)  # type: ignore[arg-type]
+    there, found = lucas_kanade(points, pyramid_from, pyramid_to, guess, **settings)  # type: ignore[arg-type]
     back_guess = None if guess is None else there - (guess - points)
-    back, returned = track(there, pyramid_to, pyramid_from, back_guess, **settings)  # type: ignore[arg-type]
+    back, returned = lucas_kanade(there, pyramid_to, pyramid_from, back_guess, **settings)  # type: ignore[arg-type]
     return there, found & returned & ((back - points).square().sum(-1) <= limit_px**2)
 
 
@@ -186,7 +192,7 @@ def _inside(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side
 
 
 def _halved(gray: Tensor) -> Tensor:
-    padded = pad_reflect(gray, 2, 2)
+    padded = pad_reflect(gray, 2, 2, 2, 2)
     for dim in (-2, -1):
         size = (padded.shape[dim] - 3) // 2
         taps = [padded.narrow(dim, k, padded.shape[dim] - k) for k in range(5)]

@@ -1,6 +1,6 @@
 """Good features to track: where both eigenvalues of the structure tensor are large (appendix B, step S1).
 
-kornia.feature.gftt_response needs 13x plain OpenCV's time on a CPU, shifts and additions 3.3x or less.
+The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response, which takes 2.6 times as long on a CPU.
 """
 
 import torch
@@ -11,9 +11,9 @@ from torch.nn import functional
 from torchvision_dddas.functional.filters import box_sum, pad_reflect
 
 
-def min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tensor, "B 1 H W"]:
+def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tensor, "B 1 H W"]:
     """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values."""
-    padded = pad_reflect(gray, 1, 1)
+    padded = pad_reflect(gray, 1, 1, 1, 1)
     scale = 1.0 / (4.0 * block)
     above, middle, below = padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]
     smooth = torch.add(above + below, middle, alpha=2.0) * scale
@@ -39,7 +39,7 @@ def grid_features(
     N is the number of cells that lie in the frame as a whole, which may be none. valid where the cell holds a pixel
     above quality times the frame's maximum, and above `least`: the rounding that a blank picture shows.
     """
-    eigen = min_eigenvalue(gray, block)
+    eigen = corner_min_eigenvalue(gray, block)
     (height, width), batch = gray.shape[-2:], len(gray)
     rows, columns = height // cell_px, width // cell_px
     if not rows or not columns:

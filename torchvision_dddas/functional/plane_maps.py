@@ -2,8 +2,9 @@
 
 Matrices are (B, 3, 3), act on (u, v, 1) in pixels and have h33 = 1; affine ones (appendix A's registration, the
 baseline of appendix B, Fig. 2 and 4) have the last row 0 0 1. Randomness is an input (which pairs each hypothesis is
-drawn from), so that a run repeats and the graph exports. kornia.geometry.homography uses SVD, which does not export,
-and its RANSAC is 16x plain OpenCV on a CPU where this one, all hypotheses at once, is about 4.6x.
+drawn from), so that a run repeats and the graph exports. Points are moved and errors measured by Kornia. Its
+find_homography_dlt solves by LU, which no ONNX graph holds, and says nothing of what it could not solve; ours has its
+arguments and tells. Its RANSAC takes one pair of frames at a time, three to five times as long.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
+from kornia.geometry import oneway_transfer_error
 from torch import Tensor
 from torch.nn import functional
 
@@ -53,7 +55,7 @@ def four_point(
     matrix = _to_pixels(matrix, p[..., 0, :], p_scale, q[..., 0, :], q_scale)
     valid = (turned > 0).all(-1) & (thin > 1e-4)
     valid = valid & (matrix[..., 2, 2].abs() > 1e-12) & torch.isfinite(matrix).all(-1).all(-1)
-    return normalize(_or_identity(matrix, valid)), valid
+    return normalize_map(_or_identity(matrix, valid)), valid
 
 
 def three_point(
@@ -73,17 +75,19 @@ def three_point(
     return _or_identity(_with_last_row(torch.cat([right.mT, shift[..., None]], -1)), valid), valid
 
 
-def fit_homography(
-    p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]
+def find_homography_dlt(
+    points1: Float[Tensor, "B N 2"], points2: Float[Tensor, "B N 2"], weights: Float[Tensor, "B N"] | None = None
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination.
+    """The homographies from points1 to points2, as in Kornia, and which are valid.
 
+    Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination.
     A pair of weight 0 is as if it were not there, whatever it holds; four pairs are met exactly. valid is False with
     fewer than four pairs of positive weight, when they do not fix eight parameters (collinear), and when one of them
     would lie on or behind the horizon: so it is with three of four points on one line and noise in their partners.
     """
+    weight = torch.ones_like(points1[..., 0]) if weights is None else weights
     used = weight > 0
-    p, q = (torch.where(used[..., None], points, torch.zeros_like(points)) for points in (p, q))
+    p, q = (torch.where(used[..., None], points, torch.zeros_like(points)) for points in (points1, points2))
     # In float64: the normal equations square the condition, and float32 leaves pixels of error outside the points.
     wide = _wide(p)
     p_unit, p_mean, p_scale = _hartley(p.to(wide), weight.to(wide))
@@ -96,10 +100,10 @@ def fit_homography(
     valid = valid & ((depth > HORIZON) | ~used).all(1)
     matrix = _to_pixels(_matrix_of(solution), p_mean, p_scale, q_mean, q_scale)
     valid = valid & (used.sum(1) >= 4) & (matrix[:, 2, 2].abs() > 1e-9)
-    return normalize(_or_identity(matrix, valid)).to(p.dtype), valid
+    return normalize_map(_or_identity(matrix, valid)).to(p.dtype), valid
 
 
-def fit_affine(
+def find_affine(
     p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
     """Weighted least squares over N pairs; valid is False with fewer than three pairs or when they are collinear."""
@@ -114,12 +118,14 @@ def fit_affine(
     return _or_identity(matrix, valid).to(p.dtype), valid
 
 
-HOMOGRAPHY = PlaneModel(4, four_point, fit_homography)
-MODELS = {"homography": HOMOGRAPHY, "affine": PlaneModel(3, three_point, fit_affine)}
+HOMOGRAPHY = PlaneModel(4, four_point, find_homography_dlt)
+MODELS = {"homography": HOMOGRAPHY, "affine": PlaneModel(3, three_point, find_affine)}
 """By the names that registration.model takes."""
 
 
-def fit_raw(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
+def find_homography_raw(
+    p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]
+) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
     """As the source prints it (appendix A, eq. 8 to 10): A m = k of four pairs, AᵀA m = Aᵀk of more, as they are given.
 
     No weights and no normalisation: in degrees cond(A) is about 1e13, that of AᵀA beyond float64, and what comes out
@@ -180,12 +186,12 @@ def ransac(
     best = cost.argmin(1, keepdim=True)
     matrix = hypotheses.gather(1, best[..., None, None].expand(-1, 1, 3, 3))[:, 0]
     found = possible.gather(1, best)[:, 0] & (valid.sum(1) >= model.size)
-    matrix = refit(p, q, valid & found[:, None], _or_identity(matrix, found), refits, model)
-    inliers = valid & found[:, None] & (transfer_error(matrix, p, q) < tolerance)
+    matrix = refit_map(p, q, valid & found[:, None], _or_identity(matrix, found), refits, model)
+    inliers = valid & found[:, None] & (oneway_transfer_error(p, q, matrix, squared=False) < tolerance)
     return matrix, inliers, found & (inliers.sum(1) >= model.size)
 
 
-def refit(
+def refit_map(
     p: Float[Tensor, "B N 2"],
     q: Float[Tensor, "B N 2"],
     valid: Bool[Tensor, "B N"],
@@ -199,7 +205,7 @@ def refit(
     """
     matrix = guess
     for gate_px in gates_px:
-        support = valid & (transfer_error(matrix, p, q) < gate_px)
+        support = valid & (oneway_transfer_error(p, q, matrix, squared=False) < gate_px)
         # Dividing by the denominator of the transfer turns the algebraic residual into pixels. Written out, so that a
         # batch of one takes the same path as a larger one.
         depth = p[..., 0] * matrix[:, 2, :1] + p[..., 1] * matrix[:, 2, 1:2] + matrix[:, 2, 2:]
@@ -209,35 +215,14 @@ def refit(
     return matrix
 
 
-def transfer(
-    later_from_earlier: Float[Tensor, "*batch 3 3"], points: Float[Tensor, "*points N 2"]
-) -> Float[Tensor, "*both N 2"]:
-    """Where the points land under each matrix; leading axes broadcast. On the horizon that is far away, not NaN."""
-    mapped = points @ later_from_earlier[..., :2].mT + later_from_earlier[..., None, :, 2]
-    depth = mapped[..., 2:]
-    tiny = torch.finfo(mapped.dtype).eps
-    return mapped[..., :2] / torch.where(depth.abs() < tiny, torch.full_like(depth, tiny), depth)
-
-
-def transfer_error(
-    later_from_earlier: Float[Tensor, "*batch 3 3"],
-    earlier_px: Float[Tensor, "*points N 2"],
-    later_px: Float[Tensor, "*points N 2"],
-) -> Float[Tensor, "*both N"]:
-    """Distance in pixels between where a point lands and where it was found."""
-    squared = (transfer(later_from_earlier, earlier_px) - later_px).square().sum(-1)
-    # The floor keeps the gradient of the root finite where a point fits exactly.
-    return squared.clamp(min=1e-18).sqrt()
-
-
-def spread(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
+def spread_ranks(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
     """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer."""
     batch, available = valid.shape
     samples = torch.arange(count, device=valid.device) * available // count
     return _ranks_to_points(valid, samples.expand(batch, 1, -1))[:, 0]
 
 
-def normalize(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+def normalize_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The same mapping with h33 = 1."""
     corner = matrix[..., 2:, 2:]
     tiny = torch.finfo(matrix.dtype).tiny

@@ -51,7 +51,7 @@ def load_colours(backend: str) -> ColourFinder:
         return mask_colours
     import torch
 
-    from torchvision_dddas.functional.color import bgr_to_hsv, within_ranges
+    from torchvision_dddas.functional import bgr_to_hsv, within_ranges
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 

@@ -66,12 +66,12 @@ def load_solver(backend: str) -> PlaneSolver:
         )
     import torch
 
-    from torchvision_dddas.functional import plane_maps
+    import torchvision_dddas.functional as F
 
     def on_arrays(function: Callable[..., Any]) -> Callable[..., Solution]:
         return lambda *arrays: tuple(result.numpy() for result in function(*map(torch.from_numpy, arrays)))
 
-    return PlaneSolver(on_arrays(plane_maps.fit_homography), on_arrays(plane_maps.fit_raw))
+    return PlaneSolver(on_arrays(F.find_homography_dlt), on_arrays(F.find_homography_raw))
 
 
 @cache

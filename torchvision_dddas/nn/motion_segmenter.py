@@ -20,16 +20,8 @@ import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor, nn
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import Settings
-from torchvision_dddas.functional import difference, filters, morphology
-from torchvision_dddas.functional.soft import (
-    blend_sizes,
-    gate_regions,
-    gates_of_pixels,
-    round_straight_through,
-    step,
-    straight_through,
-)
 
 Values = Mapping[str, Tensor]
 
@@ -91,9 +83,9 @@ class MotionSegmenter(nn.Module):
         evidence = self.evidence(differences, values)
         above = evidence - self._parameter("difference.threshold", values)
         erode_px, close_px = (self._parameter(f"morphology.{name}_px", values) for name in ("erode", "close"))
-        eroded = blend_sizes(erode_px, lambda side: morphology.erode(above, side, "ellipse"))
-        margin = blend_sizes(close_px, lambda side: morphology.closing(eroded, side, "ellipse"))
-        return Core(step(margin, softness * self.settings.difference.threshold), margin, evidence)
+        eroded = F.blend_sizes(erode_px, lambda side: F.erosion(above, F.structuring_element("ellipse", side)))
+        margin = F.blend_sizes(close_px, lambda side: F.closing(eroded, F.structuring_element("ellipse", side)))
+        return Core(F.step(margin, softness * self.settings.difference.threshold), margin, evidence)
 
     def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
         """The largest difference over the near pairs, in noise units or grey levels."""
@@ -102,7 +94,7 @@ class MotionSegmenter(nn.Module):
         if normalized:
             noise_levels = self._parameter("difference.noise_levels", values)
             gradient_share = self._parameter("difference.gradient_share", values)
-            weight = difference.noise_weight(differences.texture, noise_levels, gradient_share) * differences.steps
+            weight = F.noise_weight(differences.texture, noise_levels, gradient_share) * differences.steps
         largest: Tensor | None = None
         for k in range(differences.least.shape[1]):
             least, both = differences.least[:, k : k + 1], differences.both[:, k : k + 1]
@@ -117,7 +109,7 @@ class MotionSegmenter(nn.Module):
 
     def outlined(self, core: Core, found: Regions, values: Values, softness: float = 0.0) -> Float[Tensor, "B 1 H W"]:
         """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
-        gate = gate_regions(
+        gate = F.gate_regions(
             core.mask,
             core.evidence,
             found.near,
@@ -126,10 +118,10 @@ class MotionSegmenter(nn.Module):
             self._parameter("difference.peak", values),
             softness,
         )
-        drawn = core.mask * gates_of_pixels(gate, found.near)
+        drawn = core.mask * F.gates_of_pixels(gate, found.near)
         # In the hull of a region, a hole or a speck is foreground as far as that region is, whatever its evidence.
         carried = (core.margin <= 0) | (found.filled != found.near)
-        return torch.maximum(drawn, gates_of_pixels(gate, found.filled) * carried)
+        return torch.maximum(drawn, F.gates_of_pixels(gate, found.filled) * carried)
 
     def _parameter(self, name: str, values: Values) -> float | Tensor:
         if name in values:
@@ -139,22 +131,22 @@ class MotionSegmenter(nn.Module):
 
     def _blurred(self, levels: Tensor, values: Values) -> Tensor:
         def of_size(side: int) -> Tensor:
-            smooth = filters.gaussian(levels, side)
-            return straight_through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
+            smooth = F.gaussian_blur2d(levels, side)
+            return F.straight_through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
 
-        return blend_sizes(self._parameter("difference.blur_px", values), of_size, pitch=2)
+        return F.blend_sizes(self._parameter("difference.blur_px", values), of_size, pitch=2)
 
     def _in_units(self, z: Tensor, textured: Tensor, steps: float) -> Tensor:
         """Evidence by its median over textured pixels, where that is above one noise unit."""
-        units = difference.noise_units(z.detach().round().to(torch.uint8), textured, steps)
+        units = F.noise_units(z.detach().round().to(torch.uint8), textured, steps)
         if bool((units == 1.0).all()):
             return z
         # Computed in whole numbers, as in the hard pipeline; the gradient is that of the pixel in the middle.
-        median = difference.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / steps
+        median = F.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / steps
         per_unit = units.reciprocal().to(z.dtype)
         slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
-        per_unit = straight_through(per_unit, slope) if self.whole else slope
+        per_unit = F.straight_through(per_unit, slope) if self.whole else slope
         return self._rounded(z * per_unit.reshape(-1, 1, 1, 1))
 
     def _rounded(self, x: Tensor) -> Tensor:
-        return round_straight_through(x) if self.whole else x
+        return F.round_straight_through(x) if self.whole else x

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import DifferenceParameters, MorphologyParameters, RegistrationParameters, Settings
-from torchvision_dddas.functional import difference, filters, flow, keypoints, morphology, plane_maps, warp
 
 # Keypoints that search the whole pyramid; the others start where these say, in the full resolution alone. 200 of them
 # all searching would take three times the nodes' work. With 64 scouts, or 3 steps, a motion in some dozens is lost.
@@ -20,20 +20,20 @@ WHITE = 255.0
 
 
 class PlaneHomography(nn.Module):
-    """`functional.plane_maps.fit_homography`."""
+    """`functional.find_homography_dlt`."""
 
     def forward(self, ground: Tensor, image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Matrix (B, 3, 3), valid (B,) of ground and image (B, n, 2), weight (B, n)."""
-        return plane_maps.fit_homography(ground, image, weight)
+        return F.find_homography_dlt(ground, image, weight)
 
 
 class RawPlaneHomography(nn.Module):
-    """`functional.plane_maps.fit_raw`, which solves four landmarks in another way than more."""
+    """`functional.find_homography_raw`, which solves four landmarks in another way than more."""
 
     def forward(self, ground: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
         """Matrix (B, 3, 3), valid (B,) of ground and image (B, n, 2). A trace has no branches: both ways are taken."""
-        exact, exact_valid = plane_maps.fit_raw(ground[:, :4], image[:, :4])
-        least, least_valid = plane_maps.fit_raw(ground, image)
+        exact, exact_valid = F.find_homography_raw(ground[:, :4], image[:, :4])
+        least, least_valid = F.find_homography_raw(ground, image)
         is_exact = torch.ones_like(ground[:1, :, 0]).sum(1) == 4
         matrix = torch.where(is_exact[:, None, None], exact, least)
         return matrix, (is_exact & exact_valid) | (~is_exact & least_valid)  # the runtime has no `where` of Booleans
@@ -56,16 +56,21 @@ class WarpDifference(nn.Module):
         """
         height, width = reference.shape
         grey, levels = reference[None, None], neighbours[:, None].float()
-        warped = (warp.sample(levels, neighbour_from_reference, (height, width)) + 0.5).floor().to(torch.uint8)
-        first, last = warp.seen_columns(
+        warped = F.warp_perspective(
+            levels, neighbour_from_reference, (height, width), padding_mode="border", inverse_map=True, subpixels=32
+        )
+        warped = (warped + 0.5).floor().to(torch.uint8)
+        first, last = F.seen_columns(
             neighbour_from_reference, (height, width), (height, width), self.difference.border_px
         )
-        seen = warp.seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
-        least = torch.minimum(*(difference.absolute_difference(grey, picture) for picture in warped.split(1)))
-        found = filters.gaussian_levels(least, self.difference.blur_px) * seen
+        seen = F.seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
+        least = torch.minimum(*(torch.maximum(grey, one) - torch.minimum(grey, one) for one in warped.split(1)))
+        found = (F.gaussian_blur2d(least.float(), self.difference.blur_px) + 0.5).to(torch.uint8) * seen
         core = (found > threshold).to(torch.uint8) * 255
-        core = morphology.erode(core, self.morphology.erode_px, "ellipse")
-        return found[0, 0], morphology.closing(core, self.morphology.close_px, "ellipse")[0, 0]
+        erode, close = (
+            F.structuring_element("ellipse", side) for side in (self.morphology.erode_px, self.morphology.close_px)
+        )
+        return found[0, 0], F.closing(F.erosion(core, erode), close)[0, 0]
 
 
 class Register(nn.Module):
@@ -79,7 +84,7 @@ class Register(nn.Module):
         self.levels = 1
         while self.levels <= parameters.levels and min(size) / 2**self.levels > parameters.window_px:
             self.levels += 1
-        self.model = plane_maps.MODELS[parameters.model]
+        self.model = F.MODELS[parameters.model]
 
     def forward(
         self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor
@@ -91,22 +96,22 @@ class Register(nn.Module):
         """
         parameters, pairs = self.settings, len(neighbours)
         levels = reference[None, None].float()
-        points, _, valid = keypoints.grid_features(
+        points, _, valid = F.grid_features(
             levels, self.cell, parameters.quality, parameters.block_px, least=1e-7 * WHITE**2
         )
         points, valid = points.expand(pairs, -1, -1), valid.expand(pairs, -1)
-        earlier = [level.expand(pairs, -1, -1, -1) for level in flow.pyramid(levels, self.levels)]
-        later = flow.pyramid(neighbours[:, None].float(), self.levels)
+        earlier = [level.expand(pairs, -1, -1, -1) for level in F.build_pyramid(levels, self.levels)]
+        later = F.build_pyramid(neighbours[:, None].float(), self.levels)
         samples = samples.expand(pairs, -1, -1)
 
-        scouts = plane_maps.spread(valid, SCOUTS)
+        scouts = F.spread_ranks(valid, SCOUTS)
         start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
         ahead, found = self._track(start, earlier, later, None)
         found = found & valid.gather(1, scouts)
         places = samples * SCOUTS // self.count
         motion = self._ransac(start, ahead, found, places, tolerance_px, (1.0,))[0]
 
-        guess = plane_maps.transfer(motion.float(), points)
+        guess = F.transform_points(motion.float(), points)
         end, tracked = self._track(points, earlier[:1], later[:1], guess)
         tracked = tracked & valid
         matrix, inliers, agreed = self._ransac(points, end, tracked, samples, tolerance_px, REFITS)
@@ -122,13 +127,13 @@ class Register(nn.Module):
             "epsilon_px": parameters.epsilon_px,
             "min_eigen": 1e-4 * WHITE**2,
         } | ({} if guess is None else {"reach_px": REACH_PX})
-        return flow.track(points, earlier, later, guess, **settings)  # type: ignore[arg-type]
+        return F.lucas_kanade(points, earlier, later, guess, **settings)  # type: ignore[arg-type]
 
     def _ransac(
         self, start: Tensor, end: Tensor, tracked: Tensor, samples: Tensor, gate_px: Tensor, shares: Sequence[float]
     ) -> tuple[Tensor, Tensor, Tensor]:
         gates, samples = tuple(share * gate_px for share in shares), samples[..., : self.model.size]
-        return plane_maps.ransac(start.double(), end.double(), tracked, samples, self.model, gate_px, gates)
+        return F.ransac(start.double(), end.double(), tracked, samples, self.model, gate_px, gates)
 
 
 class Step(nn.Module):

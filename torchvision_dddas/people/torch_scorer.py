@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import hog
-from torchvision_dddas.functional.filters import reflect_index
-from torchvision_dddas.functional.warp import resize
 from torchvision_dddas.people.pyramid import count_windows
 from torchvision_dddas.types import LinearSvm, Part
 
@@ -42,7 +40,7 @@ class TorchScorer:
                 f"a window of these settings has {self.layout.features}"
             )
         weights = torch.from_numpy(np.array(svm.weights, np.float32))
-        self.weights = hog.arranged(weights, self.layout).to(self.device)
+        self.weights = F.arrange_weights(weights, self.layout).to(self.device)
         self.bias = torch.tensor(svm.bias, dtype=torch.float32, device=self.device)
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
@@ -79,26 +77,26 @@ class TorchScorer:
         and blocks, and windows that share blocks are scored together: one phase of the block stride after the other.
         """
         width, height = part.level
-        rows = reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
-        columns = reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
-        bordered = resize(levels, (height, width), rows, columns)
+        rows = F.reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
+        columns = F.reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
+        bordered = F.resize(levels, (height, width), rows, columns)
         stride = self.parameters.window_stride_px
         step = math.gcd(stride, self.layout.stride)
         hop, skip = self.layout.stride // step, stride // step
-        found = hog.blocks(bordered, replace(self.layout, stride=step))
+        found = F.hog(bordered, replace(self.layout, stride=step))
         if hop == 1:
-            return hog.scores(found, self.weights, self.bias)[:, ::skip, ::skip]
+            return F.svm_scores(found, self.weights, self.bias)[:, ::skip, ::skip]
         window_width, window_height = self.layout.window
         ny, nx = (part.height - window_height) // step + 1, (part.width - window_width) // step + 1
         dense = bordered.new_empty(len(bordered), ny, nx)
         for down in range(min(hop, ny)):
             for across in range(min(hop, nx)):
-                phase = hog.scores(found[..., down::hop, across::hop], self.weights, self.bias)
+                phase = F.svm_scores(found[..., down::hop, across::hop], self.weights, self.bias)
                 dense[:, down::hop, across::hop] = phase
         return dense[:, ::skip, ::skip]
 
 
-def layout(parameters: PeopleParameters) -> hog.Layout:
+def layout(parameters: PeopleParameters) -> F.Layout:
     """The descriptor of the settings. Raises InputError where they do not fit one another."""
     values: dict[str, Any] = parameters.descriptor
-    return hog.Layout(**values)
+    return F.Layout(**values)

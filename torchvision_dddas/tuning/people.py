@@ -17,7 +17,7 @@ from torchvision_dddas.evaluation.metrics.matching import counted
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional.soft import step
+from torchvision_dddas.functional import step
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.detector import WindowScorer, check_image, load_scorer
 from torchvision_dddas.people.suppression import body_sides, log_odds, people_from_windows

@@ -1,6 +1,6 @@
 """The family of registration: how far the background motion is off where masks say that nothing moves."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+import torchvision_dddas.functional as F
 from torchvision_dddas.config import RegistrationParameters, Settings
 from torchvision_dddas.detection import (
     LAST_TOLERANCE,
@@ -25,8 +26,6 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional.plane_maps import MODELS, Fit, transfer_error
-from torchvision_dddas.functional.soft import step
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Family
 
@@ -120,10 +119,10 @@ def _pair_loss(
     if kept.sum() >= 4:
         start, end = (side.numpy()[kept].astype(np.float32) for side in (points.earlier_px, points.later_px))
         guess = fit_motion(start, end, parameters.model_copy(update={"ransac_px": float(tolerance_px.detach())}))
-    fit, limit_px = MODELS[parameters.model].fit, check_px if has_check else None
+    fit, limit_px = F.MODELS[parameters.model].fit, check_px if has_check else None
     found = refit_motion(points, torch.from_numpy(guess), tolerance_px, limit_px, fit, softness)
     least = max(parameters.min_inlier_share, 1e-3)
-    return found.off_px + REJECTED_PX * step(1 - found.share / least, softness)
+    return found.off_px + REJECTED_PX * F.step(1 - found.share / least, softness)
 
 
 class Refit(NamedTuple):
@@ -139,22 +138,22 @@ def refit_motion(
     guess: Float[Tensor, "3 3"],
     tolerance_px: Tensor,
     check_px: Tensor | None,
-    fit: Fit,
+    fit: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]],
     softness: float = 0.0,
 ) -> Refit:
     """The motion of the points that agree with a guess and were tracked there and back.
 
     tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None without a check. fit: as
-    `fit_homography`. softness: a share of each. The gradient of the guess is left out: a refit forgets it.
+    `functional.find_homography_dlt`. softness: a share of each. The guess gets no gradient: a refit forgets it.
     """
     earlier, later = points.earlier_px[None], points.later_px[None]
     trusted = torch.ones_like(earlier[..., 0])
     if check_px is not None:
-        trusted = step(1 - points.missed_px[None] / check_px, softness)
-    error_px = transfer_error(guess[None].detach(), earlier, later)
-    matrix, solved = fit(earlier, later, step(1 - error_px / (LAST_TOLERANCE * tolerance_px), softness) * trusted)
+        trusted = F.step(1 - points.missed_px[None] / check_px, softness)
+    error_px = F.oneway_transfer_error(earlier, later, guess[None].detach(), squared=False)
+    matrix, solved = fit(earlier, later, F.step(1 - error_px / (LAST_TOLERANCE * tolerance_px), softness) * trusted)
     matrix = torch.where(solved[:, None, None], matrix, guess)
-    error_px = transfer_error(matrix, earlier, later)
-    agreeing = step(1 - error_px / tolerance_px, softness) * trusted
+    error_px = F.oneway_transfer_error(earlier, later, matrix, squared=False)
+    agreeing = F.step(1 - error_px / tolerance_px, softness) * trusted
     # Distances, not squares: a background point that was tracked wrongly counts no more than another.
     return Refit(matrix[0], error_px[0, points.still].mean(), agreeing.sum() / trusted.sum().clamp(min=1))

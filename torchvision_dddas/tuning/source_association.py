@@ -12,8 +12,7 @@ from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
-from torchvision_dddas.functional.assignment import dispersion, log_partition
-from torchvision_dddas.functional.soft import step
+from torchvision_dddas.functional import dispersion, log_partition, step
 from torchvision_dddas.tracking.source_tracker import (
     Features,
     affinity,

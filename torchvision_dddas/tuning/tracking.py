@@ -15,7 +15,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional.assignment import log_partition
+from torchvision_dddas.functional import log_partition
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.tracking import CameraMotion, kalman
 from torchvision_dddas.tracking.appearance import (

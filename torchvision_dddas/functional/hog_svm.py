@@ -156,7 +156,7 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
     return reduce(torch.add, shifted).transpose(-3, -2)
 
 
-def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tensor:
+def hog(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tensor:
     """(B, F, ny, nx) normalised histograms of every block, F = bins x cells down x cells across.
 
     bordered: as in `gradient`; its inside must hold a block. clip: a number in place of the layout's.
@@ -175,8 +175,8 @@ def blocks(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tens
     return clipped / (torch.sqrt((clipped * clipped).sum(1, keepdim=True).clamp(min=1e-30)) + SOFT_SECOND)
 
 
-def arranged(weights: Tensor, layout: Layout) -> Tensor:
-    """(down x across x F,) weights of a linear SVM in OpenCV's order, as (down, across, F) for `scores`.
+def arrange_weights(weights: Tensor, layout: Layout) -> Tensor:
+    """(down x across x F,) weights of a linear SVM in OpenCV's order, as (down, across, F) for `svm_scores`.
 
     OpenCV goes through a window's blocks, and a block's cells, column by column; the bins vary fastest.
     """
@@ -185,7 +185,7 @@ def arranged(weights: Tensor, layout: Layout) -> Tensor:
     return weights.view(across, down, cells, cells, layout.bins).permute(1, 0, 4, 3, 2).reshape(down, across, -1)
 
 
-def scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
+def svm_scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
     """(B, ny - down + 1, nx - across + 1): the SVM's score of the window that begins at each block.
 
     block_map: (B, F, ny, nx). weights: (down, across, F). bias: a number, added.
