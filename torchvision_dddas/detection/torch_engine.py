@@ -120,9 +120,9 @@ class TorchEngine(Engine):
         def evidence(pair: tuple[int, int]) -> Tensor:
             both, least = views.both(pair), views.least(pair)
             if not normalized:
-                return _blur_levels(least, parameters.blur_px) * both
+                return F.gaussian_blur2d(least, parameters.blur_px) * both
             z = least.mul_(both).float().mul_(weight).round_().clamp_(max=EVIDENCE_CAP).to(torch.uint8)
-            z = _blur_levels(z, parameters.blur_px)
+            z = F.gaussian_blur2d(z, parameters.blur_px)
             # Divided by its median over textured pixels, where that is above one noise unit.
             units = F.noise_units(z, views.textured & both, EVIDENCE_SCALE)
             if bool((units == 1.0).all()):
@@ -138,7 +138,7 @@ class TorchEngine(Engine):
         core = _close_masks(core, one.close_px or settings.morphology.close_px)
         smalls: list[Any] = [None] * len(windows)
         if one.small is not None:
-            least = _blur_levels(views.smaller(one.small), 5) * views.both(one.small)
+            least = F.gaussian_blur2d(views.smaller(one.small), 5) * views.both(one.small)
             mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
             level = (settings.small.noise_ratio * mean).clamp(min=settings.small.threshold).floor()
             small = _close_masks((least > level).to(torch.uint8) * 255, settings.small.close_px)
@@ -223,11 +223,6 @@ class WarpedWindows:
 def _absolute_difference(a: Tensor, b: Tensor) -> Tensor:
     """|a - b| of unsigned bytes."""
     return torch.maximum(a, b).sub_(torch.minimum(a, b))
-
-
-def _blur_levels(levels: Tensor, kernel_size: int) -> Tensor:
-    """Bytes, smoothed by OpenCV's Gaussian, halves rounded up."""
-    return F.gaussian_blur2d(levels.float(), kernel_size).add_(0.5).to(torch.uint8)
 
 
 def _close_masks(mask: Tensor, side: int) -> Tensor:

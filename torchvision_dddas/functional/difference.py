@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from torchvision_dddas.functional.soft import all_true
+
 
 def fit_exposure(
     reference: Float[Tensor, "B C H W"],
@@ -65,12 +67,16 @@ def noise_units(
     z: UInt8[Tensor, "B 1 H W"], textured: Bool[Tensor, "B 1 H W"], scale: float, least: int = 500
 ) -> Float[Tensor, "B"]:
     """The median of z / scale over textured pixels where that is above 1, else 1; 1 too where they are too few."""
-    units = []
-    for one, here in zip(z, textured, strict=True):
-        counts = torch.bincount(one[here], minlength=256).cumsum(0)
-        total = int(counts[-1])
-        # The mean of the two in the middle, as NumPy takes it.
-        ranks = torch.tensor([(total - 1) // 2, total // 2], device=z.device)
-        median = float(torch.searchsorted(counts, ranks, right=True).double().mean()) if total > least else 0.0
-        units.append(max(1.0, median / scale))
-    return torch.tensor(units, dtype=torch.float64, device=z.device)
+    level, seen = z.flatten(1), textured.flatten(1)
+    total = seen.sum(1)
+    # The upper one of the two in the middle is above the scale; only then can their mean be.
+    is_high = (total > least) & ((seen & (level > scale)).sum(1) >= total - total // 2)
+    units = torch.ones_like(total, dtype=torch.float64)
+    if all_true(~is_high):
+        return units
+    counts = torch.zeros(len(level), 257, dtype=torch.int64, device=z.device)
+    counts.scatter_add_(1, torch.where(seen, level.long(), 256), torch.ones_like(level, dtype=torch.int64))
+    ranks = torch.stack([(total - 1).clamp(min=0) // 2, total // 2], 1)
+    # The mean of the two in the middle, as NumPy takes it.
+    median = torch.searchsorted(counts.cumsum(1), ranks, right=True).double().mean(1)
+    return torch.where(is_high, (median / scale).clamp(min=1.0), units)

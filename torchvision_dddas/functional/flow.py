@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.functional.filters import pad_reflect, reflect_index
+from torchvision_dddas.functional.soft import all_true
 
 Pyramid = list[Tensor]
 
@@ -56,7 +57,7 @@ def lucas_kanade(
             moved, arrived = _descend(patch, pyramid_to[level], place, settled, iterations, epsilon_px, reach_px)
             place = torch.where((patch.textured & ~settled)[..., None], moved, place)
             settled = settled | arrived
-            if _all_true(settled | ~patch.textured):
+            if all_true(settled | ~patch.textured):
                 break
         found = patch.textured & settled
         if level:
@@ -152,7 +153,7 @@ def _descend(
         # Beyond the table mixing would extrapolate: a point waits at the edge, and the next table is centred there.
         place = (place + share[..., None] * step).clamp(0, span - 1)
         active = active & ~(rest | swing)
-        if _all_true(~active):
+        if all_true(~active):
             break
     inside = ((place > 0) & (place < span - 1)).all(-1)
     return place + origin + (patch.window - 1) / 2, inside
@@ -204,10 +205,3 @@ def _halved(gray: Tensor) -> Tensor:
         )
         padded = torch.add(torch.add(far, near, alpha=4.0), middle, alpha=6.0) / 16.0
     return padded
-
-
-def _all_true(condition: Tensor) -> bool:
-    """Whether to stop early: only where asking is cheap and the graph is not being traced; results are the same."""
-    if condition.device.type != "cpu" or torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[attr-defined]
-        return False
-    return bool(condition.all())

@@ -92,3 +92,10 @@ def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]
     """Each pixel's gate; 0 where its label is 0."""
     none = gate.new_zeros(gate.shape[0], 1)  # there may be no region at all
     return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
+
+
+def all_true(condition: Tensor) -> bool:
+    """Whether to stop early: only where asking is cheap and the graph is not being traced; results are the same."""
+    if condition.device.type != "cpu" or torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[attr-defined]
+        return False
+    return bool(condition.all())

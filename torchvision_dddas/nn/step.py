@@ -65,7 +65,7 @@ class WarpDifference(nn.Module):
         )
         seen = F.seen_by_both((first[:1], last[:1]), (first[1:], last[1:]), width)
         least = torch.minimum(*(torch.maximum(grey, one) - torch.minimum(grey, one) for one in warped.split(1)))
-        found = (F.gaussian_blur2d(least.float(), self.difference.blur_px) + 0.5).to(torch.uint8) * seen
+        found = F.gaussian_blur2d(least, self.difference.blur_px) * seen
         core = (found > threshold).to(torch.uint8) * 255
         erode, close = (
             F.structuring_element("ellipse", side) for side in (self.morphology.erode_px, self.morphology.close_px)
