@@ -1,5 +1,6 @@
 """Every parameter: its default, unit, range and meaning; read from TOML files and `group.parameter=value` overrides."""
 
+import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,6 +47,21 @@ class Group(BaseModel):
         return self
 
 
+EVIDENCE_SCALE, EVIDENCE_CAP = 16.0, 240
+"""Evidence is kept in 8-bit maps: in sixteenths of the local noise, clipped at 15 noise units."""
+
+WHITE = 248
+"""From this grey level on a pixel may be clipped."""
+
+EXPOSURE_PIXELS = 5000
+"""The exposure of a warped picture is fitted to some so many pixels."""
+
+
+def exposure_step(shape: tuple[int, ...]) -> int:
+    """Every so many-th row and column of a picture, (H, W), shows the exposure well enough."""
+    return max(math.isqrt(shape[0] * shape[1] // EXPOSURE_PIXELS), 1)
+
+
 class RegistrationParameters(Group):
     """How the background's motion between two frames is found (appendix B, steps S1 to S3)."""
 
@@ -74,6 +90,10 @@ class RegistrationParameters(Group):
     halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
     min_inlier_share: float = parameter(0.4, "with a smaller share of inliers registration is unreliable", "-", 0, 1)
+
+    def cell_side(self, width: int, height: int) -> int:
+        """Side in pixels of the cells with one keypoint each that keeps their number within the budget."""
+        return max(self.cell_px, math.ceil(math.sqrt(width * height / self.keypoints)))
 
 
 class IntervalParameters(Group):

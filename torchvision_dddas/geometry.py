@@ -1,7 +1,7 @@
 """Small geometry that all fields share: boxes, plane maps, rotations, matching, places on the Earth. NumPy only."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import atan2, cos, sin, sqrt
@@ -366,3 +366,33 @@ def poses_at(
     if "pitch_deg" in values:
         pitch = np.interp(when, at, np.radians(values["pitch_deg"]))
     return camera, Poses(place, np.broadcast_to(heading, n).astype(float), np.broadcast_to(pitch, n).astype(float))
+
+
+# -- frames about a frame ----------------------------------------------------------------------------------------------
+
+
+def pair_about(at: int, gap: int, first: int, last: int) -> tuple[int, int] | None:
+    """Two frames of first..last a gap apart from frame `at` on both sides, else two on one side, else None."""
+    return _first_within([(at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap)], first, last)
+
+
+def near_pairs(at: int, gaps: Sequence[int], first: int, last: int) -> list[tuple[int, int]]:
+    """The pairs of frames that a frame is compared with, within first..last; may be empty."""
+    near = list(dict.fromkeys(pair for gap in gaps if (pair := pair_about(at, gap, first, last))))
+    if not near and (pair := pair_about(at, 1, first, last)):
+        near = [pair]
+    # One-sided pairs show a target's next places too, the more of them the longer the gap: only the closest is used,
+    # and only where no pair looks both ways.
+    return [pair for pair in near if pair[0] < at < pair[1]] or near[:1]
+
+
+def later_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
+    """The source's pair: one and two intervals later, else earlier, at the shortest one frame; may be empty."""
+    later = [(at + side * gap, at + 2 * side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
+    # The middle one of three frames has a neighbour on either side only.
+    pair = _first_within([*later, (at - 1, at + 1)], first, last)
+    return [] if pair is None else [pair]
+
+
+def _first_within(pairs: Iterable[tuple[int, int]], first: int, last: int) -> tuple[int, int] | None:
+    return next((pair for pair in pairs if first <= min(pair) and max(pair) <= last), None)

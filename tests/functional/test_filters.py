@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.detection import View, match_exposure
 from torchvision_dddas.functional import reflect_index, resize
 
 
@@ -141,3 +142,15 @@ def test_a_cell_below_the_quality_yields_nothing(texture, tensor):
     picture[:38, :38] = picture[:38, :38] // 16 + 100
     _, score, valid = F.grid_features(tensor(picture), 32, quality=0.2)
     assert valid.tolist() == [[False, True, True, True]] and score[0, 0] == 0
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.2, 0.0), (0.7, 12.0), (1.0, 20.0), (3.0, 0.0)])
+def test_exposures_are_matched_as_the_onboard_engine_does(texture, gain, offset):
+    earlier = texture(3, 90, 121)
+    later = np.clip(earlier.astype(float) * gain + offset, 0, 255).round().astype(np.uint8)
+    greys = [np.stack(pair) for pair in ((earlier, earlier), (later, earlier))]
+    found = F.match_exposure(*(torch.from_numpy(grey)[:, None].float() for grey in greys))
+    for k in range(2):
+        wanted = match_exposure(*(View(grey[k], grey[k]) for grey in greys))
+        for ours, theirs in zip(found, wanted, strict=True):
+            np.testing.assert_array_equal(ours[k, 0].numpy(), theirs)

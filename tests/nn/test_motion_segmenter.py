@@ -1,8 +1,18 @@
+"""Motion segmentation: the torch engine's results without softness, gradients with it."""
+
+from itertools import pairwise
+
+import numpy as np
 import pytest
 import torch
 
-from torchvision_dddas.config import Settings, with_parameters
+from tests.synthetic_clip import render
+from torchvision_dddas.config import EVIDENCE_SCALE, Settings, with_parameters
+from torchvision_dddas.detection import Window
+from torchvision_dddas.detection.interval import choose_pairs
+from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions
+from torchvision_dddas.nn.motion_segmenter import TUNED, chain_motion
 
 KNOBS: dict[str, float] = {
     "difference.noise_levels": 4.0,
@@ -31,7 +41,7 @@ def differences(
     texture = torch.randint(0, 60, (2, 1, height, width), generator=random)
     both = torch.ones(2, 2, height, width, dtype=torch.bool)
     both[..., :2] = False
-    return Differences(least.to(torch.uint8), both, texture.to(dtype), texture > 16, 16.0, 240.0)
+    return Differences(least.to(torch.uint8), both, texture.to(dtype))
 
 
 def values() -> dict[str, torch.Tensor]:
@@ -40,18 +50,20 @@ def values() -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> None:
-    motion, windows = MotionSegmenter(NOISY if noisy else SETTINGS), differences(noisy=noisy)
-    hard = motion(windows, {}).mask
+    motion, windows = MotionSegmenter(NOISY if noisy else SETTINGS, tuned=()), differences(noisy=noisy)
+    hard = motion.segment(windows, {}).mask
     assert 0 < float(hard.mean()) < 1 and set(hard.unique().tolist()) == {0.0, 1.0}
-    misses = [float((motion(windows, {}, softness).mask - hard).abs().mean()) for softness in (0.5, 0.1, 0.02, 0.004)]
+    misses = [
+        float((motion.segment(windows, {}, softness).mask - hard).abs().mean()) for softness in (0.5, 0.1, 0.02, 0.004)
+    ]
     assert misses[0] > misses[1] > misses[2] > misses[3] and misses[3] < 0.01
 
 
 @pytest.mark.parametrize("kind", ["normalized", "to_reference"])
 def test_parameters_as_tensors_give_what_the_settings_give(kind: str) -> None:
     settings = with_parameters(SETTINGS, {"difference.kind": kind})
-    motion, windows = MotionSegmenter(settings), differences()
-    given, tuned = motion(windows, {}, 0.1), motion(windows, values(), 0.1)
+    motion, windows = MotionSegmenter(settings, tuned=()), differences()
+    given, tuned = motion.segment(windows, {}, 0.1), motion.segment(windows, values(), 0.1)
     torch.testing.assert_close(given.mask, tuned.mask)
     torch.testing.assert_close(given.evidence, tuned.evidence)
 
@@ -60,13 +72,13 @@ def test_parameters_as_tensors_give_what_the_settings_give(kind: str) -> None:
 def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> None:
     """In double precision, between whole sizes, and where nothing is rounded."""
     windows = differences(torch.float64, noisy)
-    motion = MotionSegmenter(NOISY if noisy else SETTINGS, whole=False)
+    motion = MotionSegmenter(NOISY if noisy else SETTINGS, whole=False, tuned=())
     names = [name for name in KNOBS if name not in ("difference.peak", "gates.min_area_px")]
     at = (4.1, 0.16, 1.6 if noisy else 3.9, 4.3, 2.4, 5.6)
     weight = torch.rand(2, 1, 24, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def total(*parameters: torch.Tensor) -> torch.Tensor:
-        return (motion(windows, dict(zip(names, parameters, strict=True)), 0.2).mask * weight).sum()
+        return (motion.segment(windows, dict(zip(names, parameters, strict=True)), 0.2).mask * weight).sum()
 
     starts = tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in at)
     # The unit of noise has whole steps and so has jumps; small steps stay between them.
@@ -89,22 +101,22 @@ def regions(core: Core) -> Regions:
     ],
 )
 def test_a_region_below_its_area_or_its_peak_is_gone_and_one_above_both_is_whole(name, value, left) -> None:
-    motion = MotionSegmenter(SETTINGS)
-    core = motion(differences(), {})
+    motion = MotionSegmenter(SETTINGS, tuned=())
+    core = motion.segment(differences(), {})
     mask = motion.outlined(core, regions(core), {name: torch.tensor(value)})
     assert torch.equal(mask, core.mask if left else torch.zeros_like(mask))
 
 
 def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
-    motion, windows = MotionSegmenter(SETTINGS), differences()
-    core = motion(windows, {})
+    motion, windows = MotionSegmenter(SETTINGS, tuned=()), differences()
+    core = motion.segment(windows, {})
     near = regions(core).near
     filled = near.clone()
     filled[0, 0, 0, 5] = 1
     found = Regions(near, filled, 1)
     assert float(motion.outlined(core, found, {})[0, 0, 0, 5]) == 1.0
     area = torch.tensor(300.0, dtype=torch.float64, requires_grad=True)
-    soft = motion.outlined(motion(windows, {}, 0.1), found, {"gates.min_area_px": area}, 0.3)[0, 0, 0, 5]
+    soft = motion.outlined(motion.segment(windows, {}, 0.1), found, {"gates.min_area_px": area}, 0.3)[0, 0, 0, 5]
     (slope,) = torch.autograd.grad(soft, area)
     assert 0 < float(soft.detach()) < 1 and float(slope) < 0
 
@@ -112,8 +124,80 @@ def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
 def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
     none = torch.zeros(1, 1, 20, 20)
     parameters = {name: value.requires_grad_() for name, value in values().items()}
-    motion = MotionSegmenter(SETTINGS)
-    core = motion(Differences(none.byte(), none.bool(), none, none.bool(), 16.0, 240.0), parameters, 0.1)
+    motion = MotionSegmenter(SETTINGS, tuned=())
+    core = motion.segment(Differences(none.byte(), none.bool(), none), parameters, 0.1)
     mask = motion.outlined(core, Regions(none.long(), none.long(), 0), parameters, 0.1)
     mask.sum().backward()
     assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in parameters.values())
+
+
+FRAMES, SIZE = 7, (160, 120)
+GAIN = [1.0, 1.0, 1.2, 1.0, 0.8, 1.0, 1.0]
+KINDS = ["normalized", "to_reference", "between_later"]
+
+
+@pytest.fixture(scope="module")
+def images() -> list[np.ndarray]:
+    """Colour frames of a moving camera whose exposure jumps."""
+    return render(1, FRAMES, SIZE, GAIN).images
+
+
+@pytest.fixture(scope="module")
+def clip(images) -> torch.Tensor:
+    """(1, T, 3, H, W) RGB in [0, 1]."""
+    return torch.from_numpy(np.stack(images)[..., ::-1].copy()).permute(0, 3, 1, 2)[None] / 255.0
+
+
+def of_kind(kind: str) -> Settings:
+    threshold = 3.5 if kind == "normalized" else 20.0
+    return with_parameters(Settings(), {"difference.kind": kind, "difference.threshold": threshold})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_a_clip_it_finds_bit_for_bit_what_the_torch_engine_does(kind, images, clip) -> None:
+    """Two clips at once, the second backwards; the engine is given the same motion."""
+    settings = of_kind(kind)
+    clips = torch.cat([clip, clip.flip(1)])
+    found = MotionSegmenter(settings)(clips)
+    engine = TorchEngine(settings, "cpu")
+    for number, frames in enumerate((images, images[::-1])):
+        views = [engine.prepare(image) for image in frames]
+        motion = found.later_from_earlier[number : number + 1]
+        for at in range(FRAMES):
+            pairs, _, _ = choose_pairs(at, settings.interval.frames, 0, FRAMES - 1, settings)
+            used = sorted({frame for pair in pairs for frame in pair})
+            matrices = torch.cat([chain_motion(motion, at, other) for other in used]).numpy()
+            near = tuple((used.index(a), used.index(b)) for a, b in pairs)
+            window = Window(views[at], tuple(views[k] for k in used), matrices, tuple(k - at for k in used), near)
+            (wanted,) = engine.foreground([window])
+            unit = EVIDENCE_SCALE if kind == "normalized" else 1.0
+            np.testing.assert_array_equal(found.mask[number, at, 0].numpy() > 0.5, wanted.core > 0)
+            np.testing.assert_array_equal(found.evidence[number, at, 0].numpy() * unit, wanted.evidence)
+    assert found.mask.any() and set(found.mask.unique().tolist()) == {0.0, 1.0}
+
+
+def test_of_a_clip_it_finds_the_motion_that_the_torch_engine_does(images, clip) -> None:
+    engine = TorchEngine(Settings(), "cpu")
+    wanted = engine.register(list(pairwise(engine.prepare(image) for image in images)))
+    found = MotionSegmenter()(clip)
+    assert found.inliers.tolist() == [[step.inliers for step in wanted]]
+    for matrix, step in zip(found.later_from_earlier[0].numpy(), wanted, strict=True):
+        np.testing.assert_allclose(matrix, step.later_from_earlier, rtol=0, atol=1e-6)
+
+
+def test_a_loss_on_a_clip_moves_the_parameters_that_are_learned(clip) -> None:
+    model = MotionSegmenter(softness=0.2)
+    assert set(dict(model.named_parameters())) == {name.replace(".", "_") for name in TUNED}
+    before = model(clip).mask.mean()
+    before.backward()
+    slopes = [parameter.grad for parameter in model.parameters()]
+    assert all(slope is not None and slope.isfinite() and slope < 0 for slope in slopes)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.mul_(1.1)
+    assert model(clip).mask.mean().item() < before.item()
+
+
+def test_frames_without_two_neighbours_show_nothing(clip) -> None:
+    found = MotionSegmenter()(clip[:, :2])
+    assert found.mask.shape == (1, 2, 1, 120, 160) and not found.mask.any()

@@ -5,13 +5,10 @@ from typing import TYPE_CHECKING
 from torchvision_dddas.detection.blobs import fill_hull
 from torchvision_dddas.detection.detector import MotionDetector, Retune, check_length, detect_motion, load_engine
 from torchvision_dddas.detection.engine import (
-    EVIDENCE_CAP,
-    EVIDENCE_SCALE,
     Engine,
     Foreground,
     View,
     Window,
-    cell_side,
     match_exposure,
 )
 from torchvision_dddas.detection.interval import interval_from_flow, interval_from_telemetry, pixels_per_metre
@@ -21,8 +18,6 @@ if TYPE_CHECKING:
     from torchvision_dddas.detection.torch_engine import TorchEngine
 
 __all__ = [
-    "EVIDENCE_CAP",
-    "EVIDENCE_SCALE",
     "LAST_TOLERANCE",
     "Engine",
     "Foreground",
@@ -31,7 +26,6 @@ __all__ = [
     "TorchEngine",
     "View",
     "Window",
-    "cell_side",
     "check_length",
     "detect_keypoints",
     "detect_motion",

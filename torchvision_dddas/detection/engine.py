@@ -1,6 +1,5 @@
 """Engines, which do the pixel work: their protocol and records, and what they share when they register two frames."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -8,15 +7,9 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import RegistrationParameters, Settings
+from torchvision_dddas.config import EVIDENCE_SCALE, RegistrationParameters, Settings
 from torchvision_dddas.geometry import background_flow, transfer
 from torchvision_dddas.types import Registration
-
-# Evidence is kept in 8-bit maps: in sixteenths of the local noise, clipped at 15 noise units.
-EVIDENCE_SCALE = 16.0
-EVIDENCE_CAP = 240
-# From this grey level on a pixel may be clipped.
-WHITE = 248
 
 # Exposures are compared by the grey levels below which these shares of a picture lie: a moving camera shifts them
 # little, and not in the way a gain does.
@@ -29,8 +22,6 @@ _MIN_DIFFERENCE = 2.0
 # A gain and an offset must leave at most this share of the difference; otherwise it is the content that has changed.
 _MAX_LEFT = 0.5
 _MIN_LEVELS = 8
-# Pixels that the exposure of a warped picture is fitted to.
-_EXPOSURE_PIXELS = 5000
 
 
 def evidence_scale(settings: Settings) -> float:
@@ -118,16 +109,6 @@ class Engine(Protocol):
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
         """What moves in each window's reference frame."""
         ...
-
-
-def cell_side(width: int, height: int, parameters: RegistrationParameters) -> int:
-    """Side in pixels of the cells with one keypoint each that keeps their number within the budget."""
-    return max(parameters.cell_px, math.ceil(math.sqrt(width * height / parameters.keypoints)))
-
-
-def exposure_step(shape: tuple[int, ...]) -> int:
-    """Every so many-th row and column of a picture, (H, W), shows the exposure well enough: some 5,000 pixels."""
-    return max(math.isqrt(shape[0] * shape[1] // _EXPOSURE_PIXELS), 1)
 
 
 def match_exposure(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:

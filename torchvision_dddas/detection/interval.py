@@ -1,11 +1,12 @@
 """What flight and scene decide about detection: the interval, the frames of a window, and the sizes of targets."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
+from torchvision_dddas.geometry import later_pair, near_pairs, pair_about
 from torchvision_dddas.types import Adjustment
 
 # A smaller relative change of altitude does not move the gates.
@@ -84,22 +85,10 @@ def choose_pairs(
     """
     parameters = settings.difference
     if parameters.kind == "between_later":
-        later = [(at + side * gap, at + 2 * side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
-        # The middle one of three frames has a neighbour on either side only.
-        pair = _first_within([*later, (at - 1, at + 1)], first, last)
-        return [] if pair is None else [pair], None, None
+        return later_pair(at, interval, first, last), None, None
     # No further than `look_ahead`, even if more is known: the result must not depend on how frames are batched.
     ahead = min(last, at + look_ahead(interval, settings))
-
-    def symmetric(gap: int) -> Pair | None:
-        return _first_within([(at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap)], first, ahead)
-
-    near = list(dict.fromkeys(p for gap in parameters.near_frames if (p := symmetric(gap))))
-    if not near and (p := symmetric(1)):
-        near = [p]
-    # One-sided pairs show a target's next places too, the more of them the longer the gap: only the closest is used,
-    # and only where no pair looks both ways.
-    near = [p for p in near if p[0] < at < p[1]] or near[:1]
+    near = near_pairs(at, parameters.near_frames, first, ahead)
     wide = None
     if parameters.wide_frames and near:
         forward = min(parameters.wide_frames, max(2 * interval - 2, 0), ahead - at)
@@ -107,13 +96,10 @@ def choose_pairs(
         if back >= 3 and forward >= 2:
             wide = (at - back, at + forward)
         else:
-            wide = next((p for gap in range(parameters.wide_frames, 2, -1) if (p := symmetric(gap))), None)
+            gaps = range(parameters.wide_frames, 2, -1)
+            wide = next((p for gap in gaps if (p := pair_about(at, gap, first, ahead))), None)
     gap = _small_gap(interval, settings)
-    return near, wide, symmetric(gap) if gap else None
-
-
-def _first_within(pairs: Iterable[Pair], first: int, last: int) -> Pair | None:
-    return next((pair for pair in pairs if first <= min(pair) and max(pair) <= last), None)
+    return near, wide, pair_about(at, gap, first, ahead) if gap else None
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import EVIDENCE_SCALE, Settings
 from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, blob_motion, split_by_flow
 from torchvision_dddas.detection.blobs import (
     Blob,
@@ -22,7 +22,7 @@ from torchvision_dddas.detection.blobs import (
     find_weak_blobs,
     group_fragments,
 )
-from torchvision_dddas.detection.engine import EVIDENCE_SCALE, Foreground, View, Window, evidence_scale
+from torchvision_dddas.detection.engine import Foreground, View, Window, evidence_scale
 from torchvision_dddas.detection.motion_history import MotionHistory, split_by_trail
 from torchvision_dddas.detection.persistence import Links, Sighting, find_persistent
 from torchvision_dddas.geometry import connected_parts

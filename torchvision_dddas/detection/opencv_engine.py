@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import RegistrationParameters, Settings
-from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, cell_side, judge_points, match_exposure
+from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, judge_points, match_exposure
 from torchvision_dddas.detection.opencv_foreground import find_foreground, no_texture
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
@@ -199,7 +199,7 @@ def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halve
     halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
     """
     height, width = grey.shape
-    cell, factor = cell_side(width, height, parameters), 1
+    cell, factor = parameters.cell_side(width, height), 1
     if halved and min(width, height) > 1:
         # Half a pixel to the left and top of where the corner stands: a search window does not mind.
         grey, factor = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA), 2

@@ -5,17 +5,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import DifferenceParameters, Settings
+from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, DifferenceParameters, Settings, exposure_step
 from torchvision_dddas.detection.blobs import close_mask, ellipse
 from torchvision_dddas.detection.engine import (
-    EVIDENCE_CAP,
-    EVIDENCE_SCALE,
-    WHITE,
     Foreground,
     Window,
     evidence_scale,
     exposure_between,
-    exposure_step,
 )
 from torchvision_dddas.geometry import transfer
 

@@ -13,10 +13,75 @@ from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection import cell_side
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph, open_session, trace_graph
-from torchvision_dddas.nn import PlaneHomography, RawPlaneHomography, Step, WarpDifference
+from torchvision_dddas.nn import GRAPH_EFFORT, MotionSegmenter, PlaneHomography, Registration
+
+
+class RawPlaneHomography(nn.Module):
+    """`functional.find_homography_raw`, which solves four landmarks in another way than more."""
+
+    def forward(self, ground: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Matrix (B, 3, 3), valid (B,) of ground and image (B, n, 2). A trace has no branches: both ways are taken."""
+        exact, exact_valid = F.find_homography_raw(ground[:, :4], image[:, :4])
+        least, least_valid = F.find_homography_raw(ground, image)
+        is_exact = torch.ones_like(ground[:1, :, 0]).sum(1) == 4
+        matrix = torch.where(is_exact[:, None, None], exact, least)
+        return matrix, (is_exact & exact_valid) | (~is_exact & least_valid)  # the runtime has no `where` of Booleans
+
+
+class WarpDifference(nn.Module):
+    """`nn.MotionSegmenter` on one picture and two neighbours, but for the correction of exposures.
+
+    What the controller moves is an input; sizes and budgets are baked in.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        super().__init__()
+        self.segmenter = MotionSegmenter(settings, tuned=())
+
+    def forward(
+        self, reference: Tensor, neighbours: Tensor, neighbour_from_reference: Tensor, threshold: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Difference and mask (255 where something moves), both uint8 (H, W).
+
+        reference: uint8 (H, W). neighbours: uint8 (2, H, W). neighbour_from_reference: float64 (2, 3, 3), px.
+        threshold: uint8 (), grey levels; a larger difference is foreground.
+        """
+        pictures, matrices = neighbours.float()[:, None, None], neighbour_from_reference[None]
+        views = self.segmenter.warp(reference.float()[None, None], pictures.unbind(0), matrices)
+        least, both = views.least((0, 1)), views.both((0, 1))
+        found = self.segmenter.pair_evidence(least, both, views.texture, None)
+        return found[0, 0], self.segmenter.core(found, {"difference.threshold": threshold})[0, 0]
+
+
+class Step(nn.Module):
+    """`nn.Registration` without branches, and `WarpDifference`."""
+
+    def __init__(self, size: tuple[int, int], settings: Settings) -> None:
+        super().__init__()
+        self.register = Registration(settings.registration, GRAPH_EFFORT)
+        self.compare = WarpDifference(settings)
+        cell = settings.registration.cell_side(*size)
+        self.count = (size[0] // cell) * (size[1] // cell)
+
+    def forward(
+        self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor, threshold: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """neighbour_from_reference float64 (2, 3, 3), its inliers and keypoints followed, int64 (2,); then as above.
+
+        samples: int64 (S, 4), numbers of keypoints from which the hypotheses are drawn. tolerance_px: float64 ().
+        Where nothing agrees: the identity, with 0 inliers.
+        """
+        levels, pairs = reference[None, None].float(), len(neighbours)
+        points, valid = (found.expand(pairs, *found.shape[1:]) for found in self.register.keypoints(levels, False))
+        earlier = [level.expand(pairs, -1, -1, -1) for level in self.register.pyramid(levels)]
+        later = self.register.pyramid(neighbours[:, None].float())
+        drawn = samples.expand(pairs, -1, -1)
+        motion = self.register.match(points, valid, earlier, later, drawn, tolerance_px)
+        difference, mask = self.compare(reference, neighbours, motion.later_from_earlier, threshold)
+        return motion.later_from_earlier, motion.inliers.sum(1), motion.tracked.sum(1), difference, mask
+
 
 TOLERANCE_PX = 1e-6
 HYPOTHESES = 128
@@ -81,11 +146,11 @@ def build_module(name: str, settings: Settings, size: tuple[int, int]) -> nn.Mod
             f"{len(pairs)}. Give --config fast, or change both"
         )
     if name == "warp_difference":
-        return WarpDifference(settings.difference, settings.morphology).eval()
-    step = Step(size, settings, cell_side(*size, settings.registration)).eval()
-    if step.register.count < LEAST_KEYPOINTS:
+        return WarpDifference(settings).eval()
+    step = Step(size, settings).eval()
+    if step.count < LEAST_KEYPOINTS:
         raise InputError(
-            f"the graph step has room for {step.register.count} keypoints at {size[0]}x{size[1]}; wanted "
+            f"the graph step has room for {step.count} keypoints at {size[0]}x{size[1]}; wanted "
             f"{LEAST_KEYPOINTS}. Give a larger --size, or a smaller registration.cell_px"
         )
     return step
@@ -200,7 +265,7 @@ def example_pictures(name: str, settings: Settings, size: tuple[int, int], seed:
             "neighbour_from_reference": torch.from_numpy(between / between[:, 2:, 2:]),
             "threshold": threshold,
         }
-    cell = cell_side(*size, settings.registration)
+    cell = settings.registration.cell_side(*size)
     generator, count = torch.Generator().manual_seed(seed), (width // cell) * (height // cell)
     return {
         **seen,

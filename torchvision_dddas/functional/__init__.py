@@ -13,7 +13,15 @@ from kornia.geometry import oneway_transfer_error, transform_points
 from torchvision_dddas.functional.affinity import pair_affinity, triplet_affinity
 from torchvision_dddas.functional.assignment import dispersion, log_partition
 from torchvision_dddas.functional.color import bgr_to_hsv, rgb_histogram, within_ranges
-from torchvision_dddas.functional.difference import fit_exposure, masked_median, noise_units, noise_weight
+from torchvision_dddas.functional.difference import (
+    fit_exposure,
+    fit_quantiles,
+    level_quantiles,
+    masked_median,
+    match_exposure,
+    noise_units,
+    noise_weight,
+)
 from torchvision_dddas.functional.filters import (
     box_sum,
     gaussian_blur2d,
@@ -37,6 +45,7 @@ from torchvision_dddas.functional.plane_maps import (
     spread_ranks,
 )
 from torchvision_dddas.functional.soft import (
+    all_true,
     blend_sizes,
     gate_regions,
     gates_of_pixels,
@@ -49,6 +58,7 @@ from torchvision_dddas.functional.warp import columns_between, resize, seen_by_b
 __all__ = [
     "MODELS",
     "Layout",
+    "all_true",
     "arrange_weights",
     "bgr_to_hsv",
     "blend_sizes",
@@ -65,15 +75,18 @@ __all__ = [
     "find_homography_dlt",
     "find_homography_raw",
     "fit_exposure",
+    "fit_quantiles",
     "forward_backward",
     "gate_regions",
     "gates_of_pixels",
     "gaussian_blur2d",
     "grid_features",
     "hog",
+    "level_quantiles",
     "log_partition",
     "lucas_kanade",
     "masked_median",
+    "match_exposure",
     "mean_gradient",
     "noise_units",
     "noise_weight",

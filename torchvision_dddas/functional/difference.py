@@ -42,6 +42,77 @@ def absolute_difference(a: UInt8[Tensor, "*any"], b: UInt8[Tensor, "*any"]) -> U
     return torch.maximum(a, b).sub_(torch.minimum(a, b))
 
 
+def match_exposure(
+    earlier: Float[Tensor, "B 1 H W"], later: Float[Tensor, "B 1 H W"]
+) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, "B 1 H W"]]:
+    """Both pictures, whole grey levels, the darker one in the other's exposure where the two differ clearly.
+
+    The twin of `detection.engine.match_exposure`, batched.
+    """
+    gain, offset = fit_quantiles(level_quantiles(earlier), level_quantiles(later))
+    if all_true((gain == 1) & (offset == 0)):
+        return earlier, later
+    is_later = (gain * 128 + offset >= 128)[:, None]
+    x = torch.arange(256, dtype=torch.float64, device=gain.device)
+    gain, offset = gain[:, None], offset[:, None]
+    table = torch.where(is_later, gain * x + offset, (x - offset) / gain).round().clamp(0, 255).to(earlier.dtype)
+    darker = torch.where(is_later[..., None, None], later, earlier)
+    lit = table.gather(1, darker.flatten(1).long()).reshape(darker.shape)
+    return torch.where(is_later[..., None, None], earlier, lit), torch.where(is_later[..., None, None], lit, later)
+
+
+def level_quantiles(levels: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 33"]:
+    """The grey levels below which 2 to 98 % of a picture lie, float64; the pixels of a level are spread over it.
+
+    From every 3rd pixel of every 5th row, both odd, as `detection.engine.exposure_between` explains.
+    """
+    sample = levels[..., ::5, ::3].flatten(1).round().long().clamp(0, 255)
+    counts = torch.zeros(len(levels), 257, dtype=torch.float64, device=levels.device)
+    counts.scatter_add_(1, sample + 1, torch.ones_like(sample, dtype=torch.float64))
+    below = counts.cumsum(1) / sample.shape[1]
+    shares = torch.linspace(0.02, 0.98, 33, dtype=torch.float64, device=levels.device).expand(len(levels), -1)
+    place = torch.searchsorted(below, shares.contiguous(), right=True).clamp(1, 256)
+    low, high = below.gather(1, place - 1), below.gather(1, place)
+    return place - 1.5 + (shares - low) / (high - low)
+
+
+def fit_quantiles(
+    wanted: Float[Tensor, "B 33"], given: Float[Tensor, "B 33"]
+) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
+    """Gain and offset that take the levels `given` to the levels `wanted` at the same shares of a picture.
+
+    1 and 0 where they hardly differ, or not as exposures do: the twin of `detection.engine.fit_exposure`, batched.
+    """
+    one = torch.ones_like(wanted[:, 0])
+    kept = (torch.minimum(wanted, given) > 3.0) & (torch.maximum(wanted, given) < 252.0)
+    before = _middle((wanted - given).abs(), kept)
+    is_clear = (kept.sum(1) >= 8) & (before >= 2.0)
+    if all_true(~is_clear):
+        return one, torch.zeros_like(one)
+    gain, offset = _middle(wanted / given.clamp(min=1e-9), kept), torch.zeros_like(one)
+    for _ in range(6):
+        miss = (wanted - gain[:, None] * given - offset[:, None]).abs()
+        scale = (2 * _middle(miss, kept)).clamp(min=1.0)[:, None]
+        weight = kept / (1 + (miss / scale).square())
+        total = weight.sum(1).clamp(min=1e-12)
+        mean_given, mean_wanted = (weight * given).sum(1) / total, (weight * wanted).sum(1) / total
+        apart = given - mean_given[:, None]
+        spread = (weight * apart.square()).sum(1)
+        together = (weight * apart * (wanted - mean_wanted[:, None])).sum(1)
+        gain = torch.where(spread > 1.0, together / spread.clamp(min=1.0), one)
+        offset = mean_wanted - gain * mean_given
+    left = _middle((wanted - gain[:, None] * given - offset[:, None]).abs(), kept)
+    is_exposure = is_clear & (gain > 0.5) & (gain < 2.0) & (left < 0.5 * before)
+    return torch.where(is_exposure, gain, one), torch.where(is_exposure, offset, torch.zeros_like(one))
+
+
+def _middle(values: Float[Tensor, "B N"], kept: Bool[Tensor, "B N"]) -> Float[Tensor, "B"]:
+    """The median of the values that are kept, the mean of two in the middle; 0 where there are none."""
+    ordered, count = values.masked_fill(~kept, torch.inf).sort(1).values, kept.sum(1, keepdim=True)
+    pair = ordered.gather(1, torch.cat([(count - 1).clamp(min=0) // 2, count // 2], 1).clamp(max=values.shape[1] - 1))
+    return torch.where(count[:, 0] > 0, pair.mean(1), torch.zeros_like(values[:, 0]))
+
+
 def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
     """Lower median of the values under the mask; 0 where there are none."""
     if not torch.compiler.is_compiling():

@@ -1,17 +1,30 @@
-"""torch.nn.Modules made of `functional`, for tuning and export."""
+"""torch.nn.Modules made of `functional`, for models of one's own, the torch engines, tuning and export."""
 
-from torchvision_dddas.nn.motion_segmenter import Core, Differences, MotionSegmenter, Regions, Values
-from torchvision_dddas.nn.step import PlaneHomography, RawPlaneHomography, Register, Step, WarpDifference
+from torchvision_dddas.nn.motion_segmenter import (
+    Core,
+    Differences,
+    MotionSegmenter,
+    Regions,
+    Segmentation,
+    Values,
+    WarpedWindows,
+    close_masks,
+)
+from torchvision_dddas.nn.plane_homography import PlaneHomography
+from torchvision_dddas.nn.registration import GRAPH_EFFORT, Effort, Motion, Registration
 
 __all__ = [
+    "GRAPH_EFFORT",
     "Core",
     "Differences",
+    "Effort",
+    "Motion",
     "MotionSegmenter",
     "PlaneHomography",
-    "RawPlaneHomography",
     "Regions",
-    "Register",
-    "Step",
+    "Registration",
+    "Segmentation",
     "Values",
-    "WarpDifference",
+    "WarpedWindows",
+    "close_masks",
 ]

@@ -1,53 +1,75 @@
-"""Soft motion segmentation: from differences of registered pictures to a mask with a gradient in the parameters.
+"""Motion segmentation: the torch engine's chain, the model that is tuned, and the graph that is exported, in one.
 
-No parameter that can be tuned acts before the differences: registration, warps and exposure are done once, hard. After
-them every step is that of the hard pipeline, by the same functions of `functional`:
+    warp -> light -> difference -> noise units -> blur -> largest over the pairs -> threshold -> erode -> close
 
-    noise units -> blur -> largest over the pairs -> margin over the threshold -> erode -> close -> soft threshold
-
-Thresholds and extrema commute, so the margin goes through the morphology, whose extrema stay hard, and the threshold is
-softened last: the outline lies where the hard one does, whatever the softness. Whole grey levels are rounded straight
-through. Regions are labelled hard and gated softly; a hull is the hard one of a region, and counts as far as its region
-does. What then acts on single blobs (persistence, outlines by colour, shadows, small targets) has no useful gradient
-and is given as two masks: what it takes away, and what it adds.
+Without softness all is computed in bytes, as the OpenCV engine does. With softness, a share of each threshold, the same
+steps have gradients in the parameters. None that can be tuned acts before the differences: registration, warps and
+exposure are hard and pass no gradient. Whole grey levels are rounded straight through. Thresholds and extrema commute,
+so the margin over the threshold goes through the morphology, whose extrema stay hard, and the threshold is softened
+last: the outline lies where the hard one does, whatever the softness. Regions are labelled hard and gated softly; a
+hull is the hard one of a region, and counts as far as its region does.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
+from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Settings, exposure_step
+from torchvision_dddas.geometry import later_pair, near_pairs
+from torchvision_dddas.nn.registration import LEVEL, Registration
 
-Values = Mapping[str, Tensor]
+Values = Mapping[str, float | Tensor]
+Pair = tuple[int, int]
+
+TUNED = ("difference.threshold", "difference.noise_levels", "difference.gradient_share")
+"""Parameters that are learned unless others are named."""
+
+# Pixels of more gradient, 4 x grey levels each, have texture: they show how well the registration fits.
+_TEXTURED = 16
+# The exposure is not judged by fewer pixels.
+_EXPOSURE_LEAST = 100
+_GREY_OF_RGB = tuple(share / 2**15 for share in (9798, 19235, 3735))  # OpenCV's
+
+
+class Segmentation(NamedTuple):
+    """What moves in the frames of a batch of clips.
+
+    mask: 0 to 1; all 0 where a frame has no two neighbours. evidence: the largest difference, in noise units or grey
+    levels. later_from_earlier: the background's motion from each frame to the next, float64; inliers: how many
+    keypoints agree with it.
+    """
+
+    mask: Float[Tensor, "B T 1 H W"]
+    evidence: Float[Tensor, "B T 1 H W"]
+    later_from_earlier: Float[Tensor, "B T-1 3 3"]
+    inliers: Int64[Tensor, "B T-1"]
 
 
 @dataclass(frozen=True)
 class Differences:
     """A batch of windows, before any tunable parameter acts.
 
-    least: (B, P, H, W) uint8, the difference that both neighbours of each near pair show, grey levels. both: where both
-    are seen. texture: (B, 1, H, W), 4 x grey levels a pixel; textured: where it is enough to show how well the
-    registration fits. steps: evidence is kept in so many steps a noise unit, up to `highest` of them.
+    least: the difference that both neighbours of each near pair show, grey levels. both: where both are seen. texture:
+    4 x grey levels a pixel.
     """
 
     least: UInt8[Tensor, "B P H W"]
     both: Bool[Tensor, "B P H W"]
     texture: Float[Tensor, "B 1 H W"]
-    textured: Bool[Tensor, "B 1 H W"]
-    steps: float
-    highest: float
 
 
 class Core(NamedTuple):
     """Where targets are certain.
 
-    mask: 0 to 1. margin: by how much evidence is above the threshold, cleaned; noise units, or grey levels. evidence:
-    the largest over the near pairs, same unit.
+    mask: 0 to 1. margin: above 0 where the mask is above one half; with softness by how much evidence is above the
+    threshold, cleaned. evidence: the largest over the near pairs. Both in noise units, or grey levels.
     """
 
     mask: Float[Tensor, "B 1 H W"]
@@ -67,86 +89,353 @@ class Regions:
     count: int
 
 
-class MotionSegmenter(nn.Module):
-    """The steps from differences to a mask; some parameters are given as tensors, the others are those of the settings.
+@dataclass
+class WarpedWindows:
+    """A batch of references and what their neighbours show of them.
 
-    whole: round where the engines do, straight through; False rounds nowhere, for gradient checks.
+    grey: (B, 1, H, W) uint8; warped: the same for each neighbour; seen: for each the first and last column of every row
+    that it shows (see `functional.seen_columns`); texture: (B, 1, H, W) float, 4 x grey levels a pixel. between_later:
+    compare the neighbours of a pair with each other, not with the reference.
     """
 
-    def __init__(self, settings: Settings, whole: bool = True) -> None:
+    grey: Tensor
+    warped: list[Tensor]
+    seen: list[tuple[Tensor, Tensor]]
+    texture: Tensor
+    between_later: bool
+    _distance: dict[int, Tensor] = field(default_factory=dict)
+
+    def both(self, pair: Pair) -> Tensor:
+        """Where both neighbours of a pair are seen."""
+        return F.seen_by_both(self.seen[pair[0]], self.seen[pair[1]], self.grey.shape[-1])
+
+    def least(self, pair: Pair) -> Tensor:
+        """What the settings compare of a pair."""
+        if self.between_later:
+            return _absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
+        return self.smaller(pair)
+
+    def smaller(self, pair: Pair) -> Tensor:
+        """The difference from the reference that both neighbours of a pair show."""
+        for k in pair:
+            if k not in self._distance:
+                self._distance[k] = _absolute_difference(self.grey, self.warped[k])
+        return torch.minimum(self._distance[pair[0]], self._distance[pair[1]])
+
+    def differences(self, pairs: Sequence[Pair]) -> Differences:
+        """What `MotionSegmenter.segment` takes."""
+        least, both = (torch.cat([of(pair) for pair in pairs], 1) for of in (self.least, self.both))
+        return Differences(least, both, self.texture)
+
+
+class MotionSegmenter(nn.Module):
+    """Masks of what moves in clips of a moving camera.
+
+    Parameters that are named in `tuned` are nn.Parameters, float64 as the settings' numbers; others are those of the
+    settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
+    gradient checks.
+    """
+
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        softness: float = 0.0,
+        tuned: Sequence[str] = TUNED,
+        whole: bool = True,
+    ) -> None:
+        """softness: a share of each threshold; 0 is the engine's hard chain. tuned: names as in `dddas tune`."""
         super().__init__()
-        self.settings = settings
-        self.whole = whole
+        self.settings, self.softness, self.whole = settings or Settings(), softness, whole
+        self.registration = Registration(self.settings.registration)
+        self.tuned = {name: name.replace(".", "_") for name in tuned}
+        for name, attribute in self.tuned.items():
+            start = torch.tensor(self._setting(name), dtype=torch.float64)
+            self.register_parameter(attribute, nn.Parameter(start))
 
-    def forward(self, differences: Differences, values: Values, softness: float = 0.0) -> Core:
-        """The core mask. values: the tuned parameters by name. softness: a share of the settings' threshold."""
-        evidence = self.evidence(differences, values)
-        above = evidence - self._parameter("difference.threshold", values)
-        erode_px, close_px = (self._parameter(f"morphology.{name}_px", values) for name in ("erode", "close"))
-        eroded = F.blend_sizes(erode_px, lambda side: F.erosion(above, F.structuring_element("ellipse", side)))
-        margin = F.blend_sizes(close_px, lambda side: F.closing(eroded, F.structuring_element("ellipse", side)))
-        return Core(F.step(margin, softness * self.settings.difference.threshold), margin, evidence)
+    @property
+    def is_normalized(self) -> bool:
+        """Whether differences are in units of local noise."""
+        return self.settings.difference.kind == "normalized"
 
-    def evidence(self, differences: Differences, values: Values) -> Float[Tensor, "B 1 H W"]:
-        """The largest difference over the near pairs, in noise units or grey levels."""
-        normalized = self.settings.difference.kind == "normalized"
-        weight: Tensor | None = None
-        if normalized:
-            noise_levels = self._parameter("difference.noise_levels", values)
-            gradient_share = self._parameter("difference.gradient_share", values)
-            weight = F.noise_weight(differences.texture, noise_levels, gradient_share) * differences.steps
+    @property
+    def _unit(self) -> float:
+        """The step of evidence maps for one unit of the thresholds."""
+        return EVIDENCE_SCALE if self.is_normalized else 1.0
+
+    def forward(
+        self,
+        clip: Float[Tensor, "B T C H W"],
+        later_from_earlier: Float[Tensor, "B T-1 3 3"] | None = None,
+        values: Values | None = None,
+    ) -> Segmentation:
+        """Segment every frame of clips of RGB or grey pictures in [0, 1].
+
+        later_from_earlier: px; estimated by default. values: parameters by name, in place of the settings' and the
+        module's own. A frame is compared with the neighbours of `difference.near_frames` on both sides; at the ends of
+        a clip with the two nearest on one side.
+        """
+        levels = self._levels(clip)
+        batch, frames = levels.shape[:2]
+        with torch.no_grad():
+            inliers = torch.zeros(batch, frames - 1, dtype=torch.int64, device=clip.device)
+            if later_from_earlier is None:
+                earlier, later = (levels[:, part].flatten(0, 1) / LEVEL for part in (slice(-1), slice(1, None)))
+                motion = self.registration(earlier, later)
+                later_from_earlier = motion.later_from_earlier.unflatten(0, (batch, frames - 1))
+                inliers = motion.inliers.sum(1).unflatten(0, (batch, frames - 1))
+        groups: dict[tuple[Pair, ...], list[int]] = defaultdict(list)
+        for at in range(frames):
+            groups[tuple((a - at, b - at) for a, b in self._pairs(at, frames))].append(at)
+        mask = [levels.new_zeros(batch, 1, *levels.shape[3:])] * frames
+        evidence = list(mask)
+        for pairs, places in groups.items():
+            if not pairs:
+                continue
+            with torch.no_grad():
+                windows, near = self._windows(levels, later_from_earlier, places, pairs)
+            core = self.segment(windows.differences(near), values)
+            for maps, found in ((mask, core.mask), (evidence, core.evidence)):
+                for place, of_frame in zip(places, found.unflatten(0, (batch, -1)).unbind(1), strict=True):
+                    maps[place] = of_frame
+        return Segmentation(torch.stack(mask, 1), torch.stack(evidence, 1), later_from_earlier, inliers)
+
+    def segment(self, differences: Differences, values: Values | None = None, softness: float | None = None) -> Core:
+        """The core of windows of known differences. softness: in place of the module's own."""
+        softness = self.softness if softness is None else softness
+        weight = self.noise_weight(differences.texture, values)
         largest: Tensor | None = None
         for k in range(differences.least.shape[1]):
             least, both = differences.least[:, k : k + 1], differences.both[:, k : k + 1]
-            if weight is None:
-                z = self._blurred(least.to(differences.texture.dtype), values) * both
-            else:
-                z = self._rounded(least * both * weight).clamp(max=differences.highest)
-                z = self._in_units(self._blurred(z, values), differences.textured & both, differences.steps)
+            z = self.pair_evidence(least, both, differences.texture, weight, values, softness)
             largest = z if largest is None else torch.maximum(largest, z)
         assert largest is not None, "a window has a pair"
-        return largest / differences.steps if normalized else largest
+        margin = self.core(largest, values)
+        evidence, unit = largest.to(differences.texture.dtype) / self._unit, self._unit
+        if largest.dtype == torch.uint8:
+            mask = (margin > 0).to(evidence.dtype)
+            return Core(mask, mask, evidence)
+        margin = margin / unit
+        return Core(F.step(margin, softness * self.settings.difference.threshold), margin, evidence)
 
-    def outlined(self, core: Core, found: Regions, values: Values, softness: float = 0.0) -> Float[Tensor, "B 1 H W"]:
+    def warp(
+        self,
+        levels: Float[Tensor, "B 1 H W"],
+        neighbours: Iterable[Float[Tensor, "B 1 h w"]],
+        neighbour_from_reference: Float[Tensor, "B K 3 3"],
+        light: tuple[Tensor, Tensor] | None = None,
+    ) -> WarpedWindows:
+        """K neighbours warped to their references, in the references' light. levels, neighbours: whole grey levels.
+
+        light: (B, K) gains and offsets that take the neighbours' levels to the reference's, used for `to_reference`
+        alone; `normalized` fits them to what both show.
+        """
+        parameters, size = self.settings.difference, (levels.shape[-2], levels.shape[-1])
+        warped: list[Tensor] = []
+        seen: list[tuple[Tensor, Tensor]] = []
+        for k, neighbour in enumerate(neighbours):
+            matrix = neighbour_from_reference[:, k]
+            sampled = F.warp_perspective(neighbour, matrix, size, "bilinear", "border", inverse_map=True, subpixels=32)
+            sampled = sampled.add_(0.5).floor_()
+            frame_size = neighbour.shape[-2], neighbour.shape[-1]
+            run = F.seen_columns(matrix, size, frame_size, parameters.border_px)
+            if self.is_normalized:
+                sampled = _apply_light(levels, sampled, *_fit_light(levels, sampled, run))
+            elif parameters.kind == "to_reference" and light is not None:
+                gain, offset = (part[:, k].to(levels) for part in light)
+                if not F.all_true((gain == 1) & (offset == 0)):
+                    sampled = _apply_light(levels, sampled, gain, offset)
+            warped.append(sampled.to(torch.uint8))
+            seen.append(run)
+        # Needed for neither otherwise.
+        wanted = self.is_normalized or self.settings.refine.on
+        texture = F.mean_gradient(levels) if wanted else torch.zeros_like(levels)
+        return WarpedWindows(levels.to(torch.uint8), warped, seen, texture, parameters.kind == "between_later")
+
+    def noise_weight(self, texture: Tensor, values: Values | None = None) -> Tensor | None:
+        """(B, 1, H, W) steps of evidence a grey level; None unless differences are in units of local noise."""
+        if not self.is_normalized:
+            return None
+        names = ("difference.noise_levels", "difference.gradient_share")
+        return F.noise_weight(texture, *(self._value(name, values) for name in names)) * EVIDENCE_SCALE
+
+    def pair_evidence(
+        self,
+        least: UInt8[Tensor, "B 1 H W"],
+        both: Bool[Tensor, "B 1 H W"],
+        texture: Float[Tensor, "B 1 H W"],
+        weight: Tensor | None,
+        values: Values | None = None,
+        softness: float = 0.0,
+    ) -> Tensor:
+        """(B, 1, H, W) evidence of a pair in steps: bytes without softness, else of the texture's type.
+
+        least, both: of `WarpedWindows`. weight: of `noise_weight`.
+        """
+        is_hard = softness == 0.0 and self.whole
+        if weight is None:
+            return self._blurred(least if is_hard else least.to(texture.dtype), values) * both
+        z = self._rounded((least * both * weight).clamp_(max=EVIDENCE_CAP), is_hard)
+        z = self._blurred(z, values)
+        # Divided by its median over textured pixels, where that is above one noise unit.
+        textured = (texture > _TEXTURED) & both
+        units = F.noise_units(z if is_hard else z.detach().round().to(torch.uint8), textured, EVIDENCE_SCALE)
+        if F.all_true(units == 1.0):
+            return z
+        per_unit = units.reciprocal().to(weight.dtype)
+        if not is_hard:
+            # Computed in whole numbers, as in the hard chain; the gradient is that of the pixel in the middle.
+            median = F.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / EVIDENCE_SCALE
+            slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
+            per_unit = F.straight_through(per_unit, slope) if self.whole else slope
+        return self._rounded(z * per_unit.reshape(-1, 1, 1, 1), is_hard)
+
+    def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0) -> Tensor:
+        """Evidence above the threshold, eroded and closed: bytes of 0 and 255, or a margin in steps where it is soft.
+
+        close_px: in place of the parameter.
+        """
+        threshold = self._value("difference.threshold", values)
+        limit = threshold if self._unit == 1.0 else threshold * self._unit
+        if evidence.dtype == torch.uint8:
+            limit = limit if isinstance(limit, Tensor) else int(limit)
+            margin = (evidence > limit).to(torch.uint8) * 255
+        else:
+            margin = evidence - limit
+        erode_px, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "close"))
+        eroded = F.blend_sizes(erode_px, lambda side: F.erosion(margin, F.structuring_element("ellipse", side)))
+        return F.blend_sizes(close_px or close, lambda side: close_masks(eroded, side))
+
+    def outlined(
+        self, core: Core, found: Regions, values: Values | None = None, softness: float | None = None
+    ) -> Float[Tensor, "B 1 H W"]:
         """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
         gate = F.gate_regions(
             core.mask,
             core.evidence,
             found.near,
             found.count,
-            self._parameter("gates.min_area_px", values),
-            self._parameter("difference.peak", values),
-            softness,
+            self._value("gates.min_area_px", values),
+            self._value("difference.peak", values),
+            self.softness if softness is None else softness,
         )
         drawn = core.mask * F.gates_of_pixels(gate, found.near)
         # In the hull of a region, a hole or a speck is foreground as far as that region is, whatever its evidence.
         carried = (core.margin <= 0) | (found.filled != found.near)
         return torch.maximum(drawn, F.gates_of_pixels(gate, found.filled) * carried)
 
-    def _parameter(self, name: str, values: Values) -> float | Tensor:
-        if name in values:
-            return values[name]
+    def _levels(self, clip: Tensor) -> Float[Tensor, "B T 1 H W"]:
+        """Whole grey levels, rounded as OpenCV rounds them."""
+        levels = (clip.detach() * LEVEL).round_()
+        if clip.shape[2] == 3:
+            weights = torch.tensor(_GREY_OF_RGB, dtype=clip.dtype, device=clip.device)
+            levels = rgb_to_grayscale(levels, weights).add_(0.5).floor_()
+        return levels
+
+    def _pairs(self, at: int, frames: int) -> list[Pair]:
+        """The pairs of frames that a frame is compared with."""
+        if self.settings.difference.kind == "between_later":
+            return later_pair(at, self.settings.interval.frames, 0, frames - 1)
+        return near_pairs(at, self.settings.difference.near_frames, 0, frames - 1)
+
+    def _windows(
+        self, levels: Tensor, later_from_earlier: Tensor, places: list[int], pairs: tuple[Pair, ...]
+    ) -> tuple[WarpedWindows, list[Pair]]:
+        """The windows of the places of all clips, clip by clip, and the pairs of their neighbours."""
+        offsets = sorted({offset for pair in pairs for offset in pair})
+        reference = levels[:, places].flatten(0, 1)
+        neighbours = [levels[:, [place + offset for place in places]].flatten(0, 1) for offset in offsets]
+        chained = [[chain_motion(later_from_earlier, at, at + offset) for at in places] for offset in offsets]
+        matrices = torch.stack([torch.stack(row, 1).flatten(0, 1) for row in chained], 1)
+        light = None
+        if self.settings.difference.kind == "to_reference":
+            wanted = F.level_quantiles(reference)
+            fits = [F.fit_quantiles(wanted, F.level_quantiles(neighbour)) for neighbour in neighbours]
+            light = torch.stack([gain for gain, _ in fits], 1), torch.stack([offset for _, offset in fits], 1)
+        near = [(offsets.index(a), offsets.index(b)) for a, b in pairs]
+        return self.warp(reference, neighbours, matrices, light), near
+
+    def _setting(self, name: str) -> float:
         group, key = name.split(".")
         return float(getattr(getattr(self.settings, group), key))
 
-    def _blurred(self, levels: Tensor, values: Values) -> Tensor:
+    def _value(self, name: str, values: Values | None) -> float | Tensor:
+        if values is not None and name in values:
+            return values[name]
+        if name in self.tuned:
+            own: Tensor = getattr(self, self.tuned[name])
+            return own
+        return self._setting(name)
+
+    def _blurred(self, levels: Tensor, values: Values | None) -> Tensor:
         def of_size(side: int) -> Tensor:
             smooth = F.gaussian_blur2d(levels, side)
-            return F.straight_through((smooth.detach() + 0.5).floor(), smooth) if self.whole else smooth
+            if levels.dtype == torch.uint8 or not self.whole:
+                return smooth
+            return F.straight_through((smooth.detach() + 0.5).floor(), smooth)
 
-        return F.blend_sizes(self._parameter("difference.blur_px", values), of_size, pitch=2)
+        return F.blend_sizes(self._value("difference.blur_px", values), of_size, pitch=2)
 
-    def _in_units(self, z: Tensor, textured: Tensor, steps: float) -> Tensor:
-        """Evidence by its median over textured pixels, where that is above one noise unit."""
-        units = F.noise_units(z.detach().round().to(torch.uint8), textured, steps)
-        if bool((units == 1.0).all()):
-            return z
-        # Computed in whole numbers, as in the hard pipeline; the gradient is that of the pixel in the middle.
-        median = F.masked_median(z.flatten(1), textured.flatten(1))[:, 0] / steps
-        per_unit = units.reciprocal().to(z.dtype)
-        slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
-        per_unit = F.straight_through(per_unit, slope) if self.whole else slope
-        return self._rounded(z * per_unit.reshape(-1, 1, 1, 1))
-
-    def _rounded(self, x: Tensor) -> Tensor:
+    def _rounded(self, x: Tensor, is_hard: bool) -> Tensor:
+        if is_hard:
+            return x.round_().to(torch.uint8)
         return F.round_straight_through(x) if self.whole else x
+
+
+def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: int) -> Float[Tensor, "B 3 3"]:
+    """The motion from frame `start` to frame `end` of each clip, h33 = 1."""
+    low, high = min(start, end), max(start, end)
+    matrix = torch.eye(3, dtype=later_from_earlier.dtype, device=later_from_earlier.device).expand(
+        len(later_from_earlier), 3, 3
+    )
+    for step in range(low, high):
+        matrix = later_from_earlier[:, step] @ matrix
+    matrix = matrix if end >= start else torch.linalg.inv_ex(matrix)[0]
+    return matrix / matrix[:, 2:, 2:]
+
+
+def close_masks(mask: Tensor, side: int) -> Tensor:
+    """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all."""
+    kernel = F.structuring_element("ellipse", side)
+    tracing = torch.jit.is_tracing() or torch.compiler.is_compiling()  # type: ignore[attr-defined]
+    if mask.device.type != "cpu" or mask.dtype != torch.uint8 or tracing:
+        return F.closing(mask, kernel)
+    spans = []
+    for dim in (-1, -2):
+        places = mask.amax((0, 1, dim)).nonzero()
+        if not len(places):
+            return mask
+        # A pixel's closing depends on what lies less than 2 x side away.
+        spans.append(slice(max(int(places[0]) - 2 * side, 0), int(places[-1]) + 2 * side + 1))
+    out = torch.zeros_like(mask)
+    out[..., spans[0], spans[1]] = F.closing(mask[..., spans[0], spans[1]], kernel)
+    return out
+
+
+def _absolute_difference(a: Tensor, b: Tensor) -> Tensor:
+    """|a - b| of unsigned bytes."""
+    return torch.maximum(a, b).sub_(torch.minimum(a, b))
+
+
+def _fit_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Gains and offsets, (B,) each, that give the warped pictures their references' exposure."""
+    pitch = exposure_step(reference.shape[-2:])
+    first, last = (edge[:, ::pitch, None] for edge in seen)
+    columns = torch.arange(0, reference.shape[-1], pitch, device=reference.device)
+    inside = (columns >= first) & (columns <= last)
+    wanted, given = (picture[..., ::pitch, ::pitch] / LEVEL for picture in (reference, warped))
+    gain, offset = F.fit_exposure(wanted, given, inside[:, None])
+    enough = inside.sum((1, 2)) >= _EXPOSURE_LEAST
+    return torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
+
+
+def _apply_light(reference: Tensor, warped: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
+    """The warped pictures through their gains and offsets, (B,) each, in whole levels.
+
+    Where they are clipped at white they agree with anything brighter.
+    """
+    gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
+    darkened = (gain * LEVEL + offset).round() < WHITE
+    # A clipped pixel only says that the place was at least so bright.
+    cut = None if F.all_true(~darkened) else (warped >= WHITE) & darkened
+    through = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+    return through if cut is None else torch.where(cut, torch.maximum(through, reference), through)

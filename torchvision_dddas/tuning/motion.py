@@ -15,8 +15,6 @@ from torch import Tensor
 
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import (
-    EVIDENCE_CAP,
-    EVIDENCE_SCALE,
     Foreground,
     MotionDetector,
     View,
@@ -159,8 +157,8 @@ class MotionFamily(Family):
 
 def soft_masks(frames: LabelledFrames, settings: Settings, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
     """The masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
-    motion = MotionSegmenter(settings)
-    core = motion(frames.differences, values, softness)
+    motion = MotionSegmenter(settings, tuned=())
+    core = motion.segment(frames.differences, values, softness)
     reach = _REACH * softness * settings.difference.threshold
     mask = motion.outlined(core, label_regions(core, settings.morphology.hull, reach), values, softness)
     return torch.where(frames.added, 1.0, torch.where(frames.removed, 0.0, mask))
@@ -172,10 +170,9 @@ def stack_frames(frames: Sequence[LabelledFrames], device: torch.device) -> Labe
     def stack(parts: Sequence[object], *names: str) -> dict[str, Any]:
         return {name: torch.cat([getattr(part, name) for part in parts]).to(device) for name in names}
 
-    columns = stack([frame.differences for frame in frames], "least", "both", "texture", "textured")
+    columns = stack([frame.differences for frame in frames], "least", "both", "texture")
     columns["texture"] = columns["texture"].float()
-    differences = replace(frames[0].differences, **columns)
-    return LabelledFrames(differences, **stack(frames, "truth", "known", "removed", "added"))
+    return LabelledFrames(Differences(**columns), **stack(frames, "truth", "known", "removed", "added"))
 
 
 def label_regions(core: Core, hull: bool, reach: float = 0.0) -> Regions:
@@ -266,11 +263,5 @@ def record_frames(
 def differences_of(window: Window, settings: Settings) -> Differences:
     """The part of a window that depends on no tunable parameter, on the CPU; a batch of one."""
     views = TorchEngine(settings, "cpu").warp_neighbours([window])
-    return Differences(
-        torch.cat([views.least(pair) for pair in window.near], 1).clone(),
-        torch.cat([views.both(pair) for pair in window.near], 1),
-        views.texture.to(torch.uint8),
-        views.textured,
-        EVIDENCE_SCALE,
-        EVIDENCE_CAP,
-    )
+    found = views.differences(window.near)
+    return Differences(found.least.clone(), found.both, found.texture.to(torch.uint8))

@@ -1,0 +1,228 @@
+"""The background's motion between frames (appendix B, steps S1 to S3), batched: the torch engine's and the graph's.
+
+A few points, the scouts, search the whole pyramid for the motion; the others start where it takes them, in the full
+resolution alone, which is much faster. Where the scouts do not agree, all points search the whole pyramid.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+import torchvision_dddas.functional as F
+from torchvision_dddas.config import RegistrationParameters
+
+LEVEL = 255.0
+# A scout shows the motion if this share of them, and so many, agree with it.
+_AGREEING, _FEWEST = 0.6, 12
+_SCOUT_REACH_PX, _NEAR_REACH_PX = 4, 3
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long is searched.
+
+    scouts: their number. rounds: tables a level that they make at most. scout_steps, near_steps: Lucas-Kanade steps of
+    scouts, and of points that start near their place. scout_refits, refits: gates of the refits, in RANSAC's tolerance;
+    they matter most for accuracy. branches: False takes one way for all data, as a graph must: nothing is tracked back,
+    and RANSAC on all points follows the scouts.
+    """
+
+    scouts: int = 32
+    rounds: int = 2
+    scout_steps: int = 8
+    near_steps: int = 10
+    scout_refits: tuple[float, ...] = (1.5, 1.0)
+    refits: tuple[float, ...] = (1.5, 1.0, 0.5, 0.5)
+    branches: bool = True
+
+
+# With 64 scouts, or 3 steps, a motion in some dozens is lost; 200 scouts would take three times the nodes' work.
+GRAPH_EFFORT = Effort(96, 1, 6, 6, (1.0,), (1.0, 0.5), branches=False)
+
+
+class Motion(NamedTuple):
+    """What `Registration` finds.
+
+    later_from_earlier: float64. start_px, end_px: keypoints, and where they were found if tracked. inliers: the tracked
+    ones that agree with the matrix; where nothing agrees it is the identity, with none.
+    """
+
+    later_from_earlier: Float[Tensor, "B 3 3"]
+    start_px: Float[Tensor, "B N 2"]
+    end_px: Float[Tensor, "B N 2"]
+    tracked: Bool[Tensor, "B N"]
+    inliers: Bool[Tensor, "B N"]
+
+
+class Registration(nn.Module):
+    """Corners, pyramidal Lucas-Kanade, RANSAC and refits; nothing here is learned."""
+
+    def __init__(self, parameters: RegistrationParameters | None = None, effort: Effort | None = None) -> None:
+        super().__init__()
+        self.settings, self.effort = parameters or RegistrationParameters(), effort or Effort()
+        self.model = F.MODELS[self.settings.model]
+
+    def forward(self, earlier: Float[Tensor, "B 1 H W"], later: Float[Tensor, "B 1 H W"]) -> Motion:
+        """The motion from each earlier to its later picture, grey in [0, 1], whose exposures may differ."""
+        earlier, later = (picture * LEVEL for picture in (earlier, later))
+        points, valid = self.keypoints(earlier)
+        matched = F.match_exposure(earlier, later)
+        return self.match(points, valid, self.pyramid(matched[0]), self.pyramid(matched[1]))
+
+    def keypoints(
+        self, levels: Float[Tensor, "B 1 H W"], halved: bool | None = None
+    ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+        """The best corner of every cell, and where there is one. levels: grey, 0 .. 255.
+
+        halved: search at half the resolution, at a quarter of the cost; by default as the parameter says.
+        """
+        parameters, step = self.settings, 1
+        height, width = levels.shape[-2:]
+        cell = parameters.cell_side(width, height)
+        if (parameters.halved_corners if halved is None else halved) and min(height, width) > 1:
+            # Half a pixel to the left and top of where the corner stands: a search window does not mind.
+            levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
+        least = 1e-7 * LEVEL**2
+        points, _, valid = F.grid_features(levels, cell, parameters.quality, parameters.block_px, least=least)
+        return step * points, valid
+
+    def pyramid(self, levels: Float[Tensor, "B 1 H W"]) -> list[Tensor]:
+        """By OpenCV's rule: a level that Lucas-Kanade's window does not fit into is left out."""
+        count, smaller_side = 1, min(levels.shape[-2:])
+        while count <= self.settings.levels and smaller_side / 2**count > self.settings.window_px:
+            count += 1
+        return F.build_pyramid(levels, count)
+
+    def match(
+        self,
+        points: Float[Tensor, "B N 2"],
+        valid: Bool[Tensor, "B N"],
+        earlier: list[Tensor],
+        later: list[Tensor],
+        samples: Int64[Tensor, "B S size"] | None = None,
+        ransac_px: float | Tensor | None = None,
+    ) -> Motion:
+        """The motion of the keypoints between two pyramids.
+
+        samples: numbers of keypoints that the hypotheses are drawn from, by default the same for every pair and call:
+        what one pair gives does not depend on its company. ransac_px: in place of the parameter.
+        """
+        effort, parameters = self.effort, self.settings
+        ransac_px = parameters.ransac_px if ransac_px is None else ransac_px
+        frames = _Frames(points, valid, earlier, later, samples)
+        if not points.shape[1]:
+            return Motion(_identities(points), points, points, valid, valid)
+        if effort.branches and points.shape[1] < 2 * effort.scouts:
+            return self._search_everywhere(frames, _identities(points), ransac_px)
+        scouts = F.spread_ranks(valid, effort.scouts)
+        start = points.gather(1, scouts[..., None].expand(-1, -1, 2))
+        # A scout that has not arrived after a few steps does not count.
+        search = self._search(effort.scout_steps, _SCOUT_REACH_PX)
+        ahead, found = F.lucas_kanade(start, earlier, later, rounds=effort.rounds, **search)
+        found = found & valid.gather(1, scouts)
+        places = None if samples is None else samples * effort.scouts // points.shape[1]
+        motion = self._ransac(start, ahead, found, places, ransac_px, effort.scout_refits, parameters.hypotheses // 2)
+        if not effort.branches:
+            return self._search_near(frames, motion, ransac_px)
+        near = F.oneway_transfer_error(start, ahead, motion.float(), squared=False) < ransac_px
+        agreed = (found & near).sum(1) >= (_AGREEING * valid.gather(1, scouts).sum(1)).clamp(min=_FEWEST)
+        made: dict[int, Motion] = {}
+        for choice, search_from in ((agreed, self._search_near), (~agreed, self._search_everywhere)):
+            chosen = choice.nonzero()[:, 0]
+            if len(chosen) == len(points):
+                return search_from(frames, motion, ransac_px)
+            if len(chosen):
+                part = search_from(frames.select(chosen), motion[chosen], ransac_px)
+                made |= {place: Motion(*row) for place, *row in zip(chosen.tolist(), *part, strict=True)}
+        return Motion(*(torch.stack(column) for column in zip(*(made[place] for place in sorted(made)), strict=True)))
+
+    def _search_everywhere(self, frames: "_Frames", _: Tensor, ransac_px: float | Tensor) -> Motion:
+        """Lucas-Kanade through the whole pyramid, then RANSAC."""
+        search = self._search(self.settings.iterations, _SCOUT_REACH_PX) | {"rounds": 3}
+        end, tracked = self._track(frames, None, search)
+        refits, count = self.effort.refits, self.settings.hypotheses
+        matrix = self._ransac(frames.points, end, tracked, frames.samples, ransac_px, refits, count)
+        return self._judged(matrix, frames.points, end, tracked, ransac_px)
+
+    def _search_near(self, frames: "_Frames", motion: Tensor, ransac_px: float | Tensor) -> Motion:
+        """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
+        effort, points = self.effort, frames.points
+        finest = frames._replace(earlier=frames.earlier[:1], later=frames.later[:1])
+        guess = F.transform_points(motion.float(), points)
+        end, tracked = self._track(finest, guess, self._search(effort.near_steps, _NEAR_REACH_PX))
+        if effort.branches:
+            gates_px = [share * ransac_px for share in effort.refits]
+            matrix = F.refit_map(points.double(), end.double(), tracked, motion, gates_px, self.model)
+        else:
+            count = self.settings.hypotheses
+            matrix = self._ransac(points, end, tracked, frames.samples, ransac_px, effort.refits, count)
+        return self._judged(matrix, points, end, tracked, ransac_px)
+
+    def _track(self, frames: "_Frames", guess: Tensor | None, search: dict[str, Any]) -> tuple[Tensor, Tensor]:
+        """Where the points go, and which were found there and, if that is asked for, on the way back."""
+        given, limit_px = (frames.points, frames.earlier, frames.later, guess), self.settings.forward_backward_px
+        if limit_px > 0 and self.effort.branches:
+            end, found = F.forward_backward(*given, limit_px=limit_px, **search)
+        else:
+            end, found = F.lucas_kanade(*given, **search)
+        return end, found & frames.valid
+
+    def _search(self, most_steps: int, reach_px: int) -> dict[str, Any]:
+        """Settings of the search for points."""
+        parameters = self.settings
+        return {
+            "window_px": parameters.window_px,
+            "iterations": min(parameters.iterations, most_steps),
+            "epsilon_px": parameters.epsilon_px,
+            "min_eigen": 1e-4 * LEVEL**2,
+            "reach_px": reach_px,
+        }
+
+    def _ransac(
+        self,
+        start: Tensor,
+        end: Tensor,
+        tracked: Tensor,
+        samples: Tensor | None,
+        ransac_px: float | Tensor,
+        shares: tuple[float, ...],
+        hypotheses: int,
+    ) -> Tensor:
+        """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own."""
+        model, (batch, count) = self.model, tracked.shape
+        if count < model.size:
+            return _identities(start)
+        if samples is None:
+            drawn = F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, model.size)
+            samples = drawn.to(start.device).expand(batch, -1, -1)
+        gates_px = [share * ransac_px for share in shares]
+        samples = samples[..., : model.size]
+        return F.ransac(start.double(), end.double(), tracked, samples, model, ransac_px, gates_px)[0]
+
+    def _judged(self, matrix: Tensor, start: Tensor, end: Tensor, tracked: Tensor, ransac_px: float | Tensor) -> Motion:
+        miss = F.oneway_transfer_error(start.double(), end.double(), matrix, squared=False)
+        inliers = tracked & (miss < ransac_px)
+        return Motion(matrix, start, end, tracked, inliers & (inliers.sum(1, keepdim=True) >= self.model.size))
+
+
+class _Frames(NamedTuple):
+    """points: keypoints, valid: which are there. earlier, later: pyramids."""
+
+    points: Tensor
+    valid: Tensor
+    earlier: list[Tensor]
+    later: list[Tensor]
+    samples: Tensor | None
+
+    def select(self, chosen: Tensor) -> "_Frames":
+        earlier, later = ([level[chosen] for level in pyramid] for pyramid in (self.earlier, self.later))
+        samples = None if self.samples is None else self.samples[chosen]
+        return _Frames(self.points[chosen], self.valid[chosen], earlier, later, samples)
+
+
+def _identities(like: Tensor) -> Tensor:
+    return torch.eye(3, dtype=torch.float64, device=like.device).expand(len(like), 3, 3)
