@@ -25,7 +25,6 @@ from torchvision_dddas.runtime import SHIPPED
 
 SIZE, STEP_SIZE = (96, 80), (128, 96)
 LEAST = {
-    "registration.model": "affine",
     "registration.levels": 1,
     "registration.iterations": 1,
     "registration.cell_px": 12,

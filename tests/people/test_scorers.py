@@ -116,12 +116,11 @@ def test_a_batch_of_pictures_and_parts_equals_each_alone(scorer):
 
 def test_gradients_reach_the_picture_and_the_weights():
     scorer = TorchScorer(PeopleParameters(), SVM, "cpu")
-    scorer.weights.requires_grad_()
     noise = np.random.default_rng(11).integers(0, 256, (150, 90, 3), np.uint8)
     picture = torch.from_numpy(noise).permute(2, 0, 1)[None].float().requires_grad_()
     found = scorer.score(picture, Part((80, 134), 0, 0, 80, 134))
     assert found.shape == (1, 1, 3)
-    levels, weights = torch.autograd.grad(found.sum(), [picture, scorer.weights])
+    levels, weights = torch.autograd.grad(found.sum(), [picture, scorer.model.weights])
     assert levels.isfinite().all() and (levels != 0).float().mean() > 0.5
     assert weights.isfinite().all() and (weights != 0).any(-1).all()
 

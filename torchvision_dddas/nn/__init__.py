@@ -1,5 +1,6 @@
 """torch.nn.Modules made of `functional`, for models of one's own, the torch engines, tuning and export."""
 
+from torchvision_dddas.nn.histogram_affinity import HistogramAffinity
 from torchvision_dddas.nn.motion_segmenter import (
     Core,
     Differences,
@@ -10,6 +11,7 @@ from torchvision_dddas.nn.motion_segmenter import (
     WarpedWindows,
     close_masks,
 )
+from torchvision_dddas.nn.people import HOGDescriptor, PersonScorer
 from torchvision_dddas.nn.plane_homography import PlaneHomography
 from torchvision_dddas.nn.registration import GRAPH_EFFORT, Effort, Motion, Registration
 
@@ -18,8 +20,11 @@ __all__ = [
     "Core",
     "Differences",
     "Effort",
+    "HOGDescriptor",
+    "HistogramAffinity",
     "Motion",
     "MotionSegmenter",
+    "PersonScorer",
     "PlaneHomography",
     "Regions",
     "Registration",

@@ -152,7 +152,8 @@ class Registration(nn.Module):
         """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
         effort, points = self.effort, frames.points
         finest = frames._replace(earlier=frames.earlier[:1], later=frames.later[:1])
-        guess = F.transform_points(motion.float(), points)
+        # Kornia's result has no shape that the exporter knows.
+        guess = F.transform_points(motion.float(), points).reshape([int(side) for side in points.shape])
         end, tracked = self._track(finest, guess, self._search(effort.near_steps, _NEAR_REACH_PX))
         if effort.branches:
             gates_px = [share * ransac_px for share in effort.refits]

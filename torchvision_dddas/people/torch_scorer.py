@@ -1,9 +1,7 @@
-"""Scores of windows by `functional.hog`: batched over pictures of one size, differentiable, on a CPU or GPU."""
+"""Scores of windows by `nn.PersonScorer`: batched over pictures of one size, differentiable, on a CPU or GPU."""
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,6 +12,7 @@ from torch import Tensor
 import torchvision_dddas.functional as F
 from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.nn import PersonScorer
 from torchvision_dddas.people.pyramid import count_windows
 from torchvision_dddas.types import LinearSvm, Part
 
@@ -40,8 +39,7 @@ class TorchScorer:
                 f"a window of these settings has {self.layout.features}"
             )
         weights = torch.from_numpy(np.array(svm.weights, np.float32))
-        self.weights = F.arrange_weights(weights, self.layout).to(self.device)
-        self.bias = torch.tensor(svm.bias, dtype=torch.float32, device=self.device)
+        self.model = PersonScorer(weights, float(svm.bias), self.layout, parameters.window_stride_px).to(self.device)
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
         """The score map of each part of each picture. Pictures of one size that want the same part share a batch."""
@@ -73,27 +71,12 @@ class TorchScorer:
     def score(self, levels: Tensor, part: Part) -> Tensor:
         """(B, ny, nx) scores of one part of pictures of one size, with gradients to their levels and to the weights.
 
-        levels: (B, C, H, W) floats 0 .. 255, BGR. Blocks are computed at the common divisor of the strides of windows
-        and blocks, and windows that share blocks are scored together: one phase of the block stride after the other.
+        levels: (B, C, H, W) floats 0 .. 255, BGR.
         """
         width, height = part.level
         rows = F.reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
         columns = F.reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
-        bordered = F.resize(levels, (height, width), rows, columns)
-        stride = self.parameters.window_stride_px
-        step = math.gcd(stride, self.layout.stride)
-        hop, skip = self.layout.stride // step, stride // step
-        found = F.hog(bordered, replace(self.layout, stride=step))
-        if hop == 1:
-            return F.svm_scores(found, self.weights, self.bias)[:, ::skip, ::skip]
-        window_width, window_height = self.layout.window
-        ny, nx = (part.height - window_height) // step + 1, (part.width - window_width) // step + 1
-        dense = bordered.new_empty(len(bordered), ny, nx)
-        for down in range(min(hop, ny)):
-            for across in range(min(hop, nx)):
-                phase = F.svm_scores(found[..., down::hop, across::hop], self.weights, self.bias)
-                dense[:, down::hop, across::hop] = phase
-        return dense[:, ::skip, ::skip]
+        return self.model.score(F.resize(levels, (height, width), rows, columns))
 
 
 def layout(parameters: PeopleParameters) -> F.Layout:

@@ -1,0 +1,66 @@
+"""Histograms of oriented gradients, and scores of windows for people (appendix A, III-B)."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+import torchvision_dddas.functional as F
+
+
+class HOGDescriptor(nn.Module):
+    """Normalised histograms of all blocks of RGB or grey pictures in [0, 1], as cv2.HOGDescriptor computes them."""
+
+    def __init__(self, layout: F.Layout | None = None) -> None:
+        """layout: of cells, blocks and window; OpenCV's default."""
+        super().__init__()
+        self.layout = layout or F.Layout()
+
+    def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F ny nx"]:
+        """F = bins x cells down x cells across; ny, nx: blocks of the picture, every `layout.stride` pixels."""
+        return F.hog(self.bordered(image), self.layout)
+
+    def bordered(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H+2 W+2"]:
+        """What `functional.hog` takes: levels 0 to 255 in OpenCV's order of colours, with a mirrored border."""
+        return F.pad_reflect(image.flip(1) * 255, 1, 1, 1, 1)
+
+
+class PersonScorer(nn.Module):
+    """Scores of all windows of a picture under a linear SVM of HOG; weights and bias are nn.Parameters."""
+
+    def __init__(
+        self, weights: Float[Tensor, " D"], bias: float, layout: F.Layout | None = None, window_stride_px: int = 8
+    ) -> None:
+        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window."""
+        super().__init__()
+        self.descriptor, self.window_stride_px = HOGDescriptor(layout), window_stride_px
+        arranged = F.arrange_weights(weights.detach(), self.descriptor.layout).contiguous()
+        self.weights = nn.Parameter(arranged)
+        self.bias = nn.Parameter(torch.tensor(bias, dtype=weights.dtype))
+
+    def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B ny nx"]:
+        """RGB or grey pictures in [0, 1]; the first window lies in the top left corner."""
+        return self.score(self.descriptor.bordered(image))
+
+    def score(self, bordered: Float[Tensor, "B C H+2 W+2"]) -> Float[Tensor, "B ny nx"]:
+        """As `forward`, of bordered levels.
+
+        Blocks are computed at the common divisor of the strides of windows and blocks, and windows that share blocks
+        are scored together: one phase of the block stride after the other.
+        """
+        layout, stride = self.descriptor.layout, self.window_stride_px
+        step = math.gcd(stride, layout.stride)
+        hop, skip = layout.stride // step, stride // step
+        blocks = F.hog(bordered, replace(layout, stride=step))
+        if hop == 1:
+            return F.svm_scores(blocks, self.weights, self.bias)[:, ::skip, ::skip]
+        height, width = (side - 2 for side in bordered.shape[-2:])
+        ny, nx = (height - layout.window[1]) // step + 1, (width - layout.window[0]) // step + 1
+        dense = bordered.new_empty(len(bordered), ny, nx)
+        for down in range(min(hop, ny)):
+            for across in range(min(hop, nx)):
+                phase = F.svm_scores(blocks[..., down::hop, across::hop], self.weights, self.bias)
+                dense[:, down::hop, across::hop] = phase
+        return dense[:, ::skip, ::skip]
