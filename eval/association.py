@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 import torch
 
-import torchvision_dddas.functional as F
 from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics import tracking
@@ -30,6 +29,7 @@ from torchvision_dddas.evaluation.metrics.matching import pair
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.nn import HistogramAffinity
 from torchvision_dddas.tracking import CameraMotion, FrameTracker, rgb_histograms
 from torchvision_dddas.tracking.source_tracker import (
     assign,
@@ -196,8 +196,8 @@ def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1)
         padded = np.zeros((last + 1, most, feature.shape[1]))
         for number, which in rows.items():
             padded[number, : len(which)] = feature[which]
-        tables = [torch.from_numpy(part)[torch.from_numpy(c)] for part in (padded, valid) for c in frames.T]
-        found = (F.pair_affinity(*tables) if count == 2 else F.triplet_affinity(*tables)).numpy()
+        tables = [torch.from_numpy(table) for table in (padded, valid, frames)]
+        found = HistogramAffinity().affinity(*tables).numpy()
         parts.append(
             [np.pad(one[tuple(map(slice, size))], ((1, 0),) * count) for one, size in zip(found, sizes, strict=True)]
         )

@@ -5,9 +5,11 @@ this package that made it, and a seal: the SHA-256 of everything else in it. Thi
 versions from the graphs that were checked; it is no signature, which would need a key.
 """
 
+import ctypes
 import hashlib
 import json
 import os
+import sys
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -104,13 +106,17 @@ def _again(folder: Path) -> str:
     return f"make the graphs again with `dddas export --out {folder}`"
 
 
-def wants_torch(backend: str) -> bool:
-    """Whether the back end is torch, which is then made ready to be imported."""
-    if backend in ("auto", "onboard"):
+def wants_torch(backend: str, auto_with_gpu: bool = True) -> bool:
+    """Whether the back end is torch, which is then made ready to be imported.
+
+    `auto` is torch where it sees a CUDA device, else onboard, the quicker one for a single stream on a CPU.
+    auto_with_gpu: False for work that a GPU does not help. Raises InputError for another name or missing packages.
+    """
+    if backend == "onboard" or (backend == "auto" and not (auto_with_gpu and _has_cuda())):
         return False
-    if backend != "torch":
+    if backend not in ("auto", "torch"):
         raise InputError(f"no back end is named '{backend}'; give auto, torch or onboard")
-    if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
+    if missing := _missing_packages():
         raise InputError(
             f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
             "or take --backend onboard"
@@ -118,3 +124,29 @@ def wants_torch(backend: str) -> bool:
     # Waiting threads that spin take the cores from the threads they wait for, minutes a frame on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return True
+
+
+def torch_device() -> str:
+    """Where torch computes: on the CUDA device if there is one, else on the CPU.
+
+    Apple's MPS is not taken: homographies are fitted in float64, which it does not have.
+    """
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _missing_packages() -> list[str]:
+    return [name for name in ("torch", "kornia") if find_spec(name) is None]
+
+
+@cache
+def _has_cuda() -> bool:
+    """Whether torch sees a CUDA device; where there is no driver it is not loaded to be asked, which takes seconds."""
+    if _missing_packages():
+        return False
+    try:
+        ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return False
+    return torch_device() == "cuda"

@@ -12,8 +12,11 @@ import torch
 
 from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
+from torchvision_dddas import runtime
 from torchvision_dddas.detection import Engine, View, Window, load_engine
 from torchvision_dddas.detection.torch_engine import TorchEngine
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.colours import load_colours, mask_colours
 from torchvision_dddas.geometry import chain, corner_error
 
 SIZES = [(320, 240), (251, 187)]
@@ -146,3 +149,25 @@ def test_a_batch_of_pairs_or_windows_equals_one_at_a_time() -> None:
             np.testing.assert_array_equal(getattr(found, name), getattr(single, name))
         assert (found.small is None) == (single.small is None) == (one.small is None)
         assert found.offsets == single.offsets
+
+
+@pytest.mark.parametrize(("driver", "wanted"), [(True, "torch"), (False, "onboard")])
+def test_auto_takes_torch_where_there_is_a_cuda_device_and_only_for_pictures(monkeypatch, driver, wanted) -> None:
+    monkeypatch.setattr(runtime, "_has_cuda", lambda: driver)
+    assert load_engine("auto", parameters.Settings()).name == wanted
+    assert load_colours("auto") is mask_colours, "of a picture's colours a GPU makes other ones"
+    for backend in ("onboard", "torch"):
+        assert load_engine(backend, parameters.Settings()).name == backend
+    with pytest.raises(InputError, match="no back end is named 'gpu'"):
+        load_engine("gpu", parameters.Settings())
+
+
+def test_without_a_driver_torch_is_not_asked_for_its_devices(monkeypatch) -> None:
+    def absent(name: str) -> None:
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr("ctypes.CDLL", absent)
+    monkeypatch.setattr(runtime, "torch_device", lambda: pytest.fail("torch was loaded"))
+    runtime._has_cuda.cache_clear()
+    assert not runtime.wants_torch("auto")
+    runtime._has_cuda.cache_clear()

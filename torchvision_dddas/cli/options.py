@@ -30,7 +30,7 @@ Config = Annotated[str | None, typer.Option(metavar="FILE|NAME", help="A TOML fi
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="PARAMETER=VALUE", help="Change a parameter; may be repeated.")
 ]
-EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes onboard for one stream on a CPU.")]
+EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes torch with a CUDA device, else onboard.")]
 StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as the study's file says]")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
 Poses = Annotated[

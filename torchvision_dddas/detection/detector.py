@@ -76,10 +76,7 @@ def detect_motion(
 
 
 def load_engine(backend: str, settings: Settings) -> Engine:
-    """The engine `torch` or `onboard`; `auto` is onboard, the quicker one for a single stream on a CPU.
-
-    Raises InputError for another name, and for `torch` if the extra is not installed.
-    """
+    """The engine `torch` or `onboard`, or that of `auto`. Raises InputError as `wants_torch`."""
     if not wants_torch(backend):
         return OpenCVEngine(settings)
     from torchvision_dddas.detection.torch_engine import TorchEngine

@@ -20,6 +20,7 @@ from torchvision_dddas.detection.engine import (
     match_exposure,
 )
 from torchvision_dddas.nn import MotionSegmenter, WarpedWindows, close_masks
+from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
@@ -37,7 +38,7 @@ class TorchEngine(Engine):
     def __init__(self, settings: Settings, device: str | torch.device | None = None) -> None:
         """device: by default the GPU where there is one."""
         self.parameters = settings
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = torch.device(device or torch_device())
 
     @property
     def segmenter(self) -> MotionSegmenter:

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import cheapest, occupied, shared_px
-from torchvision_dddas.runtime import wants_torch
+from torchvision_dddas.runtime import torch_device, wants_torch
 from torchvision_dddas.types import Colours, Table
 
 # Gaps of a patch up to about this wide are closed: an antenna, a seam, a pixel of noise.
@@ -47,13 +47,13 @@ def load_colours(backend: str) -> ColourFinder:
     torch compares hue and saturation unrounded, on a CPU or GPU. OpenCV's 8-bit conversion is up to 0.64 of a level
     off, so a pixel next to a bound may be classified differently.
     """
-    if not wants_torch(backend):
+    if not wants_torch(backend, auto_with_gpu=False):
         return mask_colours
     import torch
 
     from torchvision_dddas.functional import bgr_to_hsv, within_ranges
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(torch_device())
 
     def by_torch(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         if image.ndim == 2 or not len(low) or not image.size:

@@ -58,7 +58,7 @@ class PlaneSolver:
 
 def load_solver(backend: str) -> PlaneSolver:
     """The solver of a back end: auto, onboard or torch. Raises InputError for another name or missing packages."""
-    if not wants_torch(backend):
+    if not wants_torch(backend, auto_with_gpu=False):
         fit, fit_raw = open_graph("homography"), open_graph("homography_raw")
         return PlaneSolver(
             lambda ground, image, weight: fit.run(None, {"ground": ground, "image": image, "weight": weight}),

@@ -59,6 +59,8 @@ def run_live(
     Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
     """
     address = None if serve is None else parse_address(serve)
+    if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
+        backend = "onboard"
     health, supervisor, live = Health(), Supervisor(), settings.live
     for name in _COUNTED:  # a count that is there from the start can be distinguished from a missing one
         health.count(name, 0)

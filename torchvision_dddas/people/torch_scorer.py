@@ -14,6 +14,7 @@ from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.nn import PersonScorer
 from torchvision_dddas.people.pyramid import count_windows
+from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import LinearSvm, Part
 
 # So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
@@ -31,7 +32,7 @@ class TorchScorer:
         Raises InputError where cells, blocks and window do not fit one another, or the SVM is of another length.
         """
         self.parameters, self.svm = parameters, svm
-        self.device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+        self.device = torch.device(device or torch_device())
         self.layout = layout(parameters)
         if svm.weights.size != self.layout.features:
             raise InputError(
