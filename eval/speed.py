@@ -4,6 +4,7 @@ python eval/speed.py detection [DATA]   a frame by stage and resolution, beside 
 python eval/speed.py memory             peak memory of processes that run one chain, and `dddas detect`
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
+python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
 
 The processor's time is summed over threads; a ratio of two in one turn suffers least from other programs. Without DATA
 detection is timed on the tests' synthetic scene.
@@ -328,6 +329,95 @@ def _landmark_sets(n: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
     return ground, rng.normal(np.array([959.5, 539.5]) + flat, 1)
 
 
+def measure_operations(options: bench.Options) -> tuple[str, Any]:
+    """`functional` beside Kornia and OpenCV, on batches of grey pictures; processor time a picture."""
+    import kornia
+    import torch
+
+    import torchvision_dddas.functional as F
+
+    torch.set_num_threads(1)
+    (width, height), batch = bench.parse_size(options.size), options.batch
+    pictures = np.random.default_rng(0).integers(0, 256, (batch, height, width), np.uint8)
+    pictures = np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in pictures])
+    levels = torch.from_numpy(pictures)[:, None].float()
+    matrix = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
+    matrices, size = torch.from_numpy(matrix).float().expand(batch, 3, 3), (height, width)
+    around = {side: F.structuring_element("ellipse", side) for side in (3, 15)}
+    masks = (levels > 140).float()
+    points = 400 * torch.rand(batch, 300, 2, generator=torch.Generator().manual_seed(0))
+    ones, found = torch.ones(batch, 300), F.transform_points(matrices, points)
+    pair = points[0].numpy(), found[0].numpy()
+    sobel, box = kornia.filters.sobel, kornia.filters.box_blur
+
+    def each(call: Callable[[np.ndarray], object]) -> Callable[[], object]:
+        return lambda: [call(picture) for picture in pictures]
+
+    def kornia_corners() -> object:
+        du, dv = kornia.filters.spatial_gradient(levels).unbind(2)
+        uu, vv, uv = (box(product, 5) for product in (du * du, dv * dv, du * dv))
+        return (uu + vv - ((uu - vv).square() + 4 * uv.square()).sqrt()) / 2
+
+    rows: dict[str, tuple[Callable[[], object], ...]] = {
+        "warp": (
+            each(lambda picture: cv2.warpPerspective(picture, matrix, (width, height))),
+            lambda: F.warp_perspective(levels, matrices, size),
+            lambda: kornia.geometry.warp_perspective(levels, matrices, size),
+        ),
+        "Gaussian, 5": (
+            each(lambda picture: cv2.GaussianBlur(picture, (5, 5), 0)),
+            lambda: F.gaussian_blur2d(levels, 5),
+            lambda: kornia.filters.gaussian_blur2d(levels, 5, (1.1, 1.1)),
+        ),
+        "mean gradient": (
+            each(lambda p: cv2.blur(cv2.magnitude(cv2.Sobel(p, 5, 1, 0), cv2.Sobel(p, 5, 0, 1)), (5, 5))),
+            lambda: F.mean_gradient(levels),
+            lambda: box(sobel(levels, normalized=False), 5),
+        ),
+        "smaller eigenvalue": (
+            each(lambda picture: cv2.cornerMinEigenVal(picture, 5)),
+            lambda: F.corner_min_eigenvalue(levels, 5),
+            kornia_corners,
+        ),
+        "pyramid of 4": (
+            each(lambda picture: cv2.buildOpticalFlowPyramid(picture, (21, 21), 3)),
+            lambda: F.build_pyramid(levels, 4),
+            lambda: kornia.geometry.build_pyramid(levels, 4),
+        ),
+        **{
+            f"closing, {side}": (
+                each(lambda picture, side=side: cv2.morphologyEx(picture, cv2.MORPH_CLOSE, around[side].numpy())),
+                lambda side=side: F.closing(masks, around[side]),
+                lambda side=side: kornia.morphology.closing(masks, around[side].float()),
+            )
+            for side in around
+        },
+        "homography of 300": (
+            lambda: [cv2.findHomography(*pair, 0) for _ in range(batch)],
+            lambda: F.find_homography_dlt(points, found, ones),
+            lambda: kornia.geometry.find_homography_dlt(points, found, ones),
+        ),
+    }
+    load = bench.OtherLoad()
+    names = ("OpenCV", "ours", "Kornia")
+    calls = {
+        f"{row}, {name}": lambda turn, call=call: call()
+        for row, triple in rows.items()
+        for name, call in zip(names, triple, strict=True)
+    }
+    with torch.inference_mode():
+        spent = bench.time_in_turns(calls, options.rounds)
+    table, figures = [], {}
+    for row in rows:
+        to_kornia = bench.compare_turns(spent[f"{row}, Kornia"], spent[f"{row}, ours"])
+        millis = [1e3 * float(np.median(spent[f"{row}, {name}"][:, 1])) / batch for name in names]
+        table.append([row, *(f"{ms:.2f}" for ms in millis), bench.format_ratio(to_kornia)])
+        figures[row] = dict(zip(names, millis, strict=True)) | {"kornia_by_ours": to_kornia["processor_ratio"]}
+    head = ["operation", *(f"{name}, ms" for name in names), "Kornia by ours (quartiles)"]
+    about = f"{bench.machine_words()}; {load.words()}; {options.size}, batch {batch}, processor time:"
+    return f"{about}\n\n{bench.format_table(head, table)}", figures
+
+
 def _beside_first(calls: Mapping[str, Callable[[int], object]], rounds: int, title: str) -> tuple[str, Any]:
     """Table of calls beside the first of them."""
     load = bench.OtherLoad()
@@ -354,6 +444,7 @@ if __name__ == "__main__":
         "memory": (measure_memory, {"--chains": CHAINS[:4], "--size": "1280x720", "--frames": [60, 240]}),
         "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
         "geo": (measure_geo, {"--rounds": 15}),
+        "operations": (measure_operations, {"--size": "640x480", "--batch": 8, "--rounds": 9}),
         "chain": (run_chain, {"data": Path, "--name": "plain"}),
     }
     bench.main(__doc__, studies)

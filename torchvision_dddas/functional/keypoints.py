@@ -1,6 +1,6 @@
 """Good features to track: where both eigenvalues of the structure tensor are large (appendix B, step S1).
 
-The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response, which takes 2.6 times as long on a CPU.
+The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response, which takes twice as long on a CPU.
 """
 
 import torch
