@@ -201,3 +201,14 @@ def test_a_loss_on_a_clip_moves_the_parameters_that_are_learned(clip) -> None:
 def test_frames_without_two_neighbours_show_nothing(clip) -> None:
     found = MotionSegmenter()(clip[:, :2])
     assert found.mask.shape == (1, 2, 1, 120, 160) and not found.mask.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_asking_the_host_as_on_a_gpu_or_in_a_trace_the_results_are_the_same(kind, clip, monkeypatch) -> None:
+    model, softened = MotionSegmenter(of_kind(kind)), MotionSegmenter(of_kind(kind), softness=0.2)
+    motion = model(clip).later_from_earlier
+    wanted = [one(clip, motion) for one in (model, softened)]
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    for one, before in zip((model, softened), wanted, strict=True):
+        after = one(clip, motion)
+        assert torch.equal(after.mask, before.mask) and torch.equal(after.evidence, before.evidence)

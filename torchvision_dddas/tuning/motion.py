@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from kornia.losses import binary_focal_loss_with_logits
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, with_parameters
@@ -59,9 +60,10 @@ def overlap_loss(mask: Masks, truth: Labels, known: Labels, power: int = 1) -> F
 
 def focal_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"]:
     """Mean of -(1 - p)² ln p, where p is the mask's value for the truth, movers weighed 3 : 1 (Lin et al. 2017)."""
-    right = torch.where(truth, mask, 1 - mask).clamp(min=1e-6)
+    logits = torch.logit(mask, eps=1e-6)
+    loss = binary_focal_loss_with_logits(logits, truth.to(mask.dtype), alpha=0.75, gamma=2.0, reduction="none")
     weight = torch.where(truth, 0.75, 0.25) * known
-    return (-((1 - right) ** 2) * right.log() * weight).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
+    return (loss * known).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
 
 
 LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
