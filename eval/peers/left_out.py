@@ -27,7 +27,7 @@ from torchvision_dddas.types import DetectionTable
 TABLES = [("true", 1), ("true", 5), ("true", 15), ("true", 30), ("noisy", 1), ("noisy", 5), ("noisy", 15)]
 MOVED: dict[str, tuple[float, ...]] = {
     "doubt": (4.0, 16.0),
-    "wander": (0.3, 0.65),
+    "wander": (0.2, 0.45),
     "scatter": (0.04, 0.09),
     "size_scatter": (0.07, 0.15),
     "crossing": (0.1, 0.4),
