@@ -48,7 +48,9 @@ def track(
 ) -> None:
     """Give targets lasting identities: those detected in a clip, or those of a table, with or without its clip.
 
-    Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 if there is a clip, and run.json under --out.
+    Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 if there is a clip, and run.json under --out. With a clip
+    --backend chooses the engine of detection and registration, and with --config paper of the source's histograms and
+    affinities; the default association has none in torch.
     """
     from torchvision_dddas import open_video
     from torchvision_dddas.config import load_config
@@ -90,7 +92,7 @@ def track(
         record_results(
             output,
             record,
-            _track(table, source, engine, settings, interval),
+            _track(table, source, engine, settings, interval, backend.value),
             source.name if source is not None else str(detections),
             None if last is None else -(-last // interval),
             quiet,
@@ -112,6 +114,7 @@ def _track(
     engine: "Engine | None",
     settings: "Settings",
     interval: int,
+    backend: str,
 ) -> "Iterator[TrackedFrame]":
     from torchvision_dddas.detection import detect_motion
     from torchvision_dddas.tracking import track_clip, track_scenes, track_table
@@ -120,5 +123,6 @@ def _track(
         assert table is not None
         return track_table(table, settings, interval)
     if table is not None:
-        return track_clip(source, table, engine, settings, interval)
-    return track_scenes(detect_motion(source, settings, engine), settings, interval, source.size)
+        return track_clip(source, table, engine, settings, interval, backend)
+    scenes = detect_motion(source, settings, engine)
+    return track_scenes(scenes, settings, interval, source.size, backend=backend)

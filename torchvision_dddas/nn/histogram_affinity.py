@@ -6,8 +6,8 @@ from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
 
-# Frames whose histograms, and windows whose affinities, are computed at once: their temporaries are large.
-_FRAMES, _WINDOWS = 8, 64
+# Pixels of boxes that are read at once, at about 100 bytes each, and affinities computed at once.
+_PIXELS, _AFFINITIES = 1 << 20, 1 << 21
 
 
 class HistogramAffinity(nn.Module):
@@ -36,10 +36,16 @@ class HistogramAffinity(nn.Module):
         self, clip: Float[Tensor, "T 3 H W"], box_px: Float[Tensor, "T N 4"], valid: Bool[Tensor, "T N"]
     ) -> tuple[Float[Tensor, "T N 768"], Bool[Tensor, "T N"]]:
         """3 x 256 bins of every box, and which boxes lie in the picture."""
+        (frames, boxes), largest = valid.shape, _largest(clip, box_px, valid)
+        pixels = largest[0] * largest[1]
+        boxes_at_once = max(1, min(boxes, _PIXELS // pixels))
+        frames_at_once = max(1, min(frames, _PIXELS // (boxes_at_once * pixels)))
         made = []
-        for first in range(0, len(clip), _FRAMES):
-            part = slice(first, first + _FRAMES)
-            made.append(F.rgb_histogram(clip[part], box_px[part], valid[part], self.softness, self.normalize))
+        for first in range(0, frames, frames_at_once):
+            some = slice(first, first + frames_at_once)
+            columns = zip(box_px[some].split(boxes_at_once, 1), valid[some].split(boxes_at_once, 1), strict=True)
+            found = [F.rgb_histogram(clip[some], *of, self.softness, self.normalize, largest) for of in columns]
+            made.append([torch.cat(parts, 1) for parts in zip(*found, strict=True)])
         histogram, inside = zip(*made, strict=True)
         return torch.cat(histogram), torch.cat(inside)
 
@@ -47,9 +53,20 @@ class HistogramAffinity(nn.Module):
         self, feature: Float[Tensor, "T N D"], valid: Bool[Tensor, "T N"], windows: Int64[Tensor, "W K"]
     ) -> Float[Tensor, "W N N *N"]:
         """As `forward`, of any non-negative features of the boxes: histograms, or their centres in pixels."""
-        of_frames = F.pair_affinity if windows.shape[1] == 2 else F.triplet_affinity
+        count, size = feature.shape[1], windows.shape[1]
+        of_frames = F.pair_affinity if size == 2 else F.triplet_affinity
         made = []
-        for some in windows.split(_WINDOWS):
+        for some in windows.split(max(1, _AFFINITIES // max(1, count**size))):
             frames = some.unbind(1)
             made.append(of_frames(*(feature[places] for places in frames), *(valid[places] for places in frames)))
         return torch.cat(made)
+
+
+def _largest(clip: Tensor, box_px: Tensor, valid: Tensor) -> tuple[int, int]:
+    """(height, width) that no box exceeds once its edges are rounded; in a graph, of fixed shapes, the clip's."""
+    height, width = clip.shape[-2:]
+    if torch.compiler.is_compiling() or not box_px.numel():
+        return height, width
+    side = torch.where(valid[..., None], box_px[..., 2:], 0.0).nan_to_num(0.0).flatten(0, 1).amax(0)
+    wide, tall = (int(length) + 2 for length in side.clamp(0, max(height, width)).tolist())
+    return min(height, tall), min(width, wide)

@@ -4,11 +4,12 @@ With every sampled frame, the last K frames are assigned again; a target takes t
 newest link of that window names. What fails in it is kept: see the tests, and `score_tracker` for the improved one.
 
 Features are non-negative vectors, one row a target. Affinities have a dummy target at index 0 of each axis; axes and
-windows go from the newest frame to the oldest. `functional.affinity` holds the affinities for batches of tensors.
+windows go from the newest frame to the oldest. `functional.affinity` holds the affinities for batches of tensors, and
+`torch_source_tracker` computes those of many windows at once.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,6 +22,10 @@ from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.dual_ascent import add_lone_targets, assign_triplets
 from torchvision_dddas.types import Detections, Float, Int, Tracks
 
+Feature = Literal["location", "appearance"]
+
+_STEPS = 2.0**40  # that the share of a level in a histogram is rounded to
+
 # -- features ----------------------------------------------------------------------------------------------------------
 
 
@@ -30,25 +35,34 @@ def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     image: (H, W, 3) uint8 BGR, or (H, W) grey, counted three times. box_px: (N, 4) x, y, width, height; edges are
     rounded to whole pixels and clipped to the image. A box without a pixel inside has zeros.
     """
+    counts = np.zeros((len(box_px), 3, 256), np.float32)
+    for row, crop in zip(counts, crops(image, box_px), strict=True):
+        if crop.size:
+            for place, channel in enumerate((2, 1, 0)):
+                row[place] = cv2.calcHist([crop], [channel], None, [256], [0, 256])[:, 0]
+    return counts.reshape(len(box_px), 768)
+
+
+def crops(image: np.ndarray, box_px: np.ndarray) -> list[np.ndarray]:
+    """The part (h, w, 3) of the picture in each box, as `rgb_histograms` counts it."""
     bgr = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     boxes = np.array(box_px, float).reshape(-1, 4)
     boxes[~np.isfinite(boxes).all(axis=1)] = 0.0
     limit = np.array(bgr.shape[1::-1])
-    low = np.clip(np.rint(boxes[:, :2]), 0, limit).astype(int)
-    high = np.clip(np.rint(boxes[:, :2] + boxes[:, 2:]), 0, limit).astype(int)
-    counts = np.zeros((len(boxes), 3, 256), np.float32)
-    for row, (left, top), (right, bottom) in zip(counts, low, high, strict=True):
-        if right > left and bottom > top:
-            for place, channel in enumerate((2, 1, 0)):
-                row[place] = cv2.calcHist([bgr[top:bottom, left:right]], [channel], None, [256], [0, 256])[:, 0]
-    return counts.reshape(len(boxes), 768)
+    low = np.clip(np.rint(boxes[:, :2]), 0, limit).astype(int).tolist()
+    high = np.clip(np.rint(boxes[:, :2] + boxes[:, 2:]), 0, limit).astype(int).tolist()
+    return [bgr[top:bottom, left:right] for (left, top), (right, bottom) in zip(low, high, strict=True)]
 
 
 def normalize_channels(histogram: Float[np.ndarray, "N 768"]) -> Float[np.ndarray, "N 768"]:
-    """Each channel's 256 bins divided by their sum; zeros stay zeros."""
+    """Each channel's 256 bins divided by their sum, in steps of 2^-40; zeros stay zeros.
+
+    Sums of steps are exact. So affinities do not depend on the order of summation, which differs between libraries and
+    processors and would decide ties: the gate makes many.
+    """
     channels = np.asarray(histogram, float).reshape(len(histogram), 3, 256)
     total = channels.sum(axis=-1, keepdims=True)
-    return (channels / np.where(total > 0, total, 1.0)).reshape(len(histogram), 768)
+    return (np.rint(channels / np.where(total > 0, total, 1.0) * _STEPS) / _STEPS).reshape(len(histogram), 768)
 
 
 def centres(box_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
@@ -56,14 +70,31 @@ def centres(box_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
     return np.maximum(box_px[:, :2] + box_px[:, 2:] / 2, 0.0)
 
 
+@dataclass(frozen=True)
+class PicturedBoxes:
+    """The boxes of a frame and its picture; calling it gives their histograms, as `Features` wants them."""
+
+    image: np.ndarray
+    box_px: Float[np.ndarray, "N 4"]
+
+    def __call__(self) -> Float[np.ndarray, "N 768"]:
+        """The histograms of `rgb_histograms`."""
+        return rgb_histograms(self.image, self.box_px)
+
+
 class Features:
-    """The features of a frame's targets; histograms are computed when first needed."""
+    """The features of a frame's targets; histograms and dispersions are computed when first needed, and kept.
+
+    similarity: of the frame's targets to each other (N, N), by feature, where it was computed in a batch.
+    """
 
     def __init__(self, box_px: Float[np.ndarray, "N 4"], histograms: Callable[[], np.ndarray] | None) -> None:
         """histograms: gives (N, 768) counts of pixels or shares; None where there is no picture."""
         self.centre_px = centres(box_px)
-        self._compute = histograms
+        self.source = histograms
+        self.similarity: dict[Feature, np.ndarray] = {}
         self._histograms = np.zeros((len(box_px), 768)) if histograms is None or not len(box_px) else None
+        self._dispersions: dict[tuple[Feature, float, str], float] = {}
 
     def __len__(self) -> int:
         return len(self.centre_px)
@@ -71,19 +102,45 @@ class Features:
     @property
     def has_picture(self) -> bool:
         """Whether there are histograms."""
-        return self._compute is not None
+        return self.source is not None
+
+    @property
+    def has_histograms(self) -> bool:
+        """Whether the histograms are computed, or need no computing."""
+        return self._histograms is not None
+
+    def take_histograms(self, histograms: Float[np.ndarray, "N 768"]) -> None:
+        """Keep histograms that were computed. Raises InputError if they are not (N, 768)."""
+        if histograms.shape != (len(self), 768):
+            raise InputError(
+                f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
+                f"got {histograms.shape}. Compute them with tracking.rgb_histograms."
+            )
+        self._histograms = np.asarray(histograms, float)
 
     def histogram(self, normalization: str) -> Float[np.ndarray, "N 768"]:
         """The boxes' histograms by the reading that `paper.histogram` names."""
-        if self._histograms is None and self._compute is not None:
-            self._histograms = np.asarray(self._compute(), float)
-            if self._histograms.shape != (len(self), 768):
-                raise InputError(
-                    f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
-                    f"got {self._histograms.shape}. Compute them with tracking.rgb_histograms."
-                )
+        if self._histograms is None and self.source is not None:
+            self.take_histograms(self.source())
         assert self._histograms is not None
         return normalize_channels(self._histograms) if normalization == "channel" else self._histograms
+
+    def values(self, feature: Feature, normalization: str) -> Float[np.ndarray, "N D"]:
+        """The vectors of a feature: centres in pixels, or histograms."""
+        return self.centre_px if feature == "location" else self.histogram(normalization)
+
+    def dispersion(self, feature: Feature, parameters: PaperParameters) -> float:
+        """The `dispersion` of the targets in a feature."""
+        cut = parameters.location_cut if feature == "location" else parameters.appearance_cut
+        key = (feature, cut, parameters.histogram)
+        if key not in self._dispersions:
+            if len(self) < 2:
+                self._dispersions[key] = 1.0
+            elif feature in self.similarity:
+                self._dispersions[key] = _cluster_entropy(self.similarity[feature], cut)
+            else:
+                self._dispersions[key] = dispersion(self.values(feature, parameters.histogram), cut)
+        return self._dispersions[key]
 
 
 # -- affinities --------------------------------------------------------------------------------------------------------
@@ -171,11 +228,14 @@ def dispersion(feature: Float[np.ndarray, "N D"], cut: float) -> float:
 
     Clusters are of average linkage, the tree cut at a dissimilarity (eq. 10 and G).
     """
-    if len(feature) < 2:
-        return 1.0
+    return 1.0 if len(feature) < 2 else _cluster_entropy(similarity(feature, feature), cut)
+
+
+def _cluster_entropy(alike: Float[np.ndarray, "N N"], cut: float) -> float:
+    """The dispersion of two targets or more from their similarities."""
     from scipy.cluster.hierarchy import fcluster  # here, as only the source's association needs it
 
-    return normalized_entropy(fcluster(_tree(feature), cut, "distance"))
+    return normalized_entropy(fcluster(_tree(alike), cut, "distance"))
 
 
 def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
@@ -193,14 +253,14 @@ def joined_at(feature: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N N"]:
     from scipy.cluster.hierarchy import cophenet
     from scipy.spatial.distance import squareform
 
-    return np.asarray(squareform(cophenet(_tree(feature))))
+    return np.asarray(squareform(cophenet(_tree(similarity(feature, feature)))))
 
 
-def _tree(feature: Float[np.ndarray, "N D"]) -> np.ndarray:
+def _tree(alike: Float[np.ndarray, "N N"]) -> np.ndarray:
     from scipy.cluster.hierarchy import linkage
     from scipy.spatial.distance import squareform
 
-    dissimilarity = 1 - similarity(feature, feature)
+    dissimilarity = 1 - alike
     np.fill_diagonal(dissimilarity, 0.0)
     return np.asarray(linkage(squareform(dissimilarity, checks=False), "average"))
 
@@ -222,6 +282,36 @@ def location_weight(location: float, appearance: Callable[[], float], lowest: fl
     return (0.0 if found > lowest else 0.5), found
 
 
+def needs_appearance(window: Sequence[Features], parameters: PaperParameters) -> bool:
+    """Whether the association of a window asks for its histograms."""
+    if not all(frame.has_picture or not len(frame) for frame in window):
+        return False
+    if parameters.rule == "fixed":
+        return parameters.weight < 1
+    return smallest_dispersion(window, "location", parameters) <= parameters.lowest_dispersion
+
+
+def smallest_dispersion(window: Sequence[Features], feature: Feature, parameters: PaperParameters) -> float:
+    """The least dispersion of the frames of a window that count."""
+    considered = window[: frames_considered([len(frame) for frame in window], parameters)]
+    return min(frame.dispersion(feature, parameters) for frame in considered)
+
+
+def weigh(window: Sequence[Features], parameters: PaperParameters) -> tuple[float, float, float | None]:
+    """The weight of location in a window, the dispersion of location, and of appearance where it was needed."""
+    location = smallest_dispersion(window, "location", parameters)
+    if not needs_appearance(window, parameters):
+        return 1.0, location, None
+    if parameters.rule == "fixed":
+        return parameters.weight, location, None
+
+    def appearance() -> float:
+        return smallest_dispersion(window, "appearance", parameters)
+
+    weight, found = location_weight(location, appearance, parameters.lowest_dispersion)
+    return weight, location, found
+
+
 # -- association -------------------------------------------------------------------------------------------------------
 
 
@@ -239,26 +329,23 @@ class Association:
     appearance_dispersion: float | None
 
 
-def associate(window: Sequence[Features], parameters: PaperParameters) -> Association:
-    """Assign the targets of two or three frames: weigh, gate, solve."""
-    considered = window[: frames_considered([len(frame) for frame in window], parameters)]
-    location = min(dispersion(frame.centre_px, parameters.location_cut) for frame in considered)
+def associate(
+    window: Sequence[Features], parameters: PaperParameters, affinities: Mapping[Feature, np.ndarray] | None = None
+) -> Association:
+    """Assign the targets of two or three frames: weigh, gate, solve.
 
-    def appearance() -> float:
-        histograms = [frame.histogram(parameters.histogram) for frame in considered]
-        return min(dispersion(histogram, parameters.appearance_cut) for histogram in histograms)
+    affinities: the window's by the features that count, where they were computed in a batch.
+    """
+    weight, location, appearance = weigh(window, parameters)
 
-    weight, appearance_dispersion = parameters.weight, None
-    if not all(frame.has_picture or not len(frame) for frame in window):
-        weight = 1.0
-    elif parameters.rule != "fixed":
-        weight, appearance_dispersion = location_weight(location, appearance, parameters.lowest_dispersion)
-    by_location = by_appearance = None
-    if weight > 0:
-        by_location = affinity([frame.centre_px for frame in window], parameters)
-    if weight < 1:
-        by_appearance = affinity([frame.histogram(parameters.histogram) for frame in window], parameters)
-    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, appearance_dispersion)
+    def affinity_by(feature: Feature) -> np.ndarray:
+        if affinities is not None and feature in affinities:
+            return affinities[feature]
+        return affinity([frame.values(feature, parameters.histogram) for frame in window], parameters)
+
+    by_location = affinity_by("location") if weight > 0 else None
+    by_appearance = affinity_by("appearance") if weight < 1 else None
+    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, appearance)
 
 
 def assign(
@@ -315,9 +402,19 @@ class SourceTracker:
         once, where the dispersion of the locations requires it, maybe while one of the next frames is fed.
         """
         self.window.appendleft(Features(detections.box_px, appearance))
+        return [self.identify(frame, detections, list(self.window))]
+
+    def identify(
+        self,
+        frame: int,
+        detections: Detections,
+        window: Sequence[Features],
+        affinities: Mapping[Feature, np.ndarray] | None = None,
+    ) -> Tracks:
+        """The identities of the newest frame of a window. affinities: as for `associate`."""
         identity = np.zeros(len(detections), np.int64)
-        if len(self.window) > 1:
-            rows = associate(list(self.window), self.parameters).rows
+        if len(window) > 1:
+            rows = associate(window, self.parameters, affinities).rows
             # The newest link counts: i to j, or i to k where j is the dummy, unless another target has that identity by
             # its own link to j.
             for older, known in enumerate(self.identities, 1):
@@ -329,7 +426,7 @@ class SourceTracker:
         identity[new] = self.next_identity + np.arange(len(new))
         self.next_identity += len(new)
         self.identities.appendleft(identity)
-        return [Tracks(frame, identity, detections.box_px, detections.score, np.arange(len(detections)))]
+        return Tracks(frame, identity, detections.box_px, detections.score, np.arange(len(detections)))
 
     def end(self) -> list[Tracks]:
         """Nothing: no frame waits."""

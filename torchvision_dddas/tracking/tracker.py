@@ -10,10 +10,11 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
+from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.tracking.appearance import strip_histograms
 from torchvision_dddas.tracking.camera_motion import CameraMotion, Registrar
 from torchvision_dddas.tracking.score_tracker import ScoreTracker
-from torchvision_dddas.tracking.source_tracker import SourceTracker, rgb_histograms
+from torchvision_dddas.tracking.source_tracker import PicturedBoxes, SourceTracker
 from torchvision_dddas.types import (
     Adjustment,
     Detections,
@@ -33,8 +34,8 @@ MOTION = "moving"
 class Tracker:
     """Gives detections lasting identities, one sampled frame after another.
 
-    A frame is settled some frames later (with `track.mode = paper`, the source's three-frame association, at once);
-    `update` returns the frames that are settled by it, in order, and `flush` the rest.
+    A frame is settled some frames later (with `track.mode = paper`, the source's three-frame association, at once, or
+    in torch's batches); `update` returns the frames that are settled by it, in order, and `flush` the rest.
     """
 
     def __init__(
@@ -44,20 +45,25 @@ class Tracker:
         size: tuple[float, float] | None = None,
         motion: bool | None = None,
         certain: bool = False,
+        backend: str = "onboard",
     ) -> None:
         """interval: frames from one sampled frame to the next. size: (width, height) of the pictures, None if unknown.
 
         motion: whether the detections are of the motion detector. Then they count as certain, and their boxes scatter
         as blobs do; None: as the kind of the first ones says. certain: count every score as 1.
-        Raises InputError for an interval below 1 or a size that is not two positive numbers.
+        backend: torch computes the histograms and affinities of the source's association (`track.mode = paper`) of
+        some frames at once, which are then settled together; auto is torch where it sees a CUDA device. The default
+        association does not use it.
+        Raises InputError for an interval below 1, a size that is not two positive numbers, and as `wants_torch`.
         """
         if not isinstance(interval, int | np.integer) or interval < 1:
             raise InputError(f"interval must be a whole number of frames from 1, got {interval}")
         if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
             raise InputError(f"size must be (width, height) in pixels, got {size}")
         self.settings, self.interval, self.size = settings or Settings(), int(interval), size
-        self.appearance_s = 0.0  # seconds spent on histograms, some of them for earlier frames
         self._motion, self._certain = motion, certain
+        self._in_batches = self.settings.track.mode == "paper" and wants_torch(backend)
+        self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None
         self._frame: int | None = None
         self._scores: deque[np.ndarray] = deque()  # as given, of the frames that are not settled
@@ -100,7 +106,11 @@ class Tracker:
             if self._motion:  # blobs come in parts, with shadows, and joined
                 own = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter}
                 settings = settings.model_copy(update={"track": track.model_copy(update=own)})
-            if track.mode == "paper":
+            if self._in_batches:
+                from torchvision_dddas.tracking.torch_source_tracker import TorchSourceTracker
+
+                self._tracker = TorchSourceTracker(settings, self.interval, self.size)
+            elif track.mode == "paper":
                 self._tracker = SourceTracker(settings, self.interval, self.size)
             else:
                 self._tracker = ScoreTracker(settings, self.interval, self.size, confirmed=self._motion)
@@ -114,13 +124,21 @@ class Tracker:
         """The frames that are not settled yet, at the end of a run."""
         return self._with_given_scores(self._tracker.end()) if self._tracker is not None else []
 
+    @property
+    def appearance_s(self) -> float:
+        """Seconds spent on histograms, some of them for earlier frames."""
+        return self._histograms_s + getattr(self._tracker, "histograms_s", 0.0)
+
     def _histograms(self, image: np.ndarray, box_px: np.ndarray) -> Callable[[], np.ndarray]:
-        histograms = rgb_histograms if self.settings.track.mode == "paper" else strip_histograms
+        boxes = PicturedBoxes(image, box_px)
+        if self._in_batches:
+            return boxes
+        is_source = self.settings.track.mode == "paper"
 
         def compute() -> np.ndarray:
             start = time.perf_counter()
-            found = histograms(image, box_px)
-            self.appearance_s += time.perf_counter() - start
+            found = boxes() if is_source else strip_histograms(image, box_px)
+            self._histograms_s += time.perf_counter() - start
             return found
 
         return compute
@@ -173,10 +191,11 @@ class FrameTracker:
         motion: bool | None = False,
         certain: bool = False,
         pictures: bool = True,
+        backend: str = "onboard",
     ) -> None:
         """As Tracker. pictures: whether settled frames keep their pictures, which are most of a long run's memory."""
         self.interval, self.pictures = interval, pictures
-        self.tracker = Tracker(settings, interval, size, motion, certain)
+        self.tracker = Tracker(settings, interval, size, motion, certain, backend)
         self._waiting: deque[TrackedFrame] = deque()
 
     def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
@@ -209,9 +228,16 @@ def without_picture(frame: Frame) -> Frame:
 class SceneTracker:
     """Gives the targets of a clip's own scenes identities, at frames 1, 1 + interval, ... Registrations are chained."""
 
-    def __init__(self, settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        interval: int,
+        size: tuple[int, int],
+        pictures: bool = True,
+        backend: str = "onboard",
+    ) -> None:
         self._interval = interval
-        self._tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures)
+        self._tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures, backend=backend)
         self._steps: list[np.ndarray] = []
         self._adjustments: tuple[Adjustment, ...] = ()
         self._seconds: dict[str, float] = {}
@@ -239,10 +265,15 @@ class SceneTracker:
 
 
 def track_scenes(
-    scenes: Iterable[Scene], settings: Settings, interval: int, size: tuple[int, int], pictures: bool = True
+    scenes: Iterable[Scene],
+    settings: Settings,
+    interval: int,
+    size: tuple[int, int],
+    pictures: bool = True,
+    backend: str = "onboard",
 ) -> Iterator[TrackedFrame]:
-    """Identities of a clip's own detections, as by `SceneTracker`."""
-    tracker = SceneTracker(settings, interval, size, pictures)
+    """Identities of a clip's own detections, as by `SceneTracker`. backend: as for `Tracker`."""
+    tracker = SceneTracker(settings, interval, size, pictures, backend)
     for scene in scenes:
         yield from tracker.update(scene)
     yield from tracker.flush()
@@ -252,9 +283,14 @@ class _TableTracker(FrameTracker):
     """Tracks the rows of a table."""
 
     def __init__(
-        self, table: DetectionTable, settings: Settings, interval: int, size: tuple[float, float] | None
+        self,
+        table: DetectionTable,
+        settings: Settings,
+        interval: int,
+        size: tuple[float, float] | None,
+        backend: str = "onboard",
     ) -> None:
-        super().__init__(settings, interval, size, motion=table.own, certain=table.certain)
+        super().__init__(settings, interval, size, motion=table.own, certain=table.certain, backend=backend)
         self.table = table
 
     def add(
@@ -273,14 +309,19 @@ class _TableTracker(FrameTracker):
 
 
 def track_clip(
-    source: Source, table: DetectionTable, engine: Registrar, settings: Settings, interval: int
+    source: Source,
+    table: DetectionTable,
+    engine: Registrar,
+    settings: Settings,
+    interval: int,
+    backend: str = "onboard",
 ) -> Iterator[TrackedFrame]:
     """Identities of a table of detections along its clip, at frames 1, 1 + interval, ...
 
     The camera's motion is estimated from one picture to the next that can be read. Frames that cannot be read, or lie
-    after the clip's end, are tracked without picture.
+    after the clip's end, are tracked without picture. backend: as for `Tracker`.
     """
-    tracker, camera, number = _TableTracker(table, settings, interval, source.size), CameraMotion(engine), 1
+    tracker, camera, number = _TableTracker(table, settings, interval, source.size, backend), CameraMotion(engine), 1
     unread = "the frame could not be read"
     start = time.perf_counter()
     for frame in source.every(interval):

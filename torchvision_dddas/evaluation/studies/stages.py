@@ -250,7 +250,7 @@ def _find_tracks(run: _Run) -> None:
     if upstream_task(run.clip, "tracking") is not None:
         assert run.before is not None, "tracking needs the result of motion"
         scenes, size = replay_scenes(run.clip, run.before), open_clip(run.clip).size
-        _add_tracks(run, track_scenes(scenes, run.settings, run.interval, size, False))
+        _add_tracks(run, track_scenes(scenes, run.settings, run.interval, size, False, run.backend))
     else:
         assert run.clip.given is not None, "allowed_tasks() asks for detections"
         _track_table(run, read_detections(run.clip.given))
@@ -269,7 +269,8 @@ def _track_table(run: _Run, table: DetectionTable) -> None:
         return
     source = open_clip(run.clip)
     run.notes += check_table(table, run.interval, source)
-    _add_tracks(run, track_clip(source, table, load_engine(run.backend, run.settings), run.settings, run.interval))
+    engine = load_engine(run.backend, run.settings)
+    _add_tracks(run, track_clip(source, table, engine, run.settings, run.interval, run.backend))
     run.notes += map(str, source.problems)
 
 
