@@ -238,6 +238,12 @@ def now() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
 
 
+def children_s() -> np.ndarray:
+    """(2,) seconds by the clock, and of the processor over all programs that this one has started and that ended."""
+    use = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return np.array([time.perf_counter(), use.ru_utime + use.ru_stime])
+
+
 def time_in_turns(calls: Mapping[str, Callable[[int], object]], rounds: int, warm_up: int = 1) -> dict[str, np.ndarray]:
     """Seconds of each call by clock and processor, (rounds, 2), all calls once a round, so that load meets them alike.
 

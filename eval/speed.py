@@ -5,11 +5,13 @@ python eval/speed.py memory             peak memory of processes that run one ch
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
 python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
+python eval/speed.py association SEQ    the source's association of a MOTChallenge sequence, onboard and torch
 
 The processor's time is summed over threads; a ratio of two in one turn suffers least from other programs. Without DATA
 detection is timed on the tests' synthetic scene.
 """
 
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,12 +23,13 @@ import bench
 import cv2
 import numpy as np
 import plain_chain
-from clips import Size, clips_in, read_frames, resize, scene, there_and_back, write_video
+from clips import Size, clips_in, film_of, frames_of, read_frames, resize, scene, there_and_back, truth_of, write_video
 
 from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.detection import Engine, Foreground, MotionDetector, View, Window, load_engine
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.types import Frame, Registration
+from torchvision_dddas.tracking import Tracker, source_tracker
+from torchvision_dddas.types import Frame, Registration, Tracks, is_sampled
 
 TURN_FRAMES, WARM_UP = 8, 3
 STAGES = ("prepare", "register", "foreground", "targets")
@@ -330,92 +333,111 @@ def _landmark_sets(n: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure_operations(options: bench.Options) -> tuple[str, Any]:
-    """`functional` beside Kornia and OpenCV, on batches of grey pictures; processor time a picture."""
-    import kornia
+    """`functional` beside Kornia and OpenCV on batches of pictures or of pairs of points; processor time of each."""
     import torch
-
-    import torchvision_dddas.functional as F
+    from tensor_operations import operations
 
     torch.set_num_threads(1)
-    (width, height), batch = bench.parse_size(options.size), options.batch
-    pictures = np.random.default_rng(0).integers(0, 256, (batch, height, width), np.uint8)
-    pictures = np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in pictures])
-    levels = torch.from_numpy(pictures)[:, None].float()
-    matrix = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
-    matrices, size = torch.from_numpy(matrix).float().expand(batch, 3, 3), (height, width)
-    around = {side: F.structuring_element("ellipse", side) for side in (3, 15)}
-    masks = (levels > 140).float()
-    points = 400 * torch.rand(batch, 300, 2, generator=torch.Generator().manual_seed(0))
-    ones, found = torch.ones(batch, 300), F.transform_points(matrices, points)
-    pair = points[0].numpy(), found[0].numpy()
-    sobel, box = kornia.filters.sobel, kornia.filters.box_blur
-
-    def each(call: Callable[[np.ndarray], object]) -> Callable[[], object]:
-        return lambda: [call(picture) for picture in pictures]
-
-    def kornia_corners() -> object:
-        du, dv = kornia.filters.spatial_gradient(levels).unbind(2)
-        uu, vv, uv = (box(product, 5) for product in (du * du, dv * dv, du * dv))
-        return (uu + vv - ((uu - vv).square() + 4 * uv.square()).sqrt()) / 2
-
-    rows: dict[str, tuple[Callable[[], object], ...]] = {
-        "warp": (
-            each(lambda picture: cv2.warpPerspective(picture, matrix, (width, height))),
-            lambda: F.warp_perspective(levels, matrices, size),
-            lambda: kornia.geometry.warp_perspective(levels, matrices, size),
-        ),
-        "Gaussian, 5": (
-            each(lambda picture: cv2.GaussianBlur(picture, (5, 5), 0)),
-            lambda: F.gaussian_blur2d(levels, 5),
-            lambda: kornia.filters.gaussian_blur2d(levels, 5, (1.1, 1.1)),
-        ),
-        "mean gradient": (
-            each(lambda p: cv2.blur(cv2.magnitude(cv2.Sobel(p, 5, 1, 0), cv2.Sobel(p, 5, 0, 1)), (5, 5))),
-            lambda: F.mean_gradient(levels),
-            lambda: box(sobel(levels, normalized=False), 5),
-        ),
-        "smaller eigenvalue": (
-            each(lambda picture: cv2.cornerMinEigenVal(picture, 5)),
-            lambda: F.corner_min_eigenvalue(levels, 5),
-            kornia_corners,
-        ),
-        "pyramid of 4": (
-            each(lambda picture: cv2.buildOpticalFlowPyramid(picture, (21, 21), 3)),
-            lambda: F.build_pyramid(levels, 4),
-            lambda: kornia.geometry.build_pyramid(levels, 4),
-        ),
-        **{
-            f"closing, {side}": (
-                each(lambda picture, side=side: cv2.morphologyEx(picture, cv2.MORPH_CLOSE, around[side].numpy())),
-                lambda side=side: F.closing(masks, around[side]),
-                lambda side=side: kornia.morphology.closing(masks, around[side].float()),
-            )
-            for side in around
-        },
-        "homography of 300": (
-            lambda: [cv2.findHomography(*pair, 0) for _ in range(batch)],
-            lambda: F.find_homography_dlt(points, found, ones),
-            lambda: kornia.geometry.find_homography_dlt(points, found, ones),
-        ),
-    }
-    load = bench.OtherLoad()
-    names = ("OpenCV", "ours", "Kornia")
+    cv2.setNumThreads(1)
+    batch, load = options.batch, bench.OtherLoad()
+    rows = operations(bench.parse_size(options.size), batch)
     calls = {
         f"{row}, {name}": lambda turn, call=call: call()
-        for row, triple in rows.items()
-        for name, call in zip(names, triple, strict=True)
+        for row, made in rows.items()
+        for name, call in made.items()
+        if call is not None
     }
     with torch.inference_mode():
         spent = bench.time_in_turns(calls, options.rounds)
     table, figures = [], {}
-    for row in rows:
-        to_kornia = bench.compare_turns(spent[f"{row}, Kornia"], spent[f"{row}, ours"])
-        millis = [1e3 * float(np.median(spent[f"{row}, {name}"][:, 1])) / batch for name in names]
-        table.append([row, *(f"{ms:.2f}" for ms in millis), bench.format_ratio(to_kornia)])
-        figures[row] = dict(zip(names, millis, strict=True)) | {"kornia_by_ours": to_kornia["processor_ratio"]}
-    head = ["operation", *(f"{name}, ms" for name in names), "Kornia by ours (quartiles)"]
-    about = f"{bench.machine_words()}; {load.words()}; {options.size}, batch {batch}, processor time:"
+    for row, made in rows.items():
+        found: dict[str, Any] = {}
+        for name, call in made.items():
+            found[name] = None if call is None else 1e3 * float(np.median(spent[f"{row}, {name}"][:, 1])) / batch
+        ratios = {}
+        for name, other, reference in (("by_opencv", "ours", "OpenCV"), ("kornia_by_ours", "Kornia", "ours")):
+            if made[other] is not None:
+                compared = bench.compare_turns(spent[f"{row}, {other}"], spent[f"{row}, {reference}"])
+                ratios[name] = bench.format_ratio(compared)
+                found[name] = compared["processor_ratio"]
+        millis = ["–" if found[name] is None else f"{found[name]:.3f}" for name in made]
+        table.append([row, *millis, ratios["by_opencv"], ratios.get("kornia_by_ours", "–")])
+        figures[row] = found
+    head = ["operation", "OpenCV, ms", "ours, ms", "Kornia, ms", "ours by OpenCV (quartiles)", "Kornia by ours"]
+    about = f"{bench.machine_words()}; {load.words()}; {options.size}, batch {batch}, one thread, processor time:"
     return f"{about}\n\n{bench.format_table(head, table)}", figures
+
+
+def measure_association(options: bench.Options) -> tuple[str, Any]:
+    """The source's association of a sequence's true boxes, onboard and torch in turns, in processor time.
+
+    "association" is everything but reading and registering, "solver" the assignment, the same for both.
+    "dddas track" is the command, started anew, with reading and registering.
+    """
+    place, interval = options.data, options.interval
+    film = film_of(place)
+    if film is None:
+        sys.exit(f"{place} has no video; nothing was measured")
+    settings, truth = load_config("paper"), truth_of(place).tracks
+    frames = [(number, image) for number, image in frames_of(place, "video") if is_sampled(number, interval)]
+    watch = Stopwatch()
+    solve = source_tracker.assign
+
+    def timed_assign(*given: Any) -> Any:
+        watch.start()
+        rows = solve(*given)
+        watch.lap("solver")
+        return rows
+
+    def associate(backend: str) -> list[Tracks]:
+        tracker, found = Tracker(settings, interval, backend=backend), []
+        for number, image in frames:
+            box_px = truth.box_px[slice(*np.searchsorted(truth.frame, [number, number + 1]))]
+            found += tracker.update(box_px, image=image, frame=number)
+        return found + tracker.flush()
+
+    def run_command(backend: str) -> np.ndarray:
+        words = ["track", str(film), "--detections", str(place / "gt/gt.txt"), "--interval", str(interval)]
+        words += ["--config", "paper", "--backend", backend, "--save", "none", "--quiet", "--out", folder]
+        start = bench.children_s()
+        done = subprocess.run([sys.executable, "-c", "from torchvision_dddas.cli import main; main()", *words])
+        if done.returncode:
+            sys.exit(f"dddas track ended with {done.returncode}")
+        return bench.children_s() - start
+
+    load, backends = bench.OtherLoad(), ("onboard", "torch")
+    parts: dict[str, dict[str, list[float]]] = {}
+    identities: dict[str, list[list[int]]] = {}
+    source_tracker.assign = timed_assign
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for turn in range(options.rounds + 1):
+                for backend in backends:
+                    watch.spent, start = {}, bench.now()
+                    tracks = associate(backend)
+                    whole, solver = bench.now() - start, watch.spent["solver"]
+                    identities[backend] = [each.identity.tolist() for each in tracks]
+                    figures = {"association": whole, "of it solver": solver, "features and affinities": whole - solver}
+                    if turn:  # the first warms up
+                        figures["dddas track"] = run_command(backend)
+                        for name, spent in figures.items():
+                            parts.setdefault(name, {}).setdefault(backend, []).append(float(spent[1]))
+                bench.log(f"turn {turn} of {options.rounds}")
+    finally:
+        source_tracker.assign = solve
+    rows = []
+    for name, by in parts.items():
+        ratio = np.array(by["torch"]) / np.array(by["onboard"])
+        low, middle, high = np.percentile(ratio, [25, 50, 75])
+        times = [f"{1e3 * float(np.median(by[backend])) / len(frames):.2f}" for backend in backends]
+        rows.append([name, *times, f"{middle:.2f} ({low:.2f}–{high:.2f})"])
+    same = "the same" if identities["onboard"] == identities["torch"] else "not the same"
+    head = ["processor ms a frame", *backends, "torch by onboard (quartiles)"]
+    about = (
+        f"{place.name}, {len(frames)} frames, every {interval}; {bench.machine_words()}; {load.words()}; "
+        f"medians of {options.rounds} turns; identities are {same}:"
+    )
+    return f"{about}\n\n{bench.format_table(head, rows)}", parts
 
 
 def _beside_first(calls: Mapping[str, Callable[[int], object]], rounds: int, title: str) -> tuple[str, Any]:
@@ -445,6 +467,7 @@ if __name__ == "__main__":
         "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
         "geo": (measure_geo, {"--rounds": 15}),
         "operations": (measure_operations, {"--size": "640x480", "--batch": 8, "--rounds": 9}),
+        "association": (measure_association, {"data": Path, "--interval": 5, "--rounds": 3}),
         "chain": (run_chain, {"data": Path, "--name": "plain"}),
     }
     bench.main(__doc__, studies)

@@ -55,7 +55,7 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     F.dilation: (MASK, torch.ones(3, 3)),
     F.erosion: (GREY, F.structuring_element("ellipse", (3, 5))),
     F.opening: (MASK, torch.ones(3, 3)),
-    F.closing: (GREY, F.structuring_element("ellipse", 5), 0.1),
+    F.closing: (GREY, F.structuring_element("ellipse", 5)),
     F.step: (GREY, 0.1),
     F.resize: (COLOUR * 255, (20, 57)),
     F.warp_perspective: (GREY, EYES, (37, 53)),
@@ -174,7 +174,7 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
     "F.corner_min_eigenvalue": (F.corner_min_eigenvalue, (double(1, 1, 6, 7),)),
     **{
         f"morphology.{operation.__name__}": (
-            lambda x, operation=operation: operation(x, F.structuring_element("ellipse", (3, 4)), 0.3),
+            lambda x, operation=operation: operation(x, F.structuring_element("ellipse", (3, 4)), softness=0.3),
             (double(1, 1, 6, 7),),
         )
         for operation in (F.dilation, F.erosion)
@@ -203,7 +203,7 @@ SOFT: dict[str, Callable[[float], torch.Tensor]] = {
     "F.rgb_histogram": lambda s: F.rgb_histogram(COLOUR, BOXES, TWO, s, normalize=False)[0],
     **{
         f"morphology.{operation.__name__} {size} {shape}": partial(
-            lambda s, operation, size, shape: operation(4 * GREY - 2, F.structuring_element(shape, size), s),
+            lambda s, operation, size, shape: operation(4 * GREY - 2, F.structuring_element(shape, size), softness=s),
             operation=operation,
             size=size,
             shape=shape,

@@ -85,7 +85,7 @@ def test_rounding_changes_no_gradient_and_no_level_for_having_one(texture):
     (resize(smooth, (17, 23), rounded=False) * weight).sum().backward()
     torch.testing.assert_close(asked.grad, smooth.grad)
     rows, columns = torch.tensor([3, 2, 2, 10]), torch.tensor([0, 20, 7])
-    assert torch.equal(resize(picture, (17, 23), rows, columns), found[..., rows, :][..., columns])
+    assert torch.equal(resize(picture, (17, 23), rows=rows, columns=columns), found[..., rows, :][..., columns])
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.15, 0.0), (0.85, 0.03), (1.0, -0.05)])

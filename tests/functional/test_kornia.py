@@ -1,5 +1,8 @@
 """Where an operation of ours stands beside Kornia's: the same numbers, or what differs by design."""
 
+import inspect
+
+import cv2
 import kornia
 import numpy as np
 import pytest
@@ -14,6 +17,28 @@ MOTION = torch.tensor([[[1.05, 0.04, -3.0], [-0.02, 0.97, 2.0], [2e-4, -1e-4, 1.
 def picture(texture) -> torch.Tensor:
     """(2, 1, 48, 61) float64 in [0, 1], whole grey levels."""
     return torch.from_numpy(np.stack([texture(k, 48, 61) for k in range(2)]) / 255.0)[:, None]
+
+
+NAMESAKES = {
+    F.warp_perspective: kornia.geometry.warp_perspective,
+    F.resize: kornia.geometry.resize,
+    F.build_pyramid: kornia.geometry.build_pyramid,
+    F.gaussian_blur2d: kornia.filters.gaussian_blur2d,
+    F.find_homography_dlt: kornia.geometry.find_homography_dlt,
+    **{getattr(F, name): getattr(kornia.morphology, name) for name in ("dilation", "erosion", "opening", "closing")},
+}
+
+
+@pytest.mark.parametrize("ours", NAMESAKES, ids=lambda function: function.__name__)
+def test_arguments_by_place_are_kornias_in_its_order(ours):
+    """What only ours has is given by name."""
+    by_place = [p.name for p in inspect.signature(ours).parameters.values() if p.kind is not p.KEYWORD_ONLY]
+    assert by_place == list(inspect.signature(NAMESAKES[ours]).parameters)[: len(by_place)]
+
+
+def test_what_kornia_has_and_ours_would_repeat_is_kornias_own():
+    assert F.transform_points is kornia.geometry.transform_points
+    assert F.oneway_transfer_error is kornia.geometry.oneway_transfer_error
 
 
 @pytest.mark.parametrize("padding_mode", ["zeros", "border"])
@@ -40,6 +65,21 @@ def test_a_blur_with_a_given_sigma_is_kornias_at_every_border(picture):
         torch.testing.assert_close(ours, theirs)
 
 
+@pytest.mark.parametrize("size", [3, 5, 7])
+def test_a_blur_without_sigma_is_kornias_filter_of_opencvs_weights(picture, size):
+    kernel = torch.from_numpy(cv2.getGaussianKernel(size, 0)).T
+    wanted = kornia.filters.filter2d_separable(picture, kernel, kernel)  # at the border `reflect`
+    torch.testing.assert_close(F.gaussian_blur2d(picture, size), wanted)
+
+
+@pytest.mark.parametrize("size", [(31, 40), (70, 90)])
+def test_resizing_is_kornias_but_for_weights_in_256ths(picture, size):
+    levels = picture.float() * 255
+    apart = F.resize(levels, size, rounded=False) - kornia.geometry.resize(levels, size, align_corners=False)
+    steps = max(float(levels.diff(dim=axis).abs().max()) for axis in (-1, -2))
+    assert apart.abs().max() <= 2 * steps / 512 + 1e-3
+
+
 def test_the_mean_gradient_is_kornias_sobel_and_box_blur_but_for_rounding(picture):
     levels = picture * 255
     # Kornia repeats the edge pixel, OpenCV mirrors: the rim differs.
@@ -64,6 +104,8 @@ def test_a_pyramid_takes_every_other_pixel_of_kornias_smoothed_picture(picture):
     whole, half = F.build_pyramid(picture, 2)
     assert whole is picture
     torch.testing.assert_close(half, wanted)
+    by_opencv = np.stack([cv2.pyrDown(one[0].numpy()) for one in picture])[:, None]
+    np.testing.assert_allclose(half.numpy(), by_opencv, atol=1e-12)
 
 
 @pytest.mark.parametrize("operation", ["dilation", "erosion", "opening", "closing"])
@@ -83,6 +125,26 @@ def test_a_histogram_shared_between_levels_is_kornias_triangular_one(picture):
         0.97 * 255 * image, min=0.0, max=255.0, n_bins=256, bandwidth=1.0, centers=torch.arange(256.0).double()
     )
     torch.testing.assert_close(found[0, 0].reshape(3, 256), wanted[0], atol=1e-6, rtol=1e-6)
+
+
+def test_colours_are_kornias_in_opencvs_units(picture):
+    image = torch.cat([picture, picture.flip(-1), picture.flip(-2)], 1)
+    hue, saturation, value = kornia.color.rgb_to_hsv(image.flip(1)).unbind(1)
+    wanted = torch.stack([hue * 90 / np.pi, saturation * 255, value * 255], 1)
+    torch.testing.assert_close(F.bgr_to_hsv(image), wanted)
+
+
+def test_ransac_finds_what_kornias_finds():
+    generator = torch.Generator().manual_seed(0)
+    points = 400 * torch.rand(1, 100, 2, generator=generator)
+    seen = F.transform_points(MOTION.float(), points)
+    seen[:, 60:] += 50 + 40 * torch.rand(1, 40, 2, generator=generator)
+    samples = F.draw_samples(generator, 1, 128, 100)
+    found, inliers, valid = F.ransac(points, seen, torch.ones(1, 100, dtype=torch.bool), samples, tolerance_px=2.0)
+    theirs, their_inliers = kornia.geometry.RANSAC("homography", inl_th=2.0, seed=0)(points[0], seen[0])
+    assert valid.all() and inliers[0].tolist() == their_inliers.tolist() == [True] * 60 + [False] * 40
+    apart = F.transform_points(found, points) - F.transform_points(theirs[None], points)
+    assert apart.abs().max() < 0.02
 
 
 def test_a_homography_is_kornias_fit_of_the_pairs_that_have_a_weight():

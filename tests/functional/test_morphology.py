@@ -37,7 +37,7 @@ def test_a_soft_maximum_is_the_log_sum_exp_over_the_element() -> None:
     x = picture()
     around = x[0, 0, 8:13, 13:18][F.structuring_element("ellipse", 5) > 0]
     wanted = 0.3 * torch.logsumexp(around / 0.3, 0)
-    torch.testing.assert_close(F.dilation(x, F.structuring_element("ellipse", 5), 0.3)[0, 0, 10, 15], wanted)
+    torch.testing.assert_close(F.dilation(x, F.structuring_element("ellipse", 5), softness=0.3)[0, 0, 10, 15], wanted)
 
 
 @pytest.mark.parametrize(("size", "shape"), ELEMENTS)
@@ -62,5 +62,5 @@ def test_equal_pixels_of_either_sign_give_the_hard_result_and_a_finite_gradient(
     assert torch.equal(result, F.dilation(x.detach(), torch.ones(3, 3)))
     (slope,) = torch.autograd.grad(result.sum(), x)
     assert float(slope.sum()) == result.numel()
-    soft = F.erosion(x, torch.ones(3, 3), 0.01)
+    soft = F.erosion(x, torch.ones(3, 3), softness=0.01)
     assert bool(torch.autograd.grad(soft.sum(), x)[0].isfinite().all())

@@ -1,0 +1,162 @@
+"""The batched operations of `functional`, each beside OpenCV's and Kornia's for the same work."""
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import kornia
+import numpy as np
+import torch
+from clips import Size
+
+import torchvision_dddas.functional as F
+from torchvision_dddas.tracking import rgb_histograms
+
+Call = Callable[[], object]
+_POINTS, _WRONG, _HYPOTHESES, _TOLERANCE_PX = 300, 0.3, 128, 2.0
+_BOXES, _BOX_PX = 10, (40, 90)
+
+
+def operations(size: Size, batch: int) -> dict[str, dict[str, Call | None]]:
+    """{operation: {"OpenCV", "ours", "Kornia"}}, calls that do the work of a batch; None where Kornia has nothing."""
+    made = _of_pictures(size, batch) | _of_points(batch)
+    return {row: dict(zip(("OpenCV", "ours", "Kornia"), calls, strict=True)) for row, calls in made.items()}
+
+
+def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
+    width, height = size
+    random = np.random.default_rng(0)
+    coloured = random.integers(0, 256, (batch, height, width, 3), np.uint8)
+    coloured = np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in coloured])
+    grey = np.stack([cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in coloured])
+    bytes_, levels = torch.from_numpy(grey)[:, None], torch.from_numpy(grey)[:, None].float()
+    bgr = torch.from_numpy(coloured).permute(0, 3, 1, 2).float().div(255).contiguous()
+    rgb = bgr.flip(1)
+    is_set = (grey > np.percentile(grey, 90)).astype(np.uint8)
+    masks = torch.from_numpy(is_set)[:, None]
+    around = {side: F.structuring_element("ellipse", side) for side in (3, 15)}
+    matrix = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
+    matrices = torch.from_numpy(matrix).float().expand(batch, 3, 3)
+    smaller = (height * 2 // 3, width * 2 // 3)
+    corner = random.integers(0, (width - _BOX_PX[0], height - _BOX_PX[1]), (batch, _BOXES, 2))
+    box_px = np.concatenate([corner, np.broadcast_to(_BOX_PX, corner.shape)], axis=2).astype(float)
+    boxes, valid = torch.from_numpy(box_px).float(), torch.ones(batch, _BOXES, dtype=torch.bool)
+    box_blur, sobel = kornia.filters.box_blur, kornia.filters.sobel
+
+    def each(call: Callable[[np.ndarray], object], pictures: np.ndarray = grey) -> Call:
+        return lambda: [call(picture) for picture in pictures]
+
+    def kornia_corners() -> object:
+        du, dv = kornia.filters.spatial_gradient(levels).unbind(2)
+        uu, vv, uv = (box_blur(product, 5) for product in (du * du, dv * dv, du * dv))
+        return (uu + vv - ((uu - vv).square() + 4 * uv.square()).sqrt()) / 2
+
+    def kornia_histograms() -> object:
+        crops = [
+            picture[None, :, y : y + h, x : x + w]
+            for picture, some in zip(rgb * 255, box_px.astype(int).tolist(), strict=True)
+            for x, y, w, h in some
+        ]
+        count = kornia.enhance.image_histogram2d
+        return [count(crop, 0.0, 255.0, 256, 1.0, torch.arange(256.0)) for crop in crops]
+
+    def morphology(side: int, how: int, name: str) -> tuple[Call, Call, Call]:
+        kernel = around[side]
+        return (
+            each(lambda picture: cv2.morphologyEx(picture, how, kernel.numpy()), is_set),
+            lambda: getattr(F, name)(masks, kernel),
+            lambda: getattr(kornia.morphology, name)(masks.float(), kernel.float()),
+        )
+
+    components = each(lambda picture: cv2.connectedComponentsWithStats(picture, ltype=cv2.CV_32S), is_set)
+    return {
+        "warp": (
+            each(lambda picture: cv2.warpPerspective(picture, matrix, size)),
+            lambda: F.warp_perspective(levels, matrices, (height, width)),
+            lambda: kornia.geometry.warp_perspective(levels, matrices, (height, width)),
+        ),
+        "resize to two thirds": (
+            each(lambda picture: cv2.resize(picture, smaller[::-1], interpolation=cv2.INTER_LINEAR_EXACT)),
+            lambda: F.resize(levels, smaller),
+            lambda: kornia.geometry.resize(levels, smaller),
+        ),
+        "Gaussian 7, floats": (
+            each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0), grey.astype(np.float32)),
+            lambda: F.gaussian_blur2d(levels, 7),
+            lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),
+        ),
+        "Gaussian 7, bytes (Kornia: floats)": (
+            each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0)),
+            lambda: F.gaussian_blur2d(bytes_, 7),
+            lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),
+        ),
+        "gradient, box mean 5": (
+            each(lambda p: cv2.blur(cv2.magnitude(cv2.Sobel(p, 5, 1, 0), cv2.Sobel(p, 5, 0, 1)), (5, 5))),
+            lambda: F.mean_gradient(levels),
+            lambda: box_blur(sobel(levels, normalized=False), 5),
+        ),
+        "smaller eigenvalue 5": (
+            each(lambda picture: cv2.cornerMinEigenVal(picture, 5)),
+            lambda: F.corner_min_eigenvalue(levels, 5),
+            kornia_corners,
+        ),
+        "pyramid of 4": (
+            each(lambda picture: cv2.buildOpticalFlowPyramid(picture, (21, 21), 3, withDerivatives=False)),
+            lambda: F.build_pyramid(levels, 4),
+            lambda: kornia.geometry.build_pyramid(levels, 4),
+        ),
+        "erosion 3": morphology(3, cv2.MORPH_ERODE, "erosion"),
+        "closing 15": morphology(15, cv2.MORPH_CLOSE, "closing"),
+        "RGB to HSV": (
+            each(lambda picture: cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), coloured),
+            lambda: F.bgr_to_hsv(bgr),
+            lambda: kornia.color.rgb_to_hsv(rgb),
+        ),
+        "components (ours: OpenCV's)": (
+            components,
+            components,
+            lambda: kornia.contrib.connected_components_union_find(masks.float()),
+        ),
+        f"histograms of {_BOXES} boxes": (
+            lambda: [rgb_histograms(picture, some) for picture, some in zip(coloured, box_px, strict=True)],
+            lambda: F.rgb_histogram(rgb, boxes, valid, largest=_BOX_PX[::-1]),
+            kornia_histograms,
+        ),
+    }
+
+
+def _of_points(batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
+    generator = torch.Generator().manual_seed(0)
+    matrix = torch.tensor([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]]).expand(batch, 3, 3)
+    points = 400 * torch.rand(batch, _POINTS, 2, generator=generator)
+    seen = F.transform_points(matrix, points) + 0.3 * torch.randn(batch, _POINTS, 2, generator=generator)
+    wrong = seen.clone()
+    wrong[:, : round(_WRONG * _POINTS)] += 60 * torch.randn(batch, round(_WRONG * _POINTS), 2, generator=generator)
+    weights = 0.5 + torch.rand(batch, _POINTS, generator=generator)
+    there = torch.ones(batch, _POINTS, dtype=torch.bool)
+    samples = F.draw_samples(generator, 1, _HYPOTHESES, _POINTS).expand(batch, -1, -1)
+    many = points.repeat(1, 100, 1)
+    homography = matrix[0].double().numpy()
+    kornias = kornia.geometry.RANSAC("homography", inl_th=_TOLERANCE_PX, seed=0)
+
+    def each(call: Callable[[Any, Any], object], other: torch.Tensor) -> Call:
+        pairs = [(p.numpy(), q.numpy()) for p, q in zip(points, other, strict=True)]
+        return lambda: [call(p, q) for p, q in pairs]
+
+    return {
+        f"homography of {_POINTS}, weighted (OpenCV: not)": (
+            each(lambda p, q: cv2.findHomography(p, q, 0), seen),
+            lambda: F.find_homography_dlt(points, seen, weights),
+            lambda: kornia.geometry.find_homography_dlt(points, seen, weights),
+        ),
+        f"RANSAC of {_POINTS}, {_WRONG:.0%} wrong": (
+            each(lambda p, q: cv2.findHomography(p, q, cv2.RANSAC, _TOLERANCE_PX), wrong),
+            lambda: F.ransac(points, wrong, there, samples, tolerance_px=_TOLERANCE_PX),
+            lambda: [kornias(p, q) for p, q in zip(points, wrong, strict=True)],
+        ),
+        f"{many.shape[1]} points transformed (ours: Kornia's)": (
+            lambda: [cv2.perspectiveTransform(some.numpy()[:, None], homography) for some in many],
+            lambda: F.transform_points(matrix, many),
+            lambda: kornia.geometry.transform_points(matrix, many),
+        ),
+    }
