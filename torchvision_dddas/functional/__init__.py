@@ -5,8 +5,8 @@
 Images are (B, C, H, W) floats, in [0, 1] unless an argument is called levels (0 .. 255); points are (B, N, 2), (u, v)
 in pixels from the centre of the top left one; matrices are named by direction (reference_from_frame). float32, or
 float64 for gradient checks; any device; every shape is fixed by the shapes of the inputs, and what is missing is marked
-by a validity mask. What Kornia has too is named and signed as there, and what only ours has is given by name; what is Kornia's
-own is passed on.
+by a validity mask. What Kornia has too is named and signed as there, and what only ours has is given by name; what is
+Kornia's own is passed on.
 
 Each function has one form, chosen on a CPU. `python eval/speed.py operations` times it beside Kornia's and OpenCV's. On
 a GPU the choice was not measured. Engines, modules, tuning and export call these functions and nothing beside them, so

@@ -1,7 +1,7 @@
 """Gaussian smoothing (appendix B, step S5), gradients, box sums, and what pictures are outside their edges.
 
 On a CPU Kornia's convolutions hold a copy of the picture for every weight: its Gaussian takes five times the memory and
-1.3 to 1.7 times the time, its `sobel` and `box_blur` 5 to 10 times that of `mean_gradient`
+1.1 to 1.7 times the time, its `sobel` and `box_blur` 5 to 10 times that of `mean_gradient`
 (`python eval/speed.py operations`).
 
 Outside its edges a picture is mirrored, the edge pixel not repeated: Kornia's border `reflect`, OpenCV's 101.

@@ -1,6 +1,6 @@
 """Erosion and dilation with Kornia's signature, bit-exact with OpenCV (appendix B, step S5), hard or soft.
 
-On a CPU kornia.morphology takes 6 to 25 times as long (`python eval/speed.py operations`) and does not take bytes;
+On a CPU kornia.morphology takes 7 to 34 times as long (`python eval/speed.py operations`) and does not take bytes;
 here a running maximum doubles its span over flat shifts. Integer and Boolean masks keep their type; floats work too and
 pass gradients.
 Outside the picture nothing decides: this is Kornia's border `geodesic`. As in OpenCV the kernel is not mirrored, which
