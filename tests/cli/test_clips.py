@@ -248,6 +248,17 @@ def test_a_clip_with_a_table_gives_a_film_of_the_sampled_frames(dddas, clip, tab
     assert (kept["interval_frames"], kept["backend"], kept["clip"]["size"]) == (2, "onboard", [64, 48])
 
 
+def test_the_sources_association_gives_the_same_tracks_by_either_back_end(dddas, clip, table, tmp_path):
+    given = table(walker(range(1, 6)) + walker(range(1, 6), x=12))
+    for backend in ("onboard", "torch"):
+        words = ("--detections", given, "--config", "paper", "--backend", backend, "--out", tmp_path / backend)
+        assert dddas("track", clip, *words, "--save", "none", "--quiet").exit_code == 0
+        assert record(tmp_path / backend)["backend"] == backend
+    text = (tmp_path / "torch/tracks.txt").read_text()
+    assert text == (tmp_path / "onboard/tracks.txt").read_text()
+    assert text.count("\n") == 10
+
+
 MOVING = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
 MOVING += "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
 NOTED = {

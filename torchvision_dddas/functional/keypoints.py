@@ -1,8 +1,8 @@
 """Good features to track: where both eigenvalues of the structure tensor are large (appendix B, step S1).
 
 The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response. Kornia's gradients under its box take
-2 to 7 times as long on a CPU (`python eval/speed.py operations`). The picture is mirrored outside, as by OpenCV; Kornia's
-gradients repeat the edge pixel.
+2 to 7 times as long on a CPU (`python eval/speed.py operations`). The picture is mirrored outside, as by OpenCV;
+Kornia's gradients repeat the edge pixel.
 """
 
 import torch

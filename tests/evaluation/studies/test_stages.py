@@ -1,5 +1,7 @@
 """Each stage finds what its own command finds, and depends on the settings that its key holds and on no others."""
 
+from unittest.mock import patch
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from torchvision_dddas.evaluation.studies import stages
 from torchvision_dddas.evaluation.studies.stages import find, narrow_settings, open_clip, true_boxes, upstream_task
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.tracking import track_scenes
+from torchvision_dddas.tracking.torch_source_tracker import TorchSourceTracker
 
 NOW = load_config()
 
@@ -61,6 +64,14 @@ def test_tracks_of_what_was_kept_are_those_of_a_run_of_the_clip(clips, interval)
     assert found.identity.tolist() == [i for frame in wanted for i in frame.tracks.identity.tolist()]
     boxes = np.concatenate([frame.tracks.box_px for frame in wanted])
     assert np.abs(found.box_px - boxes).max(initial=0) <= 0.005
+
+
+def test_the_sources_association_in_torchs_batches_finds_the_same(clips) -> None:
+    paper, compute = load_config("paper"), TorchSourceTracker._affinities
+    with patch.object(TorchSourceTracker, "_affinities", autospec=True, side_effect=compute) as batches:
+        onboard, torch = (find(clips["tracks"], "association", paper, backend) for backend in ("onboard", "torch"))
+    assert len(onboard.identity) and onboard.identity.tolist() == torch.identity.tolist()
+    assert batches.called
 
 
 def test_a_picture_that_cannot_be_read_stays_out_of_the_tracks_too(tmp_path) -> None:
