@@ -11,7 +11,8 @@ from torchvision_dddas.config import EVIDENCE_SCALE, Settings, with_parameters
 from torchvision_dddas.detection import Window
 from torchvision_dddas.detection.interval import choose_pairs
 from torchvision_dddas.detection.torch_engine import TorchEngine
-from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions
+from torchvision_dddas.functional import soft
+from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Registration
 from torchvision_dddas.nn.motion_segmenter import TUNED, chain_motion
 
 KNOBS: dict[str, float] = {
@@ -201,6 +202,49 @@ def test_a_loss_on_a_clip_moves_the_parameters_that_are_learned(clip) -> None:
 def test_frames_without_two_neighbours_show_nothing(clip) -> None:
     found = MotionSegmenter()(clip[:, :2])
     assert found.mask.shape == (1, 2, 1, 120, 160) and not found.mask.any()
+
+
+@pytest.mark.parametrize("asks", [False, True])
+@pytest.mark.parametrize("softness", [0.0, 0.2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_off_the_cpu_nothing_from_pictures_to_masks_asks_for_a_value(kind, softness, asks, clip, monkeypatch) -> None:
+    """Tensors on `meta` have none, and meet no others: the first question raises, as branches on a CPU show."""
+    model = MotionSegmenter(of_kind(kind), softness).to("meta")
+    if asks:
+        monkeypatch.setattr(soft, "may_branch", lambda _: True)
+        with pytest.raises((RuntimeError, NotImplementedError)):
+            model(clip.to("meta"))
+    else:
+        found = model(clip.to("meta"))
+        assert {part.device.type for part in found} == {"meta"}
+        assert found.mask.shape == (1, FRAMES, 1, SIZE[1], SIZE[0])
+
+
+def test_both_ways_of_registration_taken_at_once_give_what_the_branches_give(clip, monkeypatch) -> None:
+    """Of pairs whose scouts agree, and of one whose scouts do not."""
+    grey = clip[0].mean(1, keepdim=True)
+    noise = torch.rand(1, 1, SIZE[1], SIZE[0], generator=torch.Generator().manual_seed(0))
+    earlier, later, registration = grey[:-1], torch.cat([grey[1:4], noise, grey[5:]]), Registration()
+    wanted = registration(earlier, later)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    found = registration(earlier, later)
+    assert wanted.inliers.sum(1).min() < 12 < wanted.inliers.sum(1).max()
+    assert (found.inliers == wanted.inliers).float().mean() > 0.99
+    torch.testing.assert_close(found.later_from_earlier, wanted.later_from_earlier, rtol=0, atol=1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", KINDS)
+def test_on_a_gpu_the_masks_are_those_of_the_cpu_and_nothing_is_read_back(kind, clip) -> None:
+    model, there = MotionSegmenter(of_kind(kind)), MotionSegmenter(of_kind(kind)).cuda()
+    motion = model(clip).later_from_earlier
+    given = clip.cuda(), motion.cuda()
+    there(*given)  # kernels are loaded
+    with torch.profiler.profile() as profile:
+        found = there(*given)
+    names = {event.name for event in profile.events()}
+    assert not any("DtoH" in name or name in ("aten::item", "aten::nonzero") for name in names)
+    assert (found.mask.cpu() != model(clip, motion).mask).float().mean() < 0.002
 
 
 @pytest.mark.parametrize("kind", KINDS)

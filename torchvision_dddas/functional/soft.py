@@ -94,8 +94,11 @@ def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]
     return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
 
 
+def may_branch(on: Tensor) -> bool:
+    """Whether Python may branch on a tensor's values: not on a GPU, which the host would wait for, nor in a trace."""
+    return on.device.type == "cpu" and not (torch.compiler.is_compiling() or torch.jit.is_tracing())  # type: ignore[attr-defined]
+
+
 def all_true(condition: Tensor) -> bool:
-    """Whether to stop early: only where asking is cheap and the graph is not being traced; results are the same."""
-    if condition.device.type != "cpu" or torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[attr-defined]
-        return False
-    return bool(condition.all())
+    """Whether to stop early: only where Python may branch; results are the same."""
+    return may_branch(condition) and bool(condition.all())

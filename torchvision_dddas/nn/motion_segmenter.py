@@ -134,6 +134,9 @@ class MotionSegmenter(nn.Module):
     Parameters that are named in `tuned` are nn.Parameters, float64 as the settings' numbers; others are those of the
     settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
     gradient checks.
+
+    Nothing is asked of the host on a GPU, with one exception: a size in pixels that is a tensor (blur_px, erode_px,
+    close_px) decides which kernels are built, and is read.
     """
 
     def __init__(
@@ -396,8 +399,7 @@ def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: 
 def close_masks(mask: Tensor, side: int) -> Tensor:
     """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all."""
     kernel = F.structuring_element("ellipse", side)
-    tracing = torch.jit.is_tracing() or torch.compiler.is_compiling()  # type: ignore[attr-defined]
-    if mask.device.type != "cpu" or mask.dtype != torch.uint8 or tracing:
+    if mask.dtype != torch.uint8 or not F.may_branch(mask):
         return F.closing(mask, kernel)
     spans = []
     for dim in (-1, -2):

@@ -1,7 +1,8 @@
 """The background's motion between frames (appendix B, steps S1 to S3), batched: the torch engine's and the graph's.
 
 A few points, the scouts, search the whole pyramid for the motion; the others start where it takes them, in the full
-resolution alone, which is much faster. Where the scouts do not agree, all points search the whole pyramid.
+resolution alone, which is much faster. Where the scouts do not agree, all points search the whole pyramid. On a GPU and
+in a trace both are done for every pair, and the result chosen there: the host is not asked.
 """
 
 from dataclasses import dataclass
@@ -130,6 +131,10 @@ class Registration(nn.Module):
             return self._search_near(frames, motion, ransac_px)
         near = F.oneway_transfer_error(start, ahead, motion.float(), squared=False) < ransac_px
         agreed = (found & near).sum(1) >= (_AGREEING * valid.gather(1, scouts).sum(1)).clamp(min=_FEWEST)
+        if not F.may_branch(agreed):
+            ways = (search(frames, motion, ransac_px) for search in (self._search_near, self._search_everywhere))
+            chosen = [agreed[:, None], agreed[:, None, None]]
+            return Motion(*(torch.where(chosen[a.dim() - 2], a, b) for a, b in zip(*ways, strict=True)))
         made: dict[int, Motion] = {}
         for choice, search_from in ((agreed, self._search_near), (~agreed, self._search_everywhere)):
             chosen = choice.nonzero()[:, 0]
