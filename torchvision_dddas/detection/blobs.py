@@ -1,5 +1,6 @@
 """From a mask to blobs: cleaning, labelling, area and peak gates, convex hulls, fragments of one target."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -52,6 +53,20 @@ class Blob:
         return Blob(box, mask[window], (self.core & mask)[window], self.peak)
 
 
+@dataclass(frozen=True)
+class Region:
+    """A connected region of enough area and evidence, as OpenCV or the torch engine's device finds it.
+
+    box: x, y, width, height. mask: (height, width) bool. evidence: (height, width) uint8 of the box. peak: the largest
+    evidence of the region.
+    """
+
+    box: Box
+    mask: np.ndarray
+    evidence: np.ndarray
+    peak: float
+
+
 def ellipse(side: int) -> np.ndarray:
     """The morphological element."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
@@ -78,7 +93,12 @@ def find_blobs(
     hulls; a hull that contains another one replaces it. scale: side of a map's pixel in pixels of the picture, in which
     areas and blobs are given.
     """
-    blobs = []
+    return make_blobs(find_regions(core, evidence, min_area_px, peak, scale), threshold, hull, scale)
+
+
+def find_regions(core: np.ndarray, evidence: np.ndarray, min_area_px: int, peak: float, scale: int = 1) -> list[Region]:
+    """The regions of `find_blobs`, in pixels of the maps, by OpenCV."""
+    regions = []
     for part in occupied(core, 2):
         count, labels, stats, _ = cv2.connectedComponentsWithStats(core[box_slices(part)], ltype=cv2.CV_32S)
         for label, (x, y, width, height, area) in enumerate(stats[1:count].tolist(), 1):
@@ -89,11 +109,19 @@ def find_blobs(
             seen = evidence[box_slices(box)]
             if (highest := float(seen[region].max())) < peak:
                 continue
-            certain = region & (seen > threshold)
-            if scale > 1:
-                region, certain = (kept.repeat(scale, axis=0).repeat(scale, axis=1) for kept in (region, certain))
-                box = box[0] * scale, box[1] * scale, width * scale, height * scale
-            blobs.append(Blob(box, fill_hull(region) if hull else region, certain, highest))
+            regions.append(Region(box, region, seen, highest))
+    return regions
+
+
+def make_blobs(regions: Iterable[Region], threshold: float, hull: bool, scale: int = 1) -> list[Blob]:
+    """The blobs of regions, as `find_blobs` gives them."""
+    blobs = []
+    for part in regions:
+        box, region, certain = part.box, part.mask, part.mask & (part.evidence > threshold)
+        if scale > 1:
+            region, certain = (kept.repeat(scale, axis=0).repeat(scale, axis=1) for kept in (region, certain))
+            box = box[0] * scale, box[1] * scale, box[2] * scale, box[3] * scale
+        blobs.append(Blob(box, fill_hull(region) if hull else region, certain, part.peak))
     blobs.sort(key=lambda blob: (blob.box[1], blob.box[0]))
     if not hull:
         return blobs
@@ -122,10 +150,15 @@ def find_weak_blobs(
     """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour."""
     core = cv2.threshold(wide, int(threshold), 255, cv2.THRESH_BINARY)[1]
     core = close_mask(cv2.erode(core, ellipse(parameters.erode_px)), parameters.close_px)
-    taken = np.zeros(wide.shape, bool)
+    others = find_blobs(core, wide, threshold, min_area_px, peak, parameters.hull)
+    return leave_touching(others, found, wide.shape)
+
+
+def leave_touching(others: list[Blob], found: list[Blob], shape: tuple[int, ...]) -> list[Blob]:
+    """The others, as weak ones, that share no pixel with those found. shape: (height, width) of the picture."""
+    taken = np.zeros(shape, bool)
     for blob in found:
         taken[box_slices(blob.box)] |= blob.mask
-    others = find_blobs(core, wide, threshold, min_area_px, peak, parameters.hull)
     return [replace(blob, weak=True) for blob in others if not taken[box_slices(blob.box)][blob.mask].any()]
 
 

@@ -349,6 +349,7 @@ class MotionDetector:
             (place[wide[0]], place[wide[1]]) if wide else None,
             (place[small[0]], place[small[1]]) if small else None,
             settings.morphology.close_px,
+            settings,
         )
 
     def _follow_small(self, index: int) -> None:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import EVIDENCE_SCALE, RegistrationParameters, Settings
+from torchvision_dddas.detection.blobs import Blob
 from torchvision_dddas.geometry import background_flow, transfer
 from torchvision_dddas.types import Registration
 
@@ -55,6 +56,7 @@ class Window:
     near: pairs of indices of neighbours whose evidence is combined; the last one is the widest and shows the motion.
     wide: a pair further apart, which fills the inside of large targets. small: one that shows small slow targets.
     close_px: side of the ellipse that closes gaps between fragments of a target; 0: that of the settings.
+    settings: those of the frame, for engines that find blobs themselves; None: those of the engine.
     """
 
     reference: View
@@ -65,6 +67,12 @@ class Window:
     wide: tuple[int, int] | None = None
     small: tuple[int, int] | None = None
     close_px: int = 0
+    settings: Settings | None = None
+
+    @property
+    def looks_both_ways(self) -> bool:
+        """Whether there is a wide pair, and it shows what is in the reference frame alone."""
+        return self.wide is not None and self.offsets[self.wide[0]] * self.offsets[self.wide[1]] < 0
 
 
 @dataclass(frozen=True)
@@ -77,6 +85,8 @@ class Foreground:
     small: 255 where something small may move; None when it is not wanted.
     warped: the two neighbours of the widest near pair, in the reference's frame and exposure; `offsets` their frames.
     scale: side of a map's pixel in pixels of the frame; above 1 only where the maps are used for nothing but blobs.
+    blobs: where the engine has found them itself. Then evidence, wide and texture hold only what their boxes show,
+    `core` is filled only for a motion history, and `warped` only where flow needs it; all are 0 elsewhere.
     """
 
     core: np.ndarray
@@ -87,6 +97,7 @@ class Foreground:
     warped: tuple[np.ndarray, np.ndarray]
     offsets: tuple[int, int]
     scale: int = 1
+    blobs: list[Blob] | None = None
 
 
 class Engine(Protocol):

@@ -81,16 +81,8 @@ def observe(
 
     history: already aligned to this frame; used for motion where dense flow is off.
     """
-    view, morphology, scale = window.reference, settings.morphology, evidence_scale(settings)
-    threshold, peak = settings.difference.threshold * scale, settings.difference.peak * scale
-    min_area_px = settings.gates.min_area_px
-    blobs = find_blobs(
-        foreground.core, foreground.evidence, threshold, min_area_px, peak, morphology.hull, foreground.scale
-    )
-    # A wide pair that looks both ways shows what is in the reference frame alone.
-    wide = window.wide
-    if settings.persistence.on and wide is not None and window.offsets[wide[0]] * window.offsets[wide[1]] < 0:
-        blobs += find_weak_blobs(foreground.wide, blobs, threshold, morphology, min_area_px, peak)
+    view = window.reference
+    blobs = _blobs_of(window, foreground, settings) if foreground.blobs is None else foreground.blobs
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)
@@ -102,6 +94,19 @@ def observe(
         parts = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
         blobs, motions = [blob for blob, _ in parts], [Motion(velocity_px) for _, velocity_px in parts]
     return Observation(window, foreground, blobs, motions)
+
+
+def _blobs_of(window: Window, foreground: Foreground, settings: Settings) -> list[Blob]:
+    """Strong and weak blobs, by OpenCV."""
+    morphology, scale = settings.morphology, evidence_scale(settings)
+    threshold, peak = settings.difference.threshold * scale, settings.difference.peak * scale
+    min_area_px = settings.gates.min_area_px
+    blobs = find_blobs(
+        foreground.core, foreground.evidence, threshold, min_area_px, peak, morphology.hull, foreground.scale
+    )
+    if settings.persistence.on and window.looks_both_ways:
+        blobs += find_weak_blobs(foreground.wide, blobs, threshold, morphology, min_area_px, peak)
+    return blobs
 
 
 def draw_targets(

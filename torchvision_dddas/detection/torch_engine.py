@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torchvision_dddas.detection.engine import (
     judge_points,
     match_exposure,
 )
+from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
 from torchvision_dddas.nn import MotionSegmenter, WarpedWindows, close_masks
 from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import Registration
@@ -35,10 +36,20 @@ class TorchEngine(Engine):
 
     name = "torch"
 
-    def __init__(self, settings: Settings, device: str | torch.device | None = None) -> None:
-        """device: by default the GPU where there is one."""
+    def __init__(
+        self,
+        settings: Settings,
+        device: str | torch.device | None = None,
+        components: Literal["opencv", "torch"] | None = None,
+    ) -> None:
+        """device: by default the GPU where there is one.
+
+        components: who labels regions. torch does so on the device, and whole maps stay there; by default OpenCV for
+        the CPU and torch for others.
+        """
         self.parameters = settings
         self.device = torch.device(device or torch_device())
+        self.components = components or ("opencv" if self.device.type == "cpu" else "torch")
 
     @property
     def segmenter(self) -> MotionSegmenter:
@@ -128,15 +139,21 @@ class TorchEngine(Engine):
             near = torch.maximum(near, evidence(pair))
         wide = near if one.wide is None else evidence(one.wide)
         core = segmenter.core(near, close_px=one.close_px)
-        smalls: list[Any] = [None] * len(windows)
+        small: Tensor | None = None
         if one.small is not None:
             least = F.gaussian_blur2d(views.smaller(one.small), 5) * views.both(one.small)
             mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
             level = (settings.small.noise_ratio * mean).clamp(min=settings.small.threshold).floor()
             small = close_masks((least > level).to(torch.uint8) * 255, settings.small.close_px)
-            smalls = list(small[:, 0].cpu().numpy())
         a, b = one.near[-1]
-        maps = core, near, wide, views.texture.to(torch.uint8), views.warped[a], views.warped[b]
+        texture = views.texture.to(torch.uint8)
+        if self.components == "torch":
+            is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
+            wide_core = segmenter.core(wide, close_px=one.close_px) if is_weak_wanted else None
+            warped = views.warped[a], views.warped[b]
+            return foregrounds_with_blobs(windows, settings, (core, near, wide, texture), wide_core, small, warped)
+        smalls = [None] * len(windows) if small is None else list(small[:, 0].cpu().numpy())
+        maps = core, near, wide, texture, views.warped[a], views.warped[b]
         rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)
         return [
             Foreground(core, near, wide, texture, small, (first, other), (window.offsets[a], window.offsets[b]))

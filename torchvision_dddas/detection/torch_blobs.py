@@ -1,0 +1,146 @@
+"""Blobs found on the engine's device: what OpenCV's `find_regions` finds, and only their boxes come to the host.
+
+Regions are labelled by Kornia's union-find, for all pictures of a batch at once; area, peak and box follow by scatter
+operations. One table of numbers comes to the host, is gated there, and then all pictures that are wanted of the batch
+come in one transfer: crops of the blobs' boxes, and the warped neighbours of frames with blobs, which dense flow needs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64, UInt8
+from kornia.contrib import connected_components_union_find
+from torch import Tensor
+
+from torchvision_dddas.config import Settings
+from torchvision_dddas.detection.blobs import Box, Region, box_slices, leave_touching, make_blobs
+from torchvision_dddas.detection.engine import Foreground, Window, evidence_scale
+
+
+@dataclass(frozen=True)
+class Components:
+    """The connected regions (8 neighbours) of a batch of masks, in the order of their first 2 x 2 blocks.
+
+    labels: 0, or the region's entry of `label`. The others have one entry a region: picture, box, pixels, peak.
+    """
+
+    labels: Int64[Tensor, "B 1 H W"]
+    label: Int64[Tensor, " R"]
+    picture: np.ndarray
+    box: np.ndarray
+    area_px: np.ndarray
+    peak: np.ndarray
+
+
+def label_components(mask: Bool[Tensor, "B 1 H W"], evidence: UInt8[Tensor, "B 1 H W"]) -> Components:
+    """All regions of the masks, and their largest evidence."""
+    labels = connected_components_union_find(mask)
+    height, width = mask.shape[-2:]
+    place = mask.flatten().nonzero()[:, 0]
+    label, number = labels.flatten()[place].unique(return_inverse=True)
+    u, v, picture = place % width, place // width % height, place // (width * height)
+    of_pixels = torch.stack([picture, -u, -v, u, v, evidence.flatten()[place].long()])
+    largest = torch.full((6, len(label)), -max(height, width), dtype=torch.int64, device=mask.device)
+    largest = largest.scatter_reduce(1, number.expand(6, -1), of_pixels, "amax")
+    area_px = torch.zeros_like(label).scatter_add(0, number, torch.ones_like(number))
+    picture, left, top, right, bottom, peak, area_px = torch.cat([largest, area_px[None]]).cpu().numpy()
+    box = np.stack([-left, -top, right + left + 1, bottom + top + 1], axis=1)
+    return Components(labels, label, picture, box, area_px, peak)
+
+
+def foregrounds_with_blobs(
+    windows: Sequence[Window],
+    settings: Settings,
+    maps: tuple[Tensor, Tensor, Tensor, Tensor],
+    wide_core: Tensor | None,
+    small: Tensor | None,
+    warped: tuple[Tensor, Tensor],
+) -> list[Foreground]:
+    """The foregrounds of windows of one structure, with their blobs.
+
+    maps: core, evidence, wide and texture, (B, 1, H, W) uint8 as all others. wide_core: where the wide evidence is
+    certain; None where no weak blobs are wanted. settings: of windows that have none of their own.
+    """
+    core, near, wide, texture = maps
+    given, scale = [window.settings or settings for window in windows], evidence_scale(settings)
+    searched = [(core, near, [True] * len(windows))]
+    if wide_core is not None:
+        searched.append((wide_core, wide, [window.looks_both_ways for window in windows]))
+    found: list[tuple[Components, np.ndarray]] = []
+    for mask, evidence, wanted in searched:
+        parts = label_components(mask > 0, evidence)
+        least_px = np.array([of_frame.gates.min_area_px for of_frame in given])[parts.picture]
+        least = np.array([of_frame.difference.peak * scale for of_frame in given])[parts.picture]
+        passed = np.array(wanted)[parts.picture] & (parts.area_px >= least_px) & (parts.peak >= least)
+        found.append((parts, np.flatnonzero(passed)))
+    shown = np.unique(np.concatenate([parts.picture[passed] for parts, passed in found]))
+    asked = [cut for parts, passed in found for cut in _cut_boxes(parts, passed, [near, wide, texture])]
+    for_flow = bool(len(shown)) and (settings.persistence.on or settings.refine.on)
+    for_history = settings.history.on and not (settings.persistence.on or settings.refine.on)
+    if for_flow:
+        asked += [picture[torch.from_numpy(shown).to(picture.device), 0] for picture in warped]
+    asked += [picture[:, 0] for picture in ([core] if for_history else []) + ([] if small is None else [small])]
+    arrived = iter(_fetch(asked))
+    crops = [[next(arrived) for _ in range(4)] for _ in found]
+    nothing = np.zeros(core.shape[-2:], np.uint8)
+    others = {}
+    if for_flow:
+        others = dict(zip(shown.tolist(), zip(next(arrived), next(arrived), strict=True), strict=True))
+    cores = next(arrived) if for_history else [nothing] * len(windows)
+    smalls = [None] * len(windows) if small is None else list(next(arrived))
+    foregrounds = []
+    a, b = windows[0].near[-1]
+    for number, (window, own) in enumerate(zip(windows, given, strict=True)):
+        pictures = [np.zeros_like(nothing) for _ in range(3)]
+        regions: list[list[Region]] = []
+        for (parts, passed), cut, evidence_at in zip(found, crops, (1, 2), strict=False):
+            ends = np.cumsum(parts.box[passed, 2] * parts.box[passed, 3])
+            regions.append([])
+            for k in np.flatnonzero(parts.picture[passed] == number).tolist():
+                box = _as_box(parts.box[passed[k]])
+                shape = box[3], box[2]
+                values = [line[ends[k] - shape[0] * shape[1] : ends[k]].reshape(shape) for line in cut]
+                for picture, crop in zip(pictures, values[1:], strict=True):
+                    picture[box_slices(box)] = crop
+                regions[-1].append(Region(box, values[0] > 0, values[evidence_at], float(parts.peak[passed[k]])))
+        threshold, hull = own.difference.threshold * scale, own.morphology.hull
+        blobs = make_blobs(regions[0], threshold, hull)
+        if len(regions) > 1:
+            blobs += leave_touching(make_blobs(regions[1], threshold, hull), blobs, nothing.shape)
+        warped_here = others.get(number, (nothing, nothing))
+        offsets = window.offsets[a], window.offsets[b]
+        one, other, gradient = pictures
+        foregrounds.append(
+            Foreground(cores[number], one, other, gradient, smalls[number], warped_here, offsets, blobs=blobs)
+        )
+    return foregrounds
+
+
+def _as_box(row: np.ndarray) -> Box:
+    x, y, width, height = row.tolist()
+    return x, y, width, height
+
+
+def _cut_boxes(parts: Components, chosen: np.ndarray, pictures: Sequence[Tensor]) -> list[Tensor]:
+    """(P,) uint8 of the pixels in the chosen regions' boxes, box by box: which are the region's, and each picture."""
+    device, (height, width) = parts.labels.device, parts.labels.shape[-2:]
+    x, y, wide, high = parts.box[chosen].T
+    sizes = wide * high
+    first = (parts.picture[chosen] * height + y) * width + x
+    table = np.stack([sizes, np.cumsum(sizes) - sizes, first, wide])
+    size, start, corner, across = torch.from_numpy(table).to(device)
+    region = torch.arange(len(chosen), device=device).repeat_interleave(size, output_size=int(sizes.sum()))
+    step = torch.arange(len(region), device=device) - start[region]
+    place = corner[region] + step // across[region] * width + step % across[region]
+    label = parts.label[torch.from_numpy(chosen).to(device)]
+    own = (parts.labels.flatten()[place] == label[region]).to(torch.uint8)
+    return [own, *(picture.flatten()[place] for picture in pictures)]
+
+
+def _fetch(pictures: Sequence[Tensor]) -> list[np.ndarray]:
+    """Copies on the host, in one transfer."""
+    lines = torch.cat([picture.flatten() for picture in pictures]).cpu().numpy()
+    ends = np.cumsum([picture.numel() for picture in pictures])[:-1]
+    return [line.reshape(picture.shape) for line, picture in zip(np.split(lines, ends), pictures, strict=True)]
