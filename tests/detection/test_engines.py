@@ -10,6 +10,7 @@ pytest.importorskip("torch")
 
 import torch
 
+import torchvision_dddas.functional as F
 from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
 from torchvision_dddas import runtime
@@ -161,6 +162,25 @@ def test_auto_takes_torch_where_there_is_a_cuda_device_and_only_for_pictures(mon
         assert load_engine(backend, parameters.Settings()).name == backend
     with pytest.raises(InputError, match="no back end is named 'gpu'"):
         load_engine("gpu", parameters.Settings())
+
+
+def test_a_device_without_float64_is_refused_and_auto_does_not_take_it(monkeypatch) -> None:
+    with pytest.raises(InputError, match="needs float64, which mps does not have"):
+        TorchEngine(parameters.Settings(), "mps")
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert runtime.torch_device() == "cpu"
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.backends.mps.is_available(), reason="needs MPS")
+def test_on_mps_byte_operations_hold_but_homographies_raise() -> None:
+    """What keeps MPS out: when this fails, it may be taken."""
+    mask = torch.rand(2, 1, 40, 50, generator=torch.Generator().manual_seed(0)) > 0.6
+    kernel = F.structuring_element("ellipse", 5)
+    assert torch.equal(F.closing(mask.to("mps"), kernel).cpu(), F.closing(mask, kernel))
+    with pytest.raises(TypeError):
+        torch.zeros(1, device="mps").double()
 
 
 def test_without_a_driver_torch_is_not_asked_for_its_devices(monkeypatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection import View, Window, load_engine
+from torchvision_dddas.detection import View, Window, detect_keypoints, load_engine
 from torchvision_dddas.detection.engine import fit_exposure, match_exposure
 from torchvision_dddas.geometry import corner_error
 
@@ -78,3 +78,27 @@ def test_clipped_white_in_both_neighbours_is_no_motion(backend) -> None:
     asked = Window(views[1], (views[0], views[2]), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),))
     (found,) = engine.foreground([asked])
     assert not found.core.any()
+
+
+@pytest.mark.parametrize("size", [SIZE, (251, 187)], ids=["even", "odd"])
+def test_corners_found_at_half_resolution_are_on_even_pixels_the_same_in_both_engines_and_fit_the_ground(size) -> None:
+    torch = pytest.importorskip("torch")
+    from torchvision_dddas.nn import Registration
+
+    settings = parameters.load_config(None, ["registration.halved_corners=true"])
+    clip = render(3, 2, size)
+    engine = load_engine("torch", settings)
+    views = [engine.prepare(image) for image in clip.images]
+    levels = torch.from_numpy(views[0].grey)[None, None].float()
+    points, valid = Registration(settings.registration).keypoints(levels)
+    found = {tuple(point) for point in points[0][valid[0]].tolist()}
+    wanted = {tuple(point) for point in detect_keypoints(views[0].grey, settings.registration, halved=True).tolist()}
+    assert all(u % 2 == v % 2 == 0 for u, v in found)
+    assert len(found & wanted) > 0.9 * len(wanted) > 20
+    whole = {tuple(point) for point in detect_keypoints(views[0].grey, settings.registration).tolist()}
+    assert len(found & whole) < 0.5 * len(found)
+    (step,) = engine.register([(views[0], views[1])])
+    (onboard,) = load_engine("onboard", settings).register(
+        [(View(v.image, v.grey), View(w.image, w.grey)) for v, w in [views]]
+    )
+    assert step.reliable and corner_error(step.later_from_earlier, onboard.later_from_earlier, size) <= 0.5

@@ -22,7 +22,8 @@ KNOBS: dict[str, float] = {"difference.threshold": 6.0, "difference.peak": 9.0, 
 def smooth(seed: int, sigma: float) -> np.ndarray:
     """Speckles or islands with holes, 0 to 255."""
     noise = np.random.default_rng(seed).normal(0, 1, SHAPE)
-    noise = cv2.GaussianBlur(noise, (0, 0), sigma) if sigma else noise
+    if sigma:
+        cv2.GaussianBlur(noise, (0, 0), sigma, dst=noise)
     return np.clip(128 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
 
 
@@ -43,10 +44,10 @@ MASKS += [
 ]
 
 
-def window(**changes: object) -> Window:
+def window(settings: Settings) -> Window:
     picture = np.zeros(SHAPE, np.uint8)
     view = View(picture, picture)
-    return Window(view, (view, view), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),), (0, 1), **changes)
+    return Window(view, (view, view), np.stack([np.eye(3)] * 2), (-1, 1), ((0, 1),), (0, 1), settings=settings)
 
 
 def assert_same(found: list[Blob], wanted: list[Blob]) -> None:
@@ -85,7 +86,7 @@ def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> 
     engine = TorchEngine(settings, "cpu")
     wide_core = engine.segmenter.core(batch(wide))
     maps = batch(cores), batch(near), batch(wide), batch(near)
-    windows = [window(settings=one) for one in given]
+    windows = [window(one) for one in given]
     found = foregrounds_with_blobs(windows, settings, maps, wide_core, None, (maps[1], maps[2]))
     assert any(blob.weak for frame in found for blob in frame.blobs or [])
     for frame, own, core, evidence, far in zip(found, given, cores, near, wide, strict=True):

@@ -199,6 +199,25 @@ def test_a_loss_on_a_clip_moves_the_parameters_that_are_learned(clip) -> None:
     assert model(clip).mask.mean().item() < before.item()
 
 
+def test_from_pictures_to_masks_the_gradient_of_every_learned_parameter_is_right() -> None:
+    """In double precision and without rounding; the camera stands."""
+    random = torch.Generator().manual_seed(3)
+    clip = (0.3 + 0.05 * torch.rand(1, 1, 1, 32, 40, generator=random, dtype=torch.float64)).repeat(1, 3, 1, 1, 1)
+    for frame in range(3):
+        clip[0, frame, 0, 10:20, 6 + 6 * frame : 16 + 6 * frame] += 0.2
+    still = torch.eye(3, dtype=torch.float64).expand(1, 2, 3, 3)
+    model = MotionSegmenter(with_parameters(Settings(), {"morphology.close_px": 3}), softness=0.2, whole=False)
+    weight = torch.rand(1, 3, 1, 32, 40, generator=random, dtype=torch.float64)
+
+    def total(*parameters: torch.Tensor) -> torch.Tensor:
+        return (model(clip, still, dict(zip(TUNED, parameters, strict=True))).mask * weight).sum()
+
+    starts = tuple(parameter.detach().clone().requires_grad_() for parameter in model.parameters())
+    slopes = torch.autograd.grad(total(*starts), starts)
+    assert all(slope.abs() > 1e-3 for slope in slopes)
+    assert torch.autograd.gradcheck(total, starts, eps=1e-7, atol=2e-3, rtol=2e-3)
+
+
 def test_frames_without_two_neighbours_show_nothing(clip) -> None:
     found = MotionSegmenter()(clip[:, :2])
     assert found.mask.shape == (1, 2, 1, 120, 160) and not found.mask.any()

@@ -202,6 +202,7 @@ def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halve
     cell, factor = parameters.cell_side(width, height), 1
     if halved and min(width, height) > 1:
         # Half a pixel to the left and top of where the corner stands: a search window does not mind.
+        grey = grey[: height // 2 * 2, : width // 2 * 2]  # an odd side would be stretched, and corners moved
         grey, factor = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA), 2
         cell = max(cell // 2, 1)
     rows, columns = grey.shape[0] // cell, grey.shape[1] // cell

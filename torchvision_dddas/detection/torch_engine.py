@@ -20,6 +20,7 @@ from torchvision_dddas.detection.engine import (
     match_exposure,
 )
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.nn import MotionSegmenter, WarpedWindows, close_masks
 from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import Registration
@@ -45,10 +46,12 @@ class TorchEngine(Engine):
         """device: by default the GPU where there is one.
 
         components: who labels regions. torch does so on the device, and whole maps stay there; by default OpenCV for
-        the CPU and torch for others.
+        the CPU and torch for others. Raises InputError for Apple's MPS.
         """
         self.parameters = settings
         self.device = torch.device(device or torch_device())
+        if self.device.type == "mps":
+            raise InputError("the torch engine needs float64, which mps does not have; give device cpu or cuda")
         self.components = components or ("opencv" if self.device.type == "cpu" else "torch")
 
     @property

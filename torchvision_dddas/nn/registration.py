@@ -133,8 +133,8 @@ class Registration(nn.Module):
         agreed = (found & near).sum(1) >= (_AGREEING * valid.gather(1, scouts).sum(1)).clamp(min=_FEWEST)
         if not F.may_branch(agreed):
             ways = (search(frames, motion, ransac_px) for search in (self._search_near, self._search_everywhere))
-            chosen = [agreed[:, None], agreed[:, None, None]]
-            return Motion(*(torch.where(chosen[a.dim() - 2], a, b) for a, b in zip(*ways, strict=True)))
+            wide = [agreed[:, None], agreed[:, None, None]]
+            return Motion(*(torch.where(wide[a.dim() - 2], a, b) for a, b in zip(*ways, strict=True)))
         made: dict[int, Motion] = {}
         for choice, search_from in ((agreed, self._search_near), (~agreed, self._search_everywhere)):
             chosen = choice.nonzero()[:, 0]
