@@ -491,6 +491,9 @@ class AerialParameters(Group):
     tilt_sigma_deg: float = parameter(1.0, "standard deviation of the reported tilt, per axis", "deg", 0, 90)
     tilt_guess_sigma_deg: float = parameter(15.0, "standard deviation of the tilt if pitch_deg is used", "deg", 0, 180)
     heading_sigma_deg: float = parameter(5.0, "standard deviation of the reported heading", "deg", 0, 180)
+    course_sigma_deg: float = parameter(
+        10.0, "sigma of a camera's heading that is taken from the vehicle's nose or course", "deg", 0, 180
+    )
     altitude_sigma: float = parameter(0.02, "relative standard deviation of the altitude", "-", 0, 10)
     altitude_sigma_m: float = parameter(0.0, "standard deviation added to it, in metres", "m", 0, 1000)
     position_sigma_m: float = parameter(
@@ -515,6 +518,9 @@ class AerialParameters(Group):
     )
     least_spread: float = parameter(0.02, "landmarks of a smaller width over length count as collinear", "-", 0, 1)
     clock_offset_s: float = parameter(0.0, "added to times of telemetry and landmarks: the clip's time", "s", -1e6, 1e6)
+    time_zone: str = parameter(
+        "", "of a log whose dates are in local time: a name, Europe/Berlin, or hours from UTC, +02:00"
+    )
 
 
 class CrowdParameters(Group):

@@ -169,6 +169,8 @@ class Telemetry:
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
     heading_rad, pitch_rad, roll_rad: of the camera, as in Camera; straight down the pitch is pi/2 and the heading that
     of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
+    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
+    heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
     """
 
@@ -183,6 +185,10 @@ class Telemetry:
     roll_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     hfov_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     vehicle_heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heading_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    tilt_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    altitude_sigma_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heading_from: str = ""
     start_utc_s: float = float("nan")
     origin: str = ""
     notes: tuple[str, ...] = ()
@@ -231,6 +237,10 @@ class Telemetry:
             _wrap(between(self.roll_rad, _TURN), _TURN),
             between(self.hfov_rad),
             between(self.vehicle_heading_rad, _TURN) % _TURN,
+            between(self.heading_sigma_rad),
+            between(self.tilt_sigma_rad),
+            between(self.altitude_sigma_m),
+            self.heading_from,
         )
 
     def check_overlap(self, last_s: float) -> None:
@@ -246,6 +256,7 @@ class Telemetry:
 
 
 _TURN = 2 * math.pi
+_LEAST_SINE = 0.1  # of the angle of a view below the horizon
 
 
 def _wrap(value: float, full: float) -> float:
@@ -261,6 +272,9 @@ COLUMNS_OF_TELEMETRY = (
     "roll_rad",
     "hfov_rad",
     "vehicle_heading_rad",
+    "heading_sigma_rad",
+    "tilt_sigma_rad",
+    "altitude_sigma_m",
 )
 
 
@@ -277,6 +291,20 @@ class Flight:
     roll_rad: float = float("nan")
     hfov_rad: float = float("nan")
     vehicle_heading_rad: float = float("nan")
+    heading_sigma_rad: float = float("nan")
+    tilt_sigma_rad: float = float("nan")
+    altitude_sigma_m: float = float("nan")
+    heading_from: str = ""
+
+    @property
+    def distance_m(self) -> float:
+        """From the camera to level ground along the optical axis; the altitude where the pitch is not known.
+
+        A view less than about 6 degrees below the horizon counts as one of that many: its ground is too far to tell.
+        """
+        if not math.isfinite(self.pitch_rad):
+            return self.altitude_m
+        return self.altitude_m / max(math.sin(self.pitch_rad), _LEAST_SINE)
 
 
 @dataclass(frozen=True)
@@ -539,6 +567,8 @@ class Camera:
     distortion. place: longitude and latitude in degrees if geographic, else local metres east and north.
     heading_rad: clockwise from true north. pitch_rad: below the horizon. roll_rad: clockwise, seen from behind.
     height_m: above ground, NaN if unknown. focal_sigma: relative. position_sigma_m: east and north each.
+    takeoff_above_sea_m: where the aerial vehicle took off, NaN if unknown. given: the fields that are known; None:
+    those that differ from their defaults.
     """
 
     name: str
@@ -558,6 +588,15 @@ class Camera:
     pitch_sigma_rad: float = float(np.radians(0.5))
     heading_sigma_rad: float = float(np.radians(2.0))
     position_sigma_m: float = 1.43
+    takeoff_above_sea_m: float = float("nan")
+    given: frozenset[str] | None = None
+
+    def knows(self, name: str) -> bool:
+        """Whether the value of a field is known, and no default."""
+        if self.given is not None:
+            return name in self.given
+        value, default = getattr(self, name), type(self).__dataclass_fields__[name].default
+        return not (value == default or (value != value and default != default))
 
 
 @dataclass(frozen=True)

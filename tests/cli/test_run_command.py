@@ -142,7 +142,7 @@ def test_without_landmarks_nothing_is_located_and_earlier_positions_go(dddas, cl
     (out / "positions.csv").write_text("old")
     result = dddas("run", clip, "--save", "none", "--out", out)
     assert result.exit_code == 0, result.output
-    assert "note: no --landmarks was given: nothing was located" in result.stdout
+    assert "note: 0 located, because neither --telemetry nor --landmarks were given" in result.stdout
     assert "tracks.csv" in names(out) and "positions.csv" not in names(out)
 
 

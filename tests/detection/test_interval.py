@@ -6,14 +6,15 @@ import pytest
 from torchvision_dddas.config import IntervalParameters, Settings, load_config, with_parameters
 from torchvision_dddas.detection import interval as windows
 from torchvision_dddas.detection.interval import (
-    AltitudeSettings,
+    DistanceSettings,
     Gates,
     adjust_interval,
-    follow_altitude,
+    follow_distance,
     interval_from_flow,
     interval_from_telemetry,
     settings_at,
 )
+from torchvision_dddas.types import Flight
 
 PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
 
@@ -103,18 +104,35 @@ def test_closing_in_metres_is_bounded_by_the_pixels():
     assert settings_at(200.0, 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
 
 
-def test_settings_change_only_when_the_altitude_changes_by_a_fifth_or_is_lost():
-    current, first = follow_altitude(1, AltitudeSettings(BASE), 100.0, 10, BASE)
+def test_settings_change_only_when_the_distance_changes_by_a_fifth_or_is_lost():
+    current, first = follow_distance(1, DistanceSettings(BASE), Flight(100.0), 10, BASE)
     assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}
-    assert follow_altitude(2, current, 119.0, 10, BASE) == (current, ())
-    higher, records = follow_altitude(3, current, 121.0, 10, BASE)
+    assert follow_distance(2, current, Flight(119.0), 10, BASE) == (current, ())
+    higher, records = follow_distance(3, current, Flight(121.0), 10, BASE)
     bound = next(record for record in records if record.parameter == "gates.max_size_px")
     assert bound.new == pytest.approx(bound.old * 100 / 121)
-    assert higher.altitude_m == 121.0 and "altitude 121.0 m" in bound.cause and "was 100.0 m" in bound.cause
-    after, records = follow_altitude(9, current, None, 10, BASE)
-    assert after == AltitudeSettings(BASE)
+    assert higher.distance_m == 121.0 and "altitude 121.0 m" in bound.cause and "was 100.0 m" in bound.cause
+    after, records = follow_distance(9, current, None, 10, BASE)
+    assert after == DistanceSettings(BASE)
     assert {record.cause for record in records} == {"no telemetry for this frame"}
-    assert follow_altitude(10, after, None, 10, BASE) == (after, ())
+    assert follow_distance(10, after, None, 10, BASE) == (after, ())
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "distance_m"), [(90, 40.0), (91, 40.0), (45, 56.57), (3, 400.0), (-10, 400.0), (np.nan, 40.0)]
+)
+def test_the_distance_along_the_view_is_the_altitude_over_the_sine_of_the_pitch(pitch_deg, distance_m):
+    assert Flight(40.0, pitch_rad=np.radians(pitch_deg)).distance_m == pytest.approx(distance_m, abs=0.01)
+
+
+def test_an_oblique_view_from_low_keeps_the_search_for_small_targets_on():
+    """At 40 m a body straight below is 42 px long, at 57 m along a view of 45 degrees 30 px: small."""
+    below, oblique = (
+        follow_distance(1, DistanceSettings(Settings()), Flight(40.0, pitch_rad=np.radians(pitch)), 10, Settings())
+        for pitch in (90, 45)
+    )
+    assert not below[0].settings.small.on and oblique[0].settings.small.on
+    assert {record.cause for record in oblique[1]} == {"altitude 40.0 m, 56.6 m along the view"}
 
 
 SHIPPED = {name: load_config(name) for name in ("source", "fast")} | {"default": load_config()}

@@ -15,6 +15,7 @@ from torchvision_dddas.cli.options import (
     Overrides,
     Quiet,
     Rate,
+    Telemetry,
     print_lines,
     report_errors,
 )
@@ -34,9 +35,7 @@ def detect(
     save: Annotated[
         str, typer.Option(metavar="NAMES", help="masks,overlay, all or none; the tables are always written.")
     ] = "all",
-    telemetry: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="time_s,altitude_m,speed_m_s of the vehicle.")
-    ] = None,
+    telemetry: Telemetry = None,
     rate: Rate = None,
     quiet: Quiet = False,
 ) -> None:
@@ -72,7 +71,10 @@ def detect_clip(
     refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
     with DetectionRecorder(folder, save) as output:
         source = open_video(clip, rate_hz=rate_hz)
-        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip) if telemetry else None
+        parameters = settings.aerial
+        flight = None
+        if telemetry is not None:
+            flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone)
         engine = load_engine(backend, settings)
         facts = {
             "input": clip,

@@ -15,6 +15,7 @@ from torchvision_dddas.cli.options import (
     Poses,
     Quiet,
     Rate,
+    Telemetry,
     check_rate,
     print_lines,
     report_errors,
@@ -25,11 +26,12 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.io.output import RunRecord
 
-Telemetry = Annotated[
+CameraFile = Annotated[
     Path | None,
-    typer.Option("--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, KLV, NMEA."),
+    typer.Option(
+        "--camera", metavar="FILE", help="The TOML of the camera, with what the telemetry lacks: pitch_deg, ..."
+    ),
 ]
-CameraFile = Annotated[Path | None, typer.Option("--camera", metavar="FILE", help="The TOML of the camera.")]
 Elevation = Annotated[
     Path | None, typer.Option("--dem", metavar="FILE", help="Heights of the ground, a GeoTIFF. [default: level ground]")
 ]
@@ -47,8 +49,9 @@ def aerial(
         Path, typer.Argument(metavar="TABLE", help="Detections or tracks, CSV or MOTChallenge text, of the clip.")
     ],
     landmarks: Annotated[
-        Path, typer.Option(metavar="FILE", help="A CSV of landmarks: their places, and their pixels in the frames.")
-    ],
+        Path | None,
+        typer.Option(metavar="FILE", help="A CSV of landmarks: their places, and their pixels in the frames."),
+    ] = None,
     telemetry: Telemetry = None,
     camera: CameraFile = None,
     dem: Elevation = None,
@@ -66,7 +69,7 @@ def aerial(
     rate: Rate = None,
     quiet: Quiet = False,
 ) -> None:
-    """Locate what a clip shows from the air, by landmarks of known place and by what the vehicle reports.
+    """Locate what a clip shows from the air, by what the vehicle reports, by landmarks of known place, or by both.
 
     Writes positions.csv, fixes.csv (the pose of each picture), maps, a report and run.json under --out.
     """
@@ -78,6 +81,8 @@ def aerial(
     from torchvision_dddas.io.output import AerialRecorder, parse_save
     from torchvision_dddas.io.run_inputs import AerialInput, locator_facts, map_site, read_locator
 
+    if landmarks is None and telemetry is None:
+        raise InputError("locating from the air needs --telemetry FILE or --landmarks FILE; got neither")
     given = AerialInput(landmarks, telemetry, camera, dem, background)
     settings, names = load_config(config, set_ or []), parse_save(save, AerialRecorder.saved)
     check_rate(rate)

@@ -33,6 +33,10 @@ Overrides = Annotated[
 EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes torch with a CUDA device, else onboard.")]
 StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as the study's file says]")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
+Telemetry = Annotated[
+    Path | None,
+    typer.Option("--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, KLV, NMEA."),
+]
 Poses = Annotated[
     list[Path] | None,
     typer.Option(metavar="FILE", help="A CSV of each moving camera's poses, in the cameras' order."),

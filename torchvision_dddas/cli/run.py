@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, Telemetry, position_lines
+from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines
 from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
@@ -17,6 +17,7 @@ from torchvision_dddas.cli.options import (
     Overrides,
     Quiet,
     Rate,
+    Telemetry,
     check_interval,
     print_lines,
     report_errors,
@@ -34,7 +35,8 @@ SIMULATED = "sim:"
 def run(
     clip: Annotated[str, typer.Argument(metavar="CLIP", help=f"sim:SCENARIO. {CLIP}")],
     landmarks: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A CSV of landmarks and their places. [default: locate nothing]")
+        Path | None,
+        typer.Option(metavar="FILE", help="A CSV of landmarks and their places. [default: by telemetry alone]"),
     ] = None,
     telemetry: Telemetry = None,
     colours: Annotated[
@@ -79,7 +81,9 @@ def run(
     people: Annotated[bool, typer.Option("--people", help="With --live: recognize people too.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find what moves in a clip from the air, give it lasting identities, and locate it by landmarks of known place.
+    """Find what moves in a clip from the air, give it lasting identities, and locate it.
+
+    Places come from what the vehicle reports (--telemetry), from landmarks of known place (--landmarks), or from both.
 
     Writes the tables of `dddas detect`, `dddas track` and `dddas locate aerial`, landmarks.csv (where they were seen),
     overlay.mp4, maps, a report and run.json under --out.
@@ -103,9 +107,13 @@ def run(
         return
     if scene or seed is not None:
         raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
+    if landmarks is None and telemetry is None:
+        _refuse(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
     if landmarks is None:
-        _refuse(beside, "is of no use without --landmarks FILE: nothing would be located")
-    given = None if landmarks is None else AerialInput(landmarks, telemetry, camera, dem, background, colours)
+        _refuse({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
+    given = None
+    if landmarks is not None or telemetry is not None:
+        given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_config(config, set_ or [])
     if live:
         from torchvision_dddas.live.session import run_live
@@ -133,17 +141,17 @@ def run(
             "interval_frames": interval,
             "backend": ready.engine.name,
         }
-        site, notes = None, ["no --landmarks was given: nothing was located"]
+        site = None
         if ready.watch is not None and given is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
-            site, notes = map_site(ready.watch.locator, background), []
+            site = map_site(ready.watch.locator, background)
         facts["settings"] = ready.settings.model_dump()
         record = output.begin(facts, source.rate_hz / interval, source.size, site)
-        record.notes += [*ready.notes, *notes]
+        record.notes += ready.notes
         count = None if source.count is None else -(-source.count // interval)
         pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
-    print_lines(_summary(record, out, given is not None, "overlay" in names), quiet)
+    print_lines(_summary(record, out, site is not None, "overlay" in names), quiet)
 
 
 def _refuse(options: Mapping[str, object], why: str) -> None:

@@ -16,7 +16,7 @@ from torchvision_dddas.control.rules import AdjustmentLog, every_least, every_wa
 from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
 from torchvision_dddas.control.uav_commands import UavSteering
 from torchvision_dddas.control.ugv_commands import UgvTeam
-from torchvision_dddas.detection import interval_from_flow, interval_from_telemetry, pixels_per_metre
+from torchvision_dddas.detection import describe_distance, interval_from_flow, interval_from_telemetry, pixels_per_metre
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
@@ -175,8 +175,7 @@ class Mission:
         if frame.image.any():  # an all-black picture stands for a missing one
             flight, metres_per_px = locator.telemetry_at(frame.time_s), float("nan")
             if flight is not None:  # on level ground in the middle of the picture
-                down = np.sin(flight.pitch_rad) if np.isfinite(flight.pitch_rad) else 1.0
-                metres_per_px = float(flight.altitude_m / max(down, 0.1) / self.source.camera.focal_px[0])
+                metres_per_px = float(flight.distance_m / self.source.camera.focal_px[0])
             self._monitor.check_picture(frame, scene.step, metres_per_px)
         if self._confirmation is not None:
             self._confirmation.take(self.source.pictures())
@@ -290,7 +289,7 @@ class Steering:
         return self._command, self._log.made()
 
     def _least_every(self, flight: Flight) -> float:
-        scale = pixels_per_metre(flight.altitude_m, self.camera.focal_px[0])
+        scale = pixels_per_metre(flight.distance_m, self.camera.focal_px[0])
         return every_least(scale, self.rate_hz, self.settings.steering)
 
     def _choose_frames(
@@ -315,8 +314,8 @@ class Steering:
         wanted, why = 1.0, self._alert
         if now_s >= self._alert_s:
             if flight is not None and np.isfinite([flight.altitude_m, flight.speed_m_s]).all():
-                wanted = interval_from_telemetry(flight.altitude_m, flight.speed_m_s, self.rate_hz, interval)
-                why = f"altitude {flight.altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+                wanted = interval_from_telemetry(flight.distance_m, flight.speed_m_s, self.rate_hz, interval)
+                why = f"{describe_distance(flight)}, speed {flight.speed_m_s:.1f} m/s"
             elif step is not None and step.reliable:
                 wanted = interval_from_flow([step.flow_px / between], self.camera.size_px[0], interval)
                 why = f"background flow {step.flow_px / between:.2f} px a frame"

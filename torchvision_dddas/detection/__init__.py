@@ -11,7 +11,12 @@ from torchvision_dddas.detection.engine import (
     Window,
     match_exposure,
 )
-from torchvision_dddas.detection.interval import interval_from_flow, interval_from_telemetry, pixels_per_metre
+from torchvision_dddas.detection.interval import (
+    describe_distance,
+    interval_from_flow,
+    interval_from_telemetry,
+    pixels_per_metre,
+)
 from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
 
 if TYPE_CHECKING:
@@ -27,6 +32,7 @@ __all__ = [
     "View",
     "Window",
     "check_length",
+    "describe_distance",
     "detect_keypoints",
     "detect_motion",
     "fill_hull",

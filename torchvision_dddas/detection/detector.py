@@ -12,10 +12,11 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.engine import Engine, View, Window
 from torchvision_dddas.detection.interval import (
-    AltitudeSettings,
+    DistanceSettings,
     adjust_interval,
     choose_pairs,
-    follow_altitude,
+    describe_distance,
+    follow_distance,
     interval_from_flow,
     interval_from_telemetry,
     look_ahead,
@@ -103,7 +104,7 @@ class _Slot:
     view: View
     look: int
     is_blank: bool
-    altitude: AltitudeSettings
+    distance: DistanceSettings
     adjustments: tuple[Adjustment, ...]
     seconds: dict[str, float]
     step: Registration | None = None
@@ -154,7 +155,7 @@ class MotionDetector:
         self._flows: deque[float] = deque(maxlen=self.settings.interval.memory_frames)
         self._flow = DenseFlow()
         self._small_tracks = SmallTracks(self.settings.small)
-        self._altitude = AltitudeSettings(self.settings)
+        self._distance = DistanceSettings(self.settings)
         self._history = MotionHistory(self.settings.history.duration_frames)
 
     def update(self, frame: Frame | np.ndarray, adjustments: tuple[Adjustment, ...] = ()) -> list[Scene]:
@@ -179,11 +180,11 @@ class MotionDetector:
             return
         self.settings = self.engine.parameters = settings
         self._memory = max(self._memory, _memory_frames(settings))
-        altitude_m = self._altitude.altitude_m
-        if altitude_m is None:
-            self._altitude = AltitudeSettings(settings)
+        distance_m = self._distance.distance_m
+        if distance_m is None:
+            self._distance = DistanceSettings(settings)
         else:
-            self._altitude = settings_at(altitude_m, self.rate_hz, settings)
+            self._distance = settings_at(distance_m, self.rate_hz, settings)
 
     def _as_frame(self, frame: Frame | np.ndarray) -> Frame:
         image = frame.image if isinstance(frame, Frame) else frame
@@ -205,7 +206,7 @@ class MotionDetector:
         is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
         seconds = {"prepare": time.perf_counter() - start}
         look = frame.number - self._skipped
-        self._slots.append(_Slot(frame, view, look, is_blank, self._altitude, adjustments, seconds))
+        self._slots.append(_Slot(frame, view, look, is_blank, self._distance, adjustments, seconds))
         self._last = frame
         self._total += 1
         if self._total - self._registered > self.batch:
@@ -273,22 +274,22 @@ class MotionDetector:
         return ready if self._ended or len(ready) == self.batch else []
 
     def _steer(self, index: int, slot: _Slot) -> None:
-        """Apply the feedback rules of the detection interval and of the altitude."""
+        """Apply the feedback rules of the detection interval and of the distance to the ground."""
         parameters, number = self.settings.interval, slot.frame.number
         flight = self.telemetry.at(slot.frame.time_s) if self.telemetry is not None else None
         # A log may say one of altitude and speed without the other, or fall silent for a while.
-        altitude_m = flight.altitude_m if flight is not None and np.isfinite(flight.altitude_m) else None
-        self._altitude, moved = follow_altitude(number, self._altitude, altitude_m, self.rate_hz, self.settings)
+        high = flight if flight is not None and np.isfinite(flight.altitude_m) else None
+        self._distance, moved = follow_distance(number, self._distance, high, self.rate_hz, self.settings)
         slot.adjustments += moved
-        slot.altitude = self._altitude
+        slot.distance = self._distance
         if slot.step is not None and slot.step.reliable:
             self._flows.append(slot.step.flow_px / (self._at(index + 1).frame.skipped + 1))
         wanted, cause = None, ""
         if not parameters.rule:
             pass
-        elif flight is not None and altitude_m is not None and np.isfinite(flight.speed_m_s):
-            wanted = interval_from_telemetry(altitude_m, flight.speed_m_s, self.rate_hz, parameters)
-            cause = f"altitude {altitude_m:.1f} m, speed {flight.speed_m_s:.1f} m/s"
+        elif high is not None and np.isfinite(high.speed_m_s):
+            wanted = interval_from_telemetry(high.distance_m, high.speed_m_s, self.rate_hz, parameters)
+            cause = f"{describe_distance(high)}, speed {high.speed_m_s:.1f} m/s"
         elif self._flows:
             wanted = interval_from_flow(self._flows, slot.view.size[0], parameters)
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
@@ -312,11 +313,11 @@ class MotionDetector:
                 for i in range(max(self._remembered, self._first), index + 1):
                     history.move(self._at(i).look, self._this_from_last(i))
                 self._remembered = index + 1
-            slot.observation = observe(window, foreground, self._flow, slot.altitude.settings, history)
+            slot.observation = observe(window, foreground, self._flow, slot.distance.settings, history)
             slot.seconds |= {"foreground": seconds, "blobs": time.perf_counter() - start}
 
     def _build_window(self, index: int) -> Window | None:
-        slot, settings = self._at(index), self._at(index).altitude.settings
+        slot, settings = self._at(index), self._at(index).distance.settings
         before = self._from_before(index)
         if before is not None and not before.reliable:  # a cut or a blank picture: reported once, at this frame
             slot.cause = before.cause
@@ -367,7 +368,7 @@ class MotionDetector:
             index, start = self._drawn, time.perf_counter()
             slot, slots, at = self._at(index), *self._around(index)
             observations, steps = [s.observation for s in slots], [s.next_from_this for s in slots]
-            slot.observation.targets = draw_targets(observations, steps, at, slot.altitude.settings)
+            slot.observation.targets = draw_targets(observations, steps, at, slot.distance.settings)
             slot.observation.window = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self._drawn += 1
@@ -415,8 +416,8 @@ class MotionDetector:
         targets = targets + self._small_targets(index, targets)
         if slot.frame.skipped:  # what moved from look to look, per frame
             targets = [replace(t, velocity_px=t.velocity_px / (slot.frame.skipped + 1)) for t in targets]
-        if slot.altitude.gates is not None:
-            targets = [t for t in targets if slot.altitude.gates.admit(t.box[2], t.box[3], t.velocity_px)]
+        if slot.distance.gates is not None:
+            targets = [t for t in targets if slot.distance.gates.admit(t.box[2], t.box[3], t.velocity_px)]
         detections, mask, core = build_detections(targets, slot.view.size)
         return Scene(
             frame=slot.frame,

@@ -7,25 +7,26 @@ import numpy as np
 
 from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
 from torchvision_dddas.geometry import later_pair, near_pairs, pair_about
-from torchvision_dddas.types import Adjustment
+from torchvision_dddas.types import Adjustment, Flight
 
-# A smaller relative change of altitude does not move the gates.
-_ALTITUDE_STEP = 0.2
+# A smaller relative change of distance does not move the gates.
+_DISTANCE_STEP = 0.2
 
 Pair = tuple[int, int]
 
 
 def interval_from_telemetry(
-    altitude_m: float, speed_m_s: float, rate_hz: float, parameters: IntervalParameters
+    distance_m: float, speed_m_s: float, rate_hz: float, parameters: IntervalParameters
 ) -> float:
     """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
 
-    Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz. The lowest speed, which keeps the
-    interval of a hovering vehicle finite, is ours.
+    Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz. Its A, the altitude of a camera that
+    looks straight down, is the distance to the ground along the view. The lowest speed, which keeps the interval of a
+    hovering vehicle finite, is ours.
     """
     speed = max(speed_m_s, parameters.lowest_speed_m_s)
-    by_height = altitude_m / parameters.reference_altitude_m * parameters.reference_speed_m_s / speed
-    return by_height * rate_hz / parameters.reference_rate_hz * parameters.cost
+    by_distance = distance_m / parameters.reference_altitude_m * parameters.reference_speed_m_s / speed
+    return by_distance * rate_hz / parameters.reference_rate_hz * parameters.cost
 
 
 def interval_from_flow(flows_px: Sequence[float], width: int, parameters: IntervalParameters) -> float:
@@ -117,14 +118,14 @@ class Gates:
 
 
 @dataclass(frozen=True)
-class AltitudeSettings:
-    """Settings and size gates for the current altitude. altitude_m, gates: None without telemetry.
+class DistanceSettings:
+    """Settings and size gates for the current distance to the ground. distance_m, gates: None without telemetry.
 
-    settings: those of the user with `gates.min_area_px`, `small.on` and `morphology.close_px` chosen for the altitude.
+    settings: those of the user with `gates.min_area_px`, `small.on` and `morphology.close_px` chosen for the distance.
     """
 
     settings: Settings
-    altitude_m: float | None = None
+    distance_m: float | None = None
     gates: Gates | None = None
 
     def values(self) -> dict[str, float]:
@@ -137,21 +138,28 @@ class AltitudeSettings:
         }
 
 
-def pixels_per_metre(altitude_m: float, focal_px: float) -> float:
-    """Scale of the ground straight below. An altitude below 1 m counts as 1 m, so that it stays finite on landing."""
-    return focal_px / max(altitude_m, 1.0)
+def pixels_per_metre(distance_m: float, focal_px: float) -> float:
+    """Scale of what is at a distance. One below 1 m counts as 1 m, so that it stays finite on landing."""
+    return focal_px / max(distance_m, 1.0)
 
 
-def settings_at(altitude_m: float, rate_hz: float, base: Settings) -> AltitudeSettings:
-    """The settings and gates for an altitude above ground (appendix A, and the baseline of appendix B).
+def describe_distance(flight: Flight) -> str:
+    """The altitude, and the distance along the view where it is another, in words."""
+    altitude = f"altitude {flight.altitude_m:.1f} m"
+    oblique = flight.distance_m > 1.02 * flight.altitude_m
+    return f"{altitude}, {flight.distance_m:.1f} m along the view" if oblique else altitude
 
-    A target measures e = expected_size_m x focal / altitude pixels when the camera looks straight down. Obliquely the
-    far side of the picture is smaller, so the bounds are meant to be wide. The smallest area is expected_share x e^2,
+
+def settings_at(distance_m: float, rate_hz: float, base: Settings) -> DistanceSettings:
+    """The settings and gates for a distance to the ground along the view (appendix A, and the baseline of appendix B).
+
+    A target measures e = expected_size_m x focal / distance pixels in the picture's middle. Obliquely the far side of
+    the picture is smaller, so the bounds are meant to be wide. The smallest area is expected_share x e^2,
     between that of the small path and the user's. The small path is on while e^2 is at most its largest box. Gaps of
     close_m, if it is set, are closed up to close_px, which would join ever more from a greater height.
     """
     gates, small, close_px = base.gates, base.small, base.morphology.close_px
-    scale = pixels_per_metre(altitude_m, gates.focal_px)
+    scale = pixels_per_metre(distance_m, gates.focal_px)
     square = (gates.expected_size_m * scale) ** 2
     if base.morphology.close_m:
         close_px = int(np.clip(round(base.morphology.close_m * scale), 1, close_px))
@@ -161,25 +169,26 @@ def settings_at(altitude_m: float, rate_hz: float, base: Settings) -> AltitudeSe
         "morphology.close_px": close_px,
     }
     bounds = Gates(gates.min_size_m * scale, gates.max_size_m * scale, gates.max_speed_m_s * scale / rate_hz)
-    return AltitudeSettings(with_parameters(base, chosen), altitude_m, bounds)
+    return DistanceSettings(with_parameters(base, chosen), distance_m, bounds)
 
 
-def follow_altitude(
-    frame: int, current: AltitudeSettings, altitude_m: float | None, rate_hz: float, base: Settings
-) -> tuple[AltitudeSettings, tuple[Adjustment, ...]]:
-    """The settings from this frame on, and the record of what changed.
+def follow_distance(
+    frame: int, current: DistanceSettings, flight: Flight | None, rate_hz: float, base: Settings
+) -> tuple[DistanceSettings, tuple[Adjustment, ...]]:
+    """The settings from this frame on, and the record of what changed. flight: None where no altitude is known.
 
-    They change when the altitude has changed by a fifth since their last change, or became known or unknown.
+    They change when the distance has changed by a fifth since their last change, or became known or unknown.
     """
-    before_m = current.altitude_m
-    if altitude_m is None:
-        new, cause = AltitudeSettings(base), "no telemetry for this frame"
+    before_m = current.distance_m
+    if flight is None:
+        new, cause = DistanceSettings(base), "no telemetry for this frame"
         if before_m is None:
             return current, ()
     else:
-        if before_m is not None and abs(altitude_m - before_m) <= _ALTITUDE_STEP * max(before_m, 1.0):
+        distance_m = flight.distance_m
+        if before_m is not None and abs(distance_m - before_m) <= _DISTANCE_STEP * max(before_m, 1.0):
             return current, ()
-        new, cause = settings_at(altitude_m, rate_hz, base), f"altitude {altitude_m:.1f} m"
+        new, cause = settings_at(distance_m, rate_hz, base), describe_distance(flight)
         cause += "" if before_m is None else f", was {before_m:.1f} m"
     old = current.values()
     changed = {name: value for name, value in new.values().items() if value != old[name]}

@@ -10,7 +10,17 @@ from torchvision_dddas.geo.landmark_watch import (
     group_crowds,
     without_pixels,
 )
-from torchvision_dddas.geo.site import Site, build_site, check_span, describe_unknown_heights, resolve_camera, to_local
+from torchvision_dddas.geo.site import (
+    Site,
+    build_site,
+    check_span,
+    complete_site,
+    describe_no_place,
+    describe_unknown_heights,
+    has_places,
+    resolve_camera,
+    to_local,
+)
 
 __all__ = [
     "AerialLocator",
@@ -24,9 +34,12 @@ __all__ = [
     "check_colours",
     "check_span",
     "check_table",
+    "complete_site",
+    "describe_no_place",
     "describe_unknown_heights",
     "frames_to_locate",
     "group_crowds",
+    "has_places",
     "is_outside",
     "resolve_camera",
     "to_local",

@@ -25,7 +25,7 @@ from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, LandmarkUse, select_landmarks
 from torchvision_dddas.geo.plane_homography import LEAST, PlaneSolver, load_solver, locate_pixels, relative_width
 from torchvision_dddas.geo.projection import ground_height, surface_of
-from torchvision_dddas.geo.site import Site, build_site, resolve_camera
+from torchvision_dddas.geo.site import Site, build_site, complete_site, resolve_camera
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -44,6 +44,8 @@ from torchvision_dddas.types import (
 
 # A landmark or a target may show this far beyond the picture's edge, as a share of the picture's side.
 _OUTSIDE = 0.25
+# By telemetry alone a place whose distance has a standard deviation of a larger share of itself is none.
+_VAGUE = 0.2
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ class AerialLocator:
     ) -> None:
         """Telemetry and landmarks may be in degrees or in local metres, both in one kind.
 
-        camera: None where the field of view is that of the telemetry or of the settings; then size_px is needed.
+        camera: None where the field of view is that of the telemetry or of the settings; then size_px is needed. Its
+        heading, pitch, roll and heights count where the telemetry never says them.
         elevation: heights in metres about the first landmark, or about the vehicle's first place without landmarks.
         rate_hz: frames a second. backend: auto, onboard or torch.
         Raises InputError where neither telemetry nor landmarks are given, or they contradict each other.
@@ -89,9 +92,10 @@ class AerialLocator:
             raise InputError(f"rate_hz must be positive, got {rate_hz}")
         settings = settings or Settings()
         site = replace(build_site(landmarks, telemetry), elevation=elevation)
+        site, completed = complete_site(site, camera, settings)
         camera, focal_known, notes = resolve_camera(camera, size_px, site.telemetry, settings)
         self._begin(site, camera, settings, load_solver(backend), rate_hz, focal_known)
-        self.notes += notes
+        self.notes += [*completed, *notes]
 
     @classmethod
     def from_site(
@@ -204,7 +208,10 @@ class AerialLocator:
         pixels, lift = self.target_points(fix, targets)
         place, by_pixel = locate_pixels(fix, self.camera, pixels, 1.0, lift, self._ground)
         shared = locate_pixels(fix, self.camera, pixels, 0.0, lift, self._ground)[1]
-        rows = np.flatnonzero(np.isfinite(place).all(axis=1))
+        known = np.isfinite(place).all(axis=1)
+        if fix.by == "telemetry":
+            known &= ~_is_near_horizon(fix, place, shared)
+        rows = np.flatnonzero(known)
         place = place[rows]
         own = (by_pixel - shared)[rows] * (point_sigma_px(targets, self.settings.aerial)[rows] ** 2)[:, None, None]
         relative = shared[rows] + own
@@ -269,6 +276,18 @@ class AerialLocator:
         return sun if sun is not None and sun[1] > 0 else None
 
 
+def _is_near_horizon(fix: Fix, place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(N,) bool, whether places lie so near the horizon that how far away they are is no more than a guess."""
+    if fix.pose is None:
+        return np.zeros(len(place), bool)
+    away = place - fix.pose.place_m[:2]
+    far = np.linalg.norm(away, axis=1)
+    along = away / np.maximum(far, 1e-9)[:, None]
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance, along))
+    vague: np.ndarray = sigma > _VAGUE * np.hypot(far, fix.pose.place_m[2])
+    return vague
+
+
 def frames_to_locate(table: DetectionTable, landmarks: Landmarks) -> list[int]:
     """The frames of a table, and those between its first and last with landmarks in the picture."""
     seen = landmarks.frame[np.isfinite(landmarks.image_px).all(axis=1)]
@@ -283,6 +302,8 @@ def check_table(table: DetectionTable, locator: AerialLocator) -> None:
     landmarks in every frame or all of them on one line.
     """
     landmarks, parameters = locator.site.landmarks, locator.settings.aerial
+    if not landmarks.names:
+        return
     seen = np.isfinite(landmarks.image_px).all(axis=1)
     if not seen.any():
         raise InputError(

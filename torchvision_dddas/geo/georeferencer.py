@@ -245,7 +245,7 @@ class Georeferencer:
             degrees = (np.asarray(degrees[0], float)[usable], degrees[1])
         prior = pose_prior(flight, self.camera, self.parameters, self.focal_known)
         if self.parameters.mode == "pose":
-            fix = self._by_pose(frame, time_s, prior, marks[usable])
+            fix = self._by_pose(frame, time_s, flight, prior, marks[usable])
         else:
             fix = self._by_homography(frame, prior, marks[usable], degrees)
         # Landmarks that are in the picture but could not be used are excluded.
@@ -267,8 +267,13 @@ class Georeferencer:
             changes.append(f"{self._name(int(marks.landmark[row]))} left out where it is seen a second time")
         return usable, tuple(changes)
 
-    def _by_pose(self, frame: int, time_s: float, prior: Prior | None, marks: LandmarkObservations) -> Fix:
-        cause = _describe_refusal(frame, prior, marks, self.parameters.least_spread)
+    def _by_pose(
+        self, frame: int, time_s: float, flight: Flight | None, prior: Prior | None, marks: LandmarkObservations
+    ) -> Fix:
+        if len(marks) or self.names:
+            cause = _describe_refusal(frame, prior, marks, self.parameters.least_spread)
+        else:
+            cause = describe_unknown_pose(flight, prior)
         bare = focal_prior(self.camera, self.parameters, self.focal_known)
         correlation_s = self.parameters.correlation_s
         self._filters = [bias.at(time_s, prior or bare, marks, correlation_s) for bias in self._filters]
@@ -289,9 +294,13 @@ class Georeferencer:
             self._filters[best] = before.after(prior, marks, check.used, solution)
         count = int(check.used.sum())
         if not cause and count == 0:
-            cause = f"frame {frame} has no landmark: by telemetry alone"
+            cause = f"frame {frame} has no landmark: by telemetry alone" if self.names else ""
         elif not cause and count < LEAST:
             cause = describe_too_few(frame, count)
+        if count == 0 and flight is not None and flight.heading_from:
+            sigma_deg = np.degrees(np.sqrt(solution.covariance[2, 2]))
+            words = f"heading from {flight.heading_from}, sigma {sigma_deg:.0f} degrees"
+            cause = f"{cause}; {words}" if cause else words
         return Fix(
             frame,
             "pose" if count else "telemetry",
@@ -389,6 +398,16 @@ class Georeferencer:
 
     def _name(self, identity: int) -> str:
         return self.names[identity] if 0 <= identity < len(self.names) else f"landmark {identity}"
+
+
+def describe_unknown_pose(flight: Flight | None, prior: Prior | None) -> str:
+    """Why telemetry alone does not tell the pose, in words; empty where it does. A guessed pitch does not count."""
+    if flight is None or prior is None:
+        return "the telemetry says nothing at this time"
+    lacking = list(dict.fromkeys(_POSE_PARTS[~prior.known].tolist()))
+    if not np.isfinite(flight.pitch_rad):
+        lacking.append("pitch")
+    return f"the telemetry does not say the camera's {', '.join(lacking)}" if lacking else ""
 
 
 def _describe_refusal(frame: int, prior: Prior | None, marks: LandmarkObservations, least_spread: float) -> str:

@@ -105,11 +105,13 @@ def pose_prior(
     sigma = np.full(7, np.inf)
     # Without a pitch the tilt is no more than a guess.
     tilt = parameters.tilt_sigma_deg if np.isfinite(angles[1]) else parameters.tilt_guess_sigma_deg
-    sigma[:2] = np.radians(tilt)
-    sigma[2] = np.radians(parameters.heading_sigma_deg) if np.isfinite(angles[0]) else np.inf
+    sigma[:2] = _known_or(flight.tilt_sigma_rad, np.radians(tilt))
+    if np.isfinite(angles[0]):
+        sigma[2] = _known_or(flight.heading_sigma_rad, np.radians(parameters.heading_sigma_deg))
     sigma[3:5] = np.where(np.isfinite(place[:2]), parameters.position_sigma_m, np.inf)
     if np.isfinite(place[2]):
-        sigma[5] = np.hypot(parameters.altitude_sigma * flight.altitude_m, parameters.altitude_sigma_m)
+        usual = float(np.hypot(parameters.altitude_sigma * flight.altitude_m, parameters.altitude_sigma_m))
+        sigma[5] = _known_or(flight.altitude_sigma_m, usual)
     bare = focal_prior(camera, parameters, focal_known)
     focal, information = bare.pose.focal, bare.information
     if np.isfinite(flight.hfov_rad) and 0 < flight.hfov_rad < np.pi:
@@ -119,6 +121,10 @@ def pose_prior(
     angles = np.where(np.isfinite(angles), angles, [0.0, np.radians(parameters.pitch_deg), 0.0])
     pose = CameraPose(np.where(np.isfinite(place), place, 0.0), axes_of(*angles), focal)
     return Prior(pose, information + np.diag(1 / np.maximum(sigma, 1e-6) ** 2))
+
+
+def _known_or(value: float, otherwise: float) -> float:
+    return value if np.isfinite(value) else otherwise
 
 
 def focal_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:

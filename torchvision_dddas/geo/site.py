@@ -9,6 +9,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.flight_gaps import fill_gaps
 from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
@@ -20,6 +21,8 @@ _HOLDS_S = 1.0
 _HIGHEST_DEG = 20.0
 # No vehicle sees landmarks from further away: then the files are of two flights.
 _FARTHEST_M = 100_000.0
+# Two focal lengths that differ by more than this share are not the same.
+_OTHER = 0.02
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site
     flown = _known(telemetry)
     if landmarks is None:
         if telemetry is None or not len(flown):
-            raise InputError("locating needs landmarks, or telemetry that says where the vehicle is; got neither")
+            raise InputError(describe_no_place(telemetry))
         places, rows = np.zeros((0, 2)), np.zeros(0)
         none = rows.astype(np.int64)
         landmarks = Landmarks((), rows, none, places, places, rows, rows.astype(bool), none, telemetry.geographic)
@@ -95,6 +98,26 @@ def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site
                 "theirs"
             )
     return Site(landmarks, telemetry, origin)
+
+
+def describe_no_place(telemetry: Telemetry | None) -> str:
+    """Why nothing can be located without landmarks, in words."""
+    if telemetry is None:
+        return "locating needs landmarks, or telemetry that says where the vehicle is; got neither"
+    return f"the telemetry {telemetry.origin} holds no place of the vehicle, and there are no landmarks"
+
+
+def has_places(telemetry: Telemetry | None) -> bool:
+    """Whether the telemetry says where the vehicle was at any time."""
+    return len(_known(telemetry)) > 0
+
+
+def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tuple[Site, list[str]]:
+    """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes."""
+    if site.telemetry is None:
+        return site, []
+    telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, site.elevation is not None)
+    return replace(site, telemetry=telemetry), notes
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
@@ -175,22 +198,26 @@ def resolve_camera(
     landmarks alone map pictures to the ground.
     Raises InputError where the size is not known, or the camera's is another than that of the pictures.
     """
-    parameters = settings.aerial
+    parameters, notes = settings.aerial, list[str]()
+    wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
     if camera is not None:
         if size is not None and tuple(camera.size_px) != tuple(size):
             raise InputError(
                 f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
                 f"{size[0]} x {size[1]}; give the camera's file for this size"
             )
-        notes = []
         if math.isfinite(camera.height_m) and telemetry is None:
             notes.append(f"the place of camera {camera.name} is not used from the air: give --telemetry")
         if parameters.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         # A value set by hand overrides the file.
-        if parameters.focal_sigma != Settings().aerial.focal_sigma:
+        if parameters.focal_sigma != Settings().aerial.focal_sigma or not math.isfinite(camera.focal_px[0]):
             camera = replace(camera, focal_sigma=parameters.focal_sigma)
-        return camera, True, notes
+        if math.isfinite(camera.focal_px[0]):
+            if any(abs(math.log(_focal_px(camera.size_px, hfov) / camera.focal_px[0])) > _OTHER for hfov in wide[:1]):
+                notes.append(f"the focal length of camera {camera.name} is not used: the telemetry's field of view is")
+            return camera, True, notes
+        size = camera.size_px
     if size is None and parameters.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:
@@ -198,11 +225,15 @@ def resolve_camera(
             "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
             "--set aerial.mode=homography, which needs neither"
         )
-    wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
-    hfov = float(np.median(wide)) if len(wide) else math.radians(parameters.hfov_deg)
-    focal, middle = size[0] / 2 / math.tan(hfov / 2), ((size[0] - 1) / 2, (size[1] - 1) / 2)
+    focal = _focal_px(size, float(np.median(wide)) if len(wide) else math.radians(parameters.hfov_deg))
+    middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
     made = Camera("camera", size, (focal, focal), middle, focal_sigma=parameters.focal_sigma)
+    made = made if camera is None else replace(camera, focal_px=(focal, focal))
     if len(wide) or parameters.mode != "pose":
-        return made, bool(len(wide)), []
+        return made, bool(len(wide)), notes
     note = f"neither the camera file nor telemetry gives the field of view: using {parameters.hfov_deg:g} degrees"
-    return made, False, [f"{note} (aerial.hfov_deg)"]
+    return made, False, [*notes, f"{note} (aerial.hfov_deg)"]
+
+
+def _focal_px(size: tuple[int, int], hfov_rad: float) -> float:
+    return size[0] / 2 / math.tan(hfov_rad / 2)

@@ -27,19 +27,23 @@ LIMITS: dict[str, tuple[float, float]] = {
     "height_m": (0.01, 1000), "pitch_deg": (-89, 89), "roll_deg": (-180, 180), "heading_deg": (-360, 360),
     "east_m": (-1e7, 1e7), "north_m": (-1e7, 1e7), "longitude_deg": (-180, 180), "latitude_deg": (-90, 90),
     "k1": (-10, 10), "k2": (-100, 100), "focal_sigma": (0, 1), "height_sigma_m": (0, 100), "pitch_sigma_deg": (0, 45),
-    "heading_sigma_deg": (0, 180), "position_sigma_m": (0, 1000),
+    "heading_sigma_deg": (0, 180), "position_sigma_m": (0, 1000), "takeoff_above_sea_m": (-500, 9000),
 }  # fmt: skip
 """Range of every key that is a number. `centre_px` is a pair; `name` is text.
 
 focal_v_px: along the columns, where pixels are not square. centre_px: u, v of the optical axis. pitch_deg: positive
-down. roll_deg: turned clockwise. k1, k2: radial distortion as OpenCV has it. The sigmas are standard deviations, of the
-focal length as a share: 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %) where not given.
+down. roll_deg: turned clockwise. takeoff_above_sea_m: the height where an aerial vehicle took off. k1, k2: radial
+distortion as OpenCV has it. The sigmas are standard deviations, of the focal length as a share: 1 %, 0.05 m, 0.5°, 2°
+(a compass) and 1.43 m (a GPS of 3.5 m in 95 %) where not given, from the air those of the group `aerial`.
 """
 
 KEYS = (*LIMITS, "centre_px", "name")
 _SIZE = ("width_px", "height_px")
 # Keys that are fields of Camera; degrees become radians.
-_FIELDS = ("height_m", "pitch_deg", "roll_deg", "heading_deg", "k1", "k2", *(key for key in LIMITS if "sigma" in key))
+_FIELDS = (
+    *("height_m", "pitch_deg", "roll_deg", "heading_deg", "k1", "k2", "takeoff_above_sea_m"),
+    *(key for key in LIMITS if "sigma" in key),
+)
 
 
 def read_camera_keys(path: str | Path) -> dict[str, Any]:
@@ -84,14 +88,29 @@ def describe_missing(camera: str | Path, poses: PoseTable | None = None) -> str:
     return f"{camera} has {'; '.join(gaps)}" if gaps else ""
 
 
+def read_aerial_camera(path: str | Path, size_px: tuple[int, int] | None) -> Camera:
+    """Read a camera in the air. The file may lack the size, if size_px is given, and the focal length, NaN then.
+
+    Raises InputError as `read_camera`.
+    """
+    return _build_camera(path, size_px, is_aerial=True)
+
+
 def read_camera(path: str | Path) -> Camera:
     """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
+    return _build_camera(path)
+
+
+def _build_camera(path: str | Path, size_px: tuple[int, int] | None = None, is_aerial: bool = False) -> Camera:
     content = read_camera_keys(path)
+    if size_px is not None and not set(_SIZE) & content.keys():
+        content |= dict(zip(_SIZE, size_px, strict=True))
     numbers = {key: float(content[key]) for key in LIMITS if key in content}
     if missing := [key for key in _SIZE if key not in numbers]:
         raise InputError(f"camera {path} lacks {', '.join(missing)}: the size of its pictures")
     width, height = (int(numbers[key]) for key in _SIZE)
-    if ("focal_px" in numbers) == ("hfov_deg" in numbers):
+    lenses = [key for key in ("focal_px", "hfov_deg") if key in numbers]
+    if len(lenses) != 1 and not (is_aerial and not lenses):
         given = "both focal_px and hfov_deg; give one" if "focal_px" in numbers else "no focal length (focal_px)"
         raise InputError(
             f"camera {path} has {given}. `dddas calibrate` finds it from a person of known height at a known distance"
@@ -99,7 +118,7 @@ def read_camera(path: str | Path) -> Camera:
     if "focal_px" in numbers:
         focal = numbers["focal_px"]
     else:
-        focal = width / 2 / math.tan(math.radians(numbers["hfov_deg"]) / 2)
+        focal = width / 2 / math.tan(math.radians(numbers.get("hfov_deg", math.nan)) / 2)
     place, geographic = _place(numbers, path)
     u, v = content.get("centre_px", [(width - 1) / 2, (height - 1) / 2])
     fields = {
@@ -108,6 +127,7 @@ def read_camera(path: str | Path) -> Camera:
         if key in numbers
     }
     return Camera(
+        given=frozenset(fields),
         name=content.get("name", Path(path).stem),
         size_px=(width, height),
         focal_px=(focal, numbers.get("focal_v_px", focal)),

@@ -263,7 +263,8 @@ def _summarize_location(located: AerialLocations) -> tuple[str, Colour]:
     if not fix.by:
         return f"not located: {fix.cause}", WARNING
     used = len(fix.state) - fix.state.count("excluded")
-    text = f"located by {fix.by}, {used} of {len(fix.state)} landmarks, {len(located.positions)} targets"
+    landmarks = f"{used} of {len(fix.state)} landmarks, " if fix.state else ""
+    text = f"located by {fix.by}, {landmarks}{len(located.positions)} targets"
     sigma_m = np.sqrt(np.trace(located.positions.covariance_m2, axis1=1, axis2=2))
     if np.isfinite(sigma_m).any():
         text += f" to {np.nanmedian(sigma_m):.2f} m"

@@ -16,13 +16,16 @@ from torchvision_dddas.geo import (
     build_site,
     check_colours,
     check_span,
+    complete_site,
+    describe_no_place,
     describe_unknown_heights,
+    has_places,
     resolve_camera,
     without_pixels,
 )
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
@@ -36,7 +39,7 @@ from torchvision_dddas.types import Colours, Source, Telemetry
 class AerialInput:
     """The files beside a clip or a table. landmarks, telemetry, camera, dem: as the options of `dddas locate`."""
 
-    landmarks: Path
+    landmarks: Path | None = None
     telemetry: Path | None = None
     camera: Path | None = None
     dem: Path | None = None
@@ -59,8 +62,8 @@ class AerialInput:
 class PreparedRun:
     """What a run needs beside the pictures.
 
-    settings: with the camera's focal length, where that is known. watch: None if nothing is located. flight: None
-    without telemetry. notes: what the user should know.
+    settings: with the camera's focal length, where that is known. watch: None if nothing is located; notes say why.
+    flight: None without telemetry. notes: what the user should know.
     """
 
     settings: Settings
@@ -79,8 +82,11 @@ def prepare_run(
     clip: str,
 ) -> PreparedRun:
     """Read the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
-    watch, notes = None, list[str]()
-    if given is not None:
+    watch, notes, flight = None, list[str](), None
+    reason = "neither --telemetry nor --landmarks were given"
+    if given is not None and given.landmarks is None:
+        flight, reason = _read_flight(given, settings, clip)
+    if given is not None and not (given.landmarks is None and reason):
         colours = read_colours(given.colours) if given.colours is not None else None
         frames = None if source.count is None else (1, source.count)
         locator, notes = read_locator(
@@ -91,14 +97,31 @@ def prepare_run(
         if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
             notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
         watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
-    flight = None
     if watch is not None:
         flight = watch.locator.site.telemetry
         settings, more = with_focal_length(settings, watch.locator)
         notes += more
-    elif telemetry is not None:
-        flight = read_telemetry(telemetry, settings.aerial.clock_offset_s, clip)
+    else:
+        if flight is None and telemetry is not None:
+            flight = _read_telemetry(telemetry, settings, clip)
+        notes += [*(flight.notes if flight is not None else ()), f"0 located, because {reason}"]
     return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
+
+
+def _read_flight(given: AerialInput, settings: Settings, clip: str | None) -> tuple[Telemetry | None, str]:
+    """The telemetry of a run without landmarks, and why it cannot locate anything; "" where it may."""
+    flight = None if given.telemetry is None else _read_telemetry(given.telemetry, settings, clip)
+    if not has_places(flight):
+        return flight, describe_no_place(flight)
+    try:
+        build_site(None, flight)
+    except InputError as error:
+        return flight, str(error)
+    return flight, ""
+
+
+def _read_telemetry(path: Path, settings: Settings, clip: str | None) -> Telemetry:
+    return read_telemetry(path, settings.aerial.clock_offset_s, clip, settings.aerial.time_zone)
 
 
 def read_locator(
@@ -122,8 +145,8 @@ def read_locator(
     """
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
-    landmarks = read_landmarks(given.landmarks, rate_hz, offset)
-    telemetry = read_telemetry(given.telemetry, offset, clip) if given.telemetry is not None else None
+    landmarks = None if given.landmarks is None else read_landmarks(given.landmarks, rate_hz, offset)
+    telemetry = _read_telemetry(given.telemetry, settings, clip) if given.telemetry is not None else None
     if telemetry is not None:
         if rate_hz is None:
             raise InputError(
@@ -134,11 +157,12 @@ def read_locator(
         notes += telemetry.notes
     if rate_hz is None:
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
-    site = build_site(landmarks if colours is None else without_pixels(landmarks), telemetry)
+    site = build_site(landmarks if landmarks is None or colours is None else without_pixels(landmarks), telemetry)
     if given.dem is not None:
         site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
-    notes += describe_unknown_heights(site)
-    known = read_camera(given.camera) if given.camera is not None else None
+    known = read_aerial_camera(given.camera, size) if given.camera is not None else None
+    site, more = complete_site(site, known, settings)
+    notes += [*more, *describe_unknown_heights(site)]
     camera, focal_known, more = resolve_camera(known, size, site.telemetry, settings, extent)
     locator = AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
     return locator, [*notes, *more]

@@ -38,6 +38,8 @@ from torchvision_dddas.types import (
 
 KEPT = 100  # pictures and truths kept until they are fetched: a megabyte each
 _CLEAR_M = 4.0  # nothing stands nearer to where something that moves begins
+# The first fields of Flight, from the altitude to the heading of the nose, are what a vehicle reports.
+_SAID = 9
 _FLIGHT_CLEAR_M = 1.0  # nothing that stands below it comes nearer: gusts push it about by less
 _STEP_M = 1.0
 _PARTS = 64
@@ -219,7 +221,9 @@ class SimulatorSource:
                     row = (r.frame, r.vehicle, *r.lonlat_deg.tolist(), r.sigma_m, r.planned)
                     self._reports.add(row, (r.vehicle, round(r.frame, 6), r.planned))
                 if moment.flight is not None:
-                    self._flown.add(np.hstack([moment.time_s, *astuple(moment.flight)]).tolist())
+                    # Its errors are not reported.
+                    said = astuple(moment.flight)[:_SAID]
+                    self._flown.add(np.hstack([moment.time_s, *said]).tolist())
             self._truths.append(shot.truth)
             # Vehicles look when the picture from the air is taken, dropped or not: each order is for one look.
             pictures = [self.picture(name) for name in self._wanted]

@@ -1,5 +1,6 @@
 """What each command writes into its output folder."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -168,6 +169,11 @@ class AerialRecorder(RunRecorder[AerialLocations]):
     def _count(self, item: AerialLocations) -> None:
         self._counts.add(item)
 
+    def close(self, complete: bool) -> None:
+        """Put everything in its place, with the reason if nothing was located."""
+        self._counts.note_unplaced()
+        super().close(complete)
+
 
 class PipelineRecorder(RunRecorder[FrameResult]):
     """The folder of `dddas run`: tables, overlay, log, and where targets are located maps and a report of them."""
@@ -227,6 +233,8 @@ class PipelineRecorder(RunRecorder[FrameResult]):
 
     def close(self, complete: bool) -> None:
         """Put everything in its place; a run that locates nothing removes the files of an earlier one that did."""
+        if self._locations is not None:
+            self._locations.note_unplaced()
         super().close(complete)
         if self._locations is None:
             for name in set(PipelineRecorder.files) - set(self.found_files):
@@ -253,10 +261,10 @@ def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
 class _LocationCounts:
     """Counts what is located from the air in a record.
 
-    positions: rows of positions.csv. by: frames by what gave the camera's pose, `nothing` for those not located.
-    weak: spans of frames that were located with something amiss. repairs: what was changed and why.
-    landmarks: of each, in how many frames it was seen, used, and left out of those located; and the spans of frames in
-    which it was reassigned or excluded.
+    positions: rows of positions.csv. unplaced: targets of located frames that have none. by: frames by what gave the
+    camera's pose, `nothing` for those not located. weak: spans of frames that were located with something amiss.
+    repairs: what was changed and why. landmarks: of each, in how many frames it was seen, used, and left out of those
+    located; and the spans of frames in which it was reassigned or excluded.
     """
 
     def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
@@ -265,6 +273,7 @@ class _LocationCounts:
         self._weak, self._repairs = Spans(), Spans()
         record.counts |= {
             "positions": 0,
+            "unplaced": 0,
             "by": dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0),
             "landmarks": {n: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for n in names},
             "weak": self._weak.rows,
@@ -276,6 +285,7 @@ class _LocationCounts:
         record, frame, fix = self._record, located.frame, located.fix
         counts, before = record.counts, record.last_frame
         counts["positions"] += len(located.positions)
+        counts["unplaced"] += (len(located.box_px) - len(located.positions)) * bool(fix.by)
         counts["by"][fix.by or "nothing"] += 1
         for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
             landmark = counts["landmarks"][self._names[which]]
@@ -294,6 +304,22 @@ class _LocationCounts:
             self._repairs.add(frame, before, change)
         cause = None if fix.by else fix.cause or NO_POSE
         record.note(frame, len(located.box_px), located.seconds, located.adjustments, cause)
+
+    def note_unplaced(self) -> None:
+        """Note targets without a place, and why nothing was located; call it at the end of the run."""
+        record, counts = self._record, self._record.counts
+        if unplaced := counts["unplaced"]:
+            record.notes.append(
+                f"{unplaced} boxes of located frames have no place: they lie above the horizon or too near it, or off "
+                "the known ground"
+            )
+        if counts["positions"] == 0:
+            causes = Counter[str]()
+            for span in record.unreliable.rows:
+                causes[span["cause"]] += span["last"] - span["first"] + 1
+            by_nothing = counts["by"]["nothing"] > 0 and causes
+            reason = causes.most_common(1)[0][0] if by_nothing else "no target was found"
+            record.notes.append(f"0 located, because {'none has a place' if unplaced else reason}")
 
 
 def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:

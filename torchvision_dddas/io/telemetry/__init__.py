@@ -11,7 +11,7 @@ from pathlib import Path
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.autopilots import MAGIC, looks_like_tlog, read_tlog, read_ulog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
-from torchvision_dddas.io.telemetry.tables import read_telemetry_table
+from torchvision_dddas.io.telemetry.tables import parse_time_zone, read_telemetry_table
 from torchvision_dddas.io.telemetry.text_logs import read_nmea, read_subtitles
 from torchvision_dddas.types import Telemetry
 
@@ -25,14 +25,18 @@ _OTHERS = {
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
 
-def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Path | None = None) -> Telemetry:
+def read_telemetry(
+    path: str | Path, clock_offset_s: float = 0.0, clip: str | Path | None = None, time_zone: str = ""
+) -> Telemetry:
     """What a vehicle reports of itself. clock_offset_s: added to its times to get those since the clip's first frame.
 
-    clip: the video that it belongs to; of use for a table that counts frames instead of telling times.
+    clip: the video that it belongs to; of use for a table that counts frames instead of telling times. time_zone: of
+    dates that say none, a name of the IANA data base or hours from UTC; "" leaves their clock unknown.
     Raises InputError in one line where the file cannot be read or nothing in it can be used. What can be read of a
     damaged file is returned, and its notes say what could not.
     """
     path, clip = Path(path), Path(clip) if clip is not None else None
+    zone = parse_time_zone(time_zone)
     try:
         with path.open("rb") as file:
             head = file.read(4096)
@@ -54,9 +58,9 @@ def read_telemetry(path: str | Path, clock_offset_s: float = 0.0, clip: str | Pa
     if text is not None and re.search(r"\$[A-Z]{2}[A-Z]{3},", text):
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
-        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s)
+        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s, zone)
     if suffix == ".csv" or (text is not None and "," in text):
-        return read_telemetry_table(path, clock_offset_s, clip)
+        return read_telemetry_table(path, clock_offset_s, clip, zone)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
     known = (words for mark, words in _OTHERS.items() if mark in head[:12])

@@ -108,13 +108,16 @@ def build_record(
         columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic)
         if np.isfinite(columns["speed_m_s"]).any():
             log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
+    others: dict[str, Any] = {
+        name: columns.get(name, unknown) for name in (*_TURNING, "above_sea_m", "pitch_rad", "hfov_rad")
+    }
     return Telemetry(
         times + clock_offset_s,
         columns.get("altitude_m", unknown),
         columns.get("speed_m_s", unknown),
         place,
         geographic,
-        **{name: columns.get(name, unknown) for name in (*_TURNING, "above_sea_m", "pitch_rad", "hfov_rad")},
+        **others,
         start_utc_s=float(start_utc_s + start - clock_offset_s),
         origin=f"{log.path.name} ({log.kind})",
         notes=tuple(log.notes),

@@ -2,9 +2,10 @@
 
 import math
 import re
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from functools import cache
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -46,8 +47,8 @@ SCHEMA = Schema(
 )
 
 
-def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None) -> Telemetry:
-    """Read an own table, which has a column time_s, or that of another program.
+def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None, zone: tzinfo | None = None) -> Telemetry:
+    """Read an own table, which has a column time_s, or that of another program. zone: of dates that say none.
 
     Raises InputError with file and line: as read_table, no rows, half a place, a time before the one above it.
     """
@@ -55,7 +56,7 @@ def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None) -
     names = {_plain(name)[0] for name in text.header}
     if "time_s" in text.header or not (names & (_TIMES | {"frame"}) and names & set(QUANTITY)):
         return _read_own(path, text, clock_offset_s)
-    return _read_program_table(Log(path, "flight log table"), text, clock_offset_s, clip)
+    return _read_program_table(Log(path, "flight log table"), text, clock_offset_s, clip, zone)
 
 
 def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
@@ -154,6 +155,30 @@ def parse_date(text: str) -> tuple[float, bool] | None:
     return seconds, bool(zone)
 
 
+def parse_time_zone(text: str) -> tzinfo | None:
+    """The zone of a name, Europe/Berlin, or of hours from UTC, +02:00; None for "". Raises InputError otherwise."""
+    text = text.strip()
+    if not text:
+        return None
+    if found := re.fullmatch(r"([+-])(\d{1,2})(?::?([0-5]\d))?", text):
+        away = timedelta(hours=int(found[2]), minutes=int(found[3] or 0))
+        if away < timedelta(hours=24):
+            return timezone(-away if found[1] == "-" else away)
+    try:
+        return ZoneInfo(text)
+    except (KeyError, ValueError, OSError):
+        raise InputError(
+            f"aerial.time_zone '{text[:40]}' is not known; wanted a name such as Europe/Berlin, or hours from UTC such "
+            "as +02:00"
+        ) from None
+
+
+def to_utc(local_s: float, zone: tzinfo) -> float:
+    """Seconds since 1970 of a date in a time zone that `parse_date` has taken for UTC."""
+    moment = datetime.fromtimestamp(local_s, UTC).replace(tzinfo=zone)
+    return local_s - (moment.utcoffset() or timedelta()).total_seconds()
+
+
 def hfov_of_focal(focal_text: str, fnum_text: str, zoom_text: str) -> float | None:
     """Width of the field of view, rad, from a focal length as that of a 36 mm wide picture; None if it is none.
 
@@ -187,7 +212,9 @@ def _plain(name: str) -> tuple[str, str]:
     return re.sub(r"[\s_-]|^osd\.|(?<=^gimbal)\.", "", name.lower()), unit.lower()
 
 
-def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Path | None) -> Telemetry:
+def _read_program_table(
+    log: Log, text: CsvText, clock_offset_s: float, clip: Path | None, zone: tzinfo | None
+) -> Telemetry:
     """Rows at dates, times of day, numbers of seconds, or frames of a clip.
 
     Raises InputError with the line for a time that is none, and where frames are counted and no clip is given.
@@ -235,6 +262,8 @@ def _read_program_table(log: Log, text: CsvText, clock_offset_s: float, clip: Pa
             log.note("the field of view is that of a focal length for a picture 36 mm wide")
     if not log.moments:
         raise InputError(f"telemetry {log.path} has a header but no rows")
+    if not is_zoned and zone is not None and parse_date(text.rows[0][clock]) is not None:
+        first, is_zoned = to_utc(first, zone), True
     return build_record(log, clock_offset_s, first if is_zoned else math.nan)
 
 

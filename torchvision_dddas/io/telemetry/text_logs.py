@@ -2,7 +2,7 @@
 
 import math
 import re
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.record import Log, build_record
-from torchvision_dddas.io.telemetry.tables import convert, hfov_of_focal, parse_date, quantity_of
+from torchvision_dddas.io.telemetry.tables import convert, hfov_of_focal, parse_date, quantity_of, to_utc
 from torchvision_dddas.types import Telemetry
 
 Numbers = list[tuple[float, str]]
@@ -28,8 +28,11 @@ _OPTICS = ("focal_len", "fnum", "dzoom_ratio")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 
 
-def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
-    """Raises InputError without any position, height or attitude, or if times decrease."""
+def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | None = None) -> Telemetry:
+    """zone: of dates that say none.
+
+    Raises InputError without any position, height or attitude, or if times decrease.
+    """
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     subtitles = _subtitles(text)
     tuples = [_tuples(words) for *_, words in subtitles]
@@ -51,8 +54,10 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         for name, value in values.items():
             log.add(name, time_s, value, line)
     _note_lacking(log, lacking, subtitles[-1][0] if subtitles else 0, len(subtitles))
-    if not is_zoned and math.isfinite(first_s):
-        log.note("the dates are in an unknown time zone, so the clock is not known")
+    if not is_zoned and zone is not None and math.isfinite(first_s):
+        first_s, is_zoned = to_utc(first_s, zone), True
+    elif not is_zoned and math.isfinite(first_s):
+        log.note("the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it")
     return build_record(log, clock_offset_s, first_s - log.moments[0][0] if is_zoned and log.moments else math.nan)
 
 
