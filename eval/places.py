@@ -1,7 +1,8 @@
-"""Places of people on real data: distances from the ground, people as landmarks.
+"""Places of people on real data: distances from the ground, people as landmarks; and places by telemetry alone.
 
 python eval/places.py ranging DATA      distances to people against world positions of PETS09-S2L1 and TUD-Stadtmitte
 python eval/places.py landmarks DATA    people of known place as moving landmarks, the others located
+python eval/places.py telemetry         targets located by telemetry alone, simulated; no data needed
 
 DATA is a folder of MOTChallenge 2015 sequences whose gt.txt has world metres in columns 8 to 10. PETS comes with its
 camera (Tsai); that of TUD is fitted to the true feet and their world positions. The world positions of both were made
@@ -21,16 +22,27 @@ import bench
 import numpy as np
 from clips import truth_of
 from geo_error import flight_of, inside_ellipses
-from geo_scene import ALTITUDE_SIGMA, FOCAL_SIGMA, HEADING_SIGMA, POSITION_SIGMA_M, TILT_SIGMA, looking, turned
+from geo_scene import (
+    ALTITUDE_SIGMA,
+    CAMERA,
+    FOCAL_SIGMA,
+    HEADING_SIGMA,
+    POSITION_SIGMA_M,
+    SIZE_PX,
+    TILT_SIGMA,
+    looking,
+    turned,
+)
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from torchvision_dddas.config import GroundParameters, Settings, with_parameters
+from torchvision_dddas.config import AerialParameters, GroundParameters, Settings, load_config, with_parameters
 from torchvision_dddas.evaluation.metrics.boxes import iou
+from torchvision_dddas.geo import AerialLocator
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.types import Camera, Flight, LandmarkObservations, Poses, Sightings
+from torchvision_dddas.types import Camera, Flight, LandmarkObservations, Poses, Sightings, Telemetry, Tracks
 
 SIZES = {"PETS09-S2L1": (768, 576), "TUD-Stadtmitte": (640, 480)}
 RATE_HZ = {"PETS09-S2L1": 7.0, "TUD-Stadtmitte": 25.0}
@@ -320,9 +332,79 @@ def locate_others(
     return np.array(far), np.array(inside)
 
 
+# -- telemetry alone -------------------------------------------------------------------------------------------------
+
+ERRORS = {"consumer drone (default)": None, "rtk": "rtk", "cheap": "cheap"}
+"""Whose errors the telemetry has, and the configuration that says so."""
+VIEWS_DEG, ALTITUDES_M = (90, 60, 45, 30), (40.0, 120.0)
+TARGETS = 12
+"""Targets of a flight, anywhere in the picture."""
+
+
+def measure_telemetry(options: bench.Options) -> tuple[str, Any]:
+    """Errors of targets located by telemetry alone, whose errors are drawn as the parameters say they are.
+
+    Each flight has errors of its own, common to its targets; pixels err by 1 px.
+    """
+    rows = []
+    for name, config in ERRORS.items():
+        settings = load_config(config)
+        for height in ALTITUDES_M:
+            for pitch in VIEWS_DEG:
+                found = [
+                    fly_once(np.random.default_rng([seed, pitch, int(height)]), height, np.radians(pitch), settings)
+                    for seed in range(options.seeds)
+                ]
+                off, within = (np.concatenate(part) for part in zip(*found, strict=True))
+                there = off[np.isfinite(off)]
+                cells = [f"{100 * len(there) / len(off):.0f} %", f"{np.median(there):.2f}"]
+                cells += [f"{np.quantile(there, 0.95):.2f}", f"{100 * np.nanmean(within):.1f} %"]
+                rows.append([name, f"{height:.0f} m, {pitch}°", *cells])
+                bench.log(*rows[-1])
+    head = ["errors of", "above ground, below the horizon", "placed", "median m", "95 % below", "in 95 % ellipses"]
+    return bench.format_table(head, rows, words=2), {"seeds": options.seeds, "rows": rows}
+
+
+def fly_once(
+    rng: np.random.Generator, height_m: float, pitch_rad: float, settings: Settings
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the targets of one picture in metres, NaN where there is no place, and whether ellipses hold them."""
+    sigma, count = settings.aerial, TARGETS
+    heading = np.array(rng.uniform(0, 2 * np.pi))
+    axes = looking(heading, np.array(pitch_rad), np.array(0.0))
+    shown = rng.uniform((0, 0), SIZE_PX, (count, 2))
+    share = np.exp(rng.normal(0, sigma.focal_sigma))
+    flat = (shown - CAMERA.centre_px) / (np.array(CAMERA.focal_px) * share)
+    way = np.c_[flat, np.ones(count)] @ axes.T
+    true_m = np.where(way[:, 2:] < -0.01, way[:, :2] / -way[:, 2:], np.nan) * height_m
+    said = draw_flight(rng, axes, np.array([0.0, 0.0, height_m]), sigma)
+    one = np.ones(2)
+    telemetry = Telemetry(
+        np.array([0.0, 1.0]), said.altitude_m * one, 0 * one, np.tile(said.place, (2, 1)), False,
+        heading_rad=said.heading_rad * one, pitch_rad=said.pitch_rad * one, roll_rad=said.roll_rad * one,
+    )  # fmt: skip
+    box = np.c_[shown + rng.normal(0, sigma.target_sigma_px, (count, 2)) - 2, np.full((count, 2), 5.0)]
+    settings = with_parameters(settings, {"aerial.point": "centre", "aerial.own_sigma": 0.0})
+    tracks = Tracks(1, np.arange(1, count + 1), box, np.ones(count), np.arange(count))
+    found = AerialLocator(CAMERA, telemetry, settings=settings).locate(tracks)
+    off, within = np.full(count, np.nan), np.full(count, np.nan)
+    away = found.positions.east_north_m - true_m[found.row]
+    off[found.row], within[found.row] = np.linalg.norm(away, axis=1), inside_ellipses(away, found.relative_m2)
+    return off, within
+
+
+def draw_flight(rng: np.random.Generator, axes: np.ndarray, place: np.ndarray, sigma: AerialParameters) -> Flight:
+    """What the telemetry of a camera says, with the errors that the parameters give it."""
+    tilt, heading = np.radians((sigma.tilt_sigma_deg, sigma.heading_sigma_deg))
+    up = np.hypot(sigma.altitude_sigma * place[2], sigma.altitude_sigma_m)
+    shift = rng.normal(0, (sigma.position_sigma_m, sigma.position_sigma_m, up))
+    return flight_of(turned(rng.normal(0, (tilt, tilt, heading))) @ axes, place + shift)
+
+
 if __name__ == "__main__":
     studies = {
         "ranging": (measure_ranging, {"data": Path}),
         "landmarks": (measure_landmarks, {"data": Path, "--seeds": 10, "--every": 1}),
+        "telemetry": (measure_telemetry, {"--seeds": 400}),
     }
     bench.main(__doc__, studies)

@@ -667,13 +667,15 @@ def load_config(
 ) -> Settings:
     """The defaults, changed by base, then by a TOML file and then by `group.parameter=value` overrides.
 
-    config: the name of a shipped configuration (`source`, `fast`) or a TOML file. base: `{"group.parameter": value}`.
+    config: the name of a shipped configuration (`source`, `fast`), a TOML file, or several between commas, of which a
+    later one overrides those before. base: `{"group.parameter": value}`.
     Raises InputError with one line: no such file, bad TOML, unknown parameter (with the nearest names), value out of
     range.
     """
     settings = with_parameters(Settings(), base or {})
-    if config is not None:
-        path = _config_file(config)
+    several = isinstance(config, str) and "," in config and not is_file(Path(config))
+    for one in str(config).split(",") if several else [] if config is None else [config]:
+        path = _config_file(one)
         settings = with_parameters(settings, _flat(read_toml(path), str(path)), origin=str(path))
     return with_parameters(settings, dict(parse_override(text) for text in overrides))
 

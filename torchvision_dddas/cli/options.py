@@ -26,7 +26,10 @@ class Backend(StrEnum):
 
 CLIP = "A video file, a folder or glob of images, camera:0 or rtsp://..."
 
-Config = Annotated[str | None, typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration.")]
+Config = Annotated[
+    str | None,
+    typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration; several between commas."),
+]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="PARAMETER=VALUE", help="Change a parameter; may be repeated.")
 ]

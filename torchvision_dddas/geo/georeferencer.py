@@ -44,6 +44,8 @@ _KEPT_LIKELIHOOD = 0.95
 # No single frame counts against a hypothesis by more than this: a report may jump.
 _MOST_EVIDENCE = 15.0
 _POSE_PARTS = np.array(["heading", "heading", "heading", "place", "place", "altitude", "focal length"])
+# What a camera's file calls them.
+_KEYS = {"heading": "heading_deg", "altitude": "height_m or takeoff_above_sea_m", "pitch": "pitch_deg"}
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
 """Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
@@ -407,7 +409,11 @@ def describe_unknown_pose(flight: Flight | None, prior: Prior | None) -> str:
     lacking = list(dict.fromkeys(_POSE_PARTS[~prior.known].tolist()))
     if not np.isfinite(flight.pitch_rad):
         lacking.append("pitch")
-    return f"the telemetry does not say the camera's {', '.join(lacking)}" if lacking else ""
+    if not lacking:
+        return ""
+    keys = ", ".join(_KEYS[part] for part in lacking if part in _KEYS)
+    helped = f"; {keys} in the camera's file (--camera) can" if keys else ""
+    return f"the telemetry does not say the camera's {', '.join(lacking)}{helped}"
 
 
 def _describe_refusal(frame: int, prior: Prior | None, marks: LandmarkObservations, least_spread: float) -> str:

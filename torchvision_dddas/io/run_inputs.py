@@ -93,7 +93,8 @@ def prepare_run(
             given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
         )
         landmarks = locator.site.landmarks
-        check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
+        if given.landmarks is not None:
+            check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
         if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
             notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
         watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)

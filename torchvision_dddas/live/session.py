@@ -3,14 +3,16 @@
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.io.atomic_files import cannot_write
-from torchvision_dddas.io.output import RESULTS, Event, SessionLog, make_session_folder
+from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
 from torchvision_dddas.io.sources import without_secrets
 from torchvision_dddas.io.streams import About, Stream, open_streams
@@ -31,7 +33,7 @@ from torchvision_dddas.people import PersonTracker, load_scorer
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
-from torchvision_dddas.types import Adjustment, Frame
+from torchvision_dddas.types import Adjustment, Frame, FrameResult
 
 INTERRUPTED = 130
 """Exit code of a session that Ctrl-C ended; its outputs are valid."""
@@ -83,18 +85,19 @@ def run_live(
 
         folder = make_session_folder(out)
         streams = _open(opened, [f"json:{folder / RESULTS}"], about, health, live, "--out") + streams
-        facts = {
+        facts: dict[str, Any] = {
             "input": without_secrets(clip),
             "telemetry": telemetry,
             "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
             "interval_frames": interval,
             "people": people,
             "backend": ready.engine.name,
-            "notes": ready.notes,
+            "notes": list(ready.notes),
         }
         if given is not None and ready.watch is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
-        log = SessionLog(folder, {**facts, "settings": ready.settings.model_dump()})
+        facts["settings"] = ready.settings.model_dump()
+        log = SessionLog(folder, facts)
         stack.callback(log.close)
         status = StatusWriter(health, log, streams, live.status_s)
         if not quiet:
@@ -122,9 +125,10 @@ def run_live(
         supervisor.say("READY=1")
         if not quiet:
             _print_start(source, folder, server, ready.notes)
-        failure = ""
+        failure, tally = "", _Located()
         try:
             for result in results(begin, feed, health):
+                tally.add(result[0])
                 about.start_utc_s = source.start_utc_s
                 send_result(result, streams, health)
                 record_result(result, feed, health, live.deadline_ms)
@@ -132,6 +136,9 @@ def run_live(
         except RepeatedFailure as error:
             failure, status.state = str(error), "failed"
             health.event("run", failure)
+        if ready.watch is not None and not tally.located:
+            facts["notes"].append(tally.describe())
+            health.event("locate", tally.describe())
         supervisor.say("STOPPING=1")
         opened.close()
     if not quiet:
@@ -141,6 +148,28 @@ def run_live(
     if failure:
         return HUNG
     return INTERRUPTED if signals.signal == signal.SIGINT else 0
+
+
+class _Located:
+    """Counts the targets that were located, and why others were not."""
+
+    def __init__(self) -> None:
+        self.located = self._unplaced = 0
+        self._causes = Counter[str]()
+
+    def add(self, result: FrameResult) -> None:
+        """Count a frame."""
+        if (found := result.locations) is None:
+            return
+        self.located += len(found.positions)
+        if found.fix.by:
+            self._unplaced += len(found.box_px) - len(found.positions)
+        else:
+            self._causes[found.fix.cause] += 1
+
+    def describe(self) -> str:
+        """Why nothing was located, in words."""
+        return describe_nothing_located(self._causes, self._unplaced)
 
 
 def build_path(

@@ -18,6 +18,7 @@ from torchvision_dddas.io.output.run_record import (
     RunRecord,
     SessionLog,
     clip_facts,
+    describe_nothing_located,
     finite,
     make_session_folder,
 )
@@ -44,6 +45,7 @@ __all__ = [
     "Site",
     "TrackRecorder",
     "clip_facts",
+    "describe_nothing_located",
     "finite",
     "make_session_folder",
     "parse_save",

@@ -12,7 +12,7 @@ from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
 from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder
 from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
-from torchvision_dddas.io.output.run_record import NO_POSE, RUN_JSON, RunRecord, Spans
+from torchvision_dddas.io.output.run_record import NO_POSE, RUN_JSON, RunRecord, Spans, describe_nothing_located
 from torchvision_dddas.io.output.run_report import REPORT
 from torchvision_dddas.io.overlay import LIKELY, RunPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
@@ -317,9 +317,7 @@ class _LocationCounts:
             causes = Counter[str]()
             for span in record.unreliable.rows:
                 causes[span["cause"]] += span["last"] - span["first"] + 1
-            by_nothing = counts["by"]["nothing"] > 0 and causes
-            reason = causes.most_common(1)[0][0] if by_nothing else "no target was found"
-            record.notes.append(f"0 located, because {'none has a place' if unplaced else reason}")
+            record.notes.append(describe_nothing_located(causes, unplaced))
 
 
 def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:

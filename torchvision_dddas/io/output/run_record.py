@@ -74,6 +74,20 @@ class Spans:
             self.rows.append(row)
 
 
+def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
+    """Why a run that locates targets has no position, in words.
+
+    causes: of frames that were not located, with their number. unplaced: targets without a place in the others.
+    """
+    if unplaced:
+        reason = "all targets lie above the horizon or too near it, or off the known ground"
+    elif causes:
+        reason = max(causes, key=lambda cause: causes[cause])
+    else:
+        reason = "no target was found"
+    return f"0 located, because {reason}"
+
+
 class RunRecord:
     """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
 
