@@ -232,3 +232,47 @@ def test_an_altitude_below_the_ground_for_a_while_is_reported_and_not_used(locat
 def test_boxes_far_outside_the_cameras_pictures_are_reported(located):
     _, said = located(FLIGHT, table=TRACKS + "10,9,3000,100,20,20,1,-1,-1,-1\n")
     assert "note: 1 of 41 boxes lie far outside the camera's pictures of 1280 x 720 px" in said
+
+
+ALONE = {"landmarks": None}
+
+
+def test_telemetry_alone_locates_every_target_without_a_warning(located, tmp_path):
+    flight = Overflight(geographic=False, pitch_deg=60)
+    found, said = located(flight, **ALONE)
+    assert len(found) == 40 and {row["by"] for row in found} == {"telemetry"}
+    assert np.hypot(*np.diff([[float(r["east_m"]), float(r["north_m"])] for r in found[:2]], axis=0)[0]) > 10
+    assert flight.errors(found).max() < 0.01
+    assert "located with a warning" not in said and "0 located" not in said
+    assert record(tmp_path / "out")["by"]["telemetry"] == 10
+
+
+def test_what_the_log_lacks_comes_from_the_cameras_file(located, tmp_path):
+    flight = Overflight(geographic=False, pitch_deg=60)
+    lines = [line.split(",") for line in flight.telemetry_csv().splitlines()]
+    bare = "\n".join(",".join(line[:5]) for line in lines) + "\n"  # neither heading, pitch nor roll
+    angles = f"heading_deg = {np.degrees(flight.heading_rad)}\npitch_deg = 60\nroll_deg = 0\n"
+    found, said = located(flight, telemetry=bare, camera=flight.camera_toml() + angles, **ALONE)
+    assert flight.errors(found).max() < 0.01
+    assert "note: the log does not say pitch_deg: it is that of camera c, 60" in said
+    nothing, said = located(flight, telemetry=bare, **ALONE)
+    cause = "0 located, because the telemetry does not say the camera's heading, pitch; heading_deg, pitch_deg in"
+    assert nothing == [] and f"note: {cause}" in said
+    assert any(note.startswith(cause) for note in record(tmp_path / "out")["notes"])
+
+
+def test_boxes_above_the_horizon_have_no_row_and_are_counted(located, tmp_path):
+    flight = Overflight(geographic=False, pitch_deg=15)
+    table = flight.tracks_txt() + "".join(f"{frame},9,600,2,20,20,1,-1,-1,-1\n" for frame in flight.numbers())
+    found, said = located(flight, table=table, **ALONE)
+    assert {row["target"] for row in found} == {"1", "2", "3", "4"}
+    assert "note: 10 boxes of located frames have no place: they lie above the horizon" in said
+    assert record(tmp_path / "out")["unplaced"] == 10
+
+
+def test_locating_needs_telemetry_or_landmarks_and_a_key_that_no_camera_has_is_refused(aerial):
+    assert "needs --telemetry FILE or --landmarks FILE" in bad(aerial(Overflight(), telemetry=None, **ALONE))
+    wrong = Overflight().camera_toml() + "pich_deg = 45\n"
+    assert "has the key pich_deg, which no camera has; did you mean pitch_deg?" in bad(
+        aerial(Overflight(), camera=wrong, **ALONE)
+    )

@@ -191,3 +191,41 @@ def test_a_grey_clip_is_refused_where_landmarks_are_found_by_colour(dddas, flown
     command, _, *words = given(flown)
     assert "the clip is grey" in bad(dddas(command, tmp_path / "grey", *words, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+def alone(folder, *more, telemetry="telemetry.csv"):
+    """The words of a run with telemetry and without landmarks."""
+    return ["run", folder / "clip", "--rate", RATE_HZ, "--telemetry", folder / telemetry, *FLAT, *more]
+
+
+def test_a_clip_and_a_log_alone_give_places_maps_and_a_picture_without_a_bar_of_landmarks(dddas, flown, tmp_path):
+    words = alone(flown, "--camera", flown / "camera.toml", "--config", "fast", "--save", "map,report")
+    result = dddas(*words, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    found = rows(tmp_path / "positions.csv")
+    assert {row["by"] for row in found} == {"telemetry"} and "longitude_deg" in found[0]
+    assert {"tracks.geojson", "map.png", "report.html"} <= set(names(tmp_path))
+    assert "0 of 0" not in result.stdout and "located with a warning" not in result.stdout
+    kept = record(tmp_path)
+    assert kept["positions"] == len(found) > 20 and kept["by"]["telemetry"] == FLIGHT.frames
+    assert kept["telemetry"].endswith("telemetry.csv") and kept["landmarks_file"] is None
+
+
+def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_record(dddas, flown, tmp_path):
+    lines = [line.split(",") for line in FLIGHT.telemetry_csv().splitlines()]
+    (flown / "bare.csv").write_text("\n".join(",".join(line[:5]) for line in lines) + "\n")
+    (flown / "placeless.csv").write_text("\n".join(",".join(line[:2]) for line in lines) + "\n")
+    for name, cause in (("bare.csv", "the camera's heading, pitch"), ("placeless.csv", "holds no place")):
+        out = tmp_path / name
+        words = alone(flown, "--config", "fast", "--save", "report", telemetry=name)
+        result = dddas(*words, "--out", out)
+        assert result.exit_code == 0, result.output
+        assert "note: 0 located, because the telemetry" in result.stdout and cause in result.stdout
+        assert any("0 located, because" in note and cause in note for note in record(out)["notes"])
+        page = (out / "report.html").read_text()
+        assert "0 located, because the telemetry" in page
+
+
+def test_the_telemetry_of_detect_is_any_log(dddas):
+    told = dddas("detect", "--help").output
+    assert ".SRT" in told and "--telemetry" in told and "CSV  " not in told.split("--telemetry")[1][:20]

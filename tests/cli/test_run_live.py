@@ -128,3 +128,22 @@ def test_a_password_in_an_address_is_written_nowhere():
     assert without_secrets("rtsp://me:secret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
     assert without_secrets("rtsp://me:s@cret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
     assert without_secrets("frames/a@b") == "frames/a@b"
+
+
+@pytest.mark.parametrize("pitch_deg", [60.0, None])
+def test_a_session_locates_by_telemetry_alone_or_says_why_not(dddas, frames, tmp_path, pitch_deg):
+    angle = "" if pitch_deg is None else f",{pitch_deg}"
+    lines = ["time_s,altitude_m,speed_m_s,east_m,north_m,heading_deg" + (",pitch_deg" if angle else "")]
+    lines += [f"{k / 10},15,1,{k / 10},0,20{angle}" for k in range(FRAMES + 1)]
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join(lines) + "\n")
+    done = dddas("run", frames, *FAST, "--rate", "10", "--telemetry", log, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    _, record, results = session(tmp_path / "out")
+    placed = [t for line in results for t in line["targets"] if t.get("east_north_m") is not None]
+    if pitch_deg is not None:
+        assert placed and not any("0 located" in note for note in record["notes"])
+    else:
+        cause = "0 located, because the telemetry does not say the camera's pitch"
+        assert not placed and any(note.startswith(cause) for note in record["notes"])
+        assert cause in done.stderr

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry import read_telemetry
 
 KEYED = (
@@ -157,3 +158,34 @@ def test_a_file_of_no_use_is_refused_in_one_line(refused, text, words):
 def test_the_kind_of_a_file_goes_by_its_content_not_its_name(fly):
     assert fly(timed(KEYED.format(n=1, ms=0)), "telemetry.txt").altitude_m.tolist() == [5.4]
     assert fly("time_s,altitude_m\n0,20\n", "telemetry.txt").altitude_m.tolist() == [20]
+
+
+LOCAL = """1
+00:00:00,000 --> 00:00:01,000
+2024-07-01 14:00:00.500
+[latitude: 52.500000] [longitude: 13.400000] [rel_alt: 30.000 abs_alt: 70.000] </font>
+
+2
+00:00:01,000 --> 00:00:02,000
+2024-07-01 14:00:01.500
+[latitude: 52.500010] [longitude: 13.400000] [rel_alt: 30.000 abs_alt: 70.000] </font>
+"""
+NOON_UTC_S = 1719835200.5  # 2024-07-01 12:00:00.5 UTC
+
+
+@pytest.mark.parametrize("zone", ["Europe/Berlin", "+02:00", "+0200", "+2"])
+def test_a_time_zone_tells_the_clock_of_a_log_in_local_time(fly, zone):
+    assert np.isnan(fly(LOCAL, "clip.SRT").start_utc_s)
+    told = fly(LOCAL, "clip.SRT", time_zone=zone)
+    assert told.start_utc_s == pytest.approx(NOON_UTC_S)
+    assert not any("time zone" in note for note in told.notes)
+    table = "time,latitude,longitude,rel_alt\n2024-07-01 14:00:00.5,52.5,13.4,30\n2024-07-01 14:00:01.5,52.5,13.4,30\n"
+    assert fly(table, time_zone=zone).start_utc_s == pytest.approx(NOON_UTC_S)
+    # A date that says its zone keeps it.
+    assert fly(table.replace(".5,52", ".5Z,52"), time_zone=zone).start_utc_s == pytest.approx(NOON_UTC_S + 7200)
+
+
+@pytest.mark.parametrize("zone", ["Mars/Olympus", "+25:00", "../etc/passwd", "+02:75"])
+def test_a_time_zone_that_does_not_exist_is_refused_in_one_line(fly, zone):
+    with pytest.raises(InputError, match=r"aerial\.time_zone .* is not known; wanted a name such as Europe/Berlin"):
+        fly(LOCAL, "clip.SRT", time_zone=zone)

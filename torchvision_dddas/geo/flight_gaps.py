@@ -99,7 +99,8 @@ def course_over_ground(
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """The direction flown, rad clockwise from north, and the standard deviation of its fit; NaN where not straight.
 
-    A line is fitted to the places about each time; the scatter of the places about it says how sure its direction is.
+    A line is fitted to the places about each time; their scatter about it, and how far apart they are, say how sure its
+    direction is.
     """
     course, sigma = np.full((2, len(time_s)), np.nan)
     rows = np.flatnonzero(np.isfinite(place_m).all(axis=1))
@@ -129,7 +130,11 @@ def _fit_course(time: np.ndarray, place: np.ndarray) -> tuple[float, float] | No
     bend = apart**2 - spread / len(time)
     turn_rad_s = 2 * float(bend @ across) / float(bend @ bend) / speed
     scatter = float(across @ across) / max(len(time) - 2, 1)
-    sigma = math.sqrt(scatter / spread) / speed
+    # Rounded places jump: how the vehicle went between two of them is not known.
+    jumps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    length, jump = speed * float(np.ptp(time)), float(jumps.max())
+    rounding = (jump / length) ** 1.5
+    sigma = math.hypot(math.sqrt(scatter / spread) / speed, rounding)
     if sigma > _SURE_RAD or abs(turn_rad_s) * float(np.ptp(time)) > _STRAIGHT_RAD:
         return None
     return float(np.arctan2(velocity[0], velocity[1]) % (2 * math.pi)), sigma

@@ -148,7 +148,7 @@ def ground_with_slopes(
     far, normal = _meet_ground(pose.place_m, way, np.broadcast_to(np.asarray(up_m, float), len(way)), surface)
     offset = far[:, None] * way
     # A change of the ray or of its start moves the place where it meets the ground along the ground.
-    steep = (way * normal).sum(axis=1)
+    steep = np.where(np.isfinite(far), (way * normal).sum(axis=1), np.nan)
     along = (np.eye(3) - way[:, :, None] * normal[:, None, :] / steep[:, None, None])[:, :2]
     by_lift = far[:, None, None] * along @ pose.axes[:, :2]
     by_pose = np.empty((len(way), 2, 7))
