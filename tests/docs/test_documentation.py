@@ -1,15 +1,20 @@
 """The README and the pages under docs/ hold: commands, links, files and examples exist and run."""
 
+import csv
 import re
 import shlex
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.overflight import ORIGIN, Overflight, pictures
 from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
+from torchvision_dddas.geometry import lonlat
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
@@ -80,12 +85,52 @@ def test_the_python_examples_run_one_after_another(page: str, demo_folder: Path,
 def test_the_camera_and_the_configuration_of_the_commands_page_can_be_read(tmp_path: Path) -> None:
     from torchvision_dddas.io.camera_files import describe_missing, read_camera
 
-    own, camera = blocks("commands.md", "toml")
+    own, _, camera = blocks("commands.md", "toml")
     (tmp_path / "own.toml").write_text(own)
     assert load_config(tmp_path / "own.toml").gates.min_area_px == 80
     (tmp_path / "ugv.toml").write_text(camera)
     assert read_camera(tmp_path / "ugv.toml").geographic
     assert describe_missing(tmp_path / "ugv.toml") == ""
+
+
+def test_the_path_of_a_drones_log_alone_can_be_followed(tmp_path: Path, monkeypatch) -> None:
+    """The commands of that section run one after another, on a clip and a log that says neither angles nor lens."""
+    section = PAGES["commands.md"].split("## A drone's log alone")[1].split("\n## ")[0]
+    flight = Overflight(frames=16, size=(640, 360), focal_px=457.0, height_m=45.0, heading_rad=0.1, pitch_deg=55)
+    monkeypatch.chdir(tmp_path)
+    film = cv2.VideoWriter("clip.mp4", cv2.VideoWriter.fourcc(*"mp4v"), flight.rate_hz, flight.size)
+    subtitles = []
+    for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
+        film.write(picture)
+        (longitude, latitude), second = lonlat(flight.vehicle(frame)[None, :2], ORIGIN)[0], flight.time(frame)
+        subtitles.append(
+            f"{frame}\n00:00:{second:06.3f} --> 00:00:{second + 0.1:06.3f}\n2024-07-01 14:00:{second:06.3f}\n"
+            f"[latitude: {latitude:.7f}] [longitude: {longitude:.7f}] [rel_alt: 45.000 abs_alt: 79.000]\n\n"
+        )
+    film.release()
+    Path("flight.srt").write_text("".join(subtitles))
+    (angles,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
+    Path("drone.toml").write_text(angles)
+    lines = [line.partition("#")[0] for line in section.split("```sh\n")[1].split("```")[0].splitlines()]
+    said = []
+    for line in lines:
+        result = CliRunner().invoke(app, shlex.split(line)[1:])
+        assert result.exit_code == 0, result.output
+        said.append(result.stdout)
+    assert "0 located, because the telemetry does not say the camera's heading, pitch" in said[0]
+    assert not [words for words in said[1:] if "0 located" in words]
+    assert "clock" not in said[2] and (tmp_path / "rtk/tracks.cot.xml").exists()
+    with (tmp_path / "dddas-positions/positions.csv").open() as table:
+        found = list(csv.DictReader(table))
+    # The origin of both is the vehicle's first place.
+    missed = [
+        np.linalg.norm(
+            flight.targets(int(row["frame"])) - flight.vehicle(1)[:2] - (float(row["east_m"]), float(row["north_m"])),
+            axis=1,
+        ).min()
+        for row in found
+    ]
+    assert len(found) > 20 and np.median(missed) < 3.0
 
 
 def test_the_readme_is_short_and_its_picture_small() -> None:

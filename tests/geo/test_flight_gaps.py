@@ -1,6 +1,7 @@
 """What a log lacks of the camera's pose comes from the camera's file, the vehicle's nose, or the course it flew."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ PARAMETERS = AerialParameters()
 def log(place=None, **said):
     """A log of a flight to the east at 5 m/s that says a height of 50 m and nothing of the camera."""
     place = np.c_[5.0 * TIME, 0 * TIME] if place is None else place
-    columns = {name: np.full(len(TIME), value) for name, value in said.items()}
+    columns: dict[str, Any] = {name: np.full(len(TIME), value) for name, value in said.items()}
     return Telemetry(TIME, columns.pop("altitude_m", np.full(len(TIME), 50.0)), 5 + 0 * TIME, place, False, **columns)
 
 
@@ -60,6 +61,7 @@ def test_a_log_without_a_heading_takes_the_file_then_the_nose_then_the_course():
     ):
         filled, notes = fill_gaps(telemetry, camera, PARAMETERS)
         middle = filled.at(20.0)
+        assert middle is not None
         assert np.degrees(middle.heading_rad) == pytest.approx(heading_deg, abs=0.1)
         assert middle.heading_from == source
         if source:

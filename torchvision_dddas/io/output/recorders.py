@@ -194,6 +194,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         """Start the run. rate_hz, size: of the overlay, (width, height). site: None if nothing is located."""
         folder, save = self.folder, self.save
         names = () if site is None else site.names
+        self._has_landmarks = bool(names)
         pictures = RunPictures(size, names)
         self.story = RunStory(folder, names, pictures if "report" in save else None, site is not None)
         parts: dict[str, Part[FrameResult]] = {}
@@ -203,7 +204,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             parts |= {
                 "maps": PartOf(maps, _locations),
                 "positions": PartOf(tables.aerial_tables(folder, has_degrees), _locations),
-                "landmarks": tables.landmark_table(folder, names, has_degrees),
+                **({"landmarks": tables.landmark_table(folder, names, has_degrees)} if names else {}),
                 "confirmed": tables.ConfirmedPositions(folder, has_degrees),
             }
         parts |= {
@@ -232,13 +233,15 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place; a run that locates nothing removes the files of an earlier one that did."""
+        """Put everything in its place; removes files of an earlier run that this one has not."""
         if self._locations is not None:
             self._locations.note_unplaced()
         super().close(complete)
-        if self._locations is None:
-            for name in set(PipelineRecorder.files) - set(self.found_files):
-                remove(self.folder / name)
+        unused = set(PipelineRecorder.files) - set(self.found_files) if self._locations is None else set()
+        if not self._has_landmarks:
+            unused.add("landmarks.csv")
+        for name in unused:
+            remove(self.folder / name)
 
 
 def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:

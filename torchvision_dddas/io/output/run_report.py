@@ -109,7 +109,7 @@ def location_tables(record: RunRecord) -> list[Table]:
         ("Frames located with something amiss", ("frames", "by", "cause"), weak, "none"),
         ("Repairs and exclusions", ("frames", "what and why"), rows(counts["repairs"], "cause"), "none"),
         ("Adjustments of the feedback loop", ("frame", "parameter", "from", "to", "cause"), adjustments, "none"),
-        ("Landmarks", columns, landmarks, "none"),
+        *([("Landmarks", columns, landmarks, "none")] if landmarks else []),
     ]
 
 
