@@ -254,7 +254,7 @@ def test_what_the_log_lacks_comes_from_the_cameras_file(located, tmp_path):
     angles = f"heading_deg = {np.degrees(flight.heading_rad)}\npitch_deg = 60\nroll_deg = 0\n"
     found, said = located(flight, telemetry=bare, camera=flight.camera_toml() + angles, **ALONE)
     assert flight.errors(found).max() < 0.01
-    assert "note: the log does not say pitch_deg: it is that of camera c, 60" in said
+    assert "note: the log does not say heading_deg, pitch_deg, roll_deg: they are taken from camera c" in said
     nothing, said = located(flight, telemetry=bare, **ALONE)
     cause = "0 located, because the telemetry does not say the camera's heading, pitch; heading_deg, pitch_deg in"
     assert nothing == [] and f"note: {cause}" in said

@@ -26,72 +26,78 @@ def fill_gaps(
     all times, and from takeoff_above_sea_m heights above the sea become heights above ground. has_ground: whether the
     ground's heights are known, which heights above the sea are counted from then.
     """
-    filled, notes, unused = dict[str, object](), list[str](), list[str]()
-    count = len(telemetry)
+    notes = list[str]()
+    if camera is not None:
+        telemetry, used = _take_from_camera(telemetry, camera, has_ground)
+        if used:
+            words = "it is taken" if len(used) == 1 else "they are taken"
+            notes.append(f"the log does not say {', '.join(used)}: {words} from camera {camera.name}")
+        if unused := [key for key in known_keys(camera) if key not in used]:
+            notes.append(f"camera {camera.name}: {', '.join(unused)} not used, because the log says it")
+        if any(camera.place):
+            notes.append(f"the place of camera {camera.name} is not used: it is that of the vehicle")
+    if _lacks(telemetry, "heading_rad"):
+        telemetry, more = _take_heading(telemetry, parameters)
+        notes += more
+    return telemetry, notes
 
-    def lacks(name: str) -> bool:
-        return not np.isfinite(getattr(telemetry, name)).any()
 
-    def give(name: str, value: float, sigma_name: str = "", sigma: float = math.nan) -> None:
+def known_keys(camera: Camera) -> list[str]:
+    """What a camera's file says of the pose of a camera in the air, by its keys."""
+    names = ("heading_rad", "pitch_rad", "roll_rad", "height_m", "takeoff_above_sea_m")
+    return [name.replace("_rad", "_deg") for name in names if camera.knows(name)]
+
+
+def _lacks(telemetry: Telemetry, name: str) -> bool:
+    return not np.isfinite(getattr(telemetry, name)).any()
+
+
+def _take_from_camera(telemetry: Telemetry, camera: Camera, has_ground: bool) -> tuple[Telemetry, list[str]]:
+    """Telemetry with what the camera's file says and the log does not, and the keys that were used."""
+    filled, used = dict[str, np.ndarray](), list[str]()
+    count, known = len(telemetry), known_keys(camera)
+
+    def give(key: str, name: str, value: float, sigma_name: str = "", sigma_from: str = "") -> None:
+        used.append(key)
         filled[name] = np.full(count, value)
         if sigma_name:
+            sigma = getattr(camera, sigma_from) if camera.knows(sigma_from) else math.nan
             filled[sigma_name] = np.full(count, sigma)
 
-    def sigma_of(camera: Camera, name: str) -> float:
-        return float(getattr(camera, name)) if camera.knows(name) else math.nan
-
-    above_sea = not lacks("above_sea_m")
-    for name, sigma_name, to in (
-        ("heading_rad", "heading_sigma_rad", "heading_sigma_rad"),
-        ("pitch_rad", "pitch_sigma_rad", "tilt_sigma_rad"),
-        ("roll_rad", "", ""),
-    ):
-        if camera is None or not camera.knows(name):
-            continue
-        key = name.replace("_rad", "_deg")
-        if not lacks(name):
-            unused.append(key)
-            continue
-        give(name, getattr(camera, name), to, sigma_of(camera, sigma_name) if to else math.nan)
-        notes.append(f"the log does not say {key}: it is that of camera {camera.name}, {_degrees(camera, name):g}")
-    if camera is not None and camera.knows("takeoff_above_sea_m"):
-        if lacks("altitude_m") and above_sea and not has_ground:
+    if "heading_deg" in known and _lacks(telemetry, "heading_rad"):
+        give("heading_deg", "heading_rad", camera.heading_rad, "heading_sigma_rad", "heading_sigma_rad")
+    if "pitch_deg" in known and _lacks(telemetry, "pitch_rad"):
+        give("pitch_deg", "pitch_rad", camera.pitch_rad, "tilt_sigma_rad", "pitch_sigma_rad")
+    if "roll_deg" in known and _lacks(telemetry, "roll_rad"):
+        give("roll_deg", "roll_rad", camera.roll_rad)
+    above_sea = not _lacks(telemetry, "above_sea_m")
+    if _lacks(telemetry, "altitude_m") and not (above_sea and has_ground):
+        if "takeoff_above_sea_m" in known and above_sea:
+            used.append("takeoff_above_sea_m")
             filled["altitude_m"] = telemetry.above_sea_m - camera.takeoff_above_sea_m
-            notes.append(f"the altitude is that above the take-off, {camera.takeoff_above_sea_m:g} m above the sea")
-        else:
-            unused.append("takeoff_above_sea_m")
-    if camera is not None and camera.knows("height_m"):
-        if lacks("altitude_m") and "altitude_m" not in filled and not (above_sea and has_ground):
-            give("altitude_m", camera.height_m, "altitude_sigma_m", sigma_of(camera, "height_sigma_m"))
-            notes.append(f"the log does not say the altitude: it is height_m of camera {camera.name}")
-        else:
-            unused.append("height_m")
-    if camera is not None and unused:
-        notes.append(f"camera {camera.name}: {', '.join(unused)} not used, because the log says it")
-    if lacks("heading_rad") and "heading_rad" not in filled:
-        sigma_rad = math.radians(parameters.course_sigma_deg)
-        if not lacks("vehicle_heading_rad"):
-            filled |= {"heading_rad": telemetry.vehicle_heading_rad, "heading_from": NOSE}
-            filled["heading_sigma_rad"] = np.full(count, sigma_rad)
-            notes.append(
-                "the log does not say the camera's heading: that of the vehicle's nose is taken, with a sigma of "
-                f"{parameters.course_sigma_deg:g} degrees (aerial.course_sigma_deg)"
-            )
-        else:
-            course_rad, fit_rad = course_over_ground(telemetry.time_s, telemetry.place)
-            if (known := np.isfinite(course_rad)).any():
-                filled |= {"heading_rad": course_rad, "heading_from": COURSE}
-                filled["heading_sigma_rad"] = np.hypot(fit_rad, sigma_rad)
-                notes.append(
-                    "the log does not say the heading: it is the course over ground where that is straight, in "
-                    f"{100 * known.mean():.0f} % of the samples, with a sigma of {parameters.course_sigma_deg:g} "
-                    "degrees or more (aerial.course_sigma_deg)"
-                )
-    return replace(telemetry, **filled), notes  # type: ignore[arg-type]
+        elif "height_m" in known:
+            give("height_m", "altitude_m", camera.height_m, "altitude_sigma_m", "height_sigma_m")
+    return replace(telemetry, **filled), used  # type: ignore[arg-type]
 
 
-def _degrees(camera: Camera, name: str) -> float:
-    return round(math.degrees(getattr(camera, name)), 3)
+def _take_heading(telemetry: Telemetry, parameters: AerialParameters) -> tuple[Telemetry, list[str]]:
+    """Telemetry with the heading of the vehicle's nose or of its course, and a note."""
+    sigma_rad = math.radians(parameters.course_sigma_deg)
+    with_sigma = f"with a sigma of {parameters.course_sigma_deg:g} degrees"
+    if not _lacks(telemetry, "vehicle_heading_rad"):
+        heading_rad, sigma, source = telemetry.vehicle_heading_rad, np.full(len(telemetry), sigma_rad), NOSE
+        note = f"that of the vehicle's nose is taken, {with_sigma} (aerial.course_sigma_deg)"
+    else:
+        heading_rad, fit_rad = course_over_ground(telemetry.time_s, telemetry.place)
+        sigma, source, known = np.hypot(fit_rad, sigma_rad), COURSE, np.isfinite(heading_rad)
+        if not known.any():
+            return telemetry, []
+        note = (
+            f"the course over ground is taken where it is straight, in {100 * known.mean():.0f} % of the samples, "
+            f"{with_sigma} or more (aerial.course_sigma_deg)"
+        )
+    filled = replace(telemetry, heading_rad=heading_rad, heading_sigma_rad=sigma, heading_from=source)
+    return filled, [f"the log does not say the camera's heading: {note}"]
 
 
 def course_over_ground(

@@ -9,7 +9,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.flight_gaps import fill_gaps
+from torchvision_dddas.geo.flight_gaps import fill_gaps, known_keys
 from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
@@ -115,7 +115,8 @@ def has_places(telemetry: Telemetry | None) -> bool:
 def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tuple[Site, list[str]]:
     """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes."""
     if site.telemetry is None:
-        return site, []
+        keys = [] if camera is None else known_keys(camera)
+        return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
     telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, site.elevation is not None)
     return replace(site, telemetry=telemetry), notes
 
@@ -206,8 +207,6 @@ def resolve_camera(
                 f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
                 f"{size[0]} x {size[1]}; give the camera's file for this size"
             )
-        if math.isfinite(camera.height_m) and telemetry is None:
-            notes.append(f"the place of camera {camera.name} is not used from the air: give --telemetry")
         if parameters.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         # A value set by hand overrides the file.
