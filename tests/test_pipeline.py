@@ -1,5 +1,6 @@
 """The public classes over whole clips: the pipeline on frames, and locating by records alone."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,15 @@ def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))
     assert all(r.locations is not None and r.locations.fix.by == "telemetry" for r in results)
+
+
+def test_a_pipeline_takes_what_the_telemetry_lacks_from_the_camera(frames):
+    blind = replace(DOWN, heading_rad=np.full(2, np.nan), pitch_rad=np.full(2, np.nan))
+    bare = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
+    for camera, by in ((bare, ""), (replace(bare, heading_rad=1.0, pitch_rad=1.2), "telemetry")):
+        pipeline = Pipeline("fast", telemetry=blind, camera=camera)
+        assert {result.locations.fix.by for result in pipeline(frames) if result.locations is not None} == {by}
+    assert any("heading_deg, pitch_deg" in note for note in pipeline.notes)
 
 
 WRONG: Any = "flight.csv"  # where a record is wanted

@@ -2,11 +2,13 @@
 
 import weakref
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
+from tests.overflight import Overflight, pictures
 from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import MotionDetector, detect_motion
@@ -176,6 +178,22 @@ def test_the_interval_adapts_to_the_telemetry_and_the_change_is_recorded(film):
     assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
     assert "altitude 100.0 m" in moved.cause
     assert [a.frame for s in scenes for a in s.adjustments if a.parameter == "gates.max_size_px"] == [1, 9]
+
+
+@pytest.mark.slow
+def test_slow_small_targets_seen_aslant_from_low_are_found_with_telemetry_as_without():
+    """From 40 m at 45 degrees; by the altitude alone the search for them is off, and a fifth is found."""
+    flown = Overflight(
+        frames=30, size=(960, 540), focal_px=1000.0, height_m=40.0, heading_rad=0.1, pace=0.35, pitch_deg=45
+    )
+    images = list(pictures(flown))
+    log = replace(flight(np.arange(31) / 10, 40.0), speed_m_s=np.full(31, 1.5))
+    aslant = replace(log, pitch_rad=np.full(31, np.radians(45.0)))
+    found = [
+        sum(len(scene.detections) for scene in detect_motion(Film(images), load_config(), "onboard", telemetry))
+        for telemetry in (None, aslant, log)
+    ]
+    assert found[1] > 0.9 * found[0] and found[2] < 0.5 * found[0]
 
 
 def test_targets_outside_the_gates_of_the_altitude_are_left_out(noise):
