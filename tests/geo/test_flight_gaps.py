@@ -68,6 +68,8 @@ def test_a_log_without_a_heading_takes_the_file_then_the_nose_then_the_course():
             assert np.degrees(middle.heading_sigma_rad) == pytest.approx(10.0, abs=0.5)
             assert any("sigma of 10 degrees" in note for note in notes)
     assert "camera drone: heading_deg not used, because the log says it" in notes
+    with_landmarks, _ = fill_gaps(log(), None, PARAMETERS, has_landmarks=True)
+    assert np.isnan(with_landmarks.heading_rad).all()
 
 
 def test_heights_above_the_sea_are_counted_from_the_take_off_of_the_cameras_file():

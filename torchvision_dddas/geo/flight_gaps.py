@@ -18,13 +18,18 @@ _LEAST_M_S, _SURE_RAD, _STRAIGHT_RAD = 2.0, math.radians(5.0), math.radians(10.0
 
 
 def fill_gaps(
-    telemetry: Telemetry, camera: Camera | None, parameters: AerialParameters, has_ground: bool = False
+    telemetry: Telemetry,
+    camera: Camera | None,
+    parameters: AerialParameters,
+    has_ground: bool = False,
+    has_landmarks: bool = False,
 ) -> tuple[Telemetry, list[str]]:
     """The telemetry, completed where it never says a quantity, and what the user should know of that.
 
     telemetry: in local metres. camera: as its file says; its heading_rad, pitch_rad, roll_rad and height_m stand for
     all times, and from takeoff_above_sea_m heights above the sea become heights above ground. has_ground: whether the
-    ground's heights are known, which heights above the sea are counted from then.
+    ground's heights are known, which heights above the sea are counted from then. has_landmarks: these tell the heading
+    better than the nose or the course of the vehicle.
     """
     notes = list[str]()
     if camera is not None:
@@ -36,7 +41,7 @@ def fill_gaps(
             notes.append(f"camera {camera.name}: {', '.join(unused)} not used, because the log says it")
         if any(camera.place):
             notes.append(f"the place of camera {camera.name} is not used: it is that of the vehicle")
-    if _lacks(telemetry, "heading_rad"):
+    if _lacks(telemetry, "heading_rad") and not has_landmarks:
         telemetry, more = _take_heading(telemetry, parameters)
         notes += more
     return telemetry, notes

@@ -117,7 +117,8 @@ def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tupl
     if site.telemetry is None:
         keys = [] if camera is None else known_keys(camera)
         return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
-    telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, site.elevation is not None)
+    has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
+    telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, has_ground, has_landmarks)
     return replace(site, telemetry=telemetry), notes
 
 
