@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from torchvision_dddas.io import overlay
 from torchvision_dddas.io.overlay import (
     CUT,
     PERSON,
@@ -21,7 +22,20 @@ from torchvision_dddas.io.overlay import (
     identity_colour,
 )
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo, ThreadedWriter
-from torchvision_dddas.types import Detections, Frame, FrameResult, People, PeopleFrame, Scene, TrackedFrame, Tracks
+from torchvision_dddas.types import (
+    AerialLocations,
+    Detections,
+    Fix,
+    Frame,
+    FrameResult,
+    LandmarkObservations,
+    People,
+    PeopleFrame,
+    Positions,
+    Scene,
+    TrackedFrame,
+    Tracks,
+)
 
 SIZE = (120, 90)
 
@@ -229,3 +243,18 @@ def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
     with pytest.raises(OSError, match="full"):
         last.close()
     assert last.closed
+
+
+@pytest.mark.parametrize(("states", "said"), [((), ""), (("used", "excluded"), "1 of 2 landmarks, ")])
+def test_the_caption_of_a_located_frame_counts_landmarks_only_where_there_are_any(monkeypatch, states, said):
+    written = []
+    monkeypatch.setattr(overlay, "_caption", lambda picture, *lines: written.extend(text for text, _ in lines))
+    fix = Fix(1, "telemetry", landmark=np.arange(len(states)), state=states)
+    located = AerialLocations(
+        1, 0.0, Positions(), np.zeros(0, int), np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros((0, 4)), fix,
+        LandmarkObservations(),
+    )  # fmt: skip
+    frame = Frame(1, 0.0, image())
+    tracked = TrackedFrame(1, frame, Detections(), Tracks(1))
+    RunPictures(SIZE)(FrameResult(tracked, located))
+    assert f"located by telemetry, {said}0 targets" in written

@@ -107,10 +107,10 @@ def run(
         return
     if scene or seed is not None:
         raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
-    if landmarks is None and telemetry is None:
-        _refuse(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
     if landmarks is None:
         _refuse({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
+    if landmarks is None and telemetry is None:
+        _refuse(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
     given = None
     if landmarks is not None or telemetry is not None:
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
