@@ -247,7 +247,7 @@ def test_an_error_is_raised_by_the_next_call_or_at_the_latest_at_the_end():
 
 @pytest.mark.parametrize(("states", "said"), [((), ""), (("used", "excluded"), "1 of 2 landmarks, ")])
 def test_the_caption_of_a_located_frame_counts_landmarks_only_where_there_are_any(monkeypatch, states, said):
-    written = []
+    written = list[str]()
     monkeypatch.setattr(overlay, "_caption", lambda picture, *lines: written.extend(text for text, _ in lines))
     fix = Fix(1, "telemetry", landmark=np.arange(len(states)), state=states)
     located = AerialLocations(
