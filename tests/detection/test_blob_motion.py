@@ -6,8 +6,8 @@ import pytest
 
 from torchvision_dddas.detection.blob_motion import (
     DenseFlow,
-    blob_motion,
     find_second_motion,
+    measure_motions,
     split_by_flow,
 )
 
@@ -30,7 +30,7 @@ def textured(shift: tuple[int, int]) -> np.ndarray:
 def test_the_velocity_of_a_textured_box_is_measured(velocity, box_blob):
     u, v = velocity
     measured = DenseFlow()(textured((0, 0)), [textured((-2 * u, -2 * v)), textured((2 * u, 2 * v))])
-    motion = blob_motion(box_blob(BOX), measured, (-2, 2))
+    (motion,) = measure_motions([box_blob(BOX)], measured, (-2, 2))
     np.testing.assert_allclose(motion.velocity_px, velocity, atol=0.3)
     assert motion.steady > 0.7
 
@@ -44,13 +44,13 @@ def flows(inside: float, ground: float) -> list[np.ndarray]:
 
 
 def test_a_blob_that_moves_with_its_surroundings_is_not_steady(box_blob):
-    assert blob_motion(box_blob(BOX), flows(6, 0), (-2, 2)).steady == 1
-    assert blob_motion(box_blob(BOX), flows(6, 6), (-2, 2)).steady == 0
+    assert measure_motions([box_blob(BOX)], flows(6, 0), (-2, 2))[0].steady == 1
+    assert measure_motions([box_blob(BOX)], flows(6, 6), (-2, 2))[0].steady == 0
 
 
 @pytest.mark.parametrize("box", [(0, 0, 9, 7), (151, 113, 9, 7), (0, 0, 160, 120), (77, 50, 1, 1)])
 def test_blobs_at_the_border_or_of_one_pixel_have_finite_or_unknown_motion(box, box_blob):
-    motion = blob_motion(box_blob(box), flows(1, 0), (-1, 1))
+    (motion,) = measure_motions([box_blob(box)], flows(1, 0), (-1, 1))
     assert 0 <= motion.steady <= 1
     assert np.isfinite(motion.velocity_px).all() or np.isnan(motion.velocity_px).all()
 
@@ -96,7 +96,10 @@ def test_a_blob_is_split_along_the_seam_and_keeps_every_pixel(corner, size, box_
     seam = corner[0] // 2 + 20
     field[:, :seam], field[:, seam:] = (3, 0), (-3, 0)
     blob = box_blob((*corner, *size))
-    left, right = sorted(split_by_flow(blob, [2 * field, -2 * field], (2, -2)), key=lambda part: part.box[0])
+    there_and_back, offsets = [2 * field, -2 * field], (2, -2)
+    (motion,) = measure_motions([blob], there_and_back, offsets)
+    parts = split_by_flow(blob, motion, there_and_back, offsets)
+    left, right = sorted(parts, key=lambda part: part.box[0])
     assert left.box[:2] == corner
     assert left.box[0] + left.box[2] == pytest.approx(corner[0] + 40, abs=3)
     assert left.area_px + right.area_px == blob.area_px

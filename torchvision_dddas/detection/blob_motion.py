@@ -37,13 +37,15 @@ class Motion:
 
     velocity_px: (2,) pixels a frame, NaN where unknown. steady: share of its core that moves alike to both neighbours
     and unlike its surroundings. frame: centre_u, centre_v, scale. affine: for each neighbour (3, 2), the displacement
-    affine[0] + affine[1] (u - centre_u) / scale + affine[2] (v - centre_v) / scale in pixels.
+    affine[0] + affine[1] (u - centre_u) / scale + affine[2] (v - centre_v) / scale in pixels. missed: share of its core
+    whose motion that does not explain.
     """
 
     velocity_px: np.ndarray
     steady: float = 0.0
     affine: tuple[np.ndarray, np.ndarray] = (_NO_AFFINE, _NO_AFFINE)
     frame: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    missed: float = 0.0
 
 
 class DenseFlow:
@@ -65,70 +67,126 @@ class DenseFlow:
         return [2 * self._search.calc(small, picture, np.zeros((*small.shape, 2), np.float32)) for picture in pictures]
 
 
-def blob_motion(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> Motion:
-    """The motion of one blob from two flow fields (half resolution) to frames that are `offsets` away."""
+def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Motion]:
+    """The motion of each blob from two flow fields (half resolution) to frames that are `offsets` away."""
+    if not blobs:
+        return []
+    # Of every blob the places of its core that are sampled, in shares of its size, and their displacements.
+    places, valid = np.zeros((len(blobs), 2, _SAMPLES)), np.zeros((len(blobs), _SAMPLES))
+    displacements = np.zeros((len(blobs), 2, _SAMPLES, 2))
+    frames, steady = [(0.0, 0.0, 1.0)] * len(blobs), np.zeros(len(blobs))
+    for i, blob in enumerate(blobs):
+        (left, top), body, core = _at_half(blob, flows[0].shape[:2])
+        row, column = np.nonzero(core)
+        if not len(row):
+            continue
+        near = [flow[top : top + core.shape[0], left : left + core.shape[1]] for flow in flows]
+        steady[i] = _steady_share(near, body, (row, column), offsets)
+        sample = np.arange(min(len(row), _SAMPLES)) * len(row) // min(len(row), _SAMPLES)
+        u, v = 2 * (left + column[sample]) + 0.5, 2 * (top + row[sample]) + 0.5
+        centre_u, centre_v, scale = frames[i] = (float(u.mean()), float(v.mean()), float(max(blob.box[2:])))
+        places[i, 0, : len(u)], places[i, 1, : len(u)] = (u - centre_u) / scale, (v - centre_v) / scale
+        displacements[i, :, : len(u)] = [flow[row[sample], column[sample]] for flow in near]
+        valid[i, : len(u)] = 1
+    fits = fit_robust_affine(places[:, None], displacements, valid[:, None])
+    per_frame = np.array([1 / offset for offset in offsets])[:, None, None] / 2
+    motion, velocities = (fits * per_frame).sum(axis=1), (displacements * per_frame).sum(axis=1)
+    missed = _miss(_columns(places), velocities, motion) > _clear_miss(motion)[:, None]
+    missed_share = (missed * valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
+    motion[valid.sum(axis=1) == 0] = np.nan
+    return [
+        Motion(motion[i, 0], float(steady[i]), (fits[i, 0], fits[i, 1]), frames[i], float(missed_share[i]))
+        for i in range(len(blobs))
+    ]
+
+
+def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
+    """The blob at half resolution with its surroundings: (left, top), and (H, W) uint8 masks of all of it and its core.
+
+    shape: (rows, columns) of the half picture. Where no pixel of the core is left, the core is all of the blob.
+    """
     x, y, width, height = blob.box
-    (rows, columns), far = flows[0].shape[:2], _RING_FAR_PX
+    (rows, columns), far = shape, _RING_FAR_PX
     top, left = max(y // 2 - far, 0), max(x // 2 - far, 0)
     bottom, right = min((y + height) // 2 + far, rows), min((x + width) // 2 + far, columns)
-    near = [flow[top:bottom, left:right] for flow in flows]
-
-    def at_half(mask: np.ndarray) -> np.ndarray:
-        """A mask of the box at half resolution, in the window of `near`."""
-        inside = np.zeros((bottom - top, right - left), bool)
-        row, column = np.nonzero(mask[y % 2 :: 2, x % 2 :: 2])
-        row, column = row + (y + 1) // 2 - top, column + (x + 1) // 2 - left
-        fits = (row < inside.shape[0]) & (column < inside.shape[1])
-        inside[row[fits], column[fits]] = True
-        return inside
-
-    body, core = at_half(blob.mask), at_half(blob.core)
-    core = core if core.any() else body
-    if not core.any():
-        return Motion(np.full(2, np.nan), frame=(float(x), float(y), 1.0))
-    a, b = near[0] / offsets[0], near[1] / offsets[1]
-    outer, inner = (
-        cv2.dilate(body.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) for reach in (far, _RING_NEAR_PX)
-    )
-    ring = outer > inner
-    mean = (a + b) / 2
-    around = np.median(mean[ring], axis=0) if ring.any() else np.zeros(2)
-    v = mean[core]
-    speed = np.maximum(np.linalg.norm(v, axis=1), 0.15)
-    alike = np.linalg.norm(a[core] - b[core], axis=1) < _STEADY * speed
-    unlike = np.linalg.norm(v - around, axis=1) > _UNLIKE * speed
-    steady = float((alike & unlike & (speed > _MIN_SPEED_PX)).mean())
-    places = np.argwhere(core)
-    row, column = places[:: max(1, len(places) // _SAMPLES)].T
-    centre_u, centre_v = 2 * (left + column.mean()) + 0.5, 2 * (top + row.mean()) + 0.5
-    scale = float(max(width, height))
-    u, w = (2 * (left + column) + 0.5 - centre_u) / scale, (2 * (top + row) + 0.5 - centre_v) / scale
-    first, second = (fit_robust_affine(u, w, flow[row, column]) for flow in near)
-    velocity = (first[0] / offsets[0] + second[0] / offsets[1]) / 2
-    return Motion(velocity, steady, (first, second), (centre_u, centre_v, scale))
+    masks = np.zeros((2, bottom - top, right - left), np.uint8)
+    row, column = (y + 1) // 2 - top, (x + 1) // 2 - left
+    for mask, full in zip(masks, (blob.mask, blob.core), strict=True):
+        part = full[y % 2 :: 2, x % 2 :: 2][: max(len(mask) - row, 0), : max(mask.shape[1] - column, 0)]
+        mask[row : row + part.shape[0], column : column + part.shape[1]] = part
+    body, core = masks
+    return (left, top), body, core if core.any() else body
 
 
-def fit_robust_affine(u: np.ndarray, v: np.ndarray, flow_px: np.ndarray, rounds: int = 5) -> np.ndarray:
-    """(3, 2) affine motion of (N,) places and (N, 2) displacements, by iteratively reweighted least squares."""
-    columns = np.stack([np.ones(len(u)), u, v], axis=1)
-    middle = len(flow_px) // 2
-    median = np.partition(flow_px, middle, axis=0)[middle]
-    weight = 1 / (1 + ((flow_px - median) ** 2).sum(axis=1) / max(1.0, 0.1 * float(median @ median)))
+def _steady_share(
+    near: Sequence[np.ndarray], body: np.ndarray, core: tuple[np.ndarray, np.ndarray], offsets: tuple[int, int]
+) -> float:
+    """Share of the core that moves alike to both neighbours and unlike the surroundings of the body.
+
+    near: the two flows, (H, W, 2). body: (H, W) uint8. core: rows and columns of its pixels.
+    """
+    outer, inner = (cv2.dilate(body, np.ones((2 * reach + 1,) * 2, np.uint8)) for reach in (_RING_FAR_PX, _RING_NEAR_PX))
+    ring = np.nonzero(outer > inner)
+    around = np.zeros(2, np.float32)
+    if count := len(ring[0]):
+        a, b = (flow[ring] / offset for flow, offset in zip(near, offsets, strict=True))
+        around = np.partition((a + b) / 2, count // 2, axis=0)[count // 2]
+    a, b = (flow[core] / offset for flow, offset in zip(near, offsets, strict=True))
+    v = (a + b) / 2
+    speed = np.maximum(_length(v), 0.15)
+    alike = _length(a - b) < _STEADY * speed
+    unlike = _length(v - around) > _UNLIKE * speed
+    return float((alike & unlike & (speed > _MIN_SPEED_PX)).mean())
+
+
+def fit_robust_affine(places: np.ndarray, flow_px: np.ndarray, valid: np.ndarray, rounds: int = 5) -> np.ndarray:
+    """(..., 3, 2) affine motions of (..., 2, N) places and (..., N, 2) displacements.
+
+    Iteratively reweighted least squares, all at once. valid: (..., N), 1 for the places that count and 0 for the rest.
+    """
+    columns = _columns(places)
+    # Half of the valid displacements are below their median.
+    ordered = np.sort(np.where(valid[..., None] > 0, flow_px, np.inf), axis=-2)
+    middle = (valid.sum(axis=-1).astype(int) // 2)[..., None, None]
+    median = np.take_along_axis(ordered, np.broadcast_to(middle, (*ordered.shape[:-2], 1, 2)), axis=-2)
+    median = np.where(np.isfinite(median), median, 0)
+    spread = np.maximum(1.0, 0.1 * (median**2).sum(axis=(-2, -1)))[..., None]
+    weight = valid / (1 + ((flow_px - median) ** 2).sum(axis=-1) / spread)
     fit = np.zeros((3, 2))
     for _ in range(rounds):
         before = fit
-        weighted = columns.T * weight
-        normal = weighted @ columns + _PULL * max(float(weight.sum()), 1e-9)
-        fit = np.linalg.solve(normal, weighted @ flow_px)
+        weighted = columns * weight[..., None, :]
+        pull = _PULL * np.maximum(weight.sum(axis=-1), 1e-9)[..., None, None]
+        fit = np.linalg.solve(weighted @ columns.swapaxes(-1, -2) + pull, weighted @ flow_px)
         if np.abs(fit - before).max() < _CONVERGED_PX:
             break
-        miss = flow_px - columns @ fit
-        weight = 1 / (1 + 2 * (miss[:, 0] ** 2 + miss[:, 1] ** 2))
+        weight = valid / (1 + 2 * _miss(columns, flow_px, fit) ** 2)
     return fit
 
 
-def split_by_flow(blob: Blob, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Blob]:
+def _columns(places: np.ndarray) -> np.ndarray:
+    """(..., 3, N): 1, u, v of (..., 2, N) places."""
+    return np.concatenate([np.ones_like(places[..., :1, :]), places], axis=-2)
+
+
+def _miss(columns: np.ndarray, flow_px: np.ndarray, affine: np.ndarray) -> np.ndarray:
+    """(..., N) by how much an affine motion misses each displacement."""
+    return _length(flow_px - columns.swapaxes(-1, -2) @ affine)
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)
+
+
+def _clear_miss(affine: np.ndarray) -> np.ndarray:
+    """(...) a displacement that an affine motion, (..., 3, 2), misses by more than this is not explained by it."""
+    return np.maximum(_CLEARLY_PX / 2, _CLEARLY / 2 * _length(affine[..., 0, :]))
+
+
+def split_by_flow(blob: Blob, motion: Motion, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Blob]:
     """The blob, or the two targets that touch in it, from two flow fields (half resolution) `offsets` frames away."""
+    if motion.missed < _MIN_SHARE:
+        return [blob]
     x, y, width, height = blob.box
     box = np.s_[y // 2 : (y + height + 1) // 2, x // 2 : (x + width + 1) // 2]
     velocity = (flows[0][box] / offsets[0] + flows[1][box] / offsets[1]) / 2
@@ -155,28 +213,24 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
     if len(row) < 40:
         return None
     scale = max(float(np.ptp(row)), float(np.ptp(column)), 1.0)
-    u, v = (column - column.mean()) / scale, (row - row.mean()) / scale
-    columns, flow = np.stack([np.ones(len(u)), u, v], axis=1), velocity_px[row, column]
+    places, flow = np.stack([column - column.mean(), row - row.mean()]) / scale, velocity_px[row, column]
     # The two motions are sought in a sample.
     sample = slice(None, None, max(1, len(row) // 1000))
-    some, some_flow = columns[sample], flow[sample]
-
-    def fit(which: np.ndarray) -> np.ndarray:
-        return fit_robust_affine(some[which, 1], some[which, 2], some_flow[which])
-
+    columns, some = _columns(places), places[:, sample]
+    some_columns, some_flow = columns[:, sample], flow[sample]
     # Plain least squares as well: the robust fit hardly follows a body that turns or grows.
-    for one in (fit(np.ones(len(some), bool)), np.linalg.lstsq(some, some_flow, rcond=None)[0]):
-        limit = max(_CLEARLY_PX / 2, _CLEARLY / 2 * float(np.linalg.norm(one[0])))
-        if (_miss(some, some_flow, one) > limit).mean() < _MIN_SHARE:
+    robust = fit_robust_affine(some, some_flow, np.ones(len(some_flow)))
+    for one in (robust, np.linalg.lstsq(some_columns.T, some_flow, rcond=None)[0]):
+        if (_miss(some_columns, some_flow, one) > _clear_miss(one)).mean() < _MIN_SHARE:
             return None
     second = _find_second_cluster(some_flow)
     for _ in range(_ROUNDS):
         if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
             return None
-        fits = fit(~second), fit(second)
-        first_miss, second_miss = (_miss(some, some_flow, one) for one in fits)
+        fits = fit_robust_affine(some, some_flow, np.stack([~second, second]).astype(float))
+        first_miss, second_miss = _miss(some_columns, some_flow, fits)
         second = second_miss < first_miss
-    misses = [_miss(columns, flow, one) for one in fits]
+    misses = _miss(columns, flow, fits)
     second = misses[1] < misses[0]
     if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
         return None
@@ -194,12 +248,6 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
         if (miss[chosen] < difference / 2).mean() < _EXPLAINED or largest < _ONE_PIECE:
             return None
     return part
-
-
-def _miss(columns: np.ndarray, flow_px: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """(N,) by how much an affine motion misses each displacement."""
-    across, down = (flow_px - columns @ affine).T
-    return np.hypot(across, down)
 
 
 def _find_second_cluster(flow_px: np.ndarray) -> np.ndarray:

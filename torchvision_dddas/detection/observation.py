@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings
-from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, blob_motion, split_by_flow
+from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, measure_motions, split_by_flow
 from torchvision_dddas.detection.blobs import (
     Blob,
     Box,
@@ -86,13 +86,16 @@ def observe(
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped)
+        motions = measure_motions(blobs, flows, foreground.offsets)
         if settings.history.on:
-            blobs = [part for blob in blobs for part in split_by_flow(blob, flows, foreground.offsets)]
-        motions = [blob_motion(blob, flows, foreground.offsets) for blob in blobs]
+            parts = [split_by_flow(*both, flows, foreground.offsets) for both in zip(blobs, motions, strict=True)]
+            if any(len(two) > 1 for two in parts):
+                blobs = [part for two in parts for part in two]
+                motions = measure_motions(blobs, flows, foreground.offsets)
     elif history is not None:
         history.add(foreground.core)
-        parts = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
-        blobs, motions = [blob for blob, _ in parts], [Motion(velocity_px) for _, velocity_px in parts]
+        ways = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
+        blobs, motions = [blob for blob, _ in ways], [Motion(velocity_px) for _, velocity_px in ways]
     return Observation(window, foreground, blobs, motions)
 
 

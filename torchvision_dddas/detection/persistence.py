@@ -27,8 +27,8 @@ _MEMORY_FRAMES = 30
 _LENGTHS, _LENGTHS_EACH = 0.25, 0.005
 
 
-Links = dict[tuple[int, int], int | None]
-"""The blob that continues blob i in the next (1) or last (-1) frame, by (i, 1) or (i, -1); None: there is none."""
+Links = dict[int, list[int | None]]
+"""Of every blob the one that continues it in the next (1) or last (-1) frame; None: there is none."""
 
 
 @dataclass(frozen=True)
@@ -96,30 +96,34 @@ def _follow(i: int, sightings: Sequence[Sighting], at: int, direction: int) -> i
     if not 0 <= at + direction < len(sightings):
         return None
     links = sightings[at].links
-    if (i, direction) not in links:
+    if direction not in links:
         step = sightings[at if direction > 0 else at - 1].next_from_this
-        links[i, direction] = _find_link(i, sightings[at], sightings[at + direction], step, direction)
-    return links[i, direction]
+        links[direction] = _find_links(sightings[at], sightings[at + direction], step, direction)
+    return links[direction][i]
 
 
-def _find_link(i: int, here: Sighting, there: Sighting, step: np.ndarray | None, direction: int) -> int | None:
+def _find_links(here: Sighting, there: Sighting, step: np.ndarray | None, direction: int) -> list[int | None]:
     if step is None or not there.blobs:
-        return None
-    blob, motion = here.blobs[i], here.motions[i]
+        return [None] * len(here.blobs)
     there_from_here = step if direction > 0 else np.linalg.inv(step)
-    areas, centres, sizes, velocities = there.columns
-    size, velocity = np.array(blob.box[2:]), np.nan_to_num(motion.velocity_px)
-    # Where it is by its own motion, and where it is if that was measured wrongly.
-    places = transfer(there_from_here, np.vstack([blob.centre_px + direction * velocity, blob.centre_px]))[:, None]
-    low, high = np.maximum(places - size / 2, centres - sizes / 2), np.minimum(places + size / 2, centres + sizes / 2)
-    both = np.prod(np.maximum(high - low, 0), axis=2)
-    overlap = (both / (np.prod(size) + np.prod(sizes, axis=1) - both)).max(axis=0)
-    away, unlike = centres - places[0], velocities - velocity
-    near = (np.hypot(*away.T) < 0.5 * np.hypot(*size)) & (np.hypot(*unlike.T) < _VELOCITY_PX)
-    ratio = areas / max(blob.area_px, 1)
+    areas, centres, sizes, velocities = (column[:, None] for column in here.columns)
+    other_areas, other_centres, other_sizes, other_velocities = there.columns
+    # Where they are by their own motion, and where they are if that was measured wrongly.
+    ahead = np.concatenate([centres + direction * velocities, centres], axis=1)
+    places = transfer(there_from_here, ahead.reshape(-1, 2)).reshape(-1, 2, 1, 2)
+    half, other_half = sizes[:, None] / 2, other_sizes / 2
+    low = np.maximum(places - half, other_centres - other_half)
+    high = np.minimum(places + half, other_centres + other_half)
+    both = np.prod(np.maximum(high - low, 0), axis=3)
+    either = (np.prod(sizes, axis=2) + np.prod(other_sizes, axis=1))[:, None] - both
+    overlap = (both / either).max(axis=1)
+    away, unlike = other_centres - places[:, 0], other_velocities - velocities
+    near = (np.hypot(*away.T).T < 0.5 * np.hypot(*sizes.T).T) & (np.hypot(*unlike.T).T < _VELOCITY_PX)
+    ratio = other_areas / np.maximum(areas, 1)
     fits = (ratio > 1 / _SIZE_RATIO) & (ratio < _SIZE_RATIO) & ((overlap >= _LEAST_IOU) | near)
-    best = int(np.argmax(np.where(fits, overlap, -1.0)))
-    return best if fits[best] else None
+    best = np.where(fits, overlap, -1.0).argmax(axis=1)
+    found = np.take_along_axis(fits, best[:, None], axis=1)[:, 0]
+    return [int(k) if is_found else None for k, is_found in zip(best, found, strict=True)]
 
 
 @dataclass
