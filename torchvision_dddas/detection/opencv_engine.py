@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import RegistrationParameters, Settings
+from torchvision_dddas.detection.blobs import halve_side
 from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, judge_points, match_exposure
 from torchvision_dddas.detection.opencv_foreground import find_foreground, no_texture
 from torchvision_dddas.geometry import transfer
@@ -24,8 +25,9 @@ from torchvision_dddas.types import Registration
 _WHOLE_FROM_HALF = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _HALF_FROM_WHOLE = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
 
-# The short search around a prediction: pyramid levels above the full resolution, and steps a level.
-_SHORT_LEVELS, _SHORT_STEPS = 1, 5
+# The short search around a prediction: pyramid levels above the full resolution. It takes as many steps as the deep one
+# if it needs them, which hardly any does: five at most made false targets of far parallax.
+_SHORT_LEVELS = 1
 # The window of the deep search from a cold start is at least this wide.
 _DEEP_WINDOW_PX = 21
 # Below this share of inliers a short step is done again, deep and from new keypoints.
@@ -94,7 +96,7 @@ def halve_window(window: Window) -> Window:
         reference=halve_view(window.reference),
         neighbours=tuple(halve_view(neighbour) for neighbour in window.neighbours),
         neighbour_from_reference=_HALF_FROM_WHOLE @ window.neighbour_from_reference @ _WHOLE_FROM_HALF,
-        close_px=_halve_side(window.close_px) if window.close_px else 0,
+        close_px=halve_side(window.close_px) if window.close_px else 0,
     )
 
 
@@ -102,20 +104,15 @@ def halve_settings(settings: Settings) -> Settings:
     """Settings of the difference whose lengths are those of the half picture, where slopes are twice as steep."""
     difference, morphology, small = settings.difference, settings.morphology, settings.small
     border_px, gradient_share = -(-difference.border_px // 2), difference.gradient_share / 2
-    sides = {"blur_px": _halve_side(difference.blur_px), "border_px": border_px, "gradient_share": gradient_share}
-    cleaning = {"erode_px": _halve_side(morphology.erode_px), "close_px": _halve_side(morphology.close_px)}
+    sides = {"blur_px": halve_side(difference.blur_px), "border_px": border_px, "gradient_share": gradient_share}
+    cleaning = {"erode_px": halve_side(morphology.erode_px), "close_px": halve_side(morphology.close_px)}
     return settings.model_copy(
         update={
             "difference": difference.model_copy(update=sides),
             "morphology": morphology.model_copy(update=cleaning),
-            "small": small.model_copy(update={"close_px": _halve_side(small.close_px)}),
+            "small": small.model_copy(update={"close_px": halve_side(small.close_px)}),
         }
     )
-
-
-def _halve_side(side: int) -> int:
-    """The odd side nearest to half of an odd one: 25 -> 13, 7 -> 3, 3 -> 1."""
-    return 2 * (side // 4) + 1
 
 
 def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foreground:
@@ -262,14 +259,14 @@ def track_both_ways(
 
     missed_px: (N,) of the start; 0 where the way back is left out. predicted: (3, 3), where to look first.
     """
-    levels, steps, side, flags = parameters.levels, parameters.iterations, parameters.window_px, 0
+    levels, side, flags = parameters.levels, parameters.window_px, 0
     guess: Any = None  # OpenCV's stubs know no None here
     if predicted is not None:
-        levels, steps, flags = min(levels, _SHORT_LEVELS), min(steps, _SHORT_STEPS), cv2.OPTFLOW_USE_INITIAL_FLOW
+        levels, flags = min(levels, _SHORT_LEVELS), cv2.OPTFLOW_USE_INITIAL_FLOW
         guess = transfer(predicted, start).astype(np.float32)
     elif parameters.redetect_frames > 1:
         side = max(side, _DEEP_WINDOW_PX)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, steps, parameters.epsilon_px)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, parameters.iterations, parameters.epsilon_px)
     search: dict[str, Any] = {"winSize": (side, side), "maxLevel": levels, "criteria": criteria, "flags": flags}
     end, found, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess, **search)
     tracked, missed_px = found.ravel() == 1, np.zeros(len(start))
