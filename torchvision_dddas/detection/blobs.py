@@ -72,6 +72,11 @@ def ellipse(side: int) -> np.ndarray:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
+def halve_side(side: int) -> int:
+    """The odd side nearest to half of an odd one: 25 -> 13, 7 -> 3, 3 -> 1."""
+    return 2 * (side // 4) + 1
+
+
 def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
     """Close a mask with an ellipse: the result of OpenCV bit for bit, computed only around set pixels."""
     if side <= 1:
@@ -147,10 +152,18 @@ def find_weak_blobs(
     min_area_px: int,
     peak: float,
 ) -> list[Blob]:
-    """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour."""
-    core = cv2.threshold(wide, int(threshold), 255, cv2.THRESH_BINARY)[1]
-    core = close_mask(cv2.erode(core, ellipse(parameters.erode_px)), parameters.close_px)
-    others = find_blobs(core, wide, threshold, min_area_px, peak, parameters.hull)
+    """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour.
+
+    They are sought at half the resolution, an odd last row or column left out.
+    """
+    height, width = (side // 2 for side in wide.shape)
+    if not height or not width:
+        return []
+    half = cv2.resize(wide[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+    core = cv2.threshold(half, int(threshold), 255, cv2.THRESH_BINARY)[1]
+    core = cv2.erode(core, ellipse(halve_side(parameters.erode_px)))
+    core = close_mask(core, halve_side(parameters.close_px))
+    others = find_blobs(core, half, threshold, min_area_px, peak, parameters.hull, scale=2)
     return leave_touching(others, found, wide.shape)
 
 
