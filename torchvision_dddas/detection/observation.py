@@ -29,6 +29,9 @@ from torchvision_dddas.geometry import connected_parts
 from torchvision_dddas.types import Detections
 
 _MAX_MISFIT = 15.0  # noise units
+# What the levels of texture and evidence maps mean: grey levels a pixel, and noise units.
+_SLOPES, _UNITS = np.arange(256) / 4, np.arange(256) / EVIDENCE_SCALE
+_DIFFERS = np.clip((_UNITS - 2) / 2, 0, 1)
 # How much of the surroundings is smoothed with a blob, px.
 _PAD = 24
 _WARP_FLAGS = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -234,13 +237,15 @@ def _explain_pixels(
     """How surely the pixels of a blob's box are target and background, (height, width) float32 each."""
     x, y, width, height = blob.box
     box, own = box_slices(blob.box), view.grey[box_slices(blob.box)]
-    slope = foreground.texture[box].astype(np.float32) / 4
-    noise = np.sqrt(settings.difference.noise_levels**2 + (settings.difference.gradient_share * slope) ** 2)
+    near, far, texture = (picture[box] for picture in (foreground.evidence, foreground.wide, foreground.texture))
+    noise = np.hypot(settings.difference.noise_levels, settings.difference.gradient_share * _SLOPES)
+    weight = _look_up(texture, 1 / noise)
 
     def misfit(pictures: Sequence[np.ndarray]) -> np.ndarray:
         """The smaller difference to two pictures of the box, noise units."""
-        misses = (np.minimum(cv2.absdiff(own, p) / noise, _MAX_MISFIT).astype(np.float32) for p in pictures)
-        return cv2.blur(np.minimum(*misses), (3, 3))
+        least = cv2.min(*(cv2.absdiff(own, picture) for picture in pictures))
+        miss = cv2.multiply(least, weight, dtype=cv2.CV_32F)
+        return cv2.blur(cv2.threshold(miss, _MAX_MISFIT, 0, cv2.THRESH_TRUNC)[1], (3, 3))
 
     still = misfit([picture[box] for picture in foreground.warped])
     # The parts of the neighbours that the target's motion brings into its box.
@@ -248,21 +253,27 @@ def _explain_pixels(
     moved = []
     for picture, (shift, by_u, by_v) in zip(foreground.warped, motion.affine, strict=True):
         # u + shift + by_u (u - cu) / s + by_v (v - cv) / s, with (u, v) counted from the box's corner
-        slopes = np.c_[by_u, by_v]
-        origin = np.array([x, y]) + shift + slopes @ np.array([x - centre_u, y - centre_v]) / scale
-        matrix = np.c_[np.eye(2) + slopes / scale, origin]
+        slopes = np.stack([by_u, by_v], axis=1)
+        matrix = np.empty((2, 3))
+        matrix[:, :2] = np.eye(2) + slopes / scale
+        matrix[:, 2] = np.array([x, y]) + shift + slopes @ np.array([x - centre_u, y - centre_v]) / scale
         moved.append(
             cv2.warpAffine(picture, matrix, (width, height), flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
         )
     moving = misfit(moved)
-    near, far = foreground.evidence[box] / np.float32(EVIDENCE_SCALE), foreground.wide[box] / np.float32(EVIDENCE_SCALE)
-    certain = np.clip((near - 2) / 2, 0, 1) * np.clip(1.5 - moving / np.maximum(still, 1), 0, 1)
-    filled = np.clip((far - 2) / 2, 0, 1) * np.clip(1.5 - moving / 2, 0, 1)
+    certain = _look_up(near, _DIFFERS) * np.clip(1.5 - moving / np.maximum(still, 1), 0, 1)
+    filled = _look_up(far, _DIFFERS) * np.clip(1.5 - moving / 2, 0, 1)
     certain = np.where(certain < 0.2, np.maximum(certain, filled), certain) * blob.mask
-    background = np.clip(slope / 8, 0, 1) * np.clip(1 - near / 2, 0, 1) * np.clip(0.5 + (moving - still) / 2, 0, 1)
-    background *= np.clip(1 - far / 3, 0, 1)
+    background = _look_up(texture, np.clip(_SLOPES / 8, 0, 1)) * np.clip(0.5 + (moving - still) / 2, 0, 1)
+    background *= _look_up(near, np.clip(1 - _UNITS / 2, 0, 1))
+    background *= _look_up(far, np.clip(1 - _UNITS / 3, 0, 1))
     background[~blob.mask] = 1
     return certain, background
+
+
+def _look_up(picture: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """(H, W) float32 values of a uint8 picture's levels in a table of 256."""
+    return cv2.LUT(picture, table.astype(np.float32))
 
 
 def smooth_along_edges(
@@ -278,37 +289,48 @@ def smooth_along_edges(
     colour, summed over the channels, that counts as much as that reach.
     Source: the recursive domain transform, Gastal and Oliveira 2011.
     """
+    if not values:
+        return []
     distances: list[list[np.ndarray]] = [[], []]  # along columns, along rows
     for guide in guides:
-        colours = np.atleast_3d(guide).astype(np.float32)
-        colours *= 3 / colours.shape[2]  # a grey picture is one of three equal channels
-        for axis in (0, 1):
-            change = np.abs(np.diff(colours, axis=axis)).sum(axis=2)
-            distances[axis].append(1 + spatial_px / colour_levels * change)
+        colours = np.atleast_3d(guide)
+        # A grey picture is one of three equal channels.
+        weight = np.full(colours.shape[2], 3 / colours.shape[2] * spatial_px / colour_levels, np.float32)
+        for axis, lines in enumerate((colours, colours.swapaxes(0, 1))):
+            change = np.maximum(lines[1:], lines[:-1]) - np.minimum(lines[1:], lines[:-1])
+            distances[axis].append(1 + change.astype(np.float32) @ weight)
+    # All pictures lie side by side, so that a step takes one line of each; nothing comes from beyond the last line.
+    packed = [_pack(apart, np.inf) for apart in distances]
     for i in range(rounds):
         sigma = spatial_px * np.sqrt(3) * 2 ** (rounds - i - 1) / np.sqrt(4**rounds - 1)
-        decay = np.log(np.float32(np.exp(-np.sqrt(2) / sigma)))
+        decay = np.float32(-np.sqrt(2) / sigma)
         for axis in (1, 0):
-            values = _smooth_lines(values, [np.exp(decay * distance) for distance in distances[axis]], axis)
+            lines = _pack([value.swapaxes(0, axis).swapaxes(1, 2) for value in values])
+            _smooth_lines(lines, np.exp(decay * packed[axis]))
+            ends = np.cumsum([value.shape[1 - axis] for value in values])
+            parts = np.split(lines, ends[:-1], axis=2)
+            values = [
+                part[: value.shape[axis]].swapaxes(1, 2).swapaxes(0, axis)
+                for part, value in zip(parts, values, strict=True)
+            ]
     return list(values)
 
 
-def _smooth_lines(values: Sequence[np.ndarray], keeps: Sequence[np.ndarray], axis: int) -> list[np.ndarray]:
-    """Along an axis and back: each line takes the share `keep` from the line before it.
+def _pack(pictures: Sequence[np.ndarray], beyond: float = 0.0) -> np.ndarray:
+    """Pictures, (..., W) each of its own height and width, side by side, float32; `beyond` where one has no more lines."""
+    height, width = max(map(len, pictures)), sum(picture.shape[-1] for picture in pictures)
+    packed = np.full((height, *pictures[0].shape[1:-1], width), beyond, np.float32)
+    left = 0
+    for picture in pictures:
+        packed[: len(picture), ..., left : left + picture.shape[-1]] = picture
+        left += picture.shape[-1]
+    return packed
 
-    All values lie side by side, so that a step takes one line of each. values: (H, W, K) each.
-    """
-    moved = [np.moveaxis(value, axis, 0) for value in values]
-    widths = [value[0].size for value in moved]
-    ends = np.cumsum([0, *widths]).tolist()
-    lines = np.zeros((max(map(len, moved), default=0), ends[-1]), np.float32)
-    shares = np.zeros((max(len(lines) - 1, 0), ends[-1]), np.float32)  # nothing comes from beyond the last line
-    for value, keep, left, right in zip(moved, keeps, ends, ends[1:], strict=False):
-        lines[: len(value), left:right] = value.reshape(len(value), -1)
-        keep = np.moveaxis(keep, axis, 0)
-        shares[: len(keep), left:right] = np.repeat(keep, value.shape[2], axis=1)
-    each, share, change = list(lines), list(shares), np.empty(ends[-1], np.float32)
-    steps = [*zip(each, each[1:], share, strict=False)]
+
+def _smooth_lines(lines: np.ndarray, shares: np.ndarray) -> None:
+    """Down the lines, (H, K, W), and back: each takes the share, (H - 1, W), from the line before it; in place."""
+    change = np.empty_like(lines[0])
+    steps = [*zip(lines, lines[1:], shares, strict=False)]
     for before, after, kept in steps:
         np.subtract(before, after, out=change)
         change *= kept
@@ -317,10 +339,6 @@ def _smooth_lines(values: Sequence[np.ndarray], keeps: Sequence[np.ndarray], axi
         np.subtract(after, before, out=change)
         change *= kept
         before += change
-    parts = (
-        lines[: len(v), left:right].reshape(v.shape) for v, left, right in zip(moved, ends, ends[1:], strict=False)
-    )
-    return [np.moveaxis(part, 0, axis) for part in parts]
 
 
 def remove_shadow(
@@ -343,11 +361,13 @@ def remove_shadow(
         pictures.append(
             cv2.warpPerspective(ground, ground_from_box, box[2:], flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
         )
-    own, first, second = (cv2.blur(picture, (3, 3)).astype(np.float32) for picture in pictures)
-    bare = np.abs(first - second).max(axis=2) < _GROUNDS_ALIKE
+    own, first, second = (
+        np.stack(cv2.split(cv2.blur(picture, (3, 3)))).astype(np.float32) for picture in pictures  # colours first
+    )
+    bare = np.abs(first - second).max(axis=0) < _GROUNDS_ALIKE
     light = (own + 2) / ((first + second) / 2 + 2)
-    mean = light.mean(axis=2)
-    alike = np.abs(light - mean[..., None]).max(axis=2) < _COLOURS_ALIKE * mean
+    mean = light.mean(axis=0)
+    alike = np.abs(light - mean).max(axis=0) < _COLOURS_ALIKE * mean
     low, high = _LIGHT_LEFT
     shadow = (bare & alike & (mean > low) & (mean < high)).astype(np.uint8)
     shadow = cv2.morphologyEx(shadow, cv2.MORPH_OPEN, ellipse(5))
