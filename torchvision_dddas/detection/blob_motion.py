@@ -82,7 +82,7 @@ def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets:
             continue
         near = [flow[top : top + core.shape[0], left : left + core.shape[1]] for flow in flows]
         steady[i] = _steady_share(near, body, (row, column), offsets)
-        sample = np.arange(min(len(row), _SAMPLES)) * len(row) // min(len(row), _SAMPLES)
+        sample = _choose_samples(len(row))
         u, v = 2 * (left + column[sample]) + 0.5, 2 * (top + row[sample]) + 0.5
         centre_u, centre_v, scale = frames[i] = (float(u.mean()), float(v.mean()), float(max(blob.box[2:])))
         places[i, 0, : len(u)], places[i, 1, : len(u)] = (u - centre_u) / scale, (v - centre_v) / scale
@@ -98,6 +98,12 @@ def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets:
         Motion(motion[i, 0], float(steady[i]), (fits[i, 0], fits[i, 1]), frames[i], float(missed_share[i]))
         for i in range(len(blobs))
     ]
+
+
+def _choose_samples(count: int) -> np.ndarray:
+    """Places of at most `_SAMPLES` of so many, evenly spread."""
+    chosen = min(count, _SAMPLES)
+    return np.arange(chosen) * count // chosen
 
 
 def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
@@ -215,7 +221,7 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
     scale = max(float(np.ptp(row)), float(np.ptp(column)), 1.0)
     places, flow = np.stack([column - column.mean(), row - row.mean()]) / scale, velocity_px[row, column]
     # The two motions are sought in a sample.
-    sample = slice(None, None, max(1, len(row) // 1000))
+    sample = _choose_samples(len(row))
     columns, some = _columns(places), places[:, sample]
     some_columns, some_flow = columns[:, sample], flow[sample]
     # Plain least squares as well: the robust fit hardly follows a body that turns or grows.
@@ -227,9 +233,11 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
     for _ in range(_ROUNDS):
         if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
             return None
-        fits = fit_robust_affine(some, some_flow, np.stack([~second, second]).astype(float))
+        fits = fit_robust_affine(some, some_flow, np.stack([~second, second]).astype(float), rounds=2)
         first_miss, second_miss = _miss(some_columns, some_flow, fits)
-        second = second_miss < first_miss
+        before, second = second, second_miss < first_miss
+        if np.array_equal(before, second):
+            break
     misses = _miss(columns, flow, fits)
     second = misses[1] < misses[0]
     if not _MIN_SHARE <= second.mean() <= 1 - _MIN_SHARE:
