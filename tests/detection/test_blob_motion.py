@@ -35,6 +35,19 @@ def test_the_velocity_of_a_textured_box_is_measured(velocity, box_blob):
     assert motion.steady > 0.7
 
 
+def test_flow_is_searched_around_boxes_only():
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
+    grey = cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3))
+    later = [np.roll(grey, (2, 4), axis=(0, 1))]
+    (everywhere,), (around,) = DenseFlow()(grey, later), DenseFlow()(grey, later, [BOX])
+    x, y, width, height = (v // 2 for v in BOX)
+    inside = np.s_[y : y + height, x : x + width]
+    for field in (everywhere, around):
+        np.testing.assert_allclose(np.median(field[inside], axis=(0, 1)), (4, 2), atol=0.3)
+    assert around.shape == everywhere.shape
+    assert everywhere[-60:, -80:].any() and not around[-60:, -80:].any()
+
+
 def flows(inside: float, ground: float) -> list[np.ndarray]:
     """Half-resolution flow fields to an earlier and a later frame, one motion inside BOX and another outside."""
     x, y, width, height = (v // 2 for v in BOX)

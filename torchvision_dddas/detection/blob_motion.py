@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from torchvision_dddas.detection.blobs import Blob
+from torchvision_dddas.detection.blobs import Blob, Box
 
 # Slower motion cannot be told from errors of the registration, px a frame.
 _MIN_SPEED_PX = 0.5
 # Shares of the speed: disagreement of two flows that is still steady, and difference from the surroundings that counts.
 _STEADY, _UNLIKE = 0.5, 0.25
 _RING_NEAR_PX, _RING_FAR_PX = 5, 15
+# Flow is searched so far around all blobs, px of the half picture: coarse levels of the search need surroundings.
+_SEARCH_PX = 64
 # An affine motion is fitted to so many pixels; it has converged when no term changes by more than this.
 _SAMPLES, _CONVERGED_PX = 300, 0.01
 # A small pull towards pure translation, for slim blobs.
@@ -57,14 +59,32 @@ class DenseFlow:
     def __init__(self) -> None:
         self._search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
 
-    def __call__(self, grey: np.ndarray, others: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """(H/2, W/2, 2) displacements in full-resolution pixels from a grey picture to each of the others."""
-        size = max(grey.shape[1] // 2, 1), max(grey.shape[0] // 2, 1)
-        if min(size) < 16:  # smaller than the search's patches
-            return [np.zeros((size[1], size[0], 2), np.float32) for _ in others]
-        small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        pictures = (cv2.resize(other, size, interpolation=cv2.INTER_AREA) for other in others)
-        return [2 * self._search.calc(small, picture, np.zeros((*small.shape, 2), np.float32)) for picture in pictures]
+    def __call__(
+        self, grey: np.ndarray, others: Sequence[np.ndarray], boxes: Sequence[Box] | None = None
+    ) -> list[np.ndarray]:
+        """(H/2, W/2, 2) displacements in full-resolution pixels from a grey picture to each of the others.
+
+        boxes: where they are wanted, by default everywhere; they are 0 further away.
+        """
+        height, width = (max(side // 2, 1) for side in grey.shape)
+        flows = [np.zeros((height, width, 2), np.float32) for _ in others]
+        if min(height, width) < 16:  # smaller than the search's patches
+            return flows
+        left, top, right, bottom = 0, 0, width, height
+        if boxes is not None:
+            corners = np.array(boxes) // 2
+            left, top = np.maximum(corners[:, :2].min(axis=0) - _SEARCH_PX, 0).tolist()
+            ends = (corners[:, :2] + corners[:, 2:]).max(axis=0) + _SEARCH_PX
+            right, bottom = np.minimum(ends, (width, height)).tolist()
+        inside, size = np.s_[top:bottom, left:right], (right - left, bottom - top)
+        here, *there = (
+            cv2.resize(picture[2 * top : 2 * bottom, 2 * left : 2 * right], size, interpolation=cv2.INTER_AREA)
+            for picture in (grey, *others)
+        )
+        for flow, picture in zip(flows, there, strict=True):
+            flow[inside] = self._search.calc(here, picture, np.zeros((*here.shape, 2), np.float32))
+            flow[inside] *= 2
+        return flows
 
 
 def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Motion]:
@@ -73,41 +93,42 @@ def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets:
         return []
     # Of every blob the places of its core that are sampled, in shares of its size, and their displacements.
     places, valid = np.zeros((len(blobs), 2, _SAMPLES)), np.zeros((len(blobs), _SAMPLES))
-    displacements = np.zeros((len(blobs), 2, _SAMPLES, 2))
-    frames, steady = [(0.0, 0.0, 1.0)] * len(blobs), np.zeros(len(blobs))
+    displacements, around = np.zeros((len(blobs), 2, _SAMPLES, 2)), np.zeros((len(blobs), 1, 2))
+    frames, per_frame = [(0.0, 0.0, 1.0)] * len(blobs), 1 / np.array(offsets)[:, None, None]
     for i, blob in enumerate(blobs):
-        (left, top), body, core = _at_half(blob, flows[0].shape[:2])
-        row, column = np.nonzero(core)
+        (left, top), core, ring = _at_half(blob, flows[0].shape[:2])
+        near = [flow[top : top + core.shape[0], left : left + core.shape[1]] for flow in flows]
+        row, column = _sample(core)
         if not len(row):
             continue
-        near = [flow[top : top + core.shape[0], left : left + core.shape[1]] for flow in flows]
-        steady[i] = _steady_share(near, body, (row, column), offsets)
-        sample = _choose_samples(len(row))
-        u, v = 2 * (left + column[sample]) + 0.5, 2 * (top + row[sample]) + 0.5
+        u, v = 2 * (left + column) + 0.5, 2 * (top + row) + 0.5
         centre_u, centre_v, scale = frames[i] = (float(u.mean()), float(v.mean()), float(max(blob.box[2:])))
         places[i, 0, : len(u)], places[i, 1, : len(u)] = (u - centre_u) / scale, (v - centre_v) / scale
-        displacements[i, :, : len(u)] = [flow[row[sample], column[sample]] for flow in near]
+        displacements[i, :, : len(u)] = [flow[row, column] for flow in near]
         valid[i, : len(u)] = 1
+        row, column = _sample(ring)
+        if middle := len(row) // 2:
+            beside = (np.array([flow[row, column] for flow in near]) * per_frame).mean(axis=0)
+            around[i] = np.partition(beside, middle, axis=0)[middle]
+    count = np.maximum(valid.sum(axis=1), 1)
+    before, after = (displacements * per_frame).swapaxes(0, 1)
+    velocities = (before + after) / 2
+    speed = np.maximum(_length(velocities), 0.15)
+    alike, unlike = _length(before - after) < _STEADY * speed, _length(velocities - around) > _UNLIKE * speed
+    steady = (valid * (alike & unlike & (speed > _MIN_SPEED_PX))).sum(axis=1) / count
     fits = fit_robust_affine(places[:, None], displacements, valid[:, None])
-    per_frame = np.array([1 / offset for offset in offsets])[:, None, None] / 2
-    motion, velocities = (fits * per_frame).sum(axis=1), (displacements * per_frame).sum(axis=1)
+    motion = (fits * per_frame).mean(axis=1)
     missed = _miss(_columns(places), velocities, motion) > _clear_miss(motion)[:, None]
-    missed_share = (missed * valid).sum(axis=1) / np.maximum(valid.sum(axis=1), 1)
-    motion[valid.sum(axis=1) == 0] = np.nan
+    missed_share = (valid * missed).sum(axis=1) / count
+    motion[~valid.any(axis=1)] = np.nan
     return [
         Motion(motion[i, 0], float(steady[i]), (fits[i, 0], fits[i, 1]), frames[i], float(missed_share[i]))
         for i in range(len(blobs))
     ]
 
 
-def _choose_samples(count: int) -> np.ndarray:
-    """Places of at most `_SAMPLES` of so many, evenly spread."""
-    chosen = min(count, _SAMPLES)
-    return np.arange(chosen) * count // chosen
-
-
 def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-    """The blob at half resolution with its surroundings: (left, top), and (H, W) uint8 masks of all of it and its core.
+    """Masks of the blob at half resolution: (left, top), and (H, W) of its core and of the ring around it.
 
     shape: (rows, columns) of the half picture. Where no pixel of the core is left, the core is all of the blob.
     """
@@ -115,34 +136,26 @@ def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.nd
     (rows, columns), far = shape, _RING_FAR_PX
     top, left = max(y // 2 - far, 0), max(x // 2 - far, 0)
     bottom, right = min((y + height) // 2 + far, rows), min((x + width) // 2 + far, columns)
-    masks = np.zeros((2, bottom - top, right - left), np.uint8)
+    body, core = np.zeros((2, bottom - top, right - left), np.uint8)
     row, column = (y + 1) // 2 - top, (x + 1) // 2 - left
-    for mask, full in zip(masks, (blob.mask, blob.core), strict=True):
+    for mask, full in ((body, blob.mask), (core, blob.core)):
         part = full[y % 2 :: 2, x % 2 :: 2][: max(len(mask) - row, 0), : max(mask.shape[1] - column, 0)]
         mask[row : row + part.shape[0], column : column + part.shape[1]] = part
-    body, core = masks
-    return (left, top), body, core if core.any() else body
+    outer, inner = (cv2.dilate(body, np.ones((2 * reach + 1,) * 2, np.uint8)) for reach in (far, _RING_NEAR_PX))
+    return (left, top), core if core.any() else body, outer > inner
 
 
-def _steady_share(
-    near: Sequence[np.ndarray], body: np.ndarray, core: tuple[np.ndarray, np.ndarray], offsets: tuple[int, int]
-) -> float:
-    """Share of the core that moves alike to both neighbours and unlike the surroundings of the body.
+def _sample(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of a sample of the pixels set in a mask."""
+    row, column = np.nonzero(mask)
+    sample = _choose_samples(len(row))
+    return row[sample], column[sample]
 
-    near: the two flows, (H, W, 2). body: (H, W) uint8. core: rows and columns of its pixels.
-    """
-    outer, inner = (cv2.dilate(body, np.ones((2 * reach + 1,) * 2, np.uint8)) for reach in (_RING_FAR_PX, _RING_NEAR_PX))
-    ring = np.nonzero(outer > inner)
-    around = np.zeros(2, np.float32)
-    if count := len(ring[0]):
-        a, b = (flow[ring] / offset for flow, offset in zip(near, offsets, strict=True))
-        around = np.partition((a + b) / 2, count // 2, axis=0)[count // 2]
-    a, b = (flow[core] / offset for flow, offset in zip(near, offsets, strict=True))
-    v = (a + b) / 2
-    speed = np.maximum(_length(v), 0.15)
-    alike = _length(a - b) < _STEADY * speed
-    unlike = _length(v - around) > _UNLIKE * speed
-    return float((alike & unlike & (speed > _MIN_SPEED_PX)).mean())
+
+def _choose_samples(count: int) -> np.ndarray:
+    """Places of at most `_SAMPLES` of so many, evenly spread."""
+    chosen = min(count, _SAMPLES)
+    return np.arange(chosen) * count // max(chosen, 1)
 
 
 def fit_robust_affine(places: np.ndarray, flow_px: np.ndarray, valid: np.ndarray, rounds: int = 5) -> np.ndarray:

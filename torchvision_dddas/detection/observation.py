@@ -88,7 +88,7 @@ def observe(
     blobs = _blobs_of(window, foreground, settings) if foreground.blobs is None else foreground.blobs
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
-        flows = flow(view.grey, foreground.warped)
+        flows = flow(view.grey, foreground.warped, [blob.box for blob in blobs])
         motions = measure_motions(blobs, flows, foreground.offsets)
         if settings.history.on:
             parts = [split_by_flow(*both, flows, foreground.offsets) for both in zip(blobs, motions, strict=True)]
@@ -317,7 +317,7 @@ def smooth_along_edges(
 
 
 def _pack(pictures: Sequence[np.ndarray], beyond: float = 0.0) -> np.ndarray:
-    """Pictures, (..., W) each of its own height and width, side by side, float32; `beyond` where one has no more lines."""
+    """Pictures, (H, ..., W) each of its own size, side by side, float32; `beyond` where one has no more lines."""
     height, width = max(map(len, pictures)), sum(picture.shape[-1] for picture in pictures)
     packed = np.full((height, *pictures[0].shape[1:-1], width), beyond, np.float32)
     left = 0
@@ -362,7 +362,8 @@ def remove_shadow(
             cv2.warpPerspective(ground, ground_from_box, box[2:], flags=_WARP_FLAGS, borderMode=cv2.BORDER_REPLICATE)
         )
     own, first, second = (
-        np.stack(cv2.split(cv2.blur(picture, (3, 3)))).astype(np.float32) for picture in pictures  # colours first
+        np.stack(cv2.split(cv2.blur(picture, (3, 3)))).astype(np.float32)
+        for picture in pictures  # colours first
     )
     bare = np.abs(first - second).max(axis=0) < _GROUNDS_ALIKE
     light = (own + 2) / ((first + second) / 2 + 2)

@@ -260,7 +260,7 @@ def apply_light(reference: np.ndarray, warped: np.ndarray, gain: float, offset: 
     table = np.clip(np.round(gain * _LEVELS + offset), 0, 255).astype(np.uint8)
     if (table == _LEVELS).all():
         return warped
-    through = cv2.LUT(warped, table)
+    through = cv2.addWeighted(warped, gain, warped, 0, offset)  # as the table, in less time
     if table[255] < WHITE:
         # A clipped pixel only says that the place was at least so bright.
         cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
