@@ -13,7 +13,7 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import MotionDetector, View, Window
 from torchvision_dddas.detection.blobs import Blob, find_blobs, find_weak_blobs
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs, label_components
-from torchvision_dddas.detection.torch_engine import TorchEngine
+from torchvision_dddas.detection.torch_engine import TorchEngine, weak_maps
 
 SHAPE = (67, 101)
 KNOBS: dict[str, float] = {"difference.threshold": 6.0, "difference.peak": 9.0, "gates.min_area_px": 12}
@@ -84,10 +84,10 @@ def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> 
     islands = [smooth(10 + number, 2) for number in range(len(MASKS))]
     wide = [np.where(picture > 185, picture, 0).astype(np.uint8) for picture in islands]
     engine = TorchEngine(settings, "cpu")
-    wide_core = engine.segmenter.core(batch(wide))
+    weak = weak_maps(engine.segmenter, batch(wide))
     maps = batch(cores), batch(near), batch(wide), batch(near)
     windows = [window(one) for one in given]
-    found = foregrounds_with_blobs(windows, settings, maps, wide_core, None, (maps[1], maps[2]))
+    found = foregrounds_with_blobs(windows, settings, maps, weak, None, (maps[1], maps[2]))
     assert any(blob.weak for frame in found for blob in frame.blobs or [])
     for frame, own, core, evidence, far in zip(found, given, cores, near, wide, strict=True):
         limits = 16 * own.difference.threshold, own.gates.min_area_px, 16 * own.difference.peak

@@ -33,6 +33,12 @@ class Components:
     area_px: np.ndarray
     peak: np.ndarray
 
+    def at(self, chosen: np.ndarray) -> "Components":
+        """Some of the regions."""
+        label = self.label[torch.from_numpy(chosen).to(self.label.device)]
+        rows = (column[chosen] for column in (self.picture, self.box, self.area_px, self.peak))
+        return Components(self.labels, label, *rows)
+
 
 def label_components(mask: Bool[Tensor, "B 1 H W"], evidence: UInt8[Tensor, "B 1 H W"]) -> Components:
     """All regions of the masks, and their largest evidence."""
@@ -54,36 +60,38 @@ def foregrounds_with_blobs(
     windows: Sequence[Window],
     settings: Settings,
     maps: tuple[Tensor, Tensor, Tensor, Tensor],
-    wide_core: Tensor | None,
+    weak: tuple[Tensor, Tensor] | None,
     small: Tensor | None,
     warped: tuple[Tensor, Tensor],
 ) -> list[Foreground]:
     """The foregrounds of windows of one structure, with their blobs.
 
-    maps: core, evidence, wide and texture, (B, 1, H, W) uint8 as all others. wide_core: where the wide evidence is
-    certain; None where no weak blobs are wanted. settings: of windows that have none of their own.
+    maps: core, evidence, wide and texture, (B, 1, H, W) uint8 as all others. weak: where the wide evidence is certain
+    at half the resolution, and that evidence, as `find_weak_blobs` makes them; None where no weak blobs are wanted.
+    settings: of windows that have none of their own.
     """
     core, near, wide, texture = maps
-    given, scale = [window.settings or settings for window in windows], evidence_scale(settings)
-    searched = [(core, near, [True] * len(windows))]
-    if wide_core is not None:
-        searched.append((wide_core, wide, [window.looks_both_ways for window in windows]))
-    found: list[tuple[Components, np.ndarray]] = []
-    for mask, evidence, wanted in searched:
+    given, unit = [window.settings or settings for window in windows], evidence_scale(settings)
+    searched = [(core, near, 1, [True] * len(windows))]
+    if weak is not None:
+        searched.append((*weak, 2, [window.looks_both_ways for window in windows]))
+    found: list[Components] = []
+    asked: list[Tensor] = []
+    for mask, evidence, scale, wanted in searched:
         parts = label_components(mask > 0, evidence)
         least_px = np.array([of_frame.gates.min_area_px for of_frame in given])[parts.picture]
-        least = np.array([of_frame.difference.peak * scale for of_frame in given])[parts.picture]
-        passed = np.array(wanted)[parts.picture] & (parts.area_px >= least_px) & (parts.peak >= least)
-        found.append((parts, np.flatnonzero(passed)))
-    shown = np.unique(np.concatenate([parts.picture[passed] for parts, passed in found]))
-    asked = [cut for parts, passed in found for cut in _cut_boxes(parts, passed, [near, wide, texture])]
+        least = np.array([of_frame.difference.peak * unit for of_frame in given])[parts.picture]
+        passed = np.array(wanted)[parts.picture] & (parts.area_px * scale**2 >= least_px) & (parts.peak >= least)
+        found.append(parts.at(np.flatnonzero(passed)))
+        asked += _cut_regions(found[-1], evidence) + _cut_boxes(found[-1], [near, wide, texture], scale)[0]
+    shown = np.unique(np.concatenate([parts.picture for parts in found]))
     for_flow = bool(len(shown)) and (settings.persistence.on or settings.refine.on)
     for_history = settings.history.on and not (settings.persistence.on or settings.refine.on)
     if for_flow:
         asked += [picture[torch.from_numpy(shown).to(picture.device), 0] for picture in warped]
     asked += [picture[:, 0] for picture in ([core] if for_history else []) + ([] if small is None else [small])]
     arrived = iter(_fetch(asked))
-    crops = [[next(arrived) for _ in range(4)] for _ in found]
+    crops = [[next(arrived) for _ in range(5)] for _ in found]
     nothing = np.zeros(core.shape[-2:], np.uint8)
     others = {}
     if for_flow:
@@ -95,20 +103,19 @@ def foregrounds_with_blobs(
     for number, (window, own) in enumerate(zip(windows, given, strict=True)):
         pictures = [np.zeros_like(nothing) for _ in range(3)]
         regions: list[list[Region]] = []
-        for (parts, passed), cut, evidence_at in zip(found, crops, (1, 2), strict=False):
-            ends = np.cumsum(parts.box[passed, 2] * parts.box[passed, 3])
+        for parts, (_, _, scale, _), cut in zip(found, searched, crops, strict=True):
+            ends = np.cumsum(parts.box[:, 2] * parts.box[:, 3])
             regions.append([])
-            for k in np.flatnonzero(parts.picture[passed] == number).tolist():
-                box = _as_box(parts.box[passed[k]])
-                shape = box[3], box[2]
-                values = [line[ends[k] - shape[0] * shape[1] : ends[k]].reshape(shape) for line in cut]
-                for picture, crop in zip(pictures, values[1:], strict=True):
-                    picture[box_slices(box)] = crop
-                regions[-1].append(Region(box, values[0] > 0, values[evidence_at], float(parts.peak[passed[k]])))
-        threshold, hull = own.difference.threshold * scale, own.morphology.hull
+            for k in np.flatnonzero(parts.picture == number).tolist():
+                box, large = _as_box(parts.box[k]), _as_box(parts.box[k] * scale)
+                inside, evidence = (_crop(line, int(ends[k]), box) for line in cut[:2])
+                for picture, line in zip(pictures, cut[2:], strict=True):
+                    picture[box_slices(large)] = _crop(line, int(ends[k]) * scale**2, large)
+                regions[-1].append(Region(box, inside > 0, evidence, float(parts.peak[k])))
+        threshold, hull = own.difference.threshold * unit, own.morphology.hull
         blobs = make_blobs(regions[0], threshold, hull)
         if len(regions) > 1:
-            blobs += leave_touching(make_blobs(regions[1], threshold, hull), blobs, nothing.shape)
+            blobs += leave_touching(make_blobs(regions[1], threshold, hull, scale=2), blobs, nothing.shape)
         warped_here = others.get(number, (nothing, nothing))
         offsets = window.offsets[a], window.offsets[b]
         one, other, gradient = pictures
@@ -123,20 +130,32 @@ def _as_box(row: np.ndarray) -> Box:
     return x, y, width, height
 
 
-def _cut_boxes(parts: Components, chosen: np.ndarray, pictures: Sequence[Tensor]) -> list[Tensor]:
-    """(P,) uint8 of the pixels in the chosen regions' boxes, box by box: which are the region's, and each picture."""
-    device, (height, width) = parts.labels.device, parts.labels.shape[-2:]
-    x, y, wide, high = parts.box[chosen].T
+def _crop(line: np.ndarray, end: int, box: Box) -> np.ndarray:
+    """The pixels of a box that end at a place of a line of crops."""
+    return line[end - box[2] * box[3] : end].reshape(box[3], box[2])
+
+
+def _cut_regions(parts: Components, evidence: Tensor) -> list[Tensor]:
+    """(P,) uint8 of the pixels in the regions' boxes, box by box: which are the region's, and their evidence."""
+    (labels, seen), region = _cut_boxes(parts, [parts.labels, evidence])
+    return [(labels == parts.label[region]).to(torch.uint8), seen]
+
+
+def _cut_boxes(parts: Components, pictures: Sequence[Tensor], scale: int = 1) -> tuple[list[Tensor], Tensor]:
+    """(P,) of the pixels in the boxes, box by box, of each picture; and each pixel's region.
+
+    scale: pixels of the pictures that are one of the boxes along either side.
+    """
+    device, (height, width) = pictures[0].device, pictures[0].shape[-2:]
+    x, y, wide, high = scale * parts.box.T
     sizes = wide * high
-    first = (parts.picture[chosen] * height + y) * width + x
+    first = (parts.picture * height + y) * width + x
     table = np.stack([sizes, np.cumsum(sizes) - sizes, first, wide])
     size, start, corner, across = torch.from_numpy(table).to(device)
-    region = torch.arange(len(chosen), device=device).repeat_interleave(size, output_size=int(sizes.sum()))
+    region = torch.arange(len(sizes), device=device).repeat_interleave(size, output_size=int(sizes.sum()))
     step = torch.arange(len(region), device=device) - start[region]
     place = corner[region] + step // across[region] * width + step % across[region]
-    label = parts.label[torch.from_numpy(chosen).to(device)]
-    own = (parts.labels.flatten()[place] == label[region]).to(torch.uint8)
-    return [own, *(picture.flatten()[place] for picture in pictures)]
+    return [picture.flatten()[place] for picture in pictures], region
 
 
 def _fetch(pictures: Sequence[Tensor]) -> list[np.ndarray]:

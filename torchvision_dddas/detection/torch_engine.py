@@ -7,9 +7,11 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 import torchvision_dddas.functional as F
 from torchvision_dddas.config import Settings
+from torchvision_dddas.detection.blobs import halve_side
 from torchvision_dddas.detection.engine import (
     Engine,
     Foreground,
@@ -152,9 +154,9 @@ class TorchEngine(Engine):
         texture = views.texture.to(torch.uint8)
         if self.components == "torch":
             is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
-            wide_core = segmenter.core(wide, close_px=one.close_px) if is_weak_wanted else None
+            weak = weak_maps(segmenter, wide, one.close_px) if is_weak_wanted else None
             warped = views.warped[a], views.warped[b]
-            return foregrounds_with_blobs(windows, settings, (core, near, wide, texture), wide_core, small, warped)
+            return foregrounds_with_blobs(windows, settings, (core, near, wide, texture), weak, small, warped)
         smalls = [None] * len(windows) if small is None else list(small[:, 0].cpu().numpy())
         maps = core, near, wide, texture, views.warped[a], views.warped[b]
         rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)
@@ -162,6 +164,19 @@ class TorchEngine(Engine):
             Foreground(core, near, wide, texture, small, (first, other), (window.offsets[a], window.offsets[b]))
             for window, (core, near, wide, texture, first, other), small in zip(windows, rows, smalls, strict=True)
         ]
+
+
+def weak_maps(segmenter: MotionSegmenter, wide: Tensor, close_px: int = 0) -> tuple[Tensor, Tensor] | None:
+    """Where the wide evidence is certain at half the resolution, and that evidence: as `find_weak_blobs` has them.
+
+    wide: (B, 1, H, W) uint8. None for pictures of a single row or column.
+    """
+    if min(wide.shape[-2:]) < 2:
+        return None
+    half = functional.avg_pool2d(wide.float(), 2).add_(0.5).to(torch.uint8)
+    morphology = segmenter.settings.morphology
+    sides = {"close_px": halve_side(close_px or morphology.close_px), "erode_px": halve_side(morphology.erode_px)}
+    return segmenter.core(half, **sides), half
 
 
 def _apply_in_groups(

@@ -292,10 +292,10 @@ class MotionSegmenter(nn.Module):
             per_unit = F.straight_through(per_unit, slope) if self.whole else slope
         return self._rounded(z * per_unit.reshape(-1, 1, 1, 1), is_hard)
 
-    def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0) -> Tensor:
+    def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0, erode_px: int = 0) -> Tensor:
         """Evidence above the threshold, eroded and closed: bytes of 0 and 255, or a margin in steps where it is soft.
 
-        close_px: in place of the parameter.
+        close_px, erode_px: in place of the parameters.
         """
         threshold = self._value("difference.threshold", values)
         limit = threshold if self._unit == 1.0 else threshold * self._unit
@@ -304,9 +304,10 @@ class MotionSegmenter(nn.Module):
             margin = (evidence > limit).to(torch.uint8) * 255
         else:
             margin = evidence - limit
-        erode_px, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "close"))
-        eroded = F.blend_sizes(erode_px, lambda side: F.erosion(margin, F.structuring_element("ellipse", side)))
-        return F.blend_sizes(close_px or close, lambda side: close_masks(eroded, side))
+        erode, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "close"))
+        erode, close = erode_px or erode, close_px or close
+        eroded = F.blend_sizes(erode, lambda side: F.erosion(margin, F.structuring_element("ellipse", side)))
+        return F.blend_sizes(close, lambda side: close_masks(eroded, side))
 
     def outlined(
         self, core: Core, found: Regions, values: Values | None = None, softness: float | None = None
