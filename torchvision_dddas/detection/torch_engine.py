@@ -29,9 +29,9 @@ from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
 
-# Pixels of warped neighbours, and keypoints, in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
+# Pixels of pictures in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
 _PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
-_POINTS_AT_ONCE = {"cpu": 1000, "cuda": 100_000}
+_POINTS_AT_ONCE = 100_000
 
 
 class TorchEngine(Engine):
@@ -76,14 +76,15 @@ class TorchEngine(Engine):
         for pair in pairs:  # where exposures differ, one of the two is a view of its own
             greys = zip(pair, match_exposure(*pair), strict=True)
             matched.append([view if grey is view.grey else View(view.image, grey) for view, grey in greys])
-        # The missing pyramids in one batch.
-        missing = {id(view): view for pair in matched for view in pair if "pyramid" not in view.kept}.values()
-        if missing:
-            pyramid = registration.pyramid(_join([_levels_of(view, self.device) for view in missing]))
-            for number, view in enumerate(missing):
+        missing = list({id(view): view for pair in matched for view in pair if "pyramid" not in view.kept}.values())
+        width, height = pairs[0][0].size
+        step = self._at_once(width * height)
+        for part in (missing[first : first + step] for first in range(0, len(missing), step)):
+            pyramid = registration.pyramid(_join([_levels_of(view, self.device) for view in part]))
+            for number, view in enumerate(part):
                 view.kept["pyramid"] = [level[number : number + 1] for level in pyramid]
         count = max(pairs[0][0].kept["points"].shape[1], 1)
-        step = max(1, _POINTS_AT_ONCE.get(self.device.type, 1000) // count)
+        step = max(1, _POINTS_AT_ONCE // count)
         made: list[Registration] = []
         for first in range(0, len(pairs), step):
             part = np.s_[first : first + step]
@@ -110,11 +111,14 @@ class TorchEngine(Engine):
 
         def work(group: list[Window]) -> list[Foreground]:
             width, height = group[0].reference.size
-            pixels = width * height * max(len(group[0].neighbours), 1)
-            step = max(1, _PIXELS_AT_ONCE.get(self.device.type, 1_500_000) // pixels)
+            step = self._at_once(width * height * max(len(group[0].neighbours), 1))
             return [made for i in range(0, len(group), step) for made in self._foreground(group[i : i + step])]
 
         return _apply_in_groups(windows, structure, work)
+
+    def _at_once(self, pixels: int) -> int:
+        """How many items of so many pixels are worked on at once."""
+        return max(1, _PIXELS_AT_ONCE.get(self.device.type, _PIXELS_AT_ONCE["cpu"]) // pixels)
 
     def warp_neighbours(self, windows: list[Window]) -> WarpedWindows:
         """Windows of equal structure with their neighbours warped to the references, in the references' light."""

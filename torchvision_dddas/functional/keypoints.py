@@ -10,11 +10,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from torchvision_dddas.functional.filters import box_sum, pad_reflect
+from torchvision_dddas.functional.filters import box_sum, in_strips, pad_reflect
 
 
 def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tensor, "B 1 H W"]:
     """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values."""
+    return in_strips(lambda strip: _min_eigenvalue(strip, block), gray, 1 + block // 2)
+
+
+def _min_eigenvalue(gray: Tensor, block: int) -> Tensor:
     padded = pad_reflect(gray, 1, 1, 1, 1)
     scale = 1.0 / (4.0 * block)
     above, middle, below = padded[..., :-2, :], padded[..., 1:-1, :], padded[..., 2:, :]

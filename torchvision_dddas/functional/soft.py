@@ -96,9 +96,14 @@ def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]
 
 def may_branch(on: Tensor) -> bool:
     """Whether Python may branch on a tensor's values: not on a GPU, which the host would wait for, nor in a trace."""
-    return on.device.type == "cpu" and not (torch.compiler.is_compiling() or torch.jit.is_tracing())  # type: ignore[attr-defined]
+    return on.device.type == "cpu" and not is_traced()
 
 
 def all_true(condition: Tensor) -> bool:
     """Whether to stop early: only where Python may branch; results are the same."""
     return may_branch(condition) and bool(condition.all())
+
+
+def is_traced() -> bool:
+    """Whether a graph is being made: then one way is taken for all data."""
+    return bool(torch.compiler.is_compiling() or torch.jit.is_tracing())  # type: ignore[attr-defined]

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.functional.filters import strip_rows
+
 
 def warp_perspective(
     src: Float[Tensor, "B C H W"],
@@ -31,22 +33,26 @@ def warp_perspective(
     rows, columns = dsize
     matrix = M.double() if inverse_map else torch.linalg.inv_ex(M.double())[0]
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
-    # Row y is [1, y] times a table whose columns are u, v, u, v, ...: the layout that `grid_sample` reads.
-    table = torch.stack(
-        [matrix[:, None, :, 0] * u[:, None] + matrix[:, None, :, 2], matrix[:, None, :, 1].expand(-1, columns, -1)], 1
-    )
-    ones = torch.ones(rows, dtype=torch.float64, device=src.device)
-    row = torch.stack([ones, torch.arange(rows, dtype=torch.float64, device=src.device)], -1).to(src.dtype)
-    place = row @ (table[..., :2] * max(subpixels, 1)).flatten(2).to(src.dtype)
-    depth = row @ table[..., 2:].expand(-1, -1, -1, 2).flatten(2).to(src.dtype)
-    place = place / depth if place.requires_grad else place.div_(depth)
-    del depth
-    if subpixels:
-        place = place.round_()
-    # Once for every column: other runtimes are slow where two numbers meet a picture of pairs.
+    # Row y is the first of these rows plus y times the second; along it are u, v, u, v, ...: what `grid_sample` reads.
+    start = matrix[:, :, 0, None] * u + matrix[:, :, 2:]
+    slope = matrix[:, :, 1, None].expand(-1, -1, columns)
+    ahead = [(part[:, :2] * max(subpixels, 1)).mT.flatten(1)[:, None].to(src.dtype) for part in (start, slope)]
+    # Numbers of every column, not of every pixel: other runtimes are slow where two meet a picture of pairs.
+    depth = [part[:, 2:].mT.expand(-1, -1, 2).flatten(1)[:, None].to(src.dtype) for part in (start, slope)]
     per_pixel = torch.tensor([2.0 / width, 2.0 / height], dtype=src.dtype, device=src.device).repeat(columns)
-    place = torch.addcmul(per_pixel / 2 - 1, place, per_pixel / max(subpixels, 1)).unflatten(-1, (columns, 2))
-    return functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
+    offset, per_pixel = per_pixel / 2 - 1, per_pixel / max(subpixels, 1)
+    y = torch.arange(rows, dtype=src.dtype, device=src.device)[:, None]
+
+    def sample(y: Tensor) -> Tensor:
+        place, far = torch.addcmul(ahead[0], y, ahead[1]), torch.addcmul(depth[0], y, depth[1])
+        place = place / far if place.requires_grad else place.div_(far)
+        if subpixels:
+            place = place.round_()
+        place = torch.addcmul(offset, place, per_pixel).unflatten(-1, (columns, 2))
+        return functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
+
+    step = strip_rows(src if src.requires_grad else M, rows, len(src) * columns)
+    return torch.cat([sample(y[top : top + step]) for top in range(0, rows, step)], -2)
 
 
 def seen_columns(
