@@ -23,6 +23,7 @@ from torchvision_dddas.detection.engine import (
 )
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.functional.filters import to_bytes
 from torchvision_dddas.nn import MotionSegmenter, WarpedWindows, close_masks
 from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import Registration
@@ -155,7 +156,7 @@ class TorchEngine(Engine):
             level = (settings.small.noise_ratio * mean).clamp(min=settings.small.threshold).floor()
             small = close_masks((least > level).to(torch.uint8) * 255, settings.small.close_px)
         a, b = one.near[-1]
-        texture = views.texture.to(torch.uint8)
+        texture = to_bytes(views.texture)
         if self.components == "torch":
             is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
             weak = weak_maps(segmenter, wide, one.close_px) if is_weak_wanted else None

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from torchvision_dddas.functional.filters import is_above
 from torchvision_dddas.functional.soft import all_true
 
 
@@ -16,12 +17,14 @@ def fit_exposure(
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
 
     Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
-    whose error is at most max(floor, 3.7 x the median error) and fits them again. Without inside pixels, or on a frame
+    whose error is at most max(floor, 3.7 x the median error) and fits them again, until the fit is settled to floor/30,
+    a tenth of a grey level. Without inside pixels, or on a frame
     of one single grey, the gain stays 1 (and the offset is the difference of the means).
     """
     wanted, given = reference.flatten(1), warped.flatten(1)
     seen = inside.expand_as(reference).flatten(1)
     gain, offset = torch.ones_like(wanted[:, :1]), masked_median((wanted - given).detach(), seen)
+    settled = torch.zeros_like(gain, dtype=torch.bool)
     for _ in range(4):
         error = (wanted - gain * given - offset).abs().detach()
         kept = (seen & (error <= (3.7 * masked_median(error, seen)).clamp(min=floor))).to(wanted.dtype)
@@ -32,8 +35,14 @@ def fit_exposure(
         spread = deviation.square().sum(1, keepdim=True) / count
         together = (deviation * (wanted - wanted_mean)).sum(1, keepdim=True) / count
         fitted, one = spread > 1e-6, torch.ones_like(spread)
-        gain = torch.where(fitted, together / torch.where(fitted, spread, one), one)
-        offset = wanted_mean - gain * given_mean
+        slope = torch.where(fitted, together / torch.where(fitted, spread, one), one)
+        shift = wanted_mean - slope * given_mean
+        # White is 85 x floor; no level moves by more than this.
+        moved = (85 * floor * (slope - gain).abs() + (shift - offset).abs()).detach()
+        gain, offset = torch.where(settled, gain, slope), torch.where(settled, offset, shift)
+        settled = settled | (moved < floor / 30)
+        if all_true(settled):
+            break
     return gain[:, 0], offset[:, 0]
 
 
@@ -139,9 +148,9 @@ def noise_units(
 ) -> Float[Tensor, "B"]:
     """The median of z / scale over textured pixels where that is above 1, else 1; 1 too where they are too few."""
     level, seen = z.flatten(1), textured.flatten(1)
-    total = seen.sum(1)
+    total = seen.sum(1, dtype=torch.int32)
     # The upper one of the two in the middle is above the scale; only then can their mean be.
-    is_high = (total > least) & ((seen & (level > scale)).sum(1) >= total - total // 2)
+    is_high = (total > least) & ((seen & is_above(level, int(scale))).sum(1, dtype=torch.int32) >= total - total // 2)
     units = torch.ones_like(total, dtype=torch.float64)
     if all_true(~is_high):
         return units

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import torch
-from jaxtyping import Int64, Shaped
+from jaxtyping import Bool, Float, Int64, Shaped, UInt8
 from kornia import filters
 from torch import Tensor
 from torch.nn import functional
@@ -44,13 +44,13 @@ def gaussian_blur2d(
     if input.dtype != torch.uint8:
         return _weighted(_weighted(pad_reflect(input, *border), weights, -1), weights, -2)
     if kernel_size > 9:
-        return (gaussian_blur2d(input.float(), kernel_size) + 0.5).to(torch.uint8)
+        return to_bytes(gaussian_blur2d(input.float(), kernel_size) + 0.5)
     # Sums in whole numbers are exact, and 16 bits hold those of the small kernels at half the time of floats.
     unit = {3: 4, 5: 16, 7: 64, 9: 256}[kernel_size]
     whole = [round(weight * unit) for weight in weights]
     across = _weighted(pad_reflect(input, *border).to(torch.int16 if kernel_size < 9 else torch.int32), whole, -1)
     if kernel_size > 5:
-        return _weighted(across.float(), whole, -2).mul_(1.0 / unit**2).add_(0.5).to(torch.uint8)
+        return to_bytes(_weighted(across.float(), whole, -2).mul_(1.0 / unit**2).add_(0.5))
     # A sum of up to 65280 wraps into the sign of 16 bits; its high byte, which is what is wanted, does not care.
     down = _weighted(across, whole, -2)
     return down.mul_(256 // unit**2).add_(128).bitwise_right_shift_(8).to(torch.uint8)
@@ -94,6 +94,19 @@ def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], block: int = 5) -> Shaped[T
     down = torch.add(steep[..., 2:] + steep[..., :-2], steep[..., 1:-1], alpha=2.0)
     magnitude = across.square_().addcmul_(down, down).sqrt_().mul_(0.5).round_().clamp_(max=255.0)
     return (box_sum(magnitude, block) / block**2).round()
+
+
+def to_bytes(levels: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
+    """Numbers in [0, 256), cut down to whole ones."""
+    # By way of 16 bits in a third of the time.
+    return levels.to(torch.int16).to(torch.uint8)
+
+
+def is_above(levels: UInt8[Tensor, "*any"], limit: int) -> Bool[Tensor, "*any"]:
+    """Where levels are above the limit, in a sixth of the time that torch takes to compare bytes."""
+    if is_traced() or not 0 <= limit < 255:
+        return levels > limit
+    return levels.clamp(limit, limit + 1).sub_(limit).view(torch.bool)
 
 
 def in_strips(work: Callable[[Tensor], Tensor], picture: Tensor, reach: int) -> Tensor:

@@ -13,7 +13,7 @@ float32 pictures goes to the pixel that decides; values within a 500,000th of th
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, reduce
 from itertools import groupby
 from typing import Literal
@@ -119,24 +119,26 @@ def _extremum(mask: Tensor, kernel: Tensor, highest: bool) -> Tensor:
     flat = padded.reshape(-1)
     size = flat.numel() - (height - 1) * pitch - (width - 1)
     if runs == [(row, 0, width) for row in range(height)]:
-        result = _running(_running(flat, width, 1, better), height, pitch, better)
+        result = _running(_running(flat, [width], 1, better)[width], [height], pitch, better)[height]
     else:
         # One running extremum per distinct run length, shifted into its rows.
-        spans = {last - first: _running(flat, last - first, 1, better) for _, first, last in runs}
+        spans = _running(flat, [last - first for _, first, last in runs], 1, better)
         parts = [spans[last - first].narrow(0, row * pitch + first, size) for row, first, last in runs]
         result = reduce(better, parts)
     result = functional.pad(result, (0, flat.numel() - size)).reshape(padded.shape)
     return result[..., : mask.shape[-2], : mask.shape[-1]].contiguous()
 
 
-def _running(flat: Tensor, length: int, stride: int, better: Extremum) -> Tensor:
-    """Extremum over `length` entries `stride` apart, starting at each; spans double, so a span of 25 takes 5 steps."""
-    span = 1
-    while 2 * span <= length:
-        flat = better(flat[: flat.numel() - span * stride], flat[span * stride :])
-        span *= 2
-    rest = (length - span) * stride
-    return better(flat[: flat.numel() - rest], flat[rest:]) if rest else flat
+def _running(flat: Tensor, lengths: Sequence[int], stride: int, better: Extremum) -> dict[int, Tensor]:
+    """Extrema over so many entries `stride` apart, starting at each; spans double, so a span of 25 takes 5 steps."""
+    span, found = 1, {}
+    for length in sorted(set(lengths)):
+        while 2 * span <= length:
+            flat = better(flat[: flat.numel() - span * stride], flat[span * stride :])
+            span *= 2
+        rest = (length - span) * stride
+        found[length] = better(flat[: flat.numel() - rest], flat[rest:]) if rest else flat
+    return found
 
 
 def _gather_extremum(x: Tensor, kernel: Tensor, highest: bool) -> Tensor:

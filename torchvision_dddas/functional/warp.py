@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from torchvision_dddas.functional.filters import strip_rows
+from torchvision_dddas.functional.soft import is_traced
 
 
 def warp_perspective(
@@ -51,7 +52,7 @@ def warp_perspective(
         place = torch.addcmul(offset, place, per_pixel).unflatten(-1, (columns, 2))
         return functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
 
-    step = strip_rows(src if src.requires_grad else M, rows, len(src) * columns)
+    step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)
     return torch.cat([sample(y[top : top + step]) for top in range(0, rows, step)], -2)
 
 
@@ -87,7 +88,11 @@ def seen_columns(
 def columns_between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], width: int) -> Bool[Tensor, "B 1 h w"]:
     """The columns from first to last of every row, as a mask."""
     columns = torch.arange(width, dtype=first.dtype, device=first.device)
-    return ((columns >= first[..., None]) & (columns <= last[..., None]))[:, None]
+    if is_traced():
+        return ((columns >= first[..., None]) & (columns <= last[..., None]))[:, None]
+    # Torch is slow at comparing: row k of these is 1 from column width - k on.
+    steps = torch.cat([torch.zeros_like(columns), torch.ones_like(columns)]).bool().unfold(0, width, 1)
+    return (steps[(width - first).long()] & ~steps[(width - 1 - last).long()])[:, None]
 
 
 def seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Bool[Tensor, "B 1 h w"]:

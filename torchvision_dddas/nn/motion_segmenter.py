@@ -22,6 +22,9 @@ from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
 from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Settings, exposure_step
+from torchvision_dddas.functional.difference import absolute_difference
+from torchvision_dddas.functional.filters import is_above, to_bytes
+from torchvision_dddas.functional.soft import is_traced
 from torchvision_dddas.geometry import later_pair, near_pairs
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
@@ -112,14 +115,14 @@ class WarpedWindows:
     def least(self, pair: Pair) -> Tensor:
         """What the settings compare of a pair."""
         if self.between_later:
-            return _absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
+            return absolute_difference(self.warped[pair[0]], self.warped[pair[1]])
         return self.smaller(pair)
 
     def smaller(self, pair: Pair) -> Tensor:
         """The difference from the reference that both neighbours of a pair show."""
         for k in pair:
             if k not in self._distance:
-                self._distance[k] = _absolute_difference(self.grey, self.warped[k])
+                self._distance[k] = absolute_difference(self.grey, self.warped[k])
         return torch.minimum(self._distance[pair[0]], self._distance[pair[1]])
 
     def differences(self, pairs: Sequence[Pair]) -> Differences:
@@ -238,21 +241,19 @@ class MotionSegmenter(nn.Module):
         for k, neighbour in enumerate(neighbours):
             matrix = neighbour_from_reference[:, k]
             sampled = F.warp_perspective(neighbour, matrix, size, "bilinear", "border", inverse_map=True, subpixels=32)
-            sampled = sampled.add_(0.5).floor_()
+            warped.append(to_bytes(sampled.add_(0.5)))
             frame_size = neighbour.shape[-2], neighbour.shape[-1]
-            run = F.seen_columns(matrix, size, frame_size, parameters.border_px)
-            if self.is_normalized:
-                sampled = _apply_light(levels, sampled, *_fit_light(levels, sampled, run))
-            elif parameters.kind == "to_reference" and light is not None:
-                gain, offset = (part[:, k].to(levels) for part in light)
-                if not F.all_true((gain == 1) & (offset == 0)):
-                    sampled = _apply_light(levels, sampled, gain, offset)
-            warped.append(sampled.to(torch.uint8))
-            seen.append(run)
+            seen.append(F.seen_columns(matrix, size, frame_size, parameters.border_px))
+        if self.is_normalized and warped:
+            light = _fit_light(levels, warped, seen)
+        if light is not None and parameters.kind != "between_later":
+            gains, offsets = (part.to(levels) for part in light)
+            lit = zip(warped, gains.unbind(1), offsets.unbind(1), strict=True)
+            warped = [_apply_light(levels, picture, gain, offset) for picture, gain, offset in lit]
         # Needed for neither otherwise.
         wanted = self.is_normalized or self.settings.refine.on
         texture = F.mean_gradient(levels) if wanted else torch.zeros_like(levels)
-        return WarpedWindows(levels.to(torch.uint8), warped, seen, texture, parameters.kind == "between_later")
+        return WarpedWindows(to_bytes(levels), warped, seen, texture, parameters.kind == "between_later")
 
     def noise_weight(self, texture: Tensor, values: Values | None = None) -> Tensor | None:
         """(B, 1, H, W) steps of evidence a grey level; None unless differences are in units of local noise."""
@@ -300,8 +301,8 @@ class MotionSegmenter(nn.Module):
         threshold = self._value("difference.threshold", values)
         limit = threshold if self._unit == 1.0 else threshold * self._unit
         if evidence.dtype == torch.uint8:
-            limit = limit if isinstance(limit, Tensor) else int(limit)
-            margin = (evidence > limit).to(torch.uint8) * 255
+            above = evidence > limit if isinstance(limit, Tensor) else is_above(evidence, int(limit))
+            margin = above.to(torch.uint8) * 255
         else:
             margin = evidence - limit
         erode, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "close"))
@@ -381,7 +382,7 @@ class MotionSegmenter(nn.Module):
 
     def _rounded(self, x: Tensor, is_hard: bool) -> Tensor:
         if is_hard:
-            return x.round_().to(torch.uint8)
+            return to_bytes(x.round_())
         return F.round_straight_through(x) if self.whole else x
 
 
@@ -414,31 +415,34 @@ def close_masks(mask: Tensor, side: int) -> Tensor:
     return out
 
 
-def _absolute_difference(a: Tensor, b: Tensor) -> Tensor:
-    """|a - b| of unsigned bytes."""
-    return torch.maximum(a, b).sub_(torch.minimum(a, b))
-
-
-def _fit_light(reference: Tensor, warped: Tensor, seen: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Gains and offsets, (B,) each, that give the warped pictures their references' exposure."""
+def _fit_light(
+    reference: Tensor, warped: Sequence[Tensor], seen: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """Gains and offsets, (B, K) each, that give K warped pictures their references' exposure."""
     pitch = exposure_step(reference.shape[-2:])
-    first, last = (edge[:, ::pitch, None] for edge in seen)
+    first, last = (torch.stack([edge[:, ::pitch] for edge in edges], 1)[..., None] for edges in zip(*seen, strict=True))
     columns = torch.arange(0, reference.shape[-1], pitch, device=reference.device)
-    inside = (columns >= first) & (columns <= last)
-    wanted, given = (picture[..., ::pitch, ::pitch] / LEVEL for picture in (reference, warped))
-    gain, offset = F.fit_exposure(wanted, given, inside[:, None])
-    enough = inside.sum((1, 2)) >= _EXPOSURE_LEAST
-    return torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
+    inside = ((columns >= first) & (columns <= last)).flatten(0, 1)[:, None]
+    given = torch.stack([picture[..., ::pitch, ::pitch] for picture in warped], 1) / LEVEL
+    wanted = (reference[..., ::pitch, ::pitch] / LEVEL)[:, None].expand(given.shape)
+    gain, offset = F.fit_exposure(wanted.flatten(0, 1), given.flatten(0, 1).to(reference.dtype), inside)
+    enough = inside.sum((1, 2, 3)) >= _EXPOSURE_LEAST
+    gain, offset = torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
+    return gain.unflatten(0, (-1, len(warped))), offset.unflatten(0, (-1, len(warped)))
 
 
 def _apply_light(reference: Tensor, warped: Tensor, gain: Tensor, offset: Tensor) -> Tensor:
-    """The warped pictures through their gains and offsets, (B,) each, in whole levels.
+    """The warped pictures, bytes, through their gains and offsets, (B,) each.
 
     Where they are clipped at white they agree with anything brighter.
     """
     gain, offset = gain.reshape(-1, 1, 1, 1), offset.reshape(-1, 1, 1, 1)
+    levels = torch.arange(LEVEL + 1, dtype=gain.dtype, device=gain.device)
+    if F.all_true((gain * levels + offset).round() == levels):
+        return warped
     darkened = (gain * LEVEL + offset).round() < WHITE
     # A clipped pixel only says that the place was at least so bright.
     cut = None if F.all_true(~darkened) else (warped >= WHITE) & darkened
-    through = warped.mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
-    return through if cut is None else torch.where(cut, torch.maximum(through, reference), through)
+    through = warped.to(gain.dtype).mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL)
+    through = to_bytes(through)
+    return through if cut is None else torch.where(cut, torch.maximum(through, to_bytes(reference)), through)
