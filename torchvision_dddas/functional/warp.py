@@ -5,11 +5,11 @@ grid; its resize takes 0.3 to 0.4 of the time of the exact one here (`python eva
 """
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float64, Int32, Int64, Shaped
 from torch import Tensor
 from torch.nn import functional
 
-from torchvision_dddas.functional.filters import strip_rows
+from torchvision_dddas.functional.filters import strip_rows, to_bytes
 from torchvision_dddas.functional.soft import is_traced
 
 
@@ -22,13 +22,15 @@ def warp_perspective(
     *,
     inverse_map: bool = False,
     subpixels: int = 0,
-) -> Float[Tensor, "B C h w"]:
+    whole: bool = False,
+) -> Shaped[Tensor, "B C h w"]:
     """`kornia.geometry.warp_perspective`: the picture where M takes its pixels, (u, v) from the first one's centre.
 
     dsize: (height, width). Places are as with Kornia's align_corners=True, which is not asked for. padding_mode: zeros,
     or border, whose edge pixels continue outside; Kornia's fill is not there. inverse_map: M takes
     pixels of the result to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px,
     32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
+    whole: of grey levels bytes, halves rounded up.
     """
     height, width = src.shape[-2:]
     rows, columns = dsize
@@ -50,7 +52,8 @@ def warp_perspective(
         if subpixels:
             place = place.round_()
         place = torch.addcmul(offset, place, per_pixel).unflatten(-1, (columns, 2))
-        return functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
+        found = functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
+        return to_bytes(found.add_(0.5)) if whole else found
 
     step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)
     return torch.cat([sample(y[top : top + step]) for top in range(0, rows, step)], -2)

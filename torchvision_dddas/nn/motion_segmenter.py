@@ -240,8 +240,7 @@ class MotionSegmenter(nn.Module):
         seen: list[tuple[Tensor, Tensor]] = []
         for k, neighbour in enumerate(neighbours):
             matrix = neighbour_from_reference[:, k]
-            sampled = F.warp_perspective(neighbour, matrix, size, "bilinear", "border", inverse_map=True, subpixels=32)
-            warped.append(to_bytes(sampled.add_(0.5)))
+            warped.append(F.warp_perspective(neighbour, matrix, size, "bilinear", "border", True, 32, whole=True))
             frame_size = neighbour.shape[-2], neighbour.shape[-1]
             seen.append(F.seen_columns(matrix, size, frame_size, parameters.border_px))
         if self.is_normalized and warped:
