@@ -24,7 +24,6 @@ import torchvision_dddas.functional as F
 from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Settings, exposure_step
 from torchvision_dddas.functional.difference import absolute_difference
 from torchvision_dddas.functional.filters import is_above, to_bytes
-from torchvision_dddas.functional.soft import is_traced
 from torchvision_dddas.geometry import later_pair, near_pairs
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
