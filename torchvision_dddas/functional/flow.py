@@ -17,7 +17,7 @@ from torchvision_dddas.functional.soft import all_true, is_traced
 
 Pyramid = list[Tensor]
 
-# Half the side of the table that is tried first on a CPU: nine of ten points stay in it, at a quarter of the cost.
+# Half the side of the table that is tried first on a CPU: most points stay in it, and it has a quarter of the places.
 _SMALL_REACH = 1
 _POINTS_AT_ONCE = 500
 
