@@ -86,6 +86,8 @@ def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> No
     assert torch.autograd.gradcheck(total, starts, eps=1e-7, atol=2e-3, rtol=2e-3)
 
 
+
+
 def regions(core: Core) -> Regions:
     """The squares of the first picture, and those of the second, as one region each."""
     near = (core.margin > 0).long()
@@ -216,6 +218,15 @@ def test_from_pictures_to_masks_the_gradient_of_every_learned_parameter_is_right
     slopes = torch.autograd.grad(total(*starts), starts)
     assert all(slope.abs() > 1e-3 for slope in slopes)
     assert torch.autograd.gradcheck(total, starts, eps=1e-7, atol=2e-3, rtol=2e-3)
+
+
+def test_the_margin_of_a_clip_is_above_zero_where_the_mask_is_above_one_half_and_has_gradients(clip) -> None:
+    model = MotionSegmenter(of_kind("normalized"), softness=0.2)
+    found = model(clip)
+    assert found.margin.shape == found.mask.shape and 0 < float((found.margin > 0).double().mean()) < 1
+    assert torch.equal(found.margin > 0, found.mask > 0.5)
+    found.margin.sum().backward()
+    assert all(parameter.grad is not None and parameter.grad != 0 for parameter in model.parameters())
 
 
 def test_frames_without_two_neighbours_show_nothing(clip) -> None:

@@ -45,13 +45,14 @@ class Segmentation(NamedTuple):
 
     mask: 0 to 1; all 0 where a frame has no two neighbours. evidence: the largest difference, in noise units or grey
     levels. later_from_earlier: the background's motion from each frame to the next, float64; inliers: how many
-    keypoints agree with it.
+    keypoints agree with it. margin: above 0 where the mask is above one half; see `Core`.
     """
 
     mask: Float[Tensor, "B T 1 H W"]
     evidence: Float[Tensor, "B T 1 H W"]
     later_from_earlier: Float[Tensor, "B T-1 3 3"]
     inliers: Int64[Tensor, "B T-1"]
+    margin: Float[Tensor, "B T 1 H W"]
 
 
 @dataclass(frozen=True)
@@ -192,17 +193,18 @@ class MotionSegmenter(nn.Module):
         for at in range(frames):
             groups[tuple((a - at, b - at) for a, b in self._pairs(at, frames))].append(at)
         mask = [levels.new_zeros(batch, 1, *levels.shape[3:])] * frames
-        evidence = list(mask)
+        evidence, margin = list(mask), list(mask)
         for pairs, places in groups.items():
             if not pairs:
                 continue
             with torch.no_grad():
                 windows, near = self._windows(levels, later_from_earlier, places, pairs)
             core = self.segment(windows.differences(near), values)
-            for maps, found in ((mask, core.mask), (evidence, core.evidence)):
+            for maps, found in ((mask, core.mask), (evidence, core.evidence), (margin, core.margin)):
                 for place, of_frame in zip(places, found.unflatten(0, (batch, -1)).unbind(1), strict=True):
                     maps[place] = of_frame
-        return Segmentation(torch.stack(mask, 1), torch.stack(evidence, 1), later_from_earlier, inliers)
+        masks, evidences, margins = (torch.stack(frames_of, 1) for frames_of in (mask, evidence, margin))
+        return Segmentation(masks, evidences, later_from_earlier, inliers, margins)
 
     def segment(self, differences: Differences, values: Values | None = None, softness: float | None = None) -> Core:
         """The core of windows of known differences. softness: in place of the module's own."""
