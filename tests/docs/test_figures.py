@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(
     not (ROOT / "docs" / "results").is_dir(), reason="results and studies are in a checkout, not in a package"
 )
 
-TEXTS = ("docs/benchmarks.md", "docs/tuning.md")
+TEXTS = ("docs/benchmarks.md", "docs/tuning.md", "docs/tutorial.md")
 # A table with a column of numbers, which are set to the right.
 MEASURED = re.compile(r"^\|[- |:]*---:[- |:]*\|$", re.M)
 
