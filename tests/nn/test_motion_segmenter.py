@@ -86,8 +86,6 @@ def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> No
     assert torch.autograd.gradcheck(total, starts, eps=1e-7, atol=2e-3, rtol=2e-3)
 
 
-
-
 def regions(core: Core) -> Regions:
     """The squares of the first picture, and those of the second, as one region each."""
     near = (core.margin > 0).long()
