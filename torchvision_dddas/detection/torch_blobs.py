@@ -108,10 +108,10 @@ def foregrounds_with_blobs(
             regions.append([])
             for k in np.flatnonzero(parts.picture == number).tolist():
                 box, large = _as_box(parts.box[k]), _as_box(parts.box[k] * scale)
-                inside, evidence = (_crop(line, int(ends[k]), box) for line in cut[:2])
+                inside, seen = (_crop(line, int(ends[k]), box) for line in cut[:2])
                 for picture, line in zip(pictures, cut[2:], strict=True):
                     picture[box_slices(large)] = _crop(line, int(ends[k]) * scale**2, large)
-                regions[-1].append(Region(box, inside > 0, evidence, float(parts.peak[k])))
+                regions[-1].append(Region(box, inside > 0, seen, float(parts.peak[k])))
         threshold, hull = own.difference.threshold * unit, own.morphology.hull
         blobs = make_blobs(regions[0], threshold, hull)
         if len(regions) > 1:

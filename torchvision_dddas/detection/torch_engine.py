@@ -80,9 +80,9 @@ class TorchEngine(Engine):
         missing = list({id(view): view for pair in matched for view in pair if "pyramid" not in view.kept}.values())
         width, height = pairs[0][0].size
         step = self._at_once(width * height)
-        for part in (missing[first : first + step] for first in range(0, len(missing), step)):
-            pyramid = registration.pyramid(_join([_levels_of(view, self.device) for view in part]))
-            for number, view in enumerate(part):
+        for views in (missing[first : first + step] for first in range(0, len(missing), step)):
+            pyramid = registration.pyramid(_join([_levels_of(view, self.device) for view in views]))
+            for number, view in enumerate(views):
                 view.kept["pyramid"] = [level[number : number + 1] for level in pyramid]
         count = max(pairs[0][0].kept["points"].shape[1], 1)
         step = max(1, _POINTS_AT_ONCE // count)
@@ -180,8 +180,8 @@ def weak_maps(segmenter: MotionSegmenter, wide: Tensor, close_px: int = 0) -> tu
         return None
     half = functional.avg_pool2d(wide.float(), 2).add_(0.5).to(torch.uint8)
     morphology = segmenter.settings.morphology
-    sides = {"close_px": halve_side(close_px or morphology.close_px), "erode_px": halve_side(morphology.erode_px)}
-    return segmenter.core(half, **sides), half
+    close_px = halve_side(close_px or morphology.close_px)
+    return segmenter.core(half, close_px=close_px, erode_px=halve_side(morphology.erode_px)), half
 
 
 def _apply_in_groups(

@@ -30,7 +30,7 @@ def warp_perspective(
     or border, whose edge pixels continue outside; Kornia's fill is not there. inverse_map: M takes
     pixels of the result to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px,
     32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
-    whole: of grey levels bytes, halves rounded up.
+    whole: return bytes, halves rounded up; the pictures are grey levels up to 255.
     """
     height, width = src.shape[-2:]
     rows, columns = dsize

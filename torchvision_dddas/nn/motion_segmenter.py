@@ -13,6 +13,7 @@ hull is the hard one of a region, and counts as far as its region does.
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -241,7 +242,8 @@ class MotionSegmenter(nn.Module):
         seen: list[tuple[Tensor, Tensor]] = []
         for k, neighbour in enumerate(neighbours):
             matrix = neighbour_from_reference[:, k]
-            warped.append(F.warp_perspective(neighbour, matrix, size, "bilinear", "border", True, 32, whole=True))
+            warp = partial(F.warp_perspective, dsize=size, padding_mode="border", inverse_map=True, subpixels=32)
+            warped.append(warp(neighbour, matrix, whole=True))
             frame_size = neighbour.shape[-2], neighbour.shape[-1]
             seen.append(F.seen_columns(matrix, size, frame_size, parameters.border_px))
         if self.is_normalized and warped:
