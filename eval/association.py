@@ -4,6 +4,7 @@ python eval/association.py ratio DATA        accuracy ratio of whole tracks over
 python eval/association.py weight DATA       AR_K against the weight of location (appendix C, Fig. 4a)
 python eval/association.py threshold DATA    AR_2 against threshold × weight (Fig. 6)
 python eval/association.py dispersion DATA   the dispersions and the weight that they choose (Fig. 3, 4b, 5)
+python eval/association.py scale DATA        AR_2 and AR_3 by the scale of the histograms' dissimilarity
 python eval/association.py cuts DATA         AR_2 by the dispersions, with clusters that end earlier or later (Fig. 2)
 
 DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Except for `ratio`, identities are found
@@ -36,6 +37,7 @@ from torchvision_dddas.tracking.source_tracker import (
     centres,
     dispersion,
     frames_considered,
+    histogram_cut,
     location_weight,
     normalize_channels,
 )
@@ -55,7 +57,8 @@ TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
 }
 """Whether the tracker has the clip's pictures, and its settings."""
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
-LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.25, 0.34, 0.5, 0.6, 0.75)
+LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.125, 0.17, 0.25, 0.296, 0.375)
+SCALES = (1.0, 0.75, 0.57, 0.5, 0.4, 0.33)
 
 
 # -- whole tracks ----------------------------------------------------------------------------------------------------
@@ -203,14 +206,17 @@ def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1)
         )
     identities = [[sequence.identity[rows[t]] for t in f] for f in frames]
     parameters = PaperParameters()
-    spread = measure_dispersions(sequence, frames, parameters.location_cut, parameters.appearance_cut)
+    spread = measure_dispersions(sequence, frames, parameters.location_cut, histogram_cut(parameters))
     return Windows(frames, identities, parts[0], parts[1], spread)
 
 
 def measure_dispersions(
     sequence: Sequence, frames: np.ndarray, location_cut: float, histogram_cut: float
 ) -> np.ndarray:
-    """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts."""
+    """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts.
+
+    histogram_cut: of dissimilarities as printed.
+    """
     centre, found = centres(sequence.box_px), {}
     for t in np.unique(frames).tolist():
         rows = sequence.rows(t)
@@ -276,6 +282,49 @@ def measure_threshold(options: bench.Options) -> tuple[str, Any]:
     return "\n\n".join(parts), found
 
 
+def measure_scale(options: bench.Options) -> tuple[str, Any]:
+    """AR_2 and AR_3 by the rule and by the best fixed weight, for each scale of the histograms' dissimilarity.
+
+    Of true links: how many are more dissimilar than the threshold. The last row of a sequence is its figures at the
+    scale that is best by the rule on the other sequences.
+    """
+    found: dict[str, dict[float, list[float]]] = {}
+    cells: dict[str, dict[float, list[str]]] = {}
+    for name, sequence in _sequences(options):
+        windows = {k: build_windows(sequence, k, options.interval, options.every if k == 3 else 1) for k in (2, 3)}
+        found[name], cells[name] = {}, {}
+        for scale in SCALES:
+            cut_links, ruled = _cut_links(windows[2], scale), []
+            row = [f"{100 * cut_links:.1f}"]
+            for count, some in windows.items():
+                parameters = PaperParameters.model_validate({"window": count, "histogram_scale": scale})
+                spread = measure_dispersions(sequence, some.frames, parameters.location_cut, histogram_cut(parameters))
+                some = replace(some, dispersions=spread)
+                fixed = [float(window_ratios(some, parameters, w).mean()) for w in WEIGHTS]
+                best = int(np.argmax(fixed))
+                ruled.append(float(window_ratios(some, parameters, None).mean()))
+                row += [f"{100 * ruled[-1]:.1f}", f"{100 * fixed[best]:.1f} (w = {WEIGHTS[best]:g})"]
+            found[name][scale], cells[name][scale] = ruled, row
+            bench.log(name, scale, *row)
+    rows = []
+    for name, by_scale in cells.items():
+        rows += [[name, f"{scale:g}", *row] for scale, row in by_scale.items()]
+        others = [of for other, of in found.items() if other != name]
+        if others:
+            chosen = max(SCALES, key=lambda scale: sum(sum(of[scale]) for of in others))
+            rows.append([name, f"{chosen:g}, chosen on the others", *by_scale[chosen]])
+    head = ["sequence", "scale", "true links cut, %", "AR_2 by the rule", "best fixed weight", "AR_3 by the rule"]
+    return bench.format_table([*head, "best fixed weight"], rows, words=2), found
+
+
+def _cut_links(windows: Windows, scale: float) -> float:
+    """The share of true links whose histograms are more dissimilar than the threshold."""
+    threshold, apart = PaperParameters().threshold, []
+    for affinity, (newer, older) in zip(windows.appearance, windows.identities, strict=True):
+        apart.append(scale * (1 - affinity[1:, 1:][newer[:, None] == older[None]]))
+    return float((np.concatenate(apart) > threshold).mean())
+
+
 def measure_dispersion(options: bench.Options) -> tuple[str, Any]:
     """The dispersions of windows of two frames, the weight that follows, and AR_2 by that and by fixed weights."""
     rows, panels = [], []
@@ -306,7 +355,8 @@ def measure_cuts(options: bench.Options) -> tuple[str, Any]:
     for name, sequence in _sequences(options):
         windows, rows = build_windows(sequence, 2, options.interval), []
         for location_cut in LOCATION_CUTS:
-            spreads = [measure_dispersions(sequence, windows.frames, location_cut, cut) for cut in APPEARANCE_CUTS]
+            cuts = [cut / parameters.histogram_scale for cut in APPEARANCE_CUTS]
+            spreads = [measure_dispersions(sequence, windows.frames, location_cut, cut) for cut in cuts]
             found = [window_ratios(replace(windows, dispersions=at), parameters, None) for at in spreads]
             rows.append([f"{location_cut:g}", *map(_mean_sd, found)])
         head = [f"{name}: cut of locations", *(f"of histograms {cut:g}" for cut in APPEARANCE_CUTS)]
@@ -333,6 +383,7 @@ if __name__ == "__main__":
         "weight": (measure_weight, common | {"--every": 1, "--plot": None}),
         "threshold": (measure_threshold, common),
         "dispersion": (measure_dispersion, common | {"--plot": None}),
+        "scale": (measure_scale, common | {"--every": 1}),
         "cuts": (measure_cuts, common),
     }
     bench.main(__doc__, studies)

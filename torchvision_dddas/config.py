@@ -279,11 +279,13 @@ class PaperParameters(Group):
         0.65, "a feature of larger dispersion distinguishes targets: LL of III-D", "-", 0, 1
     )
     location_cut: float = parameter(
-        0.25, "dissimilarity at which location clusters end: normalised G; empirical", "-", 0, 1
+        0.25, "dissimilarity at which clusters of locations end: G of 2 dimensions, normalised (III-E)", "-", 0, 1
     )
-    appearance_cut: float = parameter(0.25, "dissimilarity at which clusters of histograms end; empirical", "-", 0, 1)
+    appearance_cut: float = parameter(
+        0.296, "dissimilarity at which clusters of histograms end: G of 3 dimensions, normalised (III-E)", "-", 0, 1
+    )
     dispersion_of: Literal["smallest", "smallest_if_counts_differ", "newest"] = parameter(
-        "smallest", "which frame of the window gives the dispersion; the source: smallest_if_counts_differ"
+        "smallest_if_counts_differ", "which frame of the window gives the dispersion"
     )
     gate: Literal["one_dummy", "every_dummy", "off"] = parameter(
         "one_dummy", "entries to raise to 1 - threshold: with one dummy, with any number (as printed), or none"
@@ -297,6 +299,9 @@ class PaperParameters(Group):
     )
     histogram: Literal["channel", "count"] = parameter(
         "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"
+    )
+    histogram_scale: float = parameter(
+        0.5, "share of the dissimilarity of histograms that counts; 1: as printed, which the gate cuts", "-", 0.1, 1
     )
     exact_targets: int = parameter(12, "largest number of targets a frame for the exact solution", "targets", 0, 1000)
     gap: float = parameter(0.005, "relaxation aims at a solution within this share of the bound", "-", 0, 1)

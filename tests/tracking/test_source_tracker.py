@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
 
 from torchvision_dddas.config import PaperParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
@@ -189,3 +190,25 @@ def test_the_weight_rule(location, appearance, weight):
 def test_the_dispersion_of_a_window_by_each_reading(reading, same, differ):
     for counts, wanted in (([3, 3], same), ([3, 4], differ)):
         assert min([0.9, 0.4][: frames_considered(counts, parameters(dispersion_of=reading))]) == wanted
+
+
+def test_clusters_end_at_chi_squared_quantiles_relative_to_those_of_one_in_ten_thousand():
+    # beta = 0.1, two dimensions of a location and three colours (appendix C, III-E).
+    for cut, dimensions in ((PaperParameters().location_cut, 2), (PaperParameters().appearance_cut, 3)):
+        assert cut == pytest.approx(chi2.ppf(0.9, dimensions) / chi2.ppf(0.9999, dimensions), abs=5e-4)
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (3, 2, 4)])
+def test_scaling_brings_histograms_of_real_targets_closer_and_leaves_the_dummys_entries(shape):
+    score = np.random.default_rng(0).uniform(0, 1, shape)
+    scaled, real = source_tracker.scale_histograms(score, 0.5), np.index_exp[1:] * len(shape)
+    np.testing.assert_allclose(1 - scaled[real], 0.5 * (1 - score[real]))
+    scaled[real] = score[real]
+    np.testing.assert_array_equal(scaled, score)
+
+
+def test_a_link_of_half_alike_histograms_passes_the_threshold_only_where_dissimilarities_are_scaled():
+    appearance = np.zeros((2, 2))
+    appearance[1, 1] = 0.5
+    rows = [assign(None, appearance, 0.0, parameters(window=2, histogram_scale=s)).tolist() for s in (0.5, 1.0)]
+    assert rows == [[[1, 1]], [[0, 1], [1, 0]]]

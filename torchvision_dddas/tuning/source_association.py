@@ -19,9 +19,11 @@ from torchvision_dddas.tracking.source_tracker import (
     best_alternatives,
     blend_gate,
     frames_considered,
+    histogram_cut,
     joined_at,
     pair_gain_over_alone,
     rgb_histograms,
+    scale_histograms,
 )
 from torchvision_dddas.tuning.examples import boxed_frames, stack_padded, true_tracks
 from torchvision_dddas.tuning.family import Example, Family
@@ -140,7 +142,8 @@ def build_window(
     pictured = all(frame.has_picture or not len(frame) for frame in features)
     values = [[frame.centre_px for frame in features]]
     values += [[frame.histogram(parameters.histogram) for frame in features]] if pictured else values
-    similarity = np.stack([affinity(pair, parameters) for pair in values])
+    by_location, by_appearance = (affinity(pair, parameters) for pair in values)
+    similarity = np.stack([by_location, scale_histograms(by_appearance, parameters.histogram_scale)])
     joined, there = np.zeros((2, 2, max(counts), max(counts))), np.zeros((2, max(counts)), bool)
     for frame, count in enumerate(counts):
         there[frame, :count] = True
@@ -205,7 +208,7 @@ def location_weight(parameters: PaperParameters, windows: Windows, softness: flo
         fixed = torch.as_tensor(parameters.weight).to(windows.similarity)
         return torch.where(windows.pictured, fixed, 1.0)
     by_feature = []
-    for feature, cut in enumerate((parameters.location_cut, parameters.appearance_cut)):
+    for feature, cut in enumerate((parameters.location_cut, histogram_cut(parameters))):
         # The smallest dispersion of the frames that count.
         of_frames = dispersion(windows.joined_at[:, feature], windows.there, cut, softness)
         smallest = of_frames.masked_fill(~windows.speaks, torch.inf).amin(1)
