@@ -301,7 +301,7 @@ class PaperParameters(Group):
         "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"
     )
     histogram_scale: float = parameter(
-        0.5, "share of the dissimilarity of histograms that counts; 1: as printed, which the gate cuts", "-", 0.1, 1
+        0.4, "share of the dissimilarity of histograms that counts; 1: as printed, which the gate cuts", "-", 0.1, 1
     )
     exact_targets: int = parameter(12, "largest number of targets a frame for the exact solution", "targets", 0, 1000)
     gap: float = parameter(0.005, "relaxation aims at a solution within this share of the bound", "-", 0, 1)
