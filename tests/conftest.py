@@ -13,12 +13,20 @@ cv2.setNumThreads(2)
 try:
     import torch
 except ModuleNotFoundError:  # the onboard install
-    pass
+    HAS_GPU = False
 else:
+    HAS_GPU = torch.cuda.is_available()
     torch.set_num_threads(2)
 
+import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 # On a busy machine an example may take as long as it likes.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out the tests that need a CUDA device where there is none, and say so."""
+    if item.get_closest_marker("gpu") is not None and not HAS_GPU:
+        pytest.skip("needs a CUDA device")
