@@ -34,7 +34,7 @@ from torchvision_dddas.cli.progress import progress
 from torchvision_dddas.config import PeopleParameters, load_config
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import hog_svm
-from torchvision_dddas.io.atomic_files import cannot_write, refuse_folder, remove, temporary, write_whole
+from torchvision_dddas.io.atomic_files import PartFile, cannot_write, refuse_folder, utf8_name, write_whole
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.people.pyramid import everywhere, levels
 from torchvision_dddas.people.torch_scorer import TorchScorer
@@ -131,12 +131,10 @@ def check_out(path: Path, folders: Sequence[Path]) -> None:
     place = Path(os.path.realpath(path)).parent
     if among := [folder for folder in folders if place.is_relative_to(os.path.realpath(folder))]:
         raise InputError(f"--out {path} lies in {among[0]}, among the pictures; choose another place")
-    part = temporary(path)
     try:
-        part.touch()
+        PartFile(path).discard()
     except OSError as error:
         raise cannot_write(path, error) from None
-    remove(part)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -155,7 +153,7 @@ def files(folder: Path) -> list[Path]:
 
 def picture(path: Path) -> np.ndarray:
     """uint8 (H, W, 3) BGR. Raises InputError where it cannot be decoded."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = cv2.imread(utf8_name(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path} cannot be decoded; repair it or leave it out")
     return image

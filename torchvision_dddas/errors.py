@@ -1,4 +1,6 @@
-"""The one error that a user's mistake raises, and the checks that raise it."""
+"""The one error that a user's mistake raises; and what any message, table or page may show of a name or an address."""
+
+import re
 
 LONGEST = 1000
 """Characters of a message; what came may have been of any length."""
@@ -6,15 +8,55 @@ LONGEST = 1000
 _END = 300  # of these, those that are kept of its end, which says what to do
 
 
+# Between a scheme and the last @ stands who logs in, if there is a colon or no path in between: a password may hold /.
+_LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=]))[a-z][\w+.-]*:/+|[a-z][\w+.-]*://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
+# user:password@host, as it is written where the scheme is forgotten.
+_BARE_LOGIN = re.compile(r"(?:^|(?<=[\s'\"(]))[^\s/:@'\"(]+:(?!/)[^\s]*@")
+_SECRET_KEY = re.compile(
+    r"(?<=[?&;/])([^\s=?&;/]*(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]*=)[^\s&]+", re.I
+)
+_HIDDEN = r"\1***"
+
+
+def without_secrets(text: str) -> str:
+    """A text without the names and passwords of its addresses: `user:password@` is left out, `?password=` says ***.
+
+    A password may hold any sign. Where it cannot be known whether an @ ends one, all before it is left out.
+    """
+    if "@" not in text and ("://" not in text or "=" not in text):
+        return text
+    return "\n".join(_without_secrets(line) for line in text.split("\n"))
+
+
+def _without_secrets(line: str) -> str:
+    line = _BARE_LOGIN.sub("", _LOGIN.sub(r"\1", line))
+    head, scheme, address = line.partition("://")
+    return head + scheme + _SECRET_KEY.sub(_HIDDEN, address)
+
+
+def readable(text: str) -> str:
+    r"""A text that any encoding of Unicode holds: bytes of a file's name that are no UTF-8 are shown as `\xff`."""
+    if text.isascii():
+        return text
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # half a character that is no byte of a name either
+        return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 class InputError(ValueError):
     """Bad input in one clear line: what came, what was wanted, what to do. The command line exits with 2 on it.
 
     What came may hold line feeds, what steers a terminal, or half a character: such is shown by its number. The middle
-    of an endless line is left out.
+    of an endless line is left out, and so are passwords.
     """
 
     def __init__(self, text: object = "") -> None:
-        super().__init__(_line(str(text)))
+        super().__init__(_line(readable(without_secrets(str(text)))))
+
+
+class LostInputError(InputError):
+    """The input stopped before its end. What came until then is kept."""
 
 
 def _line(text: str) -> str:

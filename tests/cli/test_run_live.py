@@ -15,8 +15,8 @@ import pytest
 from tests.cli.conftest import bad
 from tests.synthetic_clip import render
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.errors import without_secrets
 from torchvision_dddas.io.run_inputs import prepare_run
-from torchvision_dddas.io.sources import without_secrets
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.

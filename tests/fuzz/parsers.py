@@ -18,7 +18,7 @@ from tests.fuzz import seeds
 from tests.fuzz.damage import damaged
 from torchvision_dddas.cli.colours import parse_box, parse_names
 from torchvision_dddas.config import PeopleParameters, changes, load_config
-from torchvision_dddas.errors import LONGEST, InputError
+from torchvision_dddas.errors import LONGEST, InputError, without_secrets
 from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Source
 from torchvision_dddas.evaluation.evaluate import evaluate, load_result
@@ -33,7 +33,7 @@ from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
 from torchvision_dddas.io.images import natural_order
 from torchvision_dddas.io.output.run_record import read_run_record
-from torchvision_dddas.io.sources import open_source, stream_target, without_secrets
+from torchvision_dddas.io.sources import open_source, stream_target
 from torchvision_dddas.io.streams import About, open_stream
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.live.server import parse_address

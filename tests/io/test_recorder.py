@@ -13,7 +13,8 @@ import pytest
 
 from tests.io.conftest import make_scene
 from tests.io.ground import NAMES, ORIGIN, START, grounded
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, LostInputError
+from torchvision_dddas.io.atomic_files import PartFile
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import (
     AerialRecorder,
@@ -172,26 +173,25 @@ def test_ctrl_c_while_a_frame_is_written_waits_for_the_whole_frame(tmp_path, mon
     assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2
 
 
-@pytest.mark.parametrize("victim", ["mask", "table", "overlay", "closing"])
+@pytest.mark.parametrize("victim", ["mask", "table", "closing"])
 def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(tmp_path, monkeypatch, victim):
-    write_bytes, replace = Path.write_bytes, Path.replace
+    write, replace = PartFile.write, Path.replace
 
     def refuse(*_):
         raise FULL
 
     def refuse_mask(self, content):
-        if "000002" in self.name:
-            write_bytes(self, content[:10])
+        if "000002" in self.path.name:
+            write(self, content[:10])
             raise FULL
-        return write_bytes(self, content)
+        write(self, content)
 
     def refuse_table(self, target):
         return refuse() if target.name == "detections.csv" else replace(self, target)
 
     place, how = {
-        "mask": ("pathlib.Path.write_bytes", refuse_mask),
+        "mask": ("torchvision_dddas.io.atomic_files.PartFile.write", refuse_mask),
         "table": ("torchvision_dddas.io.tables.mot_rows", refuse),
-        "overlay": ("torchvision_dddas.io.overlay_video._H264.encode", refuse),
         "closing": ("pathlib.Path.replace", refuse_table),
     }[victim]
     monkeypatch.setattr(place, how)
@@ -224,10 +224,10 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"cannot write into .*out.*--out"):
         DetectionRecorder(tmp_path / "out/deeper")
 
-    def refuse(self, _):
-        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+    def refuse(path, *_):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "write_bytes", refuse)
+    monkeypatch.setattr("os.open", refuse)
     with pytest.raises(InputError, match="Permission denied"):
         DetectionRecorder(tmp_path)
 
@@ -285,3 +285,29 @@ def test_the_record_counts_people_windows_and_the_frames_that_could_not_be_read(
     assert kept["unreliable"] == [{"first": 3, "last": 3, "cause": "the frame could not be read"}]
     assert [a["cause"] for a in kept["adjustments"]] == ["2 people expected"]
     assert kept["seconds"]["stages"]["score"]["total"] == pytest.approx(0.1)
+
+
+def test_an_overlay_that_fails_costs_itself_alone_and_is_told(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise ValueError("the encoder is out of order")
+
+    monkeypatch.setattr("torchvision_dddas.io.overlay_video._H264.encode", refuse)
+    with pytest.raises(InputError, match="overlay could not be written: the encoder is out of order; all else is in"):
+        fill(tmp_path, [make_scene(1), make_scene(2)])
+    assert {"detections.csv", "detections.txt", "masks/000002.png", "run.json"} <= set(visible(tmp_path))
+    assert "overlay.mp4" not in visible(tmp_path)
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert (record["state"], "overlay" in record["outputs"], len(record["problems"])) == ("complete", False, 1)
+
+
+def test_an_input_that_is_lost_keeps_what_came_before(tmp_path):
+    def scenes():
+        yield make_scene(1)
+        raise LostInputError("it sent nothing for 30 s")
+
+    with pytest.raises(LostInputError) as error:
+        fill(tmp_path, scenes())
+    assert error.value.__notes__ == ["results up to here are kept"]
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert (record["state"], record["frames"]["written"]) == ("interrupted", 1)
+    assert "detections.csv" in visible(tmp_path)

@@ -7,8 +7,9 @@ import threading
 
 import pytest
 
+from torchvision_dddas.io.interrupts import StopSignals
 from torchvision_dddas.live.health import Health
-from torchvision_dddas.live.watchdog import StopSignals, Supervisor, Watchdog
+from torchvision_dddas.live.watchdog import Supervisor, Watchdog
 
 PATIENCE_S = 60.0
 
@@ -114,7 +115,7 @@ def test_the_first_signal_asks_the_second_ends_at_once_and_handlers_are_restored
         codes.append(code)
         ended.set()
 
-    with StopSignals(lambda number: asked.set(), at_once) as stopping:
+    with StopSignals(lambda number: asked.set(), at_once, together_s=0.0) as stopping:
         assert stopping.signal is None and not asked.is_set()
         os.kill(os.getpid(), number)
         assert asked.wait(PATIENCE_S)

@@ -1,6 +1,8 @@
 """The command line, `dddas`: one file a command. Heavy imports wait until a command needs them."""
 
 import io
+import os
+import signal
 import sys
 from typing import Annotated
 
@@ -13,9 +15,18 @@ from torchvision_dddas.cli.confirm import confirm
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
+from torchvision_dddas.cli.exits import (
+    BAD_INPUT,
+    FAULT,
+    close_output,
+    describe_kept,
+    open_output,
+    say,
+    say_fault,
+    say_stopped,
+)
 from torchvision_dddas.cli.export import export
 from torchvision_dddas.cli.locate import locate
-from torchvision_dddas.cli.options import BAD_INPUT, INTERRUPTED
 from torchvision_dddas.cli.people import people
 from torchvision_dddas.cli.run import run
 from torchvision_dddas.cli.settings import settings
@@ -23,6 +34,7 @@ from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 from torchvision_dddas.cli.tune import tune
+from torchvision_dddas.io.interrupts import KEPT, StopSignals, raising_signals
 from torchvision_dddas.runtime import VERSION
 
 app = typer.Typer(
@@ -56,20 +68,33 @@ def _options(
 
 
 def main() -> None:
-    """Entry point. Exit code 0: done; 2: bad input, one line on stderr; 130: stopped by Ctrl-C, outputs valid."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal that cannot show × or ≥ shows a question mark
+    """Entry point. Exit codes: see docs/commands.md."""
+    if isinstance(sys.stderr, io.TextIOWrapper):
+        sys.stderr.reconfigure(errors="replace")
+    output = open_output()
+
+    def end(number: int, kept: bool) -> None:
+        os._exit(say_stopped(number, KEPT if kept else ""))
+
+    signals = raising_signals(end)
+    signals.__enter__()  # never left: a second signal may come while Python ends
+    sys.exit(close_output(output, _run(signals)))
+
+
+def _run(signals: StopSignals) -> int:
     try:
-        sys.exit(app(standalone_mode=False))
-    except (KeyboardInterrupt, typer.Abort):  # outside a command, while Python still loads
-        sys.exit(INTERRUPTED)
+        return int(app(standalone_mode=False) or 0)
+    except (KeyboardInterrupt, typer.Abort) as error:  # outside a command, while Python still loads
+        return say_stopped(signals.signal or signal.SIGINT, describe_kept(error))
+    except SystemExit as error:
+        return error.code if isinstance(error.code, int) else FAULT
     except Exception as error:
         # A word of the command line that will not do; Typer keeps the class of these errors to itself.
         if not hasattr(error, "format_message"):
-            raise
+            say_fault()
+            return FAULT
         if len(sys.argv) < 2 or not error.format_message():  # a group of commands, none of which was named
             error.show()  # type: ignore[attr-defined]
         else:
-            typer.echo(f"dddas: {' '.join(error.format_message().split()).rstrip('.')}; see dddas --help", err=True)
-        sys.exit(BAD_INPUT)
+            say(f"{' '.join(error.format_message().split()).rstrip('.')}; see dddas --help")
+        return BAD_INPUT

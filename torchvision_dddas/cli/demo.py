@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from torchvision_dddas.cli.exits import noting
 from torchvision_dddas.cli.options import Quiet, print_lines, report_errors
 from torchvision_dddas.cli.progress import progress
 
@@ -22,7 +23,8 @@ def demo(
     from torchvision_dddas.simulation import film_clip, load_scenario
 
     length = load_scenario("demo").clip
-    with progress("filming", round(length.seconds * length.rate_hz), quiet) as tick:
+    kept = noting(lambda: f"the pictures up to here are kept in {out / 'clip'}", (out / "clip").exists)
+    with kept, progress("filming", round(length.seconds * length.rate_hz), quiet) as tick:
         clip = film_clip(out / "clip", tick=tick)
     lines = detect_clip(str(clip / "frames"), out, load_config(), "auto", DetectionRecorder.saved, quiet=quiet)
     report = score(clip / "masks", out, None, out)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchvision_dddas.cli.exits import noting
 from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
@@ -47,8 +48,11 @@ def detect(
     from torchvision_dddas.io.output import DetectionRecorder, parse_save
 
     settings, names = load_config(config, set_ or []), parse_save(save, DetectionRecorder.saved)
-    for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
-        print_lines(detect_clip(clip, folder, settings, backend.value, names, telemetry, rate, quiet), quiet)
+    done: list[str] = []
+    with noting(lambda: f"all of {', '.join(done)} is kept", lambda: done):
+        for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
+            print_lines(detect_clip(clip, folder, settings, backend.value, names, telemetry, rate, quiet), quiet)
+            done.append(folder.name)
 
 
 def detect_clip(

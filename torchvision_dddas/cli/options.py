@@ -4,13 +4,13 @@ import functools
 from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
+from signal import SIGINT
 from typing import Annotated, ParamSpec, TypeVar
 
 import typer
 
+from torchvision_dddas.cli.exits import BAD_INPUT, describe_kept, say, say_stopped
 from torchvision_dddas.errors import InputError
-
-BAD_INPUT, INTERRUPTED = 2, 130
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -60,18 +60,18 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors."
 
 
 def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, and Ctrl-C into exit code 130."""
+    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, and a signal into 128 and its number."""
 
     @functools.wraps(command)
     def guarded(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         try:
             return command(*args, **kwargs)
         except InputError as error:
-            typer.echo(f"dddas: {' '.join(str(error).split())}", err=True)
+            kept = describe_kept(error)
+            say(f"{error}; {kept}" if kept else error)
             raise typer.Exit(BAD_INPUT) from None
-        except KeyboardInterrupt:
-            typer.echo("dddas: interrupted; results up to here are kept", err=True)
-            raise typer.Exit(INTERRUPTED) from None
+        except KeyboardInterrupt as error:
+            raise typer.Exit(say_stopped(getattr(error, "number", SIGINT), describe_kept(error))) from None
 
     return guarded
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchvision_dddas.cli.exits import noting
 from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
@@ -62,34 +63,37 @@ def people(
     if around is not None and len(inputs) > 1:
         raise InputError(f"--around is the table of one clip, and {len(inputs)} were given; run them one after another")
     scorer: WindowScorer | None = None
-    for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
-        given = [Path(clip), *([] if around is None else [around])]
-        refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
-        with PeopleRecorder(folder, names) as output:
-            table = read_detections(around) if around is not None else None
-            source = open_video(clip, rate_hz=rate, single=True)
-            if table is not None:
-                check_within_clip(table, source)
-            try:
-                levels(source.size, settings.people)  # a picture that is too small is refused before the engine loads
-            except InputError as error:
-                raise InputError(f"{source.name}: {error}") from None
-            scorer = scorer or detector.load_scorer(settings.people, backend.value)
-            facts = {
-                "input": clip,
-                "around": around,
-                "clip": clip_facts(source),
-                "backend": scorer.name,
-                "settings": settings.model_dump(),
-            }
-            is_single = source.exact and source.count == 1
-            overlay = "overlay.png" if is_single else "overlay.mp4"
-            record = output.begin(facts, source.rate_hz, is_single)
-            frames = detector.detect_in_clip(source, scorer, settings, table)
-            record_results(output, record, frames, source.name, source.count, quiet, source)
-            record.notes += [] if table is None else _notes(record, str(around), table, source)
-        files = ["detections.csv", "detections.txt", *(overlay for _ in names), "run.json"]
-        print_lines(closing_lines(_counts(record), record, folder, files), quiet)
+    done: list[str] = []
+    with noting(lambda: f"all of {', '.join(done)} is kept", lambda: done):
+        for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
+            given = [Path(clip), *([] if around is None else [around])]
+            refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
+            with PeopleRecorder(folder, names) as output:
+                table = read_detections(around) if around is not None else None
+                source = open_video(clip, rate_hz=rate, single=True)
+                if table is not None:
+                    check_within_clip(table, source)
+                try:
+                    levels(source.size, settings.people)  # refuse what is too small before the engine loads
+                except InputError as error:
+                    raise InputError(f"{source.name}: {error}") from None
+                scorer = scorer or detector.load_scorer(settings.people, backend.value)
+                facts = {
+                    "input": clip,
+                    "around": around,
+                    "clip": clip_facts(source),
+                    "backend": scorer.name,
+                    "settings": settings.model_dump(),
+                }
+                is_single = source.exact and source.count == 1
+                overlay = "overlay.png" if is_single else "overlay.mp4"
+                record = output.begin(facts, source.rate_hz, is_single)
+                frames = detector.detect_in_clip(source, scorer, settings, table)
+                record_results(output, record, frames, source.name, source.count, quiet, source)
+                record.notes += [] if table is None else _notes(record, str(around), table, source)
+            files = ["detections.csv", "detections.txt", *(overlay for _ in names), "run.json"]
+            print_lines(closing_lines(_counts(record), record, folder, files), quiet)
+            done.append(folder.name)
 
 
 def _notes(record: "RunRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.evaluate import change_spec
+from torchvision_dddas.cli.exits import noting
 from torchvision_dddas.cli.options import (
     CacheFolder,
     Clips,
@@ -81,6 +82,7 @@ def sweep(
     from torchvision_dddas.evaluation.studies import sweep as sweeps
     from torchvision_dddas.evaluation.studies.jobs import Workers
     from torchvision_dddas.evaluation.studies.summary import parse_goal
+    from torchvision_dddas.io.atomic_files import claimed
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
@@ -103,7 +105,8 @@ def sweep(
             printed = time.monotonic()
             print_now(f"{done} of {total} clips of the next points")
 
-    with Workers(jobs, scheduler) as workers:
+    kept = noting(lambda: f"{len(record.trials)} trials are kept in {out}", lambda: record.trials)
+    with claimed(out), kept, Workers(jobs, scheduler) as workers:
         study = sweeps.StudyMeasure(spec, dataset.parent, goal, workers, cache, on_progress)
         on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
         if optuna is None:
@@ -122,7 +125,7 @@ def sweep(
         if held:
             study.prepare([{}, found.parameters], held)
             on_held = (study.measure({}, held), study.measure(found.parameters, held))
-    record.finish(found, on_held)
+        record.finish(found, on_held)
     if not quiet:
         _show(record)
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.onnx import symbolic_helper
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
+from torchvision_dddas.io.atomic_files import PartFile, cannot_write, claimed
 from torchvision_dddas.runtime import MANIFEST, VERSION, manifest, seal
 
 OPSET = 20
@@ -71,18 +71,19 @@ def write_graphs(folder: Path, files: dict[str, ExportedGraph]) -> None:
     listed: dict[str, Any] = {"package": VERSION, "graphs": dict(sorted(entries.items()))}
     # The last to take its place.
     contents[MANIFEST] = (json.dumps({**listed, "seal": seal(listed)}, indent=1) + "\n").encode()
-    parts = {folder / name: temporary(folder / name) for name in contents}
+    parts: list[PartFile] = []
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, part in parts.items():
-            part.write_bytes(contents[path.name])
-        for path, part in parts.items():
-            part.replace(path)
+        with claimed(folder):
+            for name, content in contents.items():
+                parts.append(PartFile(folder / name))
+                parts[-1].write(content)
+            for part in parts:
+                part.keep()
     except OSError as error:
         raise cannot_write(folder, error) from None
     finally:
-        for part in parts.values():
-            remove(part)
+        for part in parts:
+            part.discard()
 
 
 def refuse_failed(files: dict[str, ExportedGraph]) -> None:

@@ -1,29 +1,88 @@
-"""Files that appear whole or not at all: written under a temporary name beside their place, then renamed."""
+"""Files that appear whole or not at all, and folders that one run at a time writes into.
 
+A file is written under a hidden name beside its place, then renamed. Whoever writes it holds a lock of the system on
+it, which ends with the process however that ends: a hidden file without a lock is what a killed process left.
+"""
+
+import errno
 import os
 import re
-from collections.abc import Iterable
-from contextlib import suppress
+import secrets
+import stat
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import TextIO
 
 from torchvision_dddas.errors import InputError
 
-_PART = re.compile(r"^\.(.+)\.\d+\.part(\.\w+)$")
+with suppress(ImportError):  # without such locks nothing is refused, and nothing counts as left behind
+    import fcntl
+
+LOCK = ".dddas.lock"
+"""The file in a folder that its run has locked."""
+
+_PART = re.compile(r"\.(.+)\.[0-9a-f]{16}\.part(\.\w+)?")
+_PATTERN = ".*.part*"
+# Folders in a run's folder that it writes into.
+_INNER = ("", "masks", "frames", "ground/*", "truth", "truth/masks")
 
 
-def temporary(path: Path) -> Path:
-    """A hidden name in the same folder, with the same ending, so that a rename makes it whole."""
-    return path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+class PartFile:
+    """A file under way. path: its hidden name, random and made for this process alone, with the ending of its place.
+
+    Raises OSError if it cannot be made.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        while True:
+            name = f".{place.stem}.{secrets.token_hex(8)}.part{place.suffix}"
+            self.path = place.with_name(name)
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+            # Another process may take it for one left behind, until it is locked.
+            has_lock = _lock(self._file)
+            if has_lock is None or (has_lock and _is_at(self._file, self.path)):
+                return
+            os.close(self._file)
+
+    def write(self, content: bytes) -> None:
+        """Add bytes. Raises OSError."""
+        rest = memoryview(content)
+        while rest:
+            rest = rest[os.write(self._file, rest) :]
+
+    def open_text(self) -> TextIO:
+        """A text file that writes here; closed before `keep`."""
+        return open(self._file, "w", encoding="utf-8", newline="", closefd=False)
+
+    def keep(self) -> None:
+        """Put the file in its place. Raises OSError."""
+        self.path.replace(self.place)
+        self._close()
+
+    def discard(self) -> None:
+        """Remove the file, unless it was kept. Never raises."""
+        if self._file >= 0:
+            remove(self.path)
+            self._close()
+
+    def _close(self) -> None:
+        file, self._file = self._file, -1
+        os.close(file)
 
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file at once. Raises OSError, and then leaves neither a new file nor a temporary one."""
-    part = temporary(path)
+    part = PartFile(path)
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        part.write(content)
+        part.keep()
     except BaseException:
-        remove(part)
+        part.discard()
         raise
 
 
@@ -40,6 +99,155 @@ def remove(path: Path) -> None:
     """Remove a file if it is there and can be removed: used while another error is on its way to the user."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
+
+
+def remove_left_behind(folder: Path) -> None:
+    """Remove the hidden files in a folder that killed processes left. Never raises."""
+    with suppress(OSError):
+        for path in folder.glob(_PATTERN):
+            if _PART.fullmatch(path.name) is not None:
+                with suppress(OSError), _opened(path, os.O_RDWR | os.O_NOFOLLOW) as file:
+                    if stat.S_ISREG(os.fstat(file).st_mode) and _lock(file):
+                        path.unlink()
+
+
+class ClaimedFolder:
+    """A folder that this process alone writes into, until `release` or the end of the process.
+
+    Files that killed runs left under way are removed. made: the folders that were made, innermost first.
+    Raises InputError: another run writes into it, or it cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.made: list[Path] = []
+        self._lock = -1
+        try:
+            for place in (folder, *folder.parents):
+                if place.exists():
+                    break
+                self.made.append(place)
+            self._lock = self._taken()
+        except OSError as error:
+            self.remove_made()
+            raise InputError(
+                f"cannot write into {folder}: {error.strerror or error}. Choose another folder with --out"
+            ) from error
+        for inner in _INNER:
+            for place in folder.glob(inner) if inner else [folder]:
+                remove_left_behind(place)
+
+    def _taken(self) -> int:
+        path = self.folder / LOCK
+        while True:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            if (has_lock := _lock(file)) is False:
+                os.close(file)
+                raise InputError(
+                    f"another run is writing into {self.folder}: wait for its end, or choose another folder with --out"
+                )
+            if has_lock is None or _is_at(file, path):  # else the run before removed it meanwhile
+                return file
+            os.close(file)
+
+    def release(self) -> None:
+        """Let others write there. Never raises."""
+        if self._lock >= 0:
+            remove(self.folder / LOCK)
+            file, self._lock = self._lock, -1
+            os.close(file)
+
+    def remove_made(self) -> None:
+        """Release it, and remove the folders that were made, as far as nothing is in them."""
+        self.release()
+        for folder in self.made:
+            try:
+                folder.rmdir()
+            except OSError:  # not empty: someone else uses it
+                break
+
+    def __del__(self) -> None:
+        self.release()
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[ClaimedFolder]:
+    """The block alone writes into a folder, which is not left behind if nothing was written. Raises InputError."""
+    claim = ClaimedFolder(folder)
+    try:
+        yield claim
+    finally:
+        claim.remove_made()
+
+
+def _lock(file: int) -> bool | None:
+    """Lock an open file; False if another process has it locked, None where the system has no such locks."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except NameError:
+        return None
+    except OSError as error:
+        return False if error.errno in (errno.EWOULDBLOCK, errno.EACCES) else None
+    return True
+
+
+def _is_at(file: int, path: Path) -> bool:
+    """Whether an open file is still the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except OSError:
+        return False
+
+
+def utf8_name(path: str | Path) -> str:
+    """A name for a library that takes UTF-8 alone and may crash on any other: such a file's is a link to its folder.
+
+    The link lasts as long as the process. Raises InputError if it cannot be made.
+    """
+    name = str(path)
+    if name.isascii():
+        return name
+    try:
+        folder, file = os.path.split(os.fsencode(os.path.abspath(name)))  # noqa: PTH100 (a link is not followed)
+        if sys.getfilesystemencoding() == "utf-8" and _is_utf8(folder + file):
+            return name
+        if not file.isascii():
+            return _link(folder + b"/" + file)
+        return f"{_link(folder)}/{file.decode()}"
+    except (OSError, UnicodeEncodeError) as error:
+        raise InputError(f"{name} cannot be opened under that name ({error}); give it a plain one") from None
+
+
+def _is_utf8(name: bytes) -> bool:
+    try:
+        name.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+@cache
+def _link(target: bytes) -> str:
+    """A plain name that leads to a file or folder, with its ending."""
+    ending = re.sub(r"[^\w.]", "", Path(os.fsdecode(target)).suffix, flags=re.ASCII)
+    link = Path(_links().name) / f"{secrets.token_hex(8)}{ending}"
+    link.symlink_to(os.fsdecode(target))
+    return str(link)
+
+
+@cache
+def _links() -> "tempfile.TemporaryDirectory[str]":
+    return tempfile.TemporaryDirectory(prefix="dddas-")
+
+
+@contextmanager
+def _opened(path: Path, flags: int) -> Iterator[int]:
+    file = os.open(path, flags | os.O_CLOEXEC)
+    try:
+        yield file
+    finally:
+        os.close(file)
 
 
 def refuse_own_input(given: Iterable[Path], written: Iterable[Path], option: str) -> None:
@@ -62,7 +270,8 @@ def refuse_folder(path: Path) -> None:
 
 def cannot_write(path: Path, error: OSError) -> InputError:
     """The InputError to raise for a failed write of a file."""
-    place = path.with_name(_PART.sub(r"\1\2", path.name))
+    part = _PART.fullmatch(path.name)
+    place = path if part is None else path.with_name(f"{part[1]}{part[2] or ''}")
     return InputError(
         f"cannot write {place}: {error.strerror or error}. Nothing half-written was kept; "
         "free some space or choose another --out"

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
+from torchvision_dddas.io.atomic_files import PartFile, utf8_name, write_whole
 
 Item = TypeVar("Item")
 
@@ -24,7 +24,7 @@ class OverlayVideo(Generic[Item]):
     ) -> None:
         """draw: returns a new picture of an item, (H, W, 3) uint8 BGR."""
         self._path = folder / name
-        self._part = temporary(self._path)
+        self._part: PartFile | None = None
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
         self._writer: ThreadedWriter | None = None
         self._draw = draw
@@ -37,27 +37,29 @@ class OverlayVideo(Generic[Item]):
         if height % 2 or width % 2:
             picture = cv2.copyMakeBorder(picture, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
         if self._writer is None:
-            self._writer = _open_writer(self._part, self._rate, (picture.shape[1], picture.shape[0]))
+            self._part = PartFile(self._path)
+            self._writer = _open_writer(self._part.path, self._rate, (picture.shape[1], picture.shape[0]))
         self._writer.write(picture)
 
     def close(self, complete: bool) -> None:
         """Finish the video and put it in its place; a run without frames has none."""
-        if self._writer is None:
+        if self._writer is None or self._part is None:
             return
         writer, self._writer = self._writer, None
         writer.close()
         # OpenCV's writer stays silent on a full disk: only a video that can be opened again is whole.
-        if not cv2.VideoCapture(str(self._part)).isOpened():
+        if not cv2.VideoCapture(utf8_name(self._part.path)).isOpened():
             raise OSError(f"{self._path.name} could not be finished")
-        self._part.replace(self._path)
+        self._part.keep()
 
     def discard(self) -> None:
         """Remove what was begun."""
         if self._writer is not None:
-            with suppress(OSError):  # a full disk refuses the last frames again
+            with suppress(Exception):  # a full disk refuses the last frames again; an encoder may raise anything
                 self._writer.close()
             self._writer = None
-        remove(self._part)
+        if self._part is not None:
+            self._part.discard()
 
 
 class OverlayPicture(Generic[Item]):
@@ -138,7 +140,7 @@ class _H264(ThreadedWriter):
         import av
 
         self._av = av
-        self._container = av.open(str(path), "w", options={"movflags": "faststart"})
+        self._container = av.open(utf8_name(path), "w", options={"movflags": "faststart"})
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
@@ -162,7 +164,7 @@ class _H264(ThreadedWriter):
 
 class _OpenCv(ThreadedWriter):
     def __init__(self, path: Path, rate: Fraction, size: tuple[int, int]) -> None:
-        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
+        self._writer = cv2.VideoWriter(utf8_name(path), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), size)
         if not self._writer.isOpened():
             raise OSError(
                 "OpenCV cannot write mp4v video here; install the extra `video`, or leave overlay out of --save"

@@ -1,12 +1,12 @@
 """Where frames come from: video files, folders and globs of images, cameras, network streams."""
 
 import os
-import re
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import urlsplit
 
 # FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -14,7 +14,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, LostInputError, without_secrets
+from torchvision_dddas.io.atomic_files import utf8_name
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, images_of_folder, images_of_glob, quiet_opencv, read_image
 from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
@@ -38,7 +39,7 @@ def open_source(
     if not text:
         raise InputError(f"the input's name is empty; wanted {_WANTED}")
     if (target := stream_target(text)) is not None:
-        return VideoSource(target, text, rate_hz)
+        return VideoSource(target, without_secrets(text), rate_hz)
     path = Path(text)
     try:
         path.stat()
@@ -168,6 +169,10 @@ _TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}
 _EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}
 # Reads that may fail in a row before the clip counts as ended, however many frames it announced.
 _MOST_LOST, _MOST_LOST_LIVE = 1000, 10
+STALL_S = 30.0
+"""An address that sends nothing for so long counts as lost."""
+# A read that fails after this share of the time was ended by it.
+_STALLED = 0.9
 # How far a time stamp may lie from its place on a constant frame rate, in frames.
 _REGULAR = 0.25
 
@@ -190,6 +195,7 @@ class VideoSource(_Clip):
         try:
             own_hz = _announced_hz(capture)
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            is_counted = Path(urlsplit(str(target)).path if self._live else str(target)).suffix.lower() in _EXACT_COUNT
             decoded, first = capture.read()
         finally:
             capture.release()
@@ -199,7 +205,8 @@ class VideoSource(_Clip):
         self._own_hz, self._given_hz = own_hz or 10.0, rate_hz
         self.rate_hz = rate_hz or self._own_hz
         self.count = int(count) if not self._live and 0 < count < 1e8 else None
-        self.exact = self.count is not None and Path(str(target)).suffix.lower() in _EXACT_COUNT
+        self.exact = self.count is not None and is_counted
+        self._announced = int(count) if self._live and is_counted and 0 < count < 1e8 else 0
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
@@ -253,19 +260,25 @@ class VideoSource(_Clip):
             self._note(self.last + 1, what)
 
     def _read_live(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
-        number, lost, start_s = 0, 0, time.monotonic()
+        number, lost, start_s, read = 0, 0, time.monotonic(), 0
         while lost < _MOST_LOST_LIVE:
             number += 1
             is_wanted = is_sampled(number, interval)
+            asked_s = time.monotonic()
             decoded, image = capture.read() if is_wanted else (capture.grab(), np.zeros((0, 0), np.uint8))
             if not decoded:
+                if (silent_s := time.monotonic() - asked_s) > _STALLED * STALL_S:
+                    raise LostInputError(f"{self.name} sent nothing for {silent_s:.0f} s after frame {self.last}")
                 lost += 1
                 continue
+            read += 1
             self._note_lost(number - lost, number - 1)
             lost, self.last = 0, number
             start_s = start_s if number > 1 else time.monotonic()
             if is_wanted and self._fits(image, number):
                 yield Frame(number, time.monotonic() - start_s, image)
+        if read < self._announced:
+            raise LostInputError(f"{self.name} ended after frame {self.last} of {self._announced}")
 
     def _note_lost(self, first: int, last: int) -> None:
         if first == last:
@@ -275,7 +288,7 @@ class VideoSource(_Clip):
 
     def _stored(self) -> int:
         """How many frames a file holds the data of, whether or not they can be decoded."""
-        capture = cv2.VideoCapture(str(self._target), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+        capture = cv2.VideoCapture(utf8_name(str(self._target)), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         try:
             count = 0
             while capture.grab():
@@ -285,7 +298,7 @@ class VideoSource(_Clip):
         return count
 
     def _open(self) -> cv2.VideoCapture:
-        return open_capture(self._target, self.name)
+        return open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
 
     def _fits(self, image: np.ndarray, number: int) -> bool:
         width, height = image.shape[1], image.shape[0]
@@ -307,7 +320,7 @@ def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | N
         if isinstance(target, int):
             capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
         else:  # other back ends than FFmpeg take a numbered image or a text file for a video
-            capture = cv2.VideoCapture(target, cv2.CAP_FFMPEG, limits)
+            capture = cv2.VideoCapture(utf8_name(target), cv2.CAP_FFMPEG, limits)
     if not capture.isOpened():
         live = _is_live(target)
         what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
@@ -330,7 +343,6 @@ def _announced_hz(capture: cv2.VideoCapture) -> float | None:
 # --------------------------------------------------------------------------------------------------------------------
 # Live streams, picture by picture: the camera or the sender may fall silent at any time.
 
-_SECRETS = re.compile(r"(?<=://)[^/\s]*@")
 # Pictures in a row that may fail to be decoded at the start: a stream is joined in the middle.
 _MOST_UNDECODED = 100
 
@@ -387,11 +399,6 @@ def stream_target(spec: str) -> str | int | None:
             raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
         return int(index)
     return spec if "://" in spec else None
-
-
-def without_secrets(spec: str) -> str:
-    """An address without a user's name and password."""
-    return _SECRETS.sub("", spec)
 
 
 def first_picture(stream: Stream, name: str) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any, Generic, NamedTuple, TextIO, TypeVar
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import remove, temporary
+from torchvision_dddas.io.atomic_files import PartFile
 from torchvision_dddas.types import Scene
 
 Item = TypeVar("Item")
@@ -126,6 +126,7 @@ class TextFiles:
 
     def __init__(self, content: Mapping[Path, str]) -> None:
         self._content = dict(content)
+        self._parts: list[PartFile] = []
         self._files: list[TextIO] = []
 
     def write(self, *texts: str) -> None:
@@ -137,21 +138,22 @@ class TextFiles:
         """Put the files in their places, also those to which nothing was added. Raises OSError if they cannot be."""
         for file in self._open():
             file.close()
-        for path in self._content:
-            temporary(path).replace(path)
+        for part in self._parts:
+            part.keep()
 
     def discard(self) -> None:
         """Remove what was begun."""
         for file in self._files:
             with suppress(OSError):  # a full disk refuses the last lines again
                 file.close()
-        for path in self._content:
-            remove(temporary(path))
+        for part in self._parts:
+            part.discard()
 
     def _open(self) -> list[TextIO]:
         if not self._files:
             for path, first in self._content.items():
-                self._files.append(temporary(path).open("w", encoding="utf-8", newline=""))
+                self._parts.append(PartFile(path))
+                self._files.append(self._parts[-1].open_text())
                 self._files[-1].write(first)
         return self._files
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from torchvision_dddas import open_video
 from torchvision_dddas.config import LiveParameters
-from torchvision_dddas.io.sources import ImageSource, OpenedStream, Stream, VideoSource, stream_target, without_secrets
+from torchvision_dddas.errors import without_secrets
+from torchvision_dddas.io.sources import ImageSource, OpenedStream, Stream, VideoSource, stream_target
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.receiver import OPENING, Receiver

@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from torchvision_dddas.errors import readable, without_secrets
 from torchvision_dddas.io.output import Event, SessionLog
 from torchvision_dddas.io.streams import Stream
 
@@ -69,7 +70,7 @@ class Health:
 
     def event(self, kind: str, text: str, frame: int = 0) -> Event:
         """Add an event of one word's kind, and return it. frame: 0 if it belongs to none."""
-        event = Event(time.time(), frame, kind, text)
+        event = Event(time.time(), frame, kind, readable(without_secrets(text)))
         with self._lock:
             self._counts[f"events_{kind}"] += 1
             self._events.append(event)

@@ -11,10 +11,11 @@ from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
+from torchvision_dddas.errors import without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
+from torchvision_dddas.io.interrupts import StopSignals
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
-from torchvision_dddas.io.sources import without_secrets
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
@@ -28,15 +29,12 @@ from torchvision_dddas.live.runner import (
     send_result,
 )
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
-from torchvision_dddas.live.watchdog import HUNG, StopSignals, Supervisor, Watchdog
+from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Frame, FrameResult
-
-INTERRUPTED = 130
-"""Exit code of a session that Ctrl-C ended; its outputs are valid."""
 
 _CLEAR = "\r\x1b[K"
 _COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
@@ -58,7 +56,8 @@ def run_live(
 ) -> int:
     """Run until the pictures end or a signal ends it; returns the exit code. Writes a new folder under out.
 
-    Raises InputError for anything that is wrong at the start; what goes wrong later is an event.
+    SIGTERM is how a supervisor ends a session, and gives 0; other signals give 128 and their number. Raises InputError
+    for anything that is wrong at the start; what goes wrong later is an event.
     """
     address = None if serve is None else parse_address(serve)
     if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
@@ -147,7 +146,7 @@ def run_live(
         _print(failure)
     if failure:
         return HUNG
-    return INTERRUPTED if signals.signal == signal.SIGINT else 0
+    return 0 if signals.signal in (None, signal.SIGTERM) else 128 + signals.signal
 
 
 class _Located:

@@ -1,22 +1,20 @@
-"""How a live run ends: a watchdog for one that hangs, and signals that stop it with valid outputs or at once."""
+"""What watches a live run: a watchdog that ends one that hangs, and the supervisor that is told how it is."""
 
 import os
-import signal
 import socket
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from types import FrameType, TracebackType
-from typing import Any, Self
+from types import TracebackType
+from typing import Self
 
 from torchvision_dddas.live.health import Health
 
 HUNG = 70
 """Exit code of a run that hung or failed again and again: EX_SOFTWARE of sysexits.h."""
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CHECK_S = 1.0
 
 
@@ -116,53 +114,3 @@ def abort_process(words: str) -> None:
     """End a process whose main thread hangs, without clean-up."""
     print(f"dddas: {words}", file=sys.stderr, flush=True)  # noqa: T201
     os._exit(HUNG)
-
-
-class StopSignals:
-    """A context in which SIGINT and SIGTERM are requests to stop. signal: the first that came, None before.
-
-    The signals wake a thread of this class: the main thread may be deep in a library, hold any lock, or hang.
-    """
-
-    def __init__(self, ask: Callable[[int], object], at_once: Callable[[int], object] = os._exit) -> None:
-        """ask: called in another thread with the first signal. at_once: called with the exit code at the second."""
-        self._ask, self._at_once = ask, at_once
-        self.signal: int | None = None
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Self:
-        # Python handles signals in the main thread only.
-        if threading.current_thread() is not threading.main_thread():
-            return self
-        self._ours, self._theirs = socket.socketpair()
-        self._theirs.setblocking(False)
-        self._wakeup = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
-        self._before = {number: signal.signal(number, _nothing) for number in _SIGNALS}
-        self._thread = threading.Thread(target=self._listen, name="stopping", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if not self._before:
-            return
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._wakeup)
-        self._theirs.close()
-        self._thread.join()
-        self._ours.close()
-
-    def _listen(self) -> None:
-        while numbers := self._ours.recv(64):
-            for number in numbers:
-                if number not in _SIGNALS:
-                    continue
-                if self.signal is not None:
-                    self._at_once(128 + number)
-                    continue
-                self.signal = number
-                self._ask(number)
-
-
-def _nothing(number: int, frame: FrameType | None) -> None:
-    """Replaces the default handler, which would end the process."""

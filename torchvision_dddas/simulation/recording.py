@@ -14,7 +14,7 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
-from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, claimed, remove, write_whole
 from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.output.recorder import PartOf
@@ -103,8 +103,8 @@ def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Record
 def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
     """Write the ground's heights above the sea as a GeoTIFF; returns a note if rasterio is missing."""
     try:
-        import rasterio
         from rasterio.crs import CRS
+        from rasterio.io import MemoryFile
         from rasterio.transform import from_origin
     except ImportError:
         return ["dem.tif is left out: it needs rasterio, pip install 'torchvision-dddas[elevation]'"]
@@ -124,14 +124,14 @@ def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
         "transform": from_origin(relief.corner_m[0] - step / 2, top, step, step),
         "nodata": np.nan,
     }
-    part = temporary(path)
-    try:
-        with rasterio.open(part, "w", **profile) as raster:
+    with MemoryFile() as memory:
+        with memory.open(**profile) as raster:
             raster.write(heights, 1)
             raster.units = ("m",)
-        part.replace(path)
+        content = memory.read()
+    try:
+        write_whole(path, content)
     except OSError as error:
-        remove(part)
         raise cannot_write(path, error) from error
     return []
 
@@ -296,13 +296,14 @@ def film_clip(
     refuses.
     """
     try:
-        for part in ("frames", "masks"):
-            (folder / part).mkdir(parents=True, exist_ok=True)
-        for number, (image, mask) in enumerate(film(load_scenario(scenario), seed, frames, size_px), 1):
-            png = cv2.imencode(".png", mask.astype(np.uint8))[1]
-            write_whole(folder / "frames" / f"{number:06d}.jpg", _encode_jpeg(image))
-            write_whole(folder / "masks" / f"{number:06d}.png", png.tobytes())
-            tick()
+        with claimed(folder):
+            for part in ("frames", "masks"):
+                (folder / part).mkdir(parents=True, exist_ok=True)
+            for number, (image, mask) in enumerate(film(load_scenario(scenario), seed, frames, size_px), 1):
+                png = cv2.imencode(".png", mask.astype(np.uint8))[1]
+                write_whole(folder / "frames" / f"{number:06d}.jpg", _encode_jpeg(image))
+                write_whole(folder / "masks" / f"{number:06d}.png", png.tobytes())
+                tick()
     except OSError as error:
         raise cannot_write(Path(error.filename or folder), error) from error
     return folder

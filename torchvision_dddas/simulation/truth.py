@@ -10,12 +10,12 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from torchvision_dddas.io.atomic_files import remove, temporary, write_whole
+from torchvision_dddas.io.atomic_files import remove, write_whole
 from torchvision_dddas.io.images import Masks
+from torchvision_dddas.io.interrupts import uninterrupted
 from torchvision_dddas.io.maps.formats import encode_geojson, geojson
 from torchvision_dddas.io.maps.ground_tracks import Gathered
 from torchvision_dddas.io.output import PipelineRecorder
-from torchvision_dddas.io.output.recorder import uninterrupted
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.types import Bodies, FrameResult, Positions, Truth
 
@@ -98,7 +98,6 @@ class TruthOutput:
     def discard(self) -> None:
         """Remove what was begun."""
         self._files.discard()
-        remove(temporary(self._folder / "tracks.geojson"))
         if self._masks is not None:
             self._masks.discard()
 

@@ -1,7 +1,6 @@
 """A whole tuning run on a study: examples, descent, figures before and after, and the files that record it."""
 
 import json
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -15,7 +14,7 @@ from torchvision_dddas.config import all_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.records import Spec
 from torchvision_dddas.evaluation.studies.sweep import settings_toml
-from torchvision_dddas.io.atomic_files import cannot_write, save_file
+from torchvision_dddas.io.atomic_files import claimed, save_file
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.tuning import time_cost
 from torchvision_dddas.tuning.checkpoint import set_aside
@@ -103,20 +102,18 @@ class Tuner:
         Raises InputError as `prepare`, `descend` and `judge` do, and where the folder cannot be written. A loss that is
         not finite is no error here: `Tuned.failed` says so, and the last good state is measured and written.
         """
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=self._folder).close()
-        except OSError as error:
-            raise cannot_write(self._folder / RUN, error) from error
-        try:
-            with self._timed("examples"), self._display.progress("examples", None) as tick:
-                ready = prepare(study, base, names, holdout, clips, measure, loss, tick)
-            return self._run(ready)
-        except BaseException:
-            if self._state:  # otherwise the record of an earlier run in this folder is still there
-                with suppress(InputError):
-                    self._write_json(RUN, {**self._state, "state": "interrupted"})
-            raise
+        with claimed(self._folder):
+            try:
+                with self._timed("examples"), self._display.progress("examples", None) as tick:
+                    ready = prepare(study, base, names, holdout, clips, measure, loss, tick)
+                return self._run(ready)
+            except BaseException as error:
+                if self._state:  # otherwise the record of an earlier run in this folder is still there
+                    with suppress(InputError):
+                        self._write_json(RUN, {**self._state, "state": "interrupted"})
+                if isinstance(error, KeyboardInterrupt) and (self._folder / CHECKPOINT).is_file():
+                    error.add_note(f"the descent is kept in {self._folder / CHECKPOINT}; --resume goes on from there")
+                raise
 
     def _run(self, ready: Prepared) -> Tuned:
         ready.parameters.to(self._device)

@@ -46,6 +46,9 @@ CONNECT_S = 5.0
 NO_WORKER_S = 30.0
 """How long a scheduler may be without any worker."""
 
+SILENT_S = 60.0
+"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip is begun again."""
+
 _POLL_S = _REPORT_S = 0.25
 _TOPIC = "dddas-frames"
 _ONE_THREAD = {
@@ -207,11 +210,12 @@ class Workers:
     """The processes that do jobs, each on one thread. A context manager: they end with the block.
 
     jobs: how many; 1 is this process itself; None is one per core, or 1 without Dask. scheduler: the address of a Dask
-    scheduler, whose workers are taken instead. Local workers start when they are first needed. Raises InputError if
-    Dask is needed and not installed, or the scheduler does not answer.
+    scheduler, whose workers are taken instead. Local workers start when they are first needed. silent_s: a local worker
+    that gives no sign for so long is replaced, and its clip is begun again; a scheduler has its own limit. Raises
+    InputError if Dask is needed and not installed, or the scheduler does not answer.
     """
 
-    def __init__(self, jobs: int | None = None, scheduler: str | None = None) -> None:
+    def __init__(self, jobs: int | None = None, scheduler: str | None = None, silent_s: float = SILENT_S) -> None:
         has_dask = find_spec("distributed") is not None
         if scheduler is not None and not has_dask:
             raise InputError(f"--scheduler needs {_INSTALL}")
@@ -222,7 +226,7 @@ class Workers:
             raise InputError(f"--jobs must be 1 or more, got {jobs}")
         if jobs > 1 and not has_dask:
             raise InputError(f"--jobs {jobs} needs {_INSTALL}, or take --jobs 1")
-        self._jobs, self._scheduler, self._stack = jobs, scheduler, ExitStack()
+        self._jobs, self._scheduler, self._silent_s, self._stack = jobs, scheduler, silent_s, ExitStack()
         self._client: Any = None
 
     def __enter__(self) -> "Workers":
@@ -249,7 +253,7 @@ class Workers:
 
     def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
         if self._client is None:
-            self._client = _start_local(self._jobs, self._stack)
+            self._client = _start_local(self._jobs, self._silent_s, self._stack)
         client, running, news = self._client, dict[Any, Job](), queue.SimpleQueue[Any]()
         client.subscribe_topic(_TOPIC, lambda event: news.put(event[1]))
         alone_since = time.monotonic()
@@ -342,13 +346,14 @@ def _one_thread(backend: str) -> Iterator[None]:
             set_threads(before)
 
 
-def _start_local(jobs: int, stack: ExitStack) -> Any:
+def _start_local(jobs: int, silent_s: float, stack: ExitStack) -> Any:
     """A client of new processes on this machine, which end with the stack."""
     import dask
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    with dask.config.set({"distributed.scheduler.allowed-failures": MAX_DEATHS - 1}):
+    limits = {"allowed-failures": MAX_DEATHS - 1, "worker-ttl": f"{silent_s} s"}
+    with dask.config.set({f"distributed.scheduler.{name}": limit for name, limit in limits.items()}):
         cluster = LocalCluster(
             n_workers=jobs,
             threads_per_worker=1,

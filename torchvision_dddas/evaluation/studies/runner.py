@@ -38,7 +38,7 @@ from torchvision_dddas.evaluation.studies.jobs import (
 from torchvision_dddas.evaluation.studies.records import TASKS, Case, Results, ScoredCase, Spec, Task
 from torchvision_dddas.evaluation.studies.stages import allowed_tasks
 from torchvision_dddas.evaluation.studies.summary import summarize, summarize_costs
-from torchvision_dddas.io.atomic_files import cannot_write, temporary, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.output.run_record import finite, versions
 
 FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", SCORES, "report.html", "run.json")
@@ -272,7 +272,12 @@ def write_study(
     the disk refuses; bad input leaves the files of an earlier study in the folder as they were.
     """
     start_s, place = time.perf_counter(), cache or cache_folder()
-    has_begun = False
+    has_begun, finished = False, 0
+
+    def count(event: Event) -> None:
+        nonlocal finished
+        finished += event.done is not None
+        on_event(event)
 
     def begin(planned: Plan) -> None:
         nonlocal has_begun
@@ -280,36 +285,38 @@ def write_study(
         has_begun = True
         on_start(planned)
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        results = run_study(spec, base, workers, place, clips, on_event, begin)
-        measures = summarize(results)
-        _write_json(folder / "metrics.json", measures)
-        write_csv(folder / "metrics.csv", measures)
-        write_parquet(folder, measures, results)
-        scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
-        write_scores(folder, spec.name, scored)
-        write_whole(folder / "report.html", study_report(finite(measures), results).encode())
-        study = {name: value for name, value in vars(spec).items() if name not in ("sources", "overrides")}
-        record = {
-            "state": "complete",
-            "versions": versions(),
-            "study": {**study, "set": spec.overrides},
-            **results.facts,
-            "left_out": results.left_out,
-            "cache": place,
-            "settings": results.settings.model_dump(),
-            "seconds": {"wall": round(time.perf_counter() - start_s, 3)},
-            "costs": summarize_costs(results),
-        }
-        _write_json(folder / "run.json", record)
-    except BaseException as error:
-        if has_begun:
-            with suppress(OSError):
-                _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
-        if isinstance(error, OSError):
-            raise cannot_write(folder / "run.json", error) from error
-        raise
+    with claimed(folder):
+        try:
+            results = run_study(spec, base, workers, place, clips, count, begin)
+            measures = summarize(results)
+            _write_json(folder / "metrics.json", measures)
+            write_csv(folder / "metrics.csv", measures)
+            write_parquet(folder, measures, results)
+            scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
+            write_scores(folder, spec.name, scored)
+            write_whole(folder / "report.html", study_report(finite(measures), results).encode())
+            study = {name: value for name, value in vars(spec).items() if name not in ("sources", "overrides")}
+            record = {
+                "state": "complete",
+                "versions": versions(),
+                "study": {**study, "set": spec.overrides},
+                **results.facts,
+                "left_out": results.left_out,
+                "cache": place,
+                "settings": results.settings.model_dump(),
+                "seconds": {"wall": round(time.perf_counter() - start_s, 3)},
+                "costs": summarize_costs(results),
+            }
+            _write_json(folder / "run.json", record)
+        except BaseException as error:
+            if has_begun:
+                with suppress(OSError):
+                    _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
+            if isinstance(error, KeyboardInterrupt) and finished:
+                error.add_note(f"{finished} finished clips are kept in {place}; the same command goes on from there")
+            if isinstance(error, OSError):
+                raise cannot_write(folder / "run.json", error) from error
+            raise
     return results, measures
 
 
@@ -367,13 +374,10 @@ def write_parquet(folder: Path, metrics: Mapping[str, Any], results: Results) ->
         ("frames.parquet", FRAME_COLUMNS, frame_rows(results)),
     ):
         schema = pyarrow.schema([(column, types.get(column, pyarrow.string())) for column in columns])
-        part = temporary(folder / name)
-        try:
-            table = pyarrow.Table.from_pylist([dict(zip(columns, row, strict=True)) for row in rows], schema)
-            pyarrow.parquet.write_table(table, part)
-            part.replace(folder / name)
-        finally:
-            part.unlink(missing_ok=True)
+        table = pyarrow.Table.from_pylist([dict(zip(columns, row, strict=True)) for row in rows], schema)
+        held = io.BytesIO()
+        pyarrow.parquet.write_table(table, held)
+        write_whole(folder / name, held.getvalue())
 
 
 def _write_json(path: Path, content: Any) -> None:

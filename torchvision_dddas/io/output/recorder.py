@@ -1,16 +1,16 @@
 """The output folder of a run: claimed before any work, filled item by item, valid whenever it is closed."""
 
-import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 
-from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import cannot_write, remove, temporary
+from torchvision_dddas.errors import InputError, LostInputError
+from torchvision_dddas.io.atomic_files import ClaimedFolder, cannot_write
 from torchvision_dddas.io.images import MASK_NAME
+from torchvision_dddas.io.interrupts import KEPT, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RunRecord, read_run_record
 
 Item = TypeVar("Item")
@@ -43,25 +43,60 @@ class PartOf(Generic[Whole, Item]):
         self._part.write(self._field(item))
 
 
+class _Picture(Generic[Item]):
+    """A part that shows the results and holds none: where it fails, that is a problem of the run and ends only it."""
+
+    def __init__(self, name: str, part: Part[Item], record: RunRecord) -> None:
+        self.failure = ""
+        self._name, self._part, self._record = name, part, record
+        self.discard = part.discard
+
+    def write(self, item: Item) -> None:
+        if not self.failure:
+            with self._noting():
+                self._part.write(item)
+
+    def close(self, complete: bool) -> None:
+        if not self.failure:
+            with self._noting():
+                self._part.close(complete)
+
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # an encoder may raise anything
+            self.failure = f"the {self._name} could not be written: {getattr(error, 'strerror', None) or error}"
+            self._part.discard()
+            self._record.problems.append(self.failure)
+            outputs = self._record.facts.get("outputs", [])
+            self._record.facts["outputs"] = [name for name in outputs if name != self._name]
+
+
 class RunRecorder(Generic[Item]):
     """Records a run in a folder: begin, write items, and leave the context.
 
-    Leaving it normally or by Ctrl-C keeps what there is; any other exception discards what is not whole. Files begin
-    with the first item, so bad input changes nothing.
+    Leaving it normally, by a signal (see `interrupts`) or by LostInputError keeps what there is; any other exception
+    discards what is not whole. Files begin with the first item, so bad input changes nothing.
     files: names of the files that a run may leave in the folder. saved: what `--save` may name.
     """
 
     files: ClassVar[tuple[str, ...]] = ()
     saved: ClassVar[tuple[str, ...]] = ()
+    pictures: ClassVar[tuple[str, ...]] = ("overlay", "video")
+    """Parts without which the results are whole."""
 
     def __init__(self, folder: Path, save: Sequence[str] | None = None) -> None:
         """Claim a folder. save: which of `saved` to write, all by default.
 
-        Raises InputError if the folder cannot be written or holds such files of another program.
+        Raises InputError if another run writes into the folder, it cannot be written, or holds such files of another
+        program.
         """
         self.folder = folder
         self.save = self.saved if save is None else tuple(save)
-        self._made = _claim(folder, self.files)
+        self._claim = _claim(folder, self.files)
+        self._open = ExitStack()
+        self._lock, self._is_closed = threading.RLock(), False
         self._parts: list[Part[Item]] = []
         self._record: RunRecord | None = None
 
@@ -77,7 +112,10 @@ class RunRecorder(Generic[Item]):
         Parts are written in this order and closed in the reverse; run.json is closed last.
         """
         self._record = RunRecord(self.folder, facts)
-        self._parts = [part for name, part in parts.items() if name in self.save or name not in self.saved]
+        wanted = {name: part for name, part in parts.items() if name in self.save or name not in self.saved}
+        self._parts = [
+            _Picture(name, part, self._record) if name in self.pictures else part for name, part in wanted.items()
+        ]
         return self._record
 
     def _count(self, item: Item) -> None:
@@ -85,50 +123,75 @@ class RunRecorder(Generic[Item]):
         raise NotImplementedError
 
     def write(self, item: Item) -> None:
-        """Write an item to every part, or to none if Ctrl-C came before. Raises InputError if the disk refuses."""
-        with uninterrupted(), self._refusals():
+        """Write an item to every part, or to none if a signal came before. Raises InputError if the disk refuses."""
+        with uninterrupted(), self._lock, self._refusals():
+            if self._is_closed:  # by `_rescue`: the process ends
+                return
             self._count(item)
             for part in self._parts:
                 part.write(item)
 
     def close(self, complete: bool) -> None:
         """Put everything in its place, run.json last. Raises InputError if the disk refuses."""
-        with uninterrupted(), self._refusals():
+        with uninterrupted(), self._lock, self._refusals():
+            if self._is_closed:
+                return
+            self._is_closed = True
             for part in reversed(self._parts):
                 part.close(complete)
             self.record.close(complete)
 
     def discard(self) -> None:
         """Leave only what is whole, and no folder that was made for a run that never began."""
-        with uninterrupted():
+        with uninterrupted(), self._lock:
+            self._is_closed = True
             for part in reversed(self._parts):
                 part.discard()
             if self._record is not None:
                 self._record.discard()
             if self._record is None or self._record.frames == 0:
-                for folder in self._made:
-                    try:
-                        folder.rmdir()
-                    except OSError:  # not empty: someone else uses it
-                        break
+                self._claim.remove_made()
 
     def __enter__(self) -> Self:
+        self._open.callback(self._claim.release)
+        self._open.enter_context(rescued_by(self._rescue))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        with self._open:
+            self._end(error)
+
+    def _end(self, error: BaseException | None) -> None:
         record = self._record
         if record is not None and isinstance(error, InputError):
             record.problems.append(str(error))
-        interrupted = kind is not None and issubclass(kind, KeyboardInterrupt)
-        if record is None or not (kind is None or (interrupted and record.frames > 0)):
+        is_cut = isinstance(error, (KeyboardInterrupt, LostInputError))
+        if record is None or not (error is None or (is_cut and record.frames > 0)):
             self.discard()
             return
         try:
-            self.close(complete=not interrupted)
+            self.close(complete=error is None)
         except InputError as refusal:
             record.problems.append(str(refusal))
             self.discard()
             raise
+        if error is not None:
+            error.add_note(KEPT)
+        elif failed := [part.failure for part in self._parts if isinstance(part, _Picture) and part.failure]:
+            raise InputError(f"{failed[0]}; all else is in {self.folder}")
+
+    def _rescue(self) -> bool:
+        """Close the run from another thread, if the main thread is not writing."""
+        if self._record is None or not self._record.frames or not self._lock.acquire(timeout=1.0):
+            return False
+        try:
+            self.close(complete=False)
+        except InputError:
+            self.discard()
+            return False
+        finally:
+            self._lock.release()
+        return True
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
@@ -147,43 +210,14 @@ def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
     return tuple(known) if "all" in chosen else tuple(n for n in known if n in chosen)
 
 
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back until the block is done, so that an item is written to every file or to none."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    held: list[tuple[int, FrameType | None]] = []
-    before: Any = signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if held and callable(before):
-        before(*held[0])
-
-
-def _claim(folder: Path, files: Sequence[str]) -> list[Path]:
-    """Make the folder and try to write there. Returns the folders made, innermost first."""
-    made: list[Path] = []
-    probe = temporary(folder / "probe")
-    try:
-        for place in (folder, *folder.parents):
-            if place.exists():
-                break
-            made.append(place)
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.write_bytes(b"")
-        probe.unlink()
-    except OSError as error:
-        remove(probe)
-        raise InputError(
-            f"cannot write into {folder}: {error.strerror or error}. Choose another folder with --out"
-        ) from error
+def _claim(folder: Path, files: Sequence[str]) -> ClaimedFolder:
+    """Claim a folder. Raises InputError if that fails, or if it holds such files of another program."""
+    claim = ClaimedFolder(folder)
     foreign = [folder / name for name in files if (folder / name).exists()]
     foreign += [p for p in sorted((folder / "masks").glob("*.png")) if MASK_NAME.fullmatch(p.name)]
     if foreign and read_run_record(folder) is None:
+        claim.release()
         raise InputError(
             f"{foreign[0]} was not written by dddas and would be replaced. Choose another folder with --out"
         )
-    return made
+    return claim

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, readable, without_secrets
 from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
 from torchvision_dddas.runtime import VERSION
@@ -96,7 +96,7 @@ class RunRecord:
 
     def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
         """facts: what is known before the run, such as input, backend, settings and outputs."""
-        self.facts = dict(facts)
+        self.facts = {name: without_secrets(v) if isinstance(v, str) else v for name, v in facts.items()}
         self._path = folder / RUN_JSON
         self._begun = time.perf_counter()
         self._stages: dict[str, Durations] = {}
@@ -111,7 +111,7 @@ class RunRecord:
     @property
     def input_name(self) -> str:
         """The name of the clip or table, without its folder; empty where there is none."""
-        return Path(str(self.facts.get("input", ""))).name
+        return readable(Path(str(self.facts.get("input", ""))).name)
 
     def note(
         self,
@@ -188,18 +188,23 @@ def clip_facts(source: Source) -> dict[str, Any]:
 
 
 def finite(value: Any) -> Any:
-    """A value that JSON can hold: numbers that are not finite become null, unknown types become text."""
+    """A value that JSON can hold: numbers that are not finite become null, unknown types become text.
+
+    Texts are without passwords, and readable in any encoding.
+    """
     if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
+        return {readable(str(k)): finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [finite(v) for v in value]
-    if value is None or isinstance(value, (bool, str, int)):
+    if isinstance(value, str):
+        return readable(without_secrets(value))
+    if value is None or isinstance(value, (bool, int)):
         return value
     if hasattr(value, "item"):
         return finite(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return str(value)
+    return finite(str(value))
 
 
 def versions() -> dict[str, str]:

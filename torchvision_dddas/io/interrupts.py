@@ -1,0 +1,142 @@
+"""Signals that end a run: Ctrl-C, SIGTERM and SIGHUP. They wait while a frame is written, and outputs stay whole."""
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+KEPT = "results up to here are kept"
+"""The note of an exception that cut short a run whose outputs are whole."""
+
+TOGETHER_S = 2.0
+"""Signals that follow the first within this time are one request: a second Ctrl-C, or SIGTERM and SIGHUP at once."""
+
+_DEAF_S = 1.0  # after which the main thread counts as stuck in a library, where no signal reaches it
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal asks the run to end. number: of the signal. Its notes say what is kept; without any, nothing is."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class StopSignals:
+    """A context in which SIGNALS are requests to stop. signal: the first that came, None before.
+
+    The signals wake a thread of this class: the main thread may be deep in a library, hold any lock, or hang.
+    Signals that the process ignores, as under nohup, stay ignored.
+    """
+
+    def __init__(
+        self,
+        ask: Callable[[int], object],
+        at_once: Callable[[int], object] = os._exit,
+        notice: Callable[[int, FrameType | None], object] = lambda number, frame: None,
+        together_s: float = TOGETHER_S,
+    ) -> None:
+        """ask: called in another thread with the first signal; notice: in the main thread with each, when it can.
+
+        at_once: called with the exit code at a further signal later than together_s.
+        """
+        self._ask, self._at_once, self._notice, self._together_s = ask, at_once, notice, together_s
+        self.signal: int | None = None
+        self._first_s = 0.0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        # Python handles signals in the main thread only.
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        self._ours, self._theirs = socket.socketpair()
+        self._theirs.setblocking(False)
+        self._wakeup = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
+        heeded = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+        self._before = {number: signal.signal(number, self._notice) for number in heeded}
+        self._thread = threading.Thread(target=self._listen, name="stopping", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if not self._before:
+            return
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._wakeup)
+        self._theirs.close()
+        self._thread.join()
+        self._ours.close()
+
+    def _listen(self) -> None:
+        while numbers := self._ours.recv(64):
+            for number in numbers:
+                if number not in self._before:
+                    continue
+                if self.signal is None:
+                    self.signal, self._first_s = number, time.monotonic()
+                    self._ask(number)
+                elif time.monotonic() - self._first_s >= self._together_s:
+                    self._at_once(128 + number)
+
+
+Rescue = Callable[[], bool]
+"""Makes the outputs of an open run whole, from another thread; returns whether there are any."""
+
+_rescues: list[Rescue] = []
+
+
+@contextmanager
+def rescued_by(rescue: Rescue) -> Iterator[None]:
+    """While the block runs, a signal that the main thread cannot notice calls a function before the process ends."""
+    _rescues.append(rescue)
+    try:
+        yield
+    finally:
+        _rescues.remove(rescue)
+
+
+def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
+    """Signals that raise Stopped in the main thread, once.
+
+    Where that thread is stuck in a library, open outputs are made whole beside it, and then `end` is called in another
+    thread with the signal, and whether anything was kept; it ends the process.
+    """
+    noticed = threading.Event()
+
+    def notice(number: int, frame: FrameType | None) -> None:
+        if not noticed.is_set():
+            noticed.set()
+            raise Stopped(number)
+
+    def ask(number: int) -> None:
+        if not noticed.wait(_DEAF_S):
+            noticed.set()
+            kept = [rescue() for rescue in reversed(_rescues)]
+            end(number, any(kept))
+
+    return StopSignals(ask, notice=notice)
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold signals back until the block is done, so that an item is written to every file or to none."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    before = {number: signal.signal(number, lambda number, frame: held.append(number)) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+    if held:
+        signal.raise_signal(held[0])
