@@ -1,16 +1,22 @@
-"""Ctrl-C: exit code 130, one line, and whole files of what was done until then."""
+"""Signals end a command with their exit code, one line, and whole files; a second run and a broken pipe cost nothing."""
 
+import json
+import os
 import shlex
 import signal
 import subprocess
 import sys
 import textwrap
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Event, Thread
 
 import cv2
+import numpy as np
 import pytest
 
-from tests.cli.conftest import record
+from tests.cli.conftest import bad, record
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -68,3 +74,165 @@ def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path, line, ta
     assert {row.split(",")[0] for row in (out / table).read_text().splitlines()} <= {"1", "2", "3"}
     assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
     assert not list(out.rglob("*.part*"))
+
+
+MAIN = "from torchvision_dddas.cli import main; main()"
+TABLE = "".join(f"{n},-1,{4 + n},10,8,24,0.95,-1,-1,-1\n" for n in range(1, 6))
+
+
+@contextmanager
+def tracking(clip, tmp_path, *more, program=PROGRAM):
+    """A run of `dddas track` that has written two frames and waits in the third."""
+    (tmp_path / "det.txt").write_text(TABLE)
+    words = ["track", str(clip), "--detections", str(tmp_path / "det.txt"), "--out", str(tmp_path / "out"), *more]
+    call = [sys.executable, "-c", program, *words]
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "now\n", process.communicate(timeout=60)[1]
+        yield process
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "codes"),
+    [
+        ([signal.SIGTERM], {143}),
+        ([signal.SIGHUP], {129}),
+        ([signal.SIGTERM, signal.SIGHUP, signal.SIGTERM], {143, 129}),  # as systemd sends them
+        ([signal.SIGINT, signal.SIGINT], {130}),
+    ],
+)
+def test_signals_leave_whole_outputs_also_several_at_once(clip, tmp_path, numbers, codes):
+    with tracking(clip, tmp_path, "--quiet") as process:
+        for number in numbers:
+            process.send_signal(number)
+        _, error = process.communicate(timeout=60)
+    assert process.returncode in codes
+    assert error.endswith("; results up to here are kept\n") and error.count("\n") == 1
+    assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
+    assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(clip, tmp_path):
+    # C's sleep begins again after a signal only where it is called anew, as a library's loop does.
+    deaf = PROGRAM.replace("time.sleep(60)", "deafly()").replace(
+        "import time",
+        "import ctypes\ndef deafly():\n    ctypes.CDLL(None).pthread_join(thread.ident, None)\nimport time",
+    )
+    thread = "import threading\nthread = threading.Thread(target=lambda: time.sleep(60), daemon=True)\nthread.start()\n"
+    deaf = (
+        deaf.replace("@contextmanager", thread + "@contextmanager")
+        .replace("pthread_join(", "pthread_join(ctypes.c_ulong(")
+        .replace("thread.ident,", "thread.ident),")
+    )
+    with tracking(clip, tmp_path, "--quiet", program=deaf) as process:
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    assert record(tmp_path / "out")["state"] == "interrupted"
+
+
+def test_a_second_run_into_the_same_folder_is_refused_in_one_line(clip, tmp_path, dddas):
+    with tracking(clip, tmp_path, "--quiet"):
+        assert "another run is writing into" in bad(dddas("detect", clip, "--out", tmp_path / "out"))
+    result = dddas("track", clip, "--detections", tmp_path / "det.txt", "--out", tmp_path / "out")  # it was killed
+    assert result.exit_code == 0, result.stderr
+    assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+def run_main(*words, **options):
+    call = [sys.executable, "-c", MAIN, *map(str, words)]
+    return subprocess.run(call, cwd=ROOT, stderr=subprocess.PIPE, text=True, timeout=120, **options)
+
+
+def test_nothing_was_kept_is_said_where_nothing_was(clip, tmp_path):
+    early = PROGRAM.replace("count == 3", "False").replace(
+        "def stopping(*_):", "def stopping(*_):\n    print('now', flush=True)\n    time.sleep(60)"
+    )
+    with tracking(clip, tmp_path, "--quiet", program=early) as process:
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; nothing was kept\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_or_closed_standard_output_is_one_line_and_costs_no_result(clip, tmp_path):
+    (tmp_path / "det.txt").write_text(TABLE)
+    words = ("track", clip, "--detections", tmp_path / "det.txt", "--out", tmp_path / "out")
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        result = run_main(*words, stdout=full)
+    lines = [line for line in result.stderr.splitlines() if line.startswith("dddas: ")]
+    assert (result.returncode, len(lines)) == (74, 1)
+    assert "standard output cannot be written: No space left on device" in lines[0]
+    assert record(tmp_path / "out")["state"] == "complete"
+    closed = subprocess.Popen(["true"], stdin=subprocess.PIPE)
+    closed.wait(60)
+    result = run_main("settings", stdout=closed.stdin)
+    assert result.returncode == 74 and result.stderr.count("\n") == 1
+    assert "Broken pipe" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems take no such names")
+@pytest.mark.parametrize("env", [{}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
+@pytest.mark.parametrize("name", [b"cl\xffip", "für".encode()])
+def test_names_that_are_no_utf8_or_no_ascii_are_read_and_written(tmp_path, name, env):
+    folder = os.fsencode(tmp_path) + b"/" + name
+    os.mkdir(folder)  # noqa: PTH102
+    writer = cv2.VideoWriter(str(tmp_path / "clip.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (64, 48))
+    for k in range(5):
+        writer.write(np.full((48, 64, 3), 40 * k, np.uint8))
+    writer.release()
+    os.rename(tmp_path / "clip.mp4", folder + b"/" + name + b".mp4")  # noqa: PTH104
+    call = [sys.executable, "-c", MAIN, "detect", folder + b"/" + name + b".mp4", "--out", folder + b"/out"]
+    result = subprocess.run(call, cwd=ROOT, env={**os.environ, **env}, capture_output=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    found = json.loads(Path(os.fsdecode(folder + b"/out/run.json")).read_text())
+    assert found["state"] == "complete" and found["frames"]["written"] == 5
+    assert found["input"].endswith(r"cl\xffip.mp4" if b"\xff" in name else "für.mp4")
+    assert os.path.exists(folder + b"/out/overlay.mp4")  # noqa: PTH110
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stalls", [True, False])
+def test_a_network_clip_that_stops_early_is_interrupted_and_its_password_is_shown_nowhere(
+    tmp_path, dddas, monkeypatch, capfd, stalls
+):
+    monkeypatch.setattr("torchvision_dddas.io.sources.STALL_S", 2.0)
+    av, rng = pytest.importorskip("av"), np.random.default_rng(1)
+    with av.open(str(tmp_path / "clip.mp4"), "w", options={"movflags": "faststart"}) as film:
+        stream = film.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for _ in range(40):
+            noise = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(noise, format="bgr24")))
+        film.mux(stream.encode(None))
+    content, over = (tmp_path / "clip.mp4").read_bytes(), Event()
+
+    class Stalling(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[: len(content) * 4 // 5])
+            over.wait(60 if stalls else 0)
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Stalling)
+    server.daemon_threads = True
+    Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://me:hush1@127.0.0.1:{server.server_address[1]}/clip.mp4?password=hush2"
+    result = dddas("detect", address, "--out", tmp_path / "out", "--config", "fast")
+    over.set()
+    server.shutdown()
+    server.server_close()
+    assert result.exit_code == 2
+    assert "; results up to here are kept" in result.stderr and "Traceback" not in result.output
+    found = record(tmp_path / "out")
+    assert found["state"] == "interrupted" and 0 < found["frames"]["written"] < 40
+    shown = result.output + result.stderr + "".join(capfd.readouterr())
+    shown += "".join(path.read_text(errors="ignore") for path in (tmp_path / "out").iterdir() if path.is_file())
+    assert "hush" not in shown and "Stream timeout" not in shown

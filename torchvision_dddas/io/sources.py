@@ -213,7 +213,11 @@ class VideoSource(_Clip):
         self.problems.clear()
         capture = self._open()
         try:
-            yield from self._read_live(capture, interval) if self._live else self._read_file(capture, interval)
+            if not self._live:
+                yield from self._read_file(capture, interval)
+                return
+            with quiet_opencv():
+                yield from self._read_live(capture, interval)
         finally:
             capture.release()
 
@@ -260,15 +264,15 @@ class VideoSource(_Clip):
             self._note(self.last + 1, what)
 
     def _read_live(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
-        number, lost, start_s, read = 0, 0, time.monotonic(), 0
+        number, lost, read, silent_s, start_s = 0, 0, 0, 0.0, time.monotonic()
         while lost < _MOST_LOST_LIVE:
             number += 1
             is_wanted = is_sampled(number, interval)
             asked_s = time.monotonic()
             decoded, image = capture.read() if is_wanted else (capture.grab(), np.zeros((0, 0), np.uint8))
+            # After it a decoder still gives the pictures that it holds.
+            silent_s = max(silent_s, time.monotonic() - asked_s)
             if not decoded:
-                if (silent_s := time.monotonic() - asked_s) > _STALLED * STALL_S:
-                    raise LostInputError(f"{self.name} sent nothing for {silent_s:.0f} s after frame {self.last}")
                 lost += 1
                 continue
             read += 1
@@ -277,6 +281,8 @@ class VideoSource(_Clip):
             start_s = start_s if number > 1 else time.monotonic()
             if is_wanted and self._fits(image, number):
                 yield Frame(number, time.monotonic() - start_s, image)
+        if silent_s > _STALLED * STALL_S:
+            raise LostInputError(f"{self.name} sent nothing for {silent_s:.0f} s: it ends after frame {self.last}")
         if read < self._announced:
             raise LostInputError(f"{self.name} ended after frame {self.last} of {self._announced}")
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -192,6 +192,25 @@ def stopped_after(line: str, words: list[str], by: signal.Signals) -> int:
         run.wait(60)
     assert not psutil.wait_procs(workers, 60)[1]
     return run.returncode
+
+
+def stop_once(job, keys, store, code):
+    """In place of `jobs._do_remotely`: the first worker that comes here is stopped, and stays so."""
+    with suppress(FileExistsError):
+        (store.folder / "stopped").touch(exist_ok=False)
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return (*jobs._do_on_one_thread(job, keys, store, lambda event: None), {})
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_stopped_costs_time_and_not_the_study(tmp_path, monkeypatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(jobs, "_do_remotely", stop_once)
+    study = read_spec(world.three(tmp_path / "clips"))
+    with Workers(2, silent_s=5.0) as workers:
+        results = run_study(study, tmp_path, workers, tmp_path / "cache")
+    assert (tmp_path / "cache" / "stopped").exists()
+    assert not any(case.cause for case in results.cases)
 
 
 @pytest.mark.slow

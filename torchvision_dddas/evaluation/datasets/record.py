@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, readable
 from torchvision_dddas.evaluation.metrics.truth import Truth
 from torchvision_dddas.io.images import natural_order
 
@@ -14,7 +14,7 @@ from torchvision_dddas.io.images import natural_order
 class Clip:
     """One clip.
 
-    name: unique in its data set. place: the file or folder that messages name.
+    name: unique in its data set, and `readable`. place: the file or folder that messages name.
     pictures: the files of its frames in order, or one video; empty where it has none.
     rate_hz: None where unknown. frames: how many, 0 where unknown. truth: None where nothing is known.
     still: nothing moves in it, so that every detection is false.
@@ -37,6 +37,9 @@ class Clip:
     colours: Path | None = None
     camera: Path | None = None
     elevation: Path | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", readable(self.name))  # tables and reports hold it
 
 
 @dataclass(frozen=True)

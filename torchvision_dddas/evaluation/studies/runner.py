@@ -18,7 +18,7 @@ from typing import Any
 
 from torchvision_dddas.config import Settings, load_config, read_toml
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, readable
 from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.registry import GROUPS
@@ -294,7 +294,7 @@ def write_study(
             write_parquet(folder, measures, results)
             scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
             write_scores(folder, spec.name, scored)
-            write_whole(folder / "report.html", study_report(finite(measures), results).encode())
+            write_whole(folder / "report.html", readable(study_report(finite(measures), results)).encode())
             study = {name: value for name, value in vars(spec).items() if name not in ("sources", "overrides")}
             record = {
                 "state": "complete",

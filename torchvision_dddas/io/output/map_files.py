@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from torchvision_dddas.errors import readable
 from torchvision_dddas.io.atomic_files import remove, write_whole
 from torchvision_dddas.io.maps.formats import cot, encode_geojson, geojson, kml
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
@@ -100,7 +101,7 @@ class AerialMaps:
         if "map" in save:
             makers[MAP] = lambda: picture
         if "report" in save:
-            makers[REPORT] = lambda: self._report(targets, picture, complete).encode()
+            makers[REPORT] = lambda: readable(self._report(targets, picture, complete)).encode()
         _replace(self._folder, self.files, makers)
 
     def discard(self) -> None:

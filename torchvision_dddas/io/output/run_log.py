@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.errors import readable
 from torchvision_dddas.io.atomic_files import remove, write_whole
 from torchvision_dddas.io.maps.map_picture import Signs
 from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
@@ -213,7 +214,7 @@ class RunStory:
         record, entries, clock = self.record, self.log.ordered(), self._clock()
         heading = f"{record.input_name or 'run'}: {describe_state(complete)}, {len(self.timeline)} frames looked at"
         text = format_log(entries, clock, f"{heading}; settings and totals are in run.json")
-        write_whole(self._folder / LOG_TXT, text.encode())
+        write_whole(self._folder / LOG_TXT, readable(text).encode())
         if events := [e for e in entries if e.kind == WORLD]:
             record.counts["events"] = [{"frame": e.first, "time_s": clock.time_s(e), "what": e.text} for e in events]
         if self._measures:
@@ -224,7 +225,7 @@ class RunStory:
             figures = [(name, f"{count}") for name, count in counts]
             report = RunReport(f"Detected and tracked: {record.input_name}", record, complete, self.timeline, figures)
             self.extend(report)
-            write_whole(self._folder / REPORT, report.html().encode())
+            write_whole(self._folder / REPORT, readable(report.html()).encode())
         elif not self._is_located:
             remove(self._folder / REPORT)
 
