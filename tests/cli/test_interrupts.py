@@ -1,4 +1,4 @@
-"""Signals end a command with their exit code, one line, and whole files; a second run and a broken pipe cost nothing."""
+"""Signals end a command with their exit code, one line and whole files; a second run or a broken pipe costs none."""
 
 import json
 import os
