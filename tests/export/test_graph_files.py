@@ -13,6 +13,7 @@ from onnx import TensorProto
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph, write_graphs
 from torchvision_dddas.export.people_graphs import GraphBuilder
+from torchvision_dddas.io.atomic_files import PartFile
 from torchvision_dddas.runtime import MANIFEST, manifest, opened
 
 
@@ -70,14 +71,14 @@ def test_writing_again_mends_a_folder_whose_manifest_was_changed(tmp_path: Path)
 
 def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch):
     write_graphs(tmp_path, {"a.onnx": doubled(2.0)})
-    before, real = {path.name: path.read_bytes() for path in tmp_path.iterdir()}, Path.write_bytes
+    before, real = {path.name: path.read_bytes() for path in tmp_path.iterdir()}, PartFile.write
 
-    def full(path: Path, content: bytes) -> int:
-        if "manifest" in path.name:
+    def full(part: PartFile, content: bytes) -> None:
+        if "manifest" in part.path.name:
             raise OSError(28, "No space left on device")
-        return real(path, content)
+        real(part, content)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(PartFile, "write", full)
     with pytest.raises(InputError, match=r"cannot write .*No space left on device"):
         write_graphs(tmp_path, {"a.onnx": doubled(5.0), "b.onnx": doubled(3.0)})
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -5,7 +5,6 @@ import io
 import json
 import os
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, di
 from torchvision_dddas.evaluation.studies.records import Found
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.stages import STAGES
+from torchvision_dddas.io.atomic_files import PartFile
 
 KEY, OTHER = "ab" + "0" * 62, "cd" + "0" * 62
 RNG = np.random.default_rng(0)
@@ -98,15 +98,16 @@ def test_a_damaged_entry_is_noted_once_and_removed(tmp_path, damage, read) -> No
 
 
 def test_a_cache_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path, monkeypatch) -> None:
-    def full(path: Path, content: bytes) -> int:
-        with path.open("wb") as file:
-            file.write(content[:10])
+    written = PartFile.write
+
+    def full(part: PartFile, content: bytes) -> None:
+        written(part, content[:10])
         raise OSError(28, "No space left on device")
 
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="choose another --cache"):
         Cache(tmp_path / "file" / "cache")
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(PartFile, "write", full)
     with pytest.raises(InputError, match=r"No space left on device.*choose another --cache"):
         Cache(tmp_path / "cache").put(KEY, FOUND)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["file"]
