@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.io.telemetry.autopilots import px4_lonlat
 
 pytest.importorskip("pymavlink")
 pytest.importorskip("pyulog")
@@ -159,9 +160,29 @@ def test_without_a_global_estimate_the_local_one_is_placed_about_its_origin(fly)
         (ulog({"vehicle_local_position": (fields, ranged)}), 12.5),
     ):
         flown = fly(content, "flight.ulg")
-        east_m = (flown.place[0, 0] - 10.4) * 111_320 * math.cos(math.radians(63.4))
-        assert (east_m, (flown.place[0, 1] - 63.4) * 111_320) == pytest.approx((20, 10), abs=1e-3)
+        degree_m = 6_371_000 * math.pi / 180
+        east_m = (flown.place[0, 0] - 10.4) * degree_m * math.cos(math.radians(63.4))
+        assert (east_m, (flown.place[0, 1] - 63.4) * degree_m) == pytest.approx((20, 10), abs=1e-3)
         assert flown.altitude_m[0] == altitude_m and flown.above_sea_m[0] == 90
+
+
+EIGHTH_M = 6_371_000 * math.pi / 4  # of a great circle
+
+
+@pytest.mark.parametrize(
+    ("east_north_m", "origin", "place"),
+    [
+        ((0, 0), (10.4, 63.4), (10.4, 63.4)),
+        ((0, EIGHTH_M), (10.0, 0.0), (10, 45)),
+        ((EIGHTH_M, 0), (10.0, 0.0), (55, 0)),
+        # sin(latitude) = cos 45 sin 45; tan(longitude) = sin 45 / (cos 45 cos 45)
+        ((EIGHTH_M, 0), (0.0, 45.0), (54.735610317, 30)),
+        ((EIGHTH_M, 0), (170.0, 0.0), (-145, 0)),
+        ((0, 111_194.9266446), (5.0, -30.0), (5, -29)),  # 6,371,000 m pi / 180
+    ],
+)
+def test_px4_local_positions_lie_on_its_sphere(east_north_m, origin, place):
+    assert px4_lonlat(*map(np.float64, (*east_north_m, *origin))) == pytest.approx(place, abs=1e-8)
 
 
 @pytest.mark.parametrize("is_old", [True, False])

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.telemetry.attitude import angles, axes_of_quaternion, heading_at
 from torchvision_dddas.io.telemetry.record import Log, build_record
 from torchvision_dddas.types import Telemetry
@@ -239,6 +238,7 @@ def _is_message(content: bytes, place: int, end: int, decoder: Any) -> bool:
 # --------------------------------------------------------------------------------------------------------------------
 # PX4's ULog: topics with their own time stamps.
 
+PX4_RADIUS_M = 6_371_000.0  # of the Earth in PX4's MapProjection (CONSTANTS_RADIUS_OF_EARTH)
 MAGIC = b"ULog\x01\x12\x35"
 _TOPICS = (
     *("vehicle_global_position", "vehicle_local_position", "vehicle_gps_position", "sensor_gps", "vehicle_attitude"),
@@ -351,8 +351,7 @@ def _add_px4_place(log: Log, fused: Topic | None, local: Topic | None, gps: Topi
         longitude, latitude, height = (_column(fused, name) for name in ("lon", "lat", "alt"))
     elif local is not None and np.nanmax(np.abs(_column(local, "ref_lat")), initial=0) > 0:
         topic, latitude0 = local, _column(local, "ref_lat")
-        latitude = latitude0 + _column(local, "x") / DEGREE_M
-        longitude = _column(local, "ref_lon") + _column(local, "y") / (DEGREE_M * np.cos(np.radians(latitude0)))
+        longitude, latitude = px4_lonlat(_column(local, "y"), _column(local, "x"), _column(local, "ref_lon"), latitude0)
         height = _column(local, "ref_alt") - _column(local, "z")
         known = _flag(local, "xy_valid") & _flag(local, "xy_global") & (latitude0 != 0)
     elif gps is not None:
@@ -366,6 +365,22 @@ def _add_px4_place(log: Log, fused: Topic | None, local: Topic | None, gps: Topi
     known = known & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
     values = {"longitude_deg": longitude, "latitude_deg": latitude, "above_sea_m": height}
     _add(log, topic, **{name: np.where(known, column, np.nan) for name, column in values.items()})
+
+
+def px4_lonlat(
+    east_m: np.ndarray, north_m: np.ndarray, longitude0_deg: np.ndarray, latitude0_deg: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Longitudes and latitudes of PX4's local positions, which are azimuthal equidistant about an origin on its sphere.
+
+    The inverse of what PX4's MapProjection does to the global position.
+    """
+    latitude0, distance = np.radians(latitude0_deg), np.hypot(east_m, north_m) / PX4_RADIUS_M
+    over = 1 / PX4_RADIUS_M * np.sinc(distance / np.pi)  # sin(distance) / distance, 1 at the origin
+    east, north = east_m * over, north_m * over
+    latitude = np.arcsin(np.clip(np.cos(distance) * np.sin(latitude0) + north * np.cos(latitude0), -1, 1))
+    turned = np.arctan2(east, np.cos(latitude0) * np.cos(distance) - np.sin(latitude0) * north)
+    longitude = longitude0_deg + np.degrees(turned)
+    return np.where(np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude), np.degrees(latitude)
 
 
 def _add_px4_local(log: Log, local: Topic, home: Topic | None) -> None:
