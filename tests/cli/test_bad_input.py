@@ -52,6 +52,10 @@ CASES = [
     *((f"{command} --set registration.keypints=5", "unknown parameter") for command in ("detect walk", "track walk")),
     *((f"{command} --config nosuch", "nosuch") for command in ("detect walk", "people walk", "track walk", "run walk")),
     *((f"{command} --save film", "--save must name some of") for command in ("detect walk", "people walk", "run walk")),
+    *(
+        (f"{command} --save ''", "all or none, got ''")
+        for command in ("detect walk", "people walk", "track walk", "run walk", "run sim:joining", "simulate joining")
+    ),
     ("simulate joining --save film", "--save must name some of frames, video, masks, ground, all or none, got 'film'"),
     *((f"{command} nosuch.mp4", "nosuch.mp4") for command in ("detect", "track", "people", "run")),
     *((f"{command} --rate 0", "frame rate") for command in ("detect walk", "people walk", "run walk")),
