@@ -5,6 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import pytest
+from hypothesis import HealthCheck, given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
 from pydantic import Field, ValidationError
 
 from torchvision_dddas.config import (
@@ -179,6 +182,31 @@ def test_toml_of_any_text_is_read_as_it_was_written(tmp_path: Path) -> None:
     text = format_toml(content, ["a comment"])
     (tmp_path / "any.toml").write_text(text, encoding="utf-8")
     assert read_toml(tmp_path / "any.toml") == content and "rows = [[1, 2.5], []]\n" in text
+
+
+ANY_TEXT = st.text(
+    st.characters(codec=None, categories=None) | st.sampled_from("\r\n\x00\x1b\x7f\x85\u2028\ud800\udcff\"'\\#,[]")
+)
+ANY_TABLE = st.recursive(
+    ANY_TEXT, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(ANY_TEXT, inner, max_size=3), max_leaves=6
+)
+
+
+def whole(value):
+    """The same with half characters as text."""
+    if isinstance(value, dict):
+        return {whole(key): whole(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [whole(inner) for inner in value]
+    return "".join(f"\\u{ord(letter):x}" if "\ud800" <= letter <= "\udfff" else letter for letter in value)
+
+
+@given(content=st.dictionaries(ANY_TEXT, ANY_TABLE, max_size=3), comment=ANY_TEXT)
+@examples(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_toml_of_any_unicode_text_and_comment_is_read_as_it_was_written(tmp_path: Path, content, comment) -> None:
+    path = tmp_path / "any.toml"
+    path.write_bytes(format_toml(content, [comment]).encode())
+    assert read_toml(path) == whole(content)
 
 
 def test_settings_survive_a_round_trip_through_plain_data() -> None:

@@ -13,7 +13,7 @@ import tomli_w
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, printable
 
 # --------------------------------------------------------------------------------------------------------------------
 # The parameters. A new one is a line in a group: type, default, meaning, unit, lowest, highest.
@@ -752,15 +752,27 @@ def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
 
 
 def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it."""
-    text = tomli_w.dumps(content, indent=1)
+    """TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it.
+
+    TOML has no half characters (lone surrogates, as in names of files that are no UTF-8): they become text, \\udc80.
+    """
+    text = tomli_w.dumps(_whole_characters(content), indent=1)
     while (shorter := _ARRAY.sub(lambda found: "[" + ", ".join(re.split(r",\n *", found[1])[:-1]) + "]", text)) != text:
         text = shorter
-    return "".join(f"# {line}\n" for line in comments) + ("\n" if comments else "") + text
+    lines = [printable(" ".join(comment.splitlines())) for comment in comments]
+    return "".join(f"# {line}\n" for line in lines) + ("\n" if comments else "") + text
 
 
 # An array without further arrays in it, one element a line, as tomli_w writes it.
 _ARRAY = re.compile(r"\[\n +((?:[^\n]*,\n *)+?)\]")
+
+
+def _whole_characters(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, Mapping):
+        return {_whole_characters(key): _whole_characters(inner) for key, inner in value.items()}
+    return [_whole_characters(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
 def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:

@@ -2,6 +2,8 @@
 
 import re
 
+from unicodedata import category
+
 LONGEST = 1000
 """Characters of a message; what came may have been of any length."""
 
@@ -63,6 +65,13 @@ def _line(text: str) -> str:
     if not text.isprintable():
         text = "".join(map(_shown, " ".join(text.splitlines()).replace("\t", " ")))
     return text if len(text) <= LONGEST else f"{text[: LONGEST - _END - 5]} ... {text[-_END:]}"
+
+
+def printable(text: str) -> str:
+    """The text with its line feeds and spaces, and what steers a terminal or is half a character by its number."""
+    if text.isprintable():
+        return text
+    return "".join(letter if letter == "\n" or category(letter) == "Zs" else _shown(letter) for letter in text)
 
 
 def _shown(letter: str) -> str:
