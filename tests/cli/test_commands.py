@@ -1,13 +1,16 @@
 """The commands beside detect, what they import, and what they say while they work."""
 
 import os
+import re
 import subprocess
 import sys
 import types
 from functools import partial
 
+from tests.cli.conftest import bad
 from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import progress as progress_module
+from torchvision_dddas.config import Settings
 
 
 def python(program, *words, **environ):
@@ -39,6 +42,14 @@ def test_settings_lists_every_parameter_on_its_line(dddas):
     lines = dddas("settings").stdout.splitlines()
     for parameter in all_parameters():
         assert any(parameter.name in line and str(parameter.default) in line for line in lines), parameter.name
+
+
+def test_settings_of_a_group_lists_its_parameters_alone(dddas):
+    lines = dddas("settings", "gates").stdout.splitlines()
+    names = {name for line in lines for name in re.findall(r"│ (\w+\.\w+)", line)}
+    assert names == {f"gates.{name}" for name in Settings().gates.model_dump()}
+    assert "no group of parameters is named 'gate'; did you mean gates?" in bad(dddas("settings", "gate"))
+    assert "wanted one of registration, interval," in bad(dddas("settings", "zzz"))
 
 
 def test_a_terminal_of_ascii_alone_is_written_to(dddas, engine, clip, tmp_path):

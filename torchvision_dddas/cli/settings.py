@@ -1,22 +1,40 @@
 """`dddas settings`: the table of parameters."""
 
 import sys
+from typing import Annotated
+
+import typer
 
 from torchvision_dddas.cli.options import report_errors
+from torchvision_dddas.errors import InputError
 
 
 @report_errors
-def settings() -> None:
-    """List every parameter that --set and a configuration can change: default, unit, range and meaning."""
+def settings(
+    group: Annotated[
+        str | None, typer.Argument(metavar="GROUP", help="Only this group, such as track. [default: all]")
+    ] = None,
+) -> None:
+    """List the parameters that --set and a configuration can change: default, unit, range and meaning."""
     from rich.console import Console
     from rich.table import Table
 
-    from torchvision_dddas.config import all_parameters, config_names
+    from torchvision_dddas.config import Settings, all_parameters, config_names, nearest
 
+    groups = list(Settings.model_fields)
+    if group is not None and group not in groups:
+        raise InputError(
+            f"no group of parameters is named '{group}'; {nearest(group, groups, 'wanted one of ' + ', '.join(groups))}"
+        )
     table = Table("parameter", "default", "unit", "range", "meaning")
     for parameter in all_parameters():
+        if group is not None and not parameter.name.startswith(f"{group}."):
+            continue
         table.add_row(parameter.name, str(parameter.default), parameter.unit, parameter.range, parameter.meaning)
     # A file or a pipe gets one line per parameter, so that it can be searched.
     console = Console() if sys.stdout.isatty() else Console(width=240)
     console.print(table, markup=False)
-    console.print(f"Shipped configurations for --config: {', '.join(config_names())}", markup=False, highlight=False)
+    if group is None:
+        console.print(
+            f"Shipped configurations for --config: {', '.join(config_names())}", markup=False, highlight=False
+        )
