@@ -75,9 +75,13 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     assert "results unused for 0 days were removed" in again.stdout
     shown = dddas("compare", tmp_path / "out", tmp_path / "other", "--out", tmp_path / "compare.html")
     assert "tracking, 2 clips together" in shown.stdout and "the same in both" in shown.stdout
-    assert "</html>" in (tmp_path / "compare.html").read_text()
+    page = (tmp_path / "compare.html").read_text()
+    for name in "A: study (", "B: study (", "track.memory_frames: ", " in A, 1 in B":
+        assert name in shown.stdout and name in page
+    assert f"B: study ({tmp_path / 'other'})" in shown.stdout and "</html>" in page
     found = json.loads(dddas("compare", tmp_path / "out", tmp_path / "other", "--json").stdout)
     assert found["tasks"]["association"]["pooled"]["tracks"]["mota"]["says"]
+    assert list(found["settings"]) == ["track.memory_frames"] and found["settings"]["track.memory_frames"][1] == 1
     (tmp_path / "other" / SCORES).write_bytes(b"x" * 100)
     assert "is damaged or of another version" in bad(dddas("compare", tmp_path / "out", tmp_path / "other"))
     assert "holds no study: no scores.bin" in bad(dddas("compare", tmp_path / "out", tmp_path / "clips"))

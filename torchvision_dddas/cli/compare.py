@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,18 +35,27 @@ def compare(
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
     from torchvision_dddas.evaluation.studies.cache import read_scores
-    from torchvision_dddas.evaluation.studies.comparison import compare_studies, comparison_report
+    from torchvision_dddas.evaluation.studies.comparison import (
+        compare_studies,
+        comparison_report,
+        differing_settings,
+        settings_lines,
+    )
     from torchvision_dddas.io.atomic_files import refuse_folder, save_file
-    from torchvision_dddas.io.output.run_record import finite
+    from torchvision_dddas.io.output.run_record import finite, read_run_record
 
-    found = compare_studies(read_scores(first), read_scores(second))
+    named = [(read_scores(folder), folder) for folder in (first, second)]
+    studies = [replace(study, name=f"{study.name} ({folder})") for study, folder in named]
+    settings = [(read_run_record(folder) or {}).get("settings") for folder in (first, second)]
+    is_known = all(isinstance(side, dict) for side in settings)
+    found = compare_studies(*studies) | {"settings": differing_settings(*settings) if is_known else None}
     if out is not None:
         refuse_folder(out)
         save_file(out, comparison_report(finite(found)).encode())
     if as_json:
         typer.echo(json.dumps(finite(found), indent=2))
         return
-    print_lines([f"A: {first}", f"B: {second}"])
+    print_lines([f"A: {found['first']}", f"B: {found['second']}", *settings_lines(found["settings"])])
     console = open_console()
     for task, changes in found["tasks"].items():
         pooled = [(f"{group} {name}", entry) for group, name, entry in _rows(changes["pooled"])]

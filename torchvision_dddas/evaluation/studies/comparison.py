@@ -67,6 +67,22 @@ def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
     return {"first": first.name, "second": second.name, "tasks": tasks, "notes": notes}
 
 
+def differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """{"group.parameter": [first, second]} of the settings that differ. first, second: by group, as in run.json."""
+    flat = [
+        {f"{group}.{name}": value for group in side for name, value in side[group].items()} for side in (first, second)
+    ]
+    names = dict.fromkeys([*flat[0], *flat[1]])
+    return {name: [side.get(name) for side in flat] for name in names if flat[0].get(name) != flat[1].get(name)}
+
+
+def settings_lines(settings: Mapping[str, Sequence[Any]] | None) -> list[str]:
+    """A line for each setting that differs. None: not known."""
+    if settings is None:
+        return ["settings: unknown, as a run.json lacks them"]
+    return [f"{name}: {one} in A, {other} in B" for name, (one, other) in settings.items()] or ["settings: the same"]
+
+
 def _compare_task(pairs: Pairs) -> dict[str, Any]:
     same = [clip for clip, (one, other) in pairs.items() if _same(one, other)]
     clips = {clip: _changes([pair], 1, {}) for clip, pair in pairs.items() if clip not in same}
@@ -162,7 +178,7 @@ def _unlike(one: Scored, other: Scored) -> str:
 
 
 def comparison_report(comparison: Mapping[str, Any]) -> str:
-    """The HTML of compare.html. comparison: as `compare_studies` returns it, NaN as None."""
+    """The HTML of compare.html. comparison: as `compare_studies` returns it, NaN as None; "settings": that differ."""
     first, second = str(comparison["first"]), str(comparison["second"])
     tasks = []
     for task, changes in comparison["tasks"].items():
@@ -192,6 +208,7 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
         meaning=MEANING,
         tasks=tasks,
         notes=comparison["notes"],
+        settings=settings_lines(comparison.get("settings")),
     )
 
 
