@@ -53,6 +53,13 @@ def test_the_best_of_a_grid_is_written_for_config_and_measured_on_clips_held_out
     assert set(record["on_held_out"]) == {"before", "best"} and "Held out (held)" in swept[1]
 
 
+def test_the_default_is_shown_and_marked(swept) -> None:
+    default = load_config().difference.threshold
+    assert json.loads((swept[0] / "sweep.json").read_text())["defaults"]["difference.threshold"] == default
+    assert f"default {default:g}" in swept[1] and "3 (default)" in swept[1]
+    assert f"difference.threshold: 10.0 (default {default})" in (swept[0] / "best.toml").read_text()
+
+
 def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(run, swept, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", lambda *_: pytest.fail("computed again"))
     assert run(*GRID, *HOLD, "--out", tmp_path, "--quiet").exit_code == 0

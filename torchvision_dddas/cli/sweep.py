@@ -155,13 +155,17 @@ def _show(record: "SweepRecord") -> None:
     parameters = list(dict.fromkeys(parameter for trial in record.trials for parameter in trial.parameters))
     table = Table(title=f"{record.heading}, {'least' if minimize else 'most'} first")
     for column in ("trial", *parameters, record.goal.measure):
-        table.add_column(column, justify="left" if column in parameters else "right")
+        default = f"\ndefault {_format(record.defaults[column])}" if column in parameters else ""
+        table.add_column(f"{column}{default}", justify="left" if column in parameters else "right")
     ordered = ranked(record.trials, minimize)
     shown = ordered[:MOST_SHOWN]
     if record.trials[0] not in shown:
         shown.append(record.trials[0])
     for trial in shown:
-        cells = [_format(trial.parameters[name]) if name in trial.parameters else "unchanged" for name in parameters]
+        cells = [
+            _format(value := record.value_of(trial, name)) + " (default)" * (value == record.defaults[name])
+            for name in parameters
+        ]
         table.add_row(str(trial.number), *cells, format_value(trial.value))
     open_console().print(table)
     lines = [f"trial {trial.number} has no value: {trial.cause}" for trial in ordered if trial.cause]

@@ -328,7 +328,7 @@ class SweepRecord:
         self.best, self.on_held = best, on_held
         before = format_value(self.trials[0].value)
         about = [f"dddas sweep: {self.heading}: {format_value(best.value)}, with the settings as they were {before}."]
-        about += [f"{parameter}: {value}" for parameter, value in best.parameters.items()]
+        about += [f"{name}: {value} (default {self.defaults[name]})" for name, value in best.parameters.items()]
         if on_held is not None:
             about.append(f"On the clips held out: {format_value(on_held[1][0])}, before {format_value(on_held[0][0])}.")
         self._write_json()
@@ -339,6 +339,16 @@ class SweepRecord:
     def heading(self) -> str:
         """What is measured, in words."""
         return f"{self.goal.name}, {self.goal.by} over {len(self.tuned)} clip{'s' * (len(self.tuned) != 1)}"
+
+    @property
+    def defaults(self) -> dict[str, object]:
+        """The default of each parameter that is tried."""
+        tried = {name for trial in self.trials for name in trial.parameters}
+        return {known.name: known.default for known in all_parameters() if known.name in tried}
+
+    def value_of(self, trial: Trial, parameter: str) -> object:
+        """A parameter in a trial: what was tried, else as the settings have it."""
+        return trial.parameters.get(parameter, _current(self.settings, parameter))
 
     def _write_json(self) -> None:
         def null_if_nan(value: float) -> float | None:
@@ -352,6 +362,7 @@ class SweepRecord:
             "better": "less" if self.goal.minimize else "more",
             "search": self.search,
             "settings": changes(self.settings),
+            "defaults": self.defaults,
             "clips": self.tuned,
             "held_out": self.held,
             "trials": [
