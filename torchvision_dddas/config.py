@@ -752,9 +752,9 @@ def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
 
 
 def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it.
+    r"""TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it.
 
-    TOML has no half characters (lone surrogates, as in names of files that are no UTF-8): they become text, \\udc80.
+    TOML has no half characters (lone surrogates, as in names of files that are no UTF-8): they become text, \udc80.
     """
     text = tomli_w.dumps(_whole_characters(content), indent=1)
     while (shorter := _ARRAY.sub(lambda found: "[" + ", ".join(re.split(r",\n *", found[1])[:-1]) + "]", text)) != text:

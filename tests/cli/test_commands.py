@@ -7,8 +7,12 @@ import sys
 import types
 from functools import partial
 
+import pytest
+from rich.table import Table
+
 from tests.cli.conftest import bad
 from tests.synthetic_clip import film_into
+from torchvision_dddas.cli import options
 from torchvision_dddas.cli import progress as progress_module
 from torchvision_dddas.config import Settings
 
@@ -46,10 +50,23 @@ def test_settings_lists_every_parameter_on_its_line(dddas):
 
 def test_settings_of_a_group_lists_its_parameters_alone(dddas):
     lines = dddas("settings", "gates").stdout.splitlines()
-    names = {name for line in lines for name in re.findall(r"│ (\w+\.\w+)", line)}
+    names = {name for line in lines for name in re.findall(r"^│ (\w+\.\w+)", line)}
     assert names == {f"gates.{name}" for name in Settings().gates.model_dump()}
     assert "no group of parameters is named 'gate'; did you mean gates?" in bad(dddas("settings", "gate"))
     assert "wanted one of registration, interval," in bad(dddas("settings", "zzz"))
+
+
+@pytest.mark.parametrize("err", [False, True])
+def test_names_do_not_steer_the_terminal(capsys, err):
+    name = "a\x1b[2Jb\x07\x9b\u202ec\udc80"
+    options.echo(name, err=err)
+    table = Table("\x1b]0;title\x07", title=name)
+    table.add_row(name)
+    progress_module.open_console(stderr=err).print(table)
+    progress_module.print_now(name)
+    for written in capsys.readouterr():
+        assert all(letter.isprintable() for letter in written.replace("\n", ""))
+        assert r"a\x1b[2Jb\x07\x9b\u202ec\udc80" in written or not written
 
 
 def test_a_terminal_of_ascii_alone_is_written_to(dddas, engine, clip, tmp_path):

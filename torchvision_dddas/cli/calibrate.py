@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchvision_dddas.cli.options import Config, Overrides, parse_size, report_errors
+from torchvision_dddas.cli.options import Config, Overrides, echo, parse_size, report_errors
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
@@ -96,13 +96,13 @@ def calibrate(
             keys[name] = float(f"{value:.6g}")
     text = format_toml(keys)
     for line in lines:
-        typer.echo(line, err=out is None)
+        echo(line, err=out is None)
     if out is None:
-        typer.echo(text, nl=False)
+        echo(text.removesuffix("\n"))
         return
     save_file(out, text.encode())
     missing = "" if "width_px" in known else "; width_px and height_px are still missing (--size)"
-    typer.echo(f"{out}: the camera{missing}")
+    echo(f"{out}: the camera{missing}")
 
 
 def _read_heights(table: Path) -> "np.ndarray":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchvision_dddas.cli.evaluate import MOST_CLIPS, format_figure
-from torchvision_dddas.cli.options import print_lines, report_errors
+from torchvision_dddas.cli.options import echo, print_lines, report_errors
 from torchvision_dddas.cli.progress import open_console
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def compare(
         refuse_folder(out)
         save_file(out, comparison_report(finite(found)).encode())
     if as_json:
-        typer.echo(json.dumps(finite(found), indent=2))
+        echo(json.dumps(finite(found), indent=2))
         return
     print_lines([f"A: {found['first']}", f"B: {found['second']}", *settings_lines(found["settings"])])
     console = open_console()
@@ -71,9 +71,9 @@ def compare(
         if clips:
             console.print(_table(f"{task}, single clips", clips[:MOST_CLIPS]))
         if len(clips) > MOST_CLIPS:
-            typer.echo(f"{len(clips) - MOST_CLIPS} more rows: --json")
+            echo(f"{len(clips) - MOST_CLIPS} more rows: --json")
         if changes["same"]:
-            typer.echo(f"the same in both to the last digit: {', '.join(changes['same'])}")
+            echo(f"the same in both to the last digit: {', '.join(changes['same'])}")
     console.print(MEANING, highlight=False)
     print_lines([f"note: {note}" for note in found["notes"]])
 

@@ -21,6 +21,7 @@ from torchvision_dddas.cli.options import (
     StudyBackend,
     check_interval,
     check_jobs,
+    echo,
     print_lines,
     report_errors,
     split_patterns,
@@ -107,7 +108,7 @@ def evaluate(
         report = score(truth, result, first_frame, folder, interval or 1, (ignored or Ignored.dropped).value)
         if not quiet:
             show(report)
-            typer.echo(f"{folder / 'metrics.json'}: the same with its counts")
+            echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
     from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
     from torchvision_dddas.evaluation.studies.jobs import Workers

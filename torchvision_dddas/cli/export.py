@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from torchvision_dddas.cli.options import Overrides, Quiet, parse_size, print_lines, report_errors
+from torchvision_dddas.cli.options import Overrides, Quiet, echo, parse_size, print_lines, report_errors
 from torchvision_dddas.errors import InputError
 
 NEEDED = "torch", "kornia", "onnx", "onnxscript"
@@ -55,7 +55,7 @@ def export(
             checks = "; ".join(
                 f"{c.off:.1e} {c.unit} off, {c.limit:g} allowed" for c in next(iter(found.values())).checks
             )
-            typer.echo(f"{name}: {', '.join(found)}: compared with torch: {checks}", err=True)
+            echo(f"{name}: {', '.join(found)}: compared with torch: {checks}", err=True)
     write_graphs(out, files)
     lines = [f"{out / name}: {len(made.content)} bytes" for name, made in files.items()]
     print_lines([*lines, str(out / "manifest.json")], quiet)

@@ -10,7 +10,7 @@ from typing import Annotated, ParamSpec, TypeVar
 import typer
 
 from torchvision_dddas.cli.exits import BAD_INPUT, describe_kept, say, say_stopped
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, printable
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -59,6 +59,11 @@ OutPerInput = Annotated[Path, typer.Option(help="Folder for the results; with se
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
+def echo(text: str, err: bool = False) -> None:
+    """Print text on stdout or stderr; what would steer the terminal, as names may, is shown by its number."""
+    typer.echo(printable(text), err=err)
+
+
 def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, and a signal into 128 and its number."""
 
@@ -79,7 +84,7 @@ def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments
 def print_lines(lines: Sequence[str], quiet: bool = False) -> None:
     """Print what a command reports at its end, unless --quiet was given."""
     for line in () if quiet else lines:
-        typer.echo(line)
+        echo(line)
 
 
 def check_rate(rate_hz: float | None) -> None:

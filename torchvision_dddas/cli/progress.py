@@ -8,6 +8,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchvision_dddas.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
@@ -115,7 +117,6 @@ def show_progress(quiet: bool) -> "Iterator[Hooks]":
 def _bar(text: str, clock: str) -> "Progress":
     """A bar with a text and a clock, the name of one of rich's columns, behind it."""
     from rich import progress
-    from rich.console import Console
 
     columns = (
         progress.TextColumn("{task.description}", markup=False),
@@ -124,20 +125,27 @@ def _bar(text: str, clock: str) -> "Progress":
         progress.TextColumn(text),
         getattr(progress, clock)(),
     )
-    return progress.Progress(*columns, console=Console(stderr=True), transient=True)
+    return progress.Progress(*columns, console=open_console(stderr=True), transient=True)
 
 
 def print_now(line: str) -> None:
     """Print a line on stderr at once; nothing where that is closed or full."""
     with suppress(OSError, ValueError):
-        print(line, file=sys.stderr, flush=True)
+        print(printable(line), file=sys.stderr, flush=True)
 
 
-def open_console() -> "Console":
-    """Standard output; 120 columns wide if it is no terminal."""
+def open_console(width: int = 120, stderr: bool = False) -> "Console":
+    """Standard output or error; so many columns wide if it is no terminal. Names cannot steer the terminal."""
     from rich.console import Console
+    from rich.segment import Segment
 
-    return Console() if sys.stdout.isatty() else Console(width=120)
+    class PrintableConsole(Console):
+        def render(self, *args: Any, **options: Any) -> Iterator[Segment]:
+            for text, style, control in super().render(*args, **options):
+                yield Segment(text if control else printable(text), style, control)
+
+    stream = sys.stderr if stderr else sys.stdout
+    return PrintableConsole(stderr=stderr, width=None if stream.isatty() else width)
 
 
 def record_results(

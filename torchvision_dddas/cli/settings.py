@@ -1,11 +1,11 @@
 """`dddas settings`: the table of parameters."""
 
-import sys
 from typing import Annotated
 
 import typer
 
 from torchvision_dddas.cli.options import report_errors
+from torchvision_dddas.cli.progress import open_console
 from torchvision_dddas.errors import InputError
 
 
@@ -16,7 +16,6 @@ def settings(
     ] = None,
 ) -> None:
     """List the parameters that --set and a configuration can change: default, unit, range and meaning."""
-    from rich.console import Console
     from rich.table import Table
 
     from torchvision_dddas.config import Settings, all_parameters, config_names, nearest
@@ -32,7 +31,7 @@ def settings(
             continue
         table.add_row(parameter.name, str(parameter.default), parameter.unit, parameter.range, parameter.meaning)
     # A file or a pipe gets one line per parameter, so that it can be searched.
-    console = Console() if sys.stdout.isatty() else Console(width=240)
+    console = open_console(width=240)
     console.print(table, markup=False)
     if group is None:
         console.print(

@@ -20,11 +20,12 @@ from torchvision_dddas.cli.options import (
     Quiet,
     StudyBackend,
     check_jobs,
+    echo,
     report_errors,
     split_patterns,
 )
 from torchvision_dddas.cli.progress import EVERY_S, open_console, progress, show_progress
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, printable
 
 if TYPE_CHECKING:
     from torchvision_dddas.tuning.descent import Step
@@ -153,7 +154,7 @@ class _StepLines:
 
 
 def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def _show(tuned: "Tuned", folder: Path) -> None:
@@ -173,7 +174,7 @@ def _show(tuned: "Tuned", folder: Path) -> None:
     notes = [f"note: {note}" for side in (verdict.tuned, verdict.held) if side is not None for note in side.notes]
     for line in (*verdict.lines(), *notes):
         console.print(line, markup=False, highlight=False)
-    typer.echo(f"{folder}: {TUNED} (for --config), {REPORT}, {RUN}")
+    echo(f"{folder}: {TUNED} (for --config), {REPORT}, {RUN}")
 
 
 def _device(name: str) -> Any:

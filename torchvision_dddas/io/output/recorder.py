@@ -202,7 +202,10 @@ class RunRecorder(Generic[Item]):
 
 
 def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
-    """What to save, from `masks,overlay`, `all` (or None) or `none`. Raises InputError on a name that is not known, and on no name."""
+    """What to save, from `masks,overlay`, `all` (or None) or `none`.
+
+    Raises InputError on a name that is not known, and on no name.
+    """
     chosen = [n.strip() for n in ("all" if names is None else names).split(",") if n.strip()]
     if not chosen:
         raise InputError(f"--save must name some of {', '.join(known)}, all or none, got {names!r}")
