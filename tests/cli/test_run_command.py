@@ -136,6 +136,26 @@ def test_landmarks_with_pixels_need_no_colours_and_only_sampled_frames_are_locat
     assert np.median(missed_by(found)[0]) < 0.3
 
 
+@pytest.mark.parametrize(
+    ("words", "note"),
+    [
+        (("track", "--interval", 9), "--interval 9 is beyond the clip's 5 frames: only frame 1 was tracked"),
+        (("run", "--interval", 9), "--interval 9 is beyond the clip's 5 frames: only frame 1 was tracked"),
+        (
+            ("detect", "--set", "small.min_area_px=5000", "--set", "gates.min_area_px=4000"),
+            "64x48 px are too small",
+        ),
+    ],
+    ids=["track", "run", "detect"],
+)
+def test_what_keeps_all_targets_from_being_found_is_noted(dddas, clip, tmp_path, words, note):
+    command, *more = words
+    result = dddas(command, clip, *more, "--save", "none", "--out", tmp_path / "out", "--backend", "onboard")
+    assert result.exit_code == 0, result.output
+    assert "note: " in result.stdout and note in result.stdout
+    assert any(note in line for line in record(tmp_path / "out")["notes"])
+
+
 def test_without_landmarks_nothing_is_located_and_earlier_positions_go(dddas, clip, engine, tmp_path):
     out = tmp_path / "out"
     assert dddas("run", clip, "--save", "none", "--out", out).exit_code == 0

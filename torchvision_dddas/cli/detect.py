@@ -70,6 +70,7 @@ def detect_clip(
     from torchvision_dddas.detection import detect_motion, load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import DetectionRecorder, clip_facts
+    from torchvision_dddas.io.run_inputs import clip_notes
     from torchvision_dddas.io.telemetry import read_telemetry
 
     refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
@@ -91,6 +92,7 @@ def detect_clip(
         record.notes += flight.notes if flight is not None else ()
         scenes = detect_motion(source, settings, engine, flight)
         record_results(output, record, scenes, source.name, source.count, quiet, source)
+        record.notes += clip_notes(source, 1, settings)
     saved = {"masks": "masks/", "overlay": "overlay.mp4"}
     files = ["detections.csv", "detections.txt", *(saved[name] for name in save), "run.json"]
     doubtful = f"{record.unreliable_frames} frames with unreliable registration"

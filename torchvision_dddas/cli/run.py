@@ -125,7 +125,7 @@ def run(
     from torchvision_dddas import open_video
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
-    from torchvision_dddas.io.run_inputs import locator_facts, map_site, prepare_run
+    from torchvision_dddas.io.run_inputs import clip_notes, locator_facts, map_site, prepare_run
     from torchvision_dddas.pipeline import Pipeline
 
     names = parse_save(save, PipelineRecorder.saved)
@@ -151,6 +151,7 @@ def run(
         count = None if source.count is None else -(-source.count // interval)
         pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
+        record.notes += clip_notes(source, interval, ready.settings)
     print_lines(_summary(record, out, site is not None, "overlay" in names), quiet)
 
 

@@ -58,6 +58,7 @@ def track(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_detections
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
+    from torchvision_dddas.io.run_inputs import clip_notes
     from torchvision_dddas.types import is_sampled
 
     settings, names = load_config(config, set_ or []), parse_save(save, TrackRecorder.saved)
@@ -98,6 +99,8 @@ def track(
             quiet,
             source,
         )
+        if source is not None:
+            record.notes += clip_notes(source, interval, settings)
         if source is not None and table is not None and table.last > source.last:
             record.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
     counts = record.counts

@@ -125,6 +125,19 @@ def _read_telemetry(path: Path, settings: Settings, clip: str | None) -> Telemet
     return read_telemetry(path, settings.aerial.clock_offset_s, clip, settings.aerial.time_zone)
 
 
+def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:
+    """What keeps anything from being found in a clip that was read to its end: the interval, or its size."""
+    notes = []
+    if interval > 1 and interval >= source.last:
+        notes.append(f"--interval {interval} is beyond the clip's {source.last} frames: only frame 1 was tracked")
+    (width, height), least = source.size, settings.gates.min_area_px
+    if settings.small.on:
+        least = min(least, settings.small.min_area_px)
+    if width * height < least:
+        notes.append(f"pictures of {width}x{height} px are too small for any target, which has {least} px or more")
+    return notes
+
+
 def read_locator(
     given: AerialInput,
     settings: Settings,
