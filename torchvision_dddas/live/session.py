@@ -11,7 +11,7 @@ from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
-from torchvision_dddas.errors import without_secrets
+from torchvision_dddas.errors import printable, without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.interrupts import StopSignals
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
@@ -237,7 +237,7 @@ def _open(
 
 def _print(text: str) -> None:
     clear = _CLEAR if sys.stderr.isatty() else ""
-    sys.stderr.write(f"{clear}dddas: {' '.join(text.split())}\n")
+    sys.stderr.write(f"{clear}dddas: {printable(' '.join(text.split()))}\n")
     sys.stderr.flush()
 
 
