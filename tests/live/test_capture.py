@@ -1,5 +1,8 @@
 """A live source numbers pictures by the clock, keeps the newest, and survives whatever a camera does."""
 
+import base64
+import hashlib
+import http.server
 import itertools
 import socket
 import threading
@@ -16,6 +19,7 @@ from tests.live.streams import PATIENCE_S, FakeClock, FakeStream, Gate, Streams,
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live import Health, LiveSource
+from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.types import Frame
 
 APART_S = 0.04
@@ -152,14 +156,19 @@ def test_a_stream_that_cannot_be_decoded_or_raises_is_opened_again(camera, bad, 
     assert any(line in what for what in some.reported)
 
 
-def test_pictures_of_another_size_are_scaled_only_where_the_shape_is_the_same(camera) -> None:
-    other = camera([1, *[1.0, grey(7, 64, 64)] * 20, 1.0, 9])
-    assert levels(other.take(2)) == [1, 9]
-    some = camera([1, *[1.0, grey(7, 128, 96)] * 8])
+@pytest.mark.parametrize("size", [(64, 64), (128, 96)])
+def test_a_stream_that_stays_at_another_size_goes_on_with_it(camera, size) -> None:
+    some = camera([1, *[1.0, grey(7, *size)] * 8])
     frames = some.take(3)
-    assert [f.image.shape for f in frames] == [(48, 64, 3)] * 3
-    assert [f.time_s for f in frames] == pytest.approx([0, 6, 7])
-    assert any("for 5.0 s: they are scaled" in what for what in some.reported)
+    assert [(f.image.shape[1], f.image.shape[0]) for f in frames] == [(64, 48), size, size]
+    assert some.source.size == size
+    assert any("for 5.0 s: begun anew" in what for what in some.reported)
+
+
+def test_a_picture_that_comes_only_when_the_driver_gave_up_is_not_used(camera) -> None:
+    some = camera([1, 5.0, 66, 5.0, 67], [2])
+    assert levels(some.take(2)) == [1, 2]
+    assert "lost: no picture has come for 5.0 s" in some.reported[0]
 
 
 def test_a_lost_stream_is_opened_again_with_ever_longer_pauses(camera) -> None:
@@ -192,33 +201,17 @@ def test_a_read_that_never_returns_is_given_up_and_its_thread_ends_when_it_does(
     assert some.streams[0].released.wait(PATIENCE_S)
 
 
-def test_no_more_than_four_threads_hang_at_a_time(camera, monkeypatch) -> None:
-    stuck = [Gate() for _ in range(4)]
-    some = camera([1, stuck[0]], *[[gate] for gate in stuck[1:]], [2])
+def test_a_driver_that_hangs_again_and_again_ends_the_run_within_a_minute(camera) -> None:
+    stuck = [Gate() for _ in range(3)]
+    some = camera([1, stuck[0]], [stuck[1]], [stuck[2]], [2])
     some.take(1)
-    feed, given_up, opened = some.source._feed, threading.Event(), list[int]()
-    check = feed.check
-
-    def watched() -> float:
-        until_s = check()
-        if feed._turn == len(stuck):
-            given_up.set()
-        return until_s
-
-    def end_one() -> None:
-        opened.append(some.opener.opened)
-        third = feed.threads[2]
-        stuck[2].open.set()
-        third.join(PATIENCE_S)
-        some.clock.pass_s(10)
-
-    monkeypatch.setattr(feed, "check", watched)
-    for gate in stuck:
-        after(gate.reached, lambda: some.clock.pass_s(60))
-    ending = after(given_up, end_one)
-    assert levels(some.take(1)) == [2]
-    ending.join()
-    assert opened == [4]
+    began_s, waking = some.clock.now(), [after(gate.reached, lambda: some.clock.pass_s(12.6)) for gate in stuck]
+    with pytest.raises(DeadCamera, match="camera:0 is dead"):
+        some.take(1)
+    assert some.clock.now() - began_s < 60
+    assert not some.source.seeking
+    for thread in waking:
+        thread.join()
     for gate in stuck:
         gate.open.set()
 
@@ -253,6 +246,63 @@ def test_a_stream_without_a_first_picture_is_one_line(stream, words) -> None:
         LiveSource("camera:0", opener=opener, clock=FakeClock())
     assert "\n" not in str(error.value)
     assert opener.opened == 1
+
+
+def test_a_camera_that_is_absent_at_the_start_is_waited_for_when_asked() -> None:
+    clock, health, waited = FakeClock(), Health(), threading.Event()
+    opener = Streams(None, None, FakeStream([lambda: waited.wait(PATIENCE_S), 1]))
+    source = LiveSource("camera:0", health=health, opener=opener, clock=clock, waiting=waited.set)
+    source.close()
+    assert waited.is_set() and source.size == (64, 48) and not health.snapshot().troubles
+    first, then = [event.text for event in health.snapshot().events][:2]
+    assert "camera:0 is not there yet: cannot open it" in first
+    assert then == "camera:0 is there after 1.5 s, at 2 tries"
+
+
+class Camera401(http.server.BaseHTTPRequestHandler):
+    """Answers as a camera: 401 without the right name and password, else 404."""
+
+    def do_GET(self) -> None:
+        right = "Basic " + base64.b64encode(b"pilot:s3cret").decode()
+        self.send_response(404 if self.headers["Authorization"] == right else 401)
+        self.send_header("WWW-Authenticate", 'Basic realm="camera"')
+        self.end_headers()
+
+    def do_DESCRIBE(self) -> None:
+        nonce, uri = "abc", self.path
+        inner = [hashlib.md5(text.encode()).hexdigest() for text in ("pilot:camera:s3cret", f"DESCRIBE:{uri}")]
+        right = hashlib.md5(f"{inner[0]}:{nonce}:{inner[1]}".encode()).hexdigest()
+        status = "404 Not Found" if right in (self.headers["Authorization"] or "") else "401 Unauthorized"
+        challenge = f'WWW-Authenticate: Digest realm="camera", nonce="{nonce}"'
+        sequence = self.headers["CSeq"]
+        self.wfile.write(f"RTSP/1.0 {status}\r\nCSeq: {sequence}\r\n{challenge}\r\n\r\n".encode())
+
+    def parse_request(self) -> bool:
+        self.raw_requestline = self.raw_requestline.replace(b"RTSP/1.0", b"HTTP/1.0")
+        return super().parse_request()
+
+    def do_OPTIONS(self) -> None:
+        self.wfile.write(f"RTSP/1.0 200 OK\r\nCSeq: {self.headers['CSeq']}\r\nPublic: DESCRIBE\r\n\r\n".encode())
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are not logged."""
+
+
+@pytest.mark.parametrize("scheme", ["http", "rtsp"])
+@pytest.mark.parametrize(("user", "words"), [("", "401"), ("pilot:wrong@", "401"), ("pilot:s3cret@", "404")])
+def test_a_camera_that_refuses_is_told_from_one_that_is_absent_and_not_waited_for(scheme, user, words) -> None:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Camera401) as server:
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        address = f"{scheme}://{user}127.0.0.1:{server.server_port}/cam"
+        try:
+            for waiting in (None, lambda: None):
+                with pytest.raises(InputError, match=rf"/cam is refused \({words}\)") as error:
+                    LiveSource(address, LiveParameters(stall_s=5.0), waiting=waiting)
+                assert "s3cret" not in str(error.value)
+        finally:
+            server.shutdown()
+            serving.join()
 
 
 def test_a_camera_that_hangs_at_the_start_is_one_line() -> None:

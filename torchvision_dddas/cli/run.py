@@ -79,6 +79,9 @@ def run(
         typer.Option(metavar="[HOST:]PORT", help="With --live: serve a status page, /metrics and /health.json."),
     ] = None,
     people: Annotated[bool, typer.Option("--people", help="With --live: recognize people too.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="With --live: wait for a camera or stream that is not there yet.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Find what moves in a clip from the air, give it lasting identities, and locate it.
@@ -96,7 +99,7 @@ def run(
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
         _refuse(others, "is of no use with --live, which draws and steers nothing")
     else:
-        others = {"--emit": emit, "--serve": serve, "--people": people or None}
+        others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
         _refuse(others, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
     if clip.startswith(SIMULATED) and not live:
@@ -119,7 +122,7 @@ def run(
         from torchvision_dddas.live.session import run_live
 
         code = run_live(
-            out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet
+            out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet, wait
         )
         raise typer.Exit(code)
     from torchvision_dddas import open_video

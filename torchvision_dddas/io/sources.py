@@ -415,8 +415,3 @@ def first_picture(stream: Stream, name: str) -> np.ndarray:
         if (image := stream.retrieve()) is not None:
             return image
     raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection too poor")
-
-
-def scaled(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A picture brought to (width, height)."""
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)

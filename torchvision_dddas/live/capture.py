@@ -13,6 +13,7 @@ from torchvision_dddas.io.sources import ImageSource, OpenedStream, Stream, Vide
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.receiver import OPENING, Receiver
+from torchvision_dddas.live.refusal import open_or_refuse
 from torchvision_dddas.types import Frame, Problem, Source
 
 _JOIN_S = 1.0
@@ -26,7 +27,7 @@ class LiveSource:
     ends; with pace 0 it waits for the run. A camera or stream is opened again whenever it is lost, and ends by `stop`.
     Frame numbers follow the clock at rate_hz; a frame's `skipped` counts those before it that were dropped, left out or
     lost. time_s is a recording's own; that of a camera counts from its first picture. What goes wrong while it runs is
-    an event of `health` (kind `stream`) and a problem, never an exception.
+    an event of `health` (kind `stream`) and a problem; only a driver that hangs again and again raises DeadCamera.
 
     name: as given, without passwords. recorded: the number of frames of a recording, None where it is not certain.
     busy_s: how long the run worked on the frame before. Raises InputError if it cannot be opened or sends no picture.
@@ -45,8 +46,12 @@ class LiveSource:
         full_scale: int | None = None,
         opener: Callable[[], Stream] | None = None,
         clock: Clock | None = None,
+        waiting: Callable[[], object] | None = None,
     ) -> None:
-        """spec, rate_hz, full_scale: as `open_video` takes them. opener: opens the stream instead of OpenCV."""
+        """spec, rate_hz, full_scale: as `open_video` takes them. opener: opens the stream instead of OpenCV.
+
+        waiting: called every second while a camera that is not there yet is waited for; None: it is not waited for.
+        """
         text = str(spec)
         self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
         self.parameters, self.health, self._clock = parameters or LiveParameters(), health or Health(), clock or Clock()
@@ -59,14 +64,24 @@ class LiveSource:
         if opener is None and target is None:
             recording = open_video(text, rate_hz=rate_hz, full_scale=full_scale)
             self._feed = Player(recording, self.parameters.pace, *shared)
-            self.rate_hz, self.size = recording.rate_hz, recording.size
+            self.rate_hz = recording.rate_hz
             self.recorded = recording.count if recording.exact else None
             return
         limit_s = self.parameters.stall_s
         where = text if target is None else target
-        opening = opener or (lambda: OpenedStream(where, self.name, (OPENING * limit_s, limit_s)))
-        self._feed = Receiver(self.name, opening, rate_hz, self.parameters, *shared)
-        self.rate_hz, self.size = self._feed.rate_hz, self._feed.size
+        opening = opener or (lambda: open_or_refuse(where, self.name, (OPENING * limit_s, limit_s)))
+        self._feed = Receiver(self.name, opening, rate_hz, self.parameters, *shared, waiting)
+        self.rate_hz = self._feed.rate_hz
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures; a stream may change it."""
+        return self._feed.size
+
+    @property
+    def seeking(self) -> bool:
+        """Whether the camera is lost and is being opened again by a driver that answers."""
+        return self._feed.seeking
 
     @property
     def apart_s(self) -> float:
@@ -130,6 +145,7 @@ class Player:
     ) -> None:
         self._recording, self._pace, self._queue, self._log = recording, pace, queue, log
         self._health, self._clock = health, clock
+        self.size, self.seeking = recording.size, False
         if isinstance(recording, (VideoSource, ImageSource)):
             recording.tolerant = True  # leave out pictures of another size
         self.apart_s = 1 / (recording.rate_hz * pace) if pace else 0.0

@@ -152,7 +152,7 @@ class CaptureLog:
         self._count += 1
         if (spent_s := taken_s - self._since_s) >= _COUNTED_S:
             self.sent_hz = self._count / spent_s
-            self._health.gauge("rate_hz", self.sent_hz)
+            self._health.gauge("sent_hz", self.sent_hz)
             note(self.sent_hz)
             self.restart(taken_s)
 

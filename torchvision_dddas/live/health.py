@@ -19,12 +19,14 @@ from torchvision_dddas.io.streams import Stream
 
 _DURATIONS = 4096  # kept of each kind: percentiles are of the latest
 _EVENTS = 64
+_LATE = 25  # results are late if most of so many were
 
 
 @dataclass(frozen=True)
 class Snapshot:
     """Health at one moment. since_s: since the start. idle_s: since the last result, or the start.
 
+    troubles: what is not well now, in words.
     counts: since the start. gauges: now. seconds: 50, 95 and 99 % quantiles of the latest durations, by name.
     """
 
@@ -34,6 +36,7 @@ class Snapshot:
     gauges: Mapping[str, float]
     seconds: Mapping[str, tuple[float, float, float]]
     events: tuple[Event, ...] = ()
+    troubles: tuple[str, ...] = ()
 
 
 class Health:
@@ -46,6 +49,8 @@ class Health:
         self._gauges: dict[str, float] = {}
         self._seconds: dict[str, deque[float]] = {}
         self._events: deque[Event] = deque(maxlen=_EVENTS)
+        self._troubles: dict[str, str] = {}
+        self._late: deque[bool] = deque(maxlen=_LATE)
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a count."""
@@ -68,6 +73,26 @@ class Health:
             self._counts["results"] += 1
             self._result = time.monotonic()
 
+    def timed(self, is_late: bool) -> None:
+        """Count a result that came late; results are a trouble while most of the latest are."""
+        self.count("late", int(is_late))
+        self._late.append(is_late)
+        late = sum(self._late)
+        self.trouble("late", f"{late} of the latest {len(self._late)} results are late" if late > _LATE // 2 else "")
+
+    def trouble(self, name: str, words: str = "") -> None:
+        """Say that something is not well until it is called with no words."""
+        with self._lock:
+            if words:
+                self._troubles[name] = words
+            else:
+                self._troubles.pop(name, None)
+
+    @property
+    def idle_s(self) -> float:
+        """Seconds since the last result, or the start."""
+        return time.monotonic() - self._result
+
     def event(self, kind: str, text: str, frame: int = 0) -> Event:
         """Add an event of one word's kind, and return it. frame: 0 if it belongs to none."""
         event = Event(time.time(), frame, kind, readable(without_secrets(text)))
@@ -89,10 +114,11 @@ class Health:
             now = time.monotonic()
             since_s, idle_s = now - self._start, now - self._result
             counts, gauges, events = dict(self._counts), dict(self._gauges), tuple(self._events)
+            troubles = tuple(self._troubles.values())
             taken = {name: list(values) for name, values in self._seconds.items()}
         # Sorting thousands of times takes a millisecond, which a frame must not wait for.
         seconds = {name: tuple(np.percentile(values, (50, 95, 99)).tolist()) for name, values in taken.items()}
-        return Snapshot(since_s, idle_s, counts, gauges, seconds, events)
+        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, troubles)
 
 
 _EVENTS_S = 0.2

@@ -8,9 +8,10 @@ import numpy as np
 
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.sources import Stream, first_picture, scaled
+from torchvision_dddas.io.sources import Stream, first_picture
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.refusal import Refused
 from torchvision_dddas.types import Frame
 
 OPENING = 2.0
@@ -19,9 +20,16 @@ _GRACE = 1.25  # times stall_s after which a call that the driver should have en
 _MOST_FAILED = 10  # reads in a row, after which a stream is lost
 _AHEAD_S = 0.5  # frames of a stream that is further ahead of the clock are dropped
 _OFF = 0.2  # a larger relative error of the announced rate is reported
-_MOST_HUNG = 4  # threads that hang in a driver, which cannot be ended
+_MOST_HUNG = 3  # threads that hang in a driver, which cannot be ended
 _MEASURED = 12  # pictures by which a rate that is not announced is measured
 _FALLBACK_HZ = 10.0  # where they come all at once
+
+
+_WAITING_S = 1.0  # between two calls of `waiting`
+
+
+class DeadCamera(Exception):
+    """The driver hung again and again; only a new process can open the camera. The message is for the user."""
 
 
 class _GivenUp(Exception):
@@ -31,8 +39,8 @@ class _GivenUp(Exception):
 class Receiver:
     """Reads a stream in a thread of its own from the start on, and fills the queue once frames are taken.
 
-    rate_hz: as given, else as announced, else measured. size: of the first picture, to which later ones are scaled.
-    Raises InputError if no first picture comes.
+    rate_hz: as given, else as announced, else measured. size: of the first picture; it follows a stream that changes.
+    waiting: as in LiveSource. Raises InputError if no first picture comes.
     """
 
     def __init__(
@@ -45,7 +53,9 @@ class Receiver:
         log: CaptureLog,
         health: Health,
         clock: Clock,
+        waiting: Callable[[], object] | None = None,
     ) -> None:
+        self._waiting = waiting
         self.name, self.rate_hz, self.size = name, rate_hz or 0.0, (0, 0)
         self._opener, self._parameters, self._queue, self._log = opener, parameters, queue, log
         self._health, self._clock = health, clock
@@ -73,11 +83,19 @@ class Receiver:
         """Seconds between pictures as measured."""
         return 1 / (self._log.sent_hz or self.rate_hz)
 
+    @property
+    def seeking(self) -> bool:
+        """Whether the stream is lost and is being opened again by a driver that answers."""
+        return self._lost_s is not None and sum(thread.is_alive() for thread in self.threads) <= 1
+
     def begin(self) -> None:
         """Nothing to do: it reads already, so that the first frame taken is a fresh one."""
 
     def check(self) -> float:
-        """Replace a thread that hangs; called by the run while it waits. Returns the time of the next check."""
+        """Replace a thread that hangs; called by the run while it waits. Returns the time of the next check.
+
+        Raises DeadCamera if too many hang.
+        """
         with self._queue.changed:
             now_s = self._clock.now()
             if self._call is not None:
@@ -87,11 +105,13 @@ class Receiver:
                 self._turn += 1
                 self._call = self._at_work = None
                 self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
+                self._pause_s = self._parameters.retry_s  # the hung call was pause enough
             elif self._at_work is not None and self._at_work.is_alive():
                 return now_s + self._parameters.stall_s
             self.threads = [thread for thread in self.threads if thread.is_alive()]
-            if len(self.threads) < _MOST_HUNG:
-                self._spawn()
+            if len(self.threads) >= _MOST_HUNG:
+                raise DeadCamera(f"{self.name} is dead: its driver hung {_MOST_HUNG} times and cannot be ended")
+            self._spawn()
             return now_s + self._parameters.stall_s
 
     def _spawn(self) -> None:
@@ -101,6 +121,8 @@ class Receiver:
         thread.start()
 
     def _await_first(self) -> None:
+        if self._waiting is not None:
+            self._wait_for_first(self._waiting)
         allowed_s = 2 * _GRACE * OPENING * self._parameters.stall_s
         with self._queue.changed:
             until_s = self._clock.now() + allowed_s
@@ -113,10 +135,18 @@ class Receiver:
         if self._failure is not None:
             raise self._failure
 
+    def _wait_for_first(self, waiting: Callable[[], object]) -> None:
+        while not self._ready and self._failure is None:
+            waiting()
+            with self._queue.changed:
+                left = min(self.check() - self._clock.now(), _WAITING_S)
+                if not self._ready and self._failure is None:
+                    self._clock.wait(self._queue.changed, max(left, 0.0))
+
     def _work(self, turn: int) -> None:
         try:
             while not self._queue.closed and turn == self._turn:
-                if self._ready:
+                if self._lost_s is not None:
                     self._queue.sleep(self._clock.now() + self._pause_s)
                     self._pause_s = min(2 * self._pause_s, self._parameters.retry_most_s)
                     if self._queue.closed or turn != self._turn:
@@ -134,19 +164,21 @@ class Receiver:
             with self._driver(turn, OPENING):
                 stream = self._opener()
             if not self._ready:
-                # Here the driver's own limits apply; _await_first has one for all of it.
-                image = first_picture(stream, self.name)
-                self.size = (image.shape[1], image.shape[0])
-                self.rate_hz = self.rate_hz or stream.rate_hz or self._measured(stream)
+                with self._driver(turn, OPENING):
+                    image = first_picture(stream, self.name)
+                    rate_hz = self.rate_hz or stream.rate_hz or self._measured(stream)
                 with self._queue.changed:
-                    self._ready = turn == self._turn
+                    if turn != self._turn:
+                        raise _GivenUp
+                    self.size, self.rate_hz, self._ready = (image.shape[1], image.shape[0]), rate_hz, True
+                    self._found()
                     self._queue.changed.notify_all()
             why = self._read(stream, turn)
         except _GivenUp:
             raise
         except Exception as error:  # a driver may raise anything
             why = f"{error}"
-            if not self._ready:
+            if not self._ready and (self._waiting is None or isinstance(error, Refused)):
                 failure = error if isinstance(error, InputError) else InputError(f"{self.name} cannot be read: {error}")
                 with self._queue.changed:
                     self._turn += 1
@@ -189,7 +221,11 @@ class Receiver:
         good_s = came_s
         while not self._queue.closed:
             with self._driver(turn):
+                began_s = self._clock.now()
                 came = stream.grab()
+                blocked_s = self._clock.now() - began_s
+            if blocked_s >= self._parameters.stall_s:  # what comes now was left in a buffer when the driver gave up
+                return f"no picture has come for {self._clock.now() - came_s:.1f} s"
             if not came:
                 failed += 1
                 # A driver may time out again and again: once is enough.
@@ -224,40 +260,50 @@ class Receiver:
             self._health.count("undecoded")
             log.report(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
             return False
-        if (fitted := self._fitted(image, taken_s)) is not None:
-            self._health.gauge("connected", 1)
-            if self._lost_s is not None:
-                gone_s, self._lost_s = self._clock.now() - self._lost_s, None
-                self._health.count("reconnects")
-                tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
-                log.report(f"{self.name} is back after {gone_s:.1f} s, at {tries}")
-            self._queue.put(Frame(log.number, taken_s - self._start_s, fitted, 0, taken_s))
+        if self._fits(image, taken_s):
+            self._found()
+            self._queue.put(Frame(log.number, taken_s - self._start_s, image, 0, taken_s))
         return True
 
-    def _fitted(self, image: np.ndarray, taken_s: float) -> np.ndarray | None:
-        """The picture at the run's size; None if it is left out."""
+    def _found(self) -> None:
+        """Note that pictures come."""
+        self._health.gauge("connected", 1)
+        if self._lost_s is None:
+            return
+        gone_s, self._lost_s = self._clock.now() - self._lost_s, None
+        self._health.trouble("stream")
+        tries = f"{self._tries} tries" if self._tries > 1 else "the first try"
+        if self._queue.begun:
+            self._health.count("reconnects")
+        self._log.report(f"{self.name} is {'back' if self._queue.begun else 'there'} after {gone_s:.1f} s, at {tries}")
+
+    def _fits(self, image: np.ndarray, taken_s: float) -> bool:
+        """Whether the picture has the stream's size, which changes where another one lasts."""
         width, height = self.size
         if image.shape[:2] == (height, width):
             self._odd = None
-            return image
+            return True
         self._health.count("wrong_size")
         what = f"pictures are {image.shape[1]}x{image.shape[0]} in place of {width}x{height}"
         if self._odd is None or self._odd[0] != image.shape:
             self._odd = (image.shape, taken_s)
             self._log.report(f"{what}: they are left out", topic="size")
-        # Single ones are left out; a stream that stays at another size of the same shape is scaled.
-        same = abs(image.shape[1] * height - image.shape[0] * width) <= 0.02 * image.shape[1] * height
-        if taken_s - self._odd[1] < self._parameters.stall_s or not same:
-            return None
-        self._log.report(f"{what} for {taken_s - self._odd[1]:.1f} s: they are scaled", topic="scaled")
-        return scaled(image, self.size)
+        if taken_s - self._odd[1] < self._parameters.stall_s:  # single ones are left out
+            return False
+        self._log.report(f"{what} for {taken_s - self._odd[1]:.1f} s: begun anew with them")
+        self.size, self._odd = (image.shape[1], image.shape[0]), None
+        return True
 
     def _lost(self, why: str) -> None:
         self._log.restart()
         if self._lost_s is None:
             self._lost_s, self._tries = self._clock.now(), 0
             self._health.gauge("connected", 0)
-            self._log.report(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
+            self._health.trouble("stream", f"{self.name} sends no pictures")
+            if self._ready:
+                self._log.report(f"{self.name} is lost: {why}; it is opened again as soon as it is there")
+            else:
+                self._log.report(f"{self.name} is not there yet: {why}; it is waited for")
 
     def _compare(self, sent_hz: float) -> None:
         if not self._off and abs(sent_hz / self.rate_hz - 1) > _OFF:

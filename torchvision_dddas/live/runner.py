@@ -16,6 +16,7 @@ from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
 
@@ -24,7 +25,7 @@ _MOST_FAILURES = 25
 
 
 class RepeatedFailure(Exception):
-    """The work failed too often in a row. The message is for the user."""
+    """The work failed too often in a row, or the camera is dead. The message is for the user."""
 
 
 class Feed:
@@ -50,6 +51,7 @@ class Feed:
         self._frames = iter(source)
         self._log, self._silent = telemetry, False
         self._first = True
+        self._held: Frame | None = None  # the first of another size, for the pipeline that begins anew
 
     @property
     def last(self) -> int:
@@ -65,9 +67,16 @@ class Feed:
     def __iter__(self) -> Iterator[Frame]:
         while not self.ended:
             self._watchdog.done()
-            frame = next(self._frames, None)
+            frame, self._held = self._held or next(self._frames, None), None
             if frame is None:
                 self.ended = True
+                return
+            if (size := (frame.image.shape[1], frame.image.shape[0])) != self.size:
+                # The pipeline settles what it has, and begins anew with this one.
+                self._held, self.size = frame, size
+                words = f"pictures are {size[0]}x{size[1]} from now on: begun anew"
+                self._health.event("run", words, frame.number)
+                self._health.count("begun_anew")
                 return
             if self._first:
                 # Earlier frames are not missing: the pipeline that failed has seen them.
@@ -80,6 +89,7 @@ class Feed:
                     self._silent = silent
                     words = "silent: the altitude is not known any more" if silent else "there again"
                     self._health.event("telemetry", f"telemetry is {words}", frame.number)
+                    self._health.trouble("telemetry", "telemetry is silent" if silent else "")
             self._watchdog.begin(frame.number)
             yield frame
 
@@ -119,8 +129,8 @@ class _Renumbering:
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
     """Yield the results of `begin(feed)`; after an error it is called again and goes on with the frames that follow.
 
-    Each error is an event, but the 25th without a result between them raises RepeatedFailure. An InputError after the
-    feed ended ends the run.
+    Each error is an event, but the 25th without a result between them raises RepeatedFailure, as a dead camera does. An
+    InputError after the feed ended ends the run. A feed whose pictures change size ends `begin(feed)` too.
     """
     renumbered, failures = _Renumbering(), 0
     while True:
@@ -128,6 +138,8 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
             for result in begin(feed):
                 failures = 0
                 yield renumbered(result)
+        except DeadCamera as error:
+            raise RepeatedFailure(str(error)) from error
         except Exception as error:
             if feed.ended and isinstance(error, InputError):  # as of a clip that was stopped after its second frame
                 health.event("run", str(error))
@@ -164,7 +176,7 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
     if feed.newest is not None and isfinite(feed.newest.taken_s):
         latency_s = now_s - feed.newest.taken_s
         health.took("latency", latency_s)
-        health.count("late", int(1000 * latency_s > deadline_ms))
+        health.timed(1000 * latency_s > deadline_ms)
     if frame is not None and isfinite(frame.taken_s):
         health.took("age", now_s - frame.taken_s)
     health.gauge("targets", len(located.tracked.tracks))

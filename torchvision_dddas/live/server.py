@@ -2,8 +2,10 @@
 
 import json
 import math
+import socket
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
@@ -22,7 +24,7 @@ Page = Callable[[], tuple[int, str, str]]
 """Returns (status, type, text); called in a thread of the server."""
 
 _CLIENT_TIMEOUT_S = 5.0
-_MOST_CLIENTS = 8  # at a time; more are refused, so that they cannot take the run's time
+_MOST_CLIENTS = 8  # at a time; one more hangs up on the oldest, so that slow ones cannot take the page away
 _SHOWN_EVENTS = 20
 
 
@@ -75,7 +77,7 @@ def health_pages(
     def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
         late = f"no result for {_span(now.idle_s)}" if now.idle_s > patience_s else ""
-        return now, watchdog.hung or late
+        return now, "; ".join(words for words in (watchdog.hung or late, *now.troubles) if words)
 
     def page() -> tuple[int, str, str]:
         now, trouble = state()
@@ -100,20 +102,25 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
         self.pages = pages
-        self._free = threading.BoundedSemaphore(_MOST_CLIENTS)
+        self._clients: list[socket.socket] = []
+        self._lock = threading.Lock()
         super().__init__(address, _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        with self._lock:
+            self._clients.append(request)
+            oldest = self._clients.pop(0) if len(self._clients) > _MOST_CLIENTS else None
+        if oldest is not None:
+            with suppress(OSError):
+                oldest.shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            with self._lock, suppress(ValueError):
+                self._clients.remove(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore clients that hung up."""
@@ -152,16 +159,19 @@ _COUNTS = {
     "undecoded": ("not decoded", "Pictures that could not be decoded."),
     "unreliable": ("without a conclusion", "Frames from which nothing could be concluded."),
     "reconnects": ("reconnected", "Times that the stream was opened again."),
-    "begun_anew": ("begun anew", "Times that the work failed and was restarted."),
+    "begun_anew": ("begun anew", "Times that the work failed, or the pictures changed size, and it was restarted."),
+    "wrong_size": ("of another size", "Pictures of another size than the run's."),
     "looked_at": ("", "Pictures that were looked at."),
     "results": ("", "Frames whose results were handed on."),
 }
 _GAUGES = {
+    "sent_hz": ("pictures a second", "Pictures a second that the source sends."),
     "rate_hz": ("results a second", "Results a second."),
+    "connected": ("", "1 while the camera sends pictures."),
     "targets": ("targets now", "Targets in the latest frame."),
     "people": ("people now", "People in the latest frame."),
-    "every": ("looks at one picture of", "One of so many pictures is looked at."),
-    "keypoints": ("keypoints", "Keypoints that a registration may take."),
+    "every": ("pictures for each one looked at", "One of so many pictures is looked at."),
+    "keypoints": ("keypoints at most", "Keypoints that a registration may take."),
     "queue": ("pictures waiting", "Pictures that wait."),
     "resident_bytes": ("memory", "Memory of the process."),
 }
@@ -183,7 +193,9 @@ def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int
     for key, (title, _) in _GAUGES.items():
         if key in now.gauges:
             is_bytes = key == "resident_bytes"
-            figures.append((title, f"{now.gauges[key] / (1e6 if is_bytes else 1):.3g}{' MB' if is_bytes else ''}"))
+            shown = now.gauges[key] / (1e6 if is_bytes else 1)
+            digits = 1 if key in ("sent_hz", "rate_hz") else 0
+            figures.append((title, f"{shown:,.{digits}f}".replace(",", " ") + (" MB" if is_bytes else "")))
     for key, (title, _) in _SECONDS.items():
         if key in now.seconds:
             median, _, most = now.seconds[key]

@@ -5,13 +5,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
-from torchvision_dddas.errors import printable, without_secrets
+from torchvision_dddas.errors import InputError, printable, without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.interrupts import StopSignals
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
@@ -19,6 +19,7 @@ from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_fa
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
+from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.runner import (
     Feed,
     LoadShedding,
@@ -53,6 +54,7 @@ def run_live(
     people: bool = False,
     rate_hz: float | None = None,
     quiet: bool = False,
+    wait: bool = False,
 ) -> int:
     """Run until the pictures end or a signal ends it; returns the exit code. Writes a new folder under out.
 
@@ -60,6 +62,8 @@ def run_live(
     for anything that is wrong at the start; what goes wrong later is an event.
     """
     address = None if serve is None else parse_address(serve)
+    if wait and stream_target(clip) is None:
+        raise InputError(f"--wait is for a camera or a stream, and {clip} is none; leave it out")
     if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
         backend = "onboard"
     health, supervisor, live = Health(), Supervisor(), settings.live
@@ -67,11 +71,36 @@ def run_live(
         health.count(name, 0)
     with ExitStack() as stack:
         # What may be wrong at the start is found before the session has a folder.
-        source = stack.enter_context(closing(LiveSource(clip, live, health, rate_hz=rate_hz)))
+        watchdog = Watchdog(health, live.watchdog_s, supervisor)
+        if wait:  # the service is up, and has no camera yet
+            supervisor.say("READY=1", "STATUS=waiting for the camera")
+        told: list[Event] = []
+
+        def waiting() -> None:
+            """Notify the supervisor, and tell once why there is no camera yet."""
+            watchdog.check()
+            if not told and (events := health.snapshot().events):
+                told.append(events[0])
+                _print_event(events[0])
+
+        try:
+            source = LiveSource(clip, live, health, rate_hz=rate_hz, waiting=waiting if wait else None)
+        except DeadCamera as error:
+            _print(str(error))
+            return HUNG
+        stack.callback(source.close)
         if source.recorded is not None:
             check_length(source.recorded)
         ready = prepare_run(given, telemetry, settings, source, backend, clip)
-        begin = build_path(ready, source, people, interval, backend, health)
+        begin = build_path(
+            ready,
+            source,
+            people,
+            interval,
+            backend,
+            health,
+            lambda: prepare_run(given, telemetry, settings, source, backend, clip),
+        )
         # What streams need to know; the time follows the source's clock.
         site = None if ready.watch is None else ready.watch.locator.site
         about = About(time.time())
@@ -105,7 +134,7 @@ def run_live(
             status.begin()
         except OSError as error:
             raise cannot_write(folder / "run.json", error) from None
-        watchdog = Watchdog(health, live.watchdog_s, supervisor)
+        watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
         pages |= health_pages(health, watchdog, streams, status, without_secrets(clip), VERSION, patience_s)
 
@@ -121,7 +150,7 @@ def run_live(
         stack.enter_context(watchdog)
         if server is not None:
             stack.enter_context(server)
-        supervisor.say("READY=1")
+        supervisor.say("READY=1", "STATUS=running")
         if not quiet:
             _print_start(source, folder, server, ready.notes)
         failure, tally = "", _Located()
@@ -172,10 +201,17 @@ class _Located:
 
 
 def build_path(
-    ready: PreparedRun, source: LiveSource, people: bool, interval: int, backend: str, health: Health
+    ready: PreparedRun,
+    source: LiveSource,
+    people: bool,
+    interval: int,
+    backend: str,
+    health: Health,
+    prepare: Callable[[], PreparedRun],
 ) -> Callable[[Feed], Iterator[Result]]:
     """The path from frames to results, which restarts each time that it is called, and sheds load.
 
+    prepare: makes `ready` again for pictures of another size.
     Raises InputError at once for pictures that are too small for people.
     """
     settings, scorer = ready.settings, None
@@ -187,18 +223,22 @@ def build_path(
     shedding = LoadShedding(source, settings, health, people)
     engines = iter([ready.engine])
 
-    def build_person_tracker() -> PersonTracker | None:
+    def build_person_tracker(size: tuple[int, int]) -> PersonTracker | None:
         if scorer is None:
             return None
-        tracker = FrameTracker(shedding.settings, interval, source.size, pictures=False)
-        return PersonTracker(scorer, shedding.settings, interval, source.size, tracker)
+        tracker = FrameTracker(shedding.settings, interval, size, pictures=False)
+        return PersonTracker(scorer, shedding.settings, interval, size, tracker)
 
-    build_person_tracker()
+    watch, watch_size = ready.watch, source.size
+    build_person_tracker(watch_size)
 
     def begin(feed: Feed) -> Iterator[Result]:
         # After an error nothing that remembers a frame is used again.
+        nonlocal watch, watch_size
+        if watch is not None and feed.size != watch_size:  # the camera model is for a size
+            watch, watch_size = prepare().watch, feed.size
         engine = next(engines, None) or load_engine(backend, shedding.settings)
-        person_tracker = build_person_tracker()
+        person_tracker = build_person_tracker(feed.size)
 
         def retune(frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:
             settings, adjustments = shedding(frame)
@@ -210,7 +250,7 @@ def build_path(
             engine,
             shedding.settings,
             None,
-            None if ready.watch is None else ready.watch.restarted(),
+            None if watch is None else watch.restarted(),
             interval,
             seen=None if person_tracker is None else person_tracker.update,
             retune=retune,

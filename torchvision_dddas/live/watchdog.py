@@ -44,7 +44,8 @@ class Supervisor:
 class Watchdog:
     """Reports a step that takes longer than hung_s as an event, and ends the process after twice that.
 
-    While its context is open, a thread checks the step and notifies the supervisor as long as none hangs.
+    While its context is open, a thread checks the step and notifies the supervisor as long as none hangs and results
+    come. idle_s: seconds since the last result while one is due.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Watchdog:
         self._step: tuple[int, float] | None = None  # frame and start; one attribute needs no lock
         self._reported = 0  # frame of the step that was reported
         self._notified_s = -float("inf")
+        self.idle_s: Callable[[], float] = lambda: 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
@@ -86,6 +88,8 @@ class Watchdog:
         hung, step = self.hung, self._step
         if not hung or step is None:
             self._reported = 0
+            if self._hung_s and self.idle_s() > self._hung_s:
+                return
             if self._supervisor.every_s and self._clock() - self._notified_s >= self._supervisor.every_s / 2:
                 self._notified_s = self._clock()
                 self._supervisor.say("WATCHDOG=1")
