@@ -250,7 +250,8 @@ def test_a_stream_without_a_first_picture_is_one_line(stream, words) -> None:
 
 def test_a_camera_that_is_absent_at_the_start_is_waited_for_when_asked() -> None:
     clock, health, waited = FakeClock(), Health(), threading.Event()
-    opener = Streams(None, None, FakeStream([lambda: waited.wait(PATIENCE_S), 1]))
+    pictures = itertools.chain([lambda: waited.wait(PATIENCE_S)], itertools.repeat(1))
+    opener = Streams(None, None, FakeStream(pictures))
     source = LiveSource("camera:0", health=health, opener=opener, clock=clock, waiting=waited.set)
     source.close()
     assert waited.is_set() and source.size == (64, 48) and not health.snapshot().troubles
@@ -278,13 +279,13 @@ class Camera401(http.server.BaseHTTPRequestHandler):
         self.wfile.write(f"RTSP/1.0 {status}\r\nCSeq: {sequence}\r\n{challenge}\r\n\r\n".encode())
 
     def parse_request(self) -> bool:
-        self.raw_requestline = self.raw_requestline.replace(b"RTSP/1.0", b"HTTP/1.0")
+        self.raw_requestline: bytes = self.raw_requestline.replace(b"RTSP/1.0", b"HTTP/1.0")
         return super().parse_request()
 
     def do_OPTIONS(self) -> None:
         self.wfile.write(f"RTSP/1.0 200 OK\r\nCSeq: {self.headers['CSeq']}\r\nPublic: DESCRIBE\r\n\r\n".encode())
 
-    def log_message(self, format: str, *args: Any) -> None:
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         """Requests are not logged."""
 
 

@@ -6,6 +6,7 @@ import socket
 import threading
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 from html.parser import HTMLParser
 from typing import Any
 
@@ -190,6 +191,44 @@ def test_json_is_strict_and_all_pages_show_the_same_trouble(health):
     assert "dddas_healthy 0" in pages["/metrics"]()[2] and run.hung in pages["/"]()[2]
 
 
+def test_health_is_not_well_while_a_trouble_lasts_or_most_results_are_late():
+    health, run = Health(), Run()
+
+    def answer():
+        status, _, text = health_pages(health, run, [run], run, "x", "1", 60.0)["/health.json"]()
+        return status, json.loads(text)["trouble"]
+
+    health.trouble("stream", "camera:0 sends no pictures")
+    health.trouble("telemetry", "telemetry is silent")
+    assert answer() == (503, "camera:0 sends no pictures; telemetry is silent")
+    health.trouble("stream")
+    health.trouble("telemetry")
+    for late in (*[False] * 25, *[True] * 12):
+        health.timed(late)
+    assert answer() == (200, "")
+    health.timed(True)
+    assert answer() == (503, "13 of the latest 25 results are late")
+    assert health.snapshot().counts["late"] == 13
+    for _ in range(25):
+        health.timed(False)
+    assert answer() == (200, "")
+
+
+def test_figures_of_the_page_are_labelled_and_written_out():
+    health = Health()
+    for name, value in {"sent_hz": 25.0, "rate_hz": 8.34, "keypoints": 1500, "resident_bytes": 1.234e9}.items():
+        health.gauge(name, value)
+    text = re.sub(r"<[^>]+>|\s", " ", html_page(health.snapshot(), "x", "running", ""))
+    words = re.sub(" +", " ", text)
+    for figure, label in (
+        ("25.0", "pictures a second"),
+        ("8.3", "results a second"),
+        ("1 500", "keypoints at most"),
+        ("1 234 MB", "memory"),
+    ):
+        assert f"{figure} {label}" in words or f"{label} {figure}" in words
+
+
 PATIENCE_S = 60.0
 
 
@@ -233,6 +272,15 @@ def test_silent_clients_and_a_page_that_fails_keep_nobody_from_the_others(server
         with pytest.raises((urllib.error.URLError, ConnectionError)):
             asked(server, "/failing")
         assert asked(server)[0] == 200
+
+
+def test_slow_clients_cannot_take_the_page_away(server):
+    with ExitStack() as stack:
+        for _ in range(20):
+            slow = stack.enter_context(socket.create_connection(server.address))
+            slow.sendall(b"GET / HT")
+        for _ in range(3):
+            assert asked(server)[0] == 200
 
 
 def test_a_closed_server_frees_its_port_and_leaves_no_thread():

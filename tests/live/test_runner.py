@@ -11,6 +11,7 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.runner import Feed, LoadShedding, RepeatedFailure, record_result, results, send_result
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Adjustment, Detections, Frame, FrameResult, Telemetry, TrackedFrame, Tracks
@@ -94,6 +95,33 @@ def test_a_run_fails_after_many_errors_in_a_row_and_not_where_results_come_betwe
 
 def test_a_source_that_breaks_is_iterated_again():
     assert numbers(results(path(), feed_of(6, breaks=3), Health())) == [1, 2, 3, 4, 5, 6]
+
+
+def test_pictures_of_another_size_begin_anew_with_an_event_and_lose_no_frame():
+    source: Any = Camera(0)
+    health, sizes = Health(), []
+    pictures = [PICTURE] * 3 + [np.zeros((8, 6), np.uint8)] * 3
+    source.frames = iter([Frame(n, n / 10, picture) for n, picture in enumerate(pictures, 1)])
+    feed = Feed(source, health, Watchdog(health, 0))
+
+    def begin(feed):
+        sizes.append(feed.size)
+        yield from map(result_of, list(feed))  # a window that looks ahead is settled too
+
+    assert numbers(results(begin, feed, health)) == [1, 2, 3, 4, 5, 6]
+    assert sizes == [(4, 4), (6, 8)]
+    assert [(e.frame, e.text) for e in health.snapshot().events] == [(4, "pictures are 6x8 from now on: begun anew")]
+
+
+def test_a_dead_camera_ends_the_run_at_once():
+    def begin(feed):
+        raise DeadCamera("camera:0 is dead")
+        yield
+
+    health = Health()
+    with pytest.raises(RepeatedFailure, match="camera:0 is dead"):
+        list(results(begin, feed_of(), health))
+    assert not health.snapshot().events
 
 
 def test_a_stop_settles_the_frames_before_it_and_may_come_too_early_for_a_window():

@@ -87,6 +87,17 @@ def test_a_supervisor_is_notified_while_no_step_hangs(notified):
     assert received() == ["WATCHDOG=1"]
 
 
+def test_a_supervisor_is_not_notified_while_results_are_due_and_do_not_come(notified):
+    path, received = notified
+    case = Case(supervisor=Supervisor({"NOTIFY_SOCKET": path, "WATCHDOG_USEC": "8000000"}))
+    case.dog.idle_s = lambda: case.now_s
+    case.at(4.0, 9.0, 14.0, 60.0)
+    assert received() == ["WATCHDOG=1"] * 2
+    case.dog.idle_s = lambda: 0.0
+    case.at(61.0)
+    assert received() == ["WATCHDOG=1"]
+
+
 @pytest.mark.parametrize(
     "environ",
     [{}, {"NOTIFY_SOCKET": "/nowhere/at/all"}, {"NOTIFY_SOCKET": "@nobody-is-there"}, {"WATCHDOG_USEC": "1000"}],
