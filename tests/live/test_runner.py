@@ -116,7 +116,6 @@ def test_pictures_of_another_size_begin_anew_with_an_event_and_lose_no_frame():
 def test_a_dead_camera_ends_the_run_at_once():
     def begin(feed):
         raise DeadCamera("camera:0 is dead")
-        yield
 
     health = Health()
     with pytest.raises(RepeatedFailure, match="camera:0 is dead"):
