@@ -69,9 +69,13 @@ class LiveSource:
             return
         limit_s = self.parameters.stall_s
         where = text if target is None else target
-        opening = opener or (lambda: open_or_refuse(where, self.name, (OPENING * limit_s, limit_s)))
+        opening = opener or (lambda: self._open(where, (OPENING * limit_s, limit_s)))
         self._feed = Receiver(self.name, opening, rate_hz, self.parameters, *shared, waiting)
         self.rate_hz = self._feed.rate_hz
+
+    def _open(self, target: str | int, limits_s: tuple[float, float]) -> Stream:
+        # A lost stream is not asked why: it was there, and may count its clients.
+        return (OpenedStream if self._queue.begun else open_or_refuse)(target, self.name, limits_s)
 
     @property
     def size(self) -> tuple[int, int]:

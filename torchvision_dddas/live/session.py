@@ -16,6 +16,7 @@ from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.interrupts import StopSignals
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
+from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
@@ -58,8 +59,9 @@ def run_live(
 ) -> int:
     """Run until the pictures end or a signal ends it; returns the exit code. Writes a new folder under out.
 
-    SIGTERM is how a supervisor ends a session, and gives 0; other signals give 128 and their number. Raises InputError
-    for anything that is wrong at the start; what goes wrong later is an event.
+    SIGTERM is how a supervisor ends a session, and gives 0; other signals give 128 and their number. wait: for a camera
+    that is not there at the start. Raises InputError for anything else that is wrong then; what goes wrong later is an
+    event.
     """
     address = None if serve is None else parse_address(serve)
     if wait and stream_target(clip) is None:
