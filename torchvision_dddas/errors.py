@@ -1,7 +1,6 @@
 """The one error that a user's mistake raises; and what any message, table or page may show of a name or an address."""
 
 import re
-
 from unicodedata import category
 
 LONGEST = 1000

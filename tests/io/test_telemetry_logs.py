@@ -182,7 +182,7 @@ EIGHTH_M = 6_371_000 * math.pi / 4  # of a great circle
     ],
 )
 def test_px4_local_positions_lie_on_its_sphere(east_north_m, origin, place):
-    assert px4_lonlat(*map(np.float64, (*east_north_m, *origin))) == pytest.approx(place, abs=1e-8)
+    assert px4_lonlat(*map(np.asarray, (*east_north_m, *origin))) == pytest.approx(place, abs=1e-8)
 
 
 @pytest.mark.parametrize("is_old", [True, False])

@@ -46,9 +46,9 @@ def compare(
 
     named = [(read_scores(folder), folder) for folder in (first, second)]
     studies = [replace(study, name=f"{study.name} ({folder})") for study, folder in named]
-    settings = [(read_run_record(folder) or {}).get("settings") for folder in (first, second)]
-    is_known = all(isinstance(side, dict) for side in settings)
-    found = compare_studies(*studies) | {"settings": differing_settings(*settings) if is_known else None}
+    mine, other = ((read_run_record(folder) or {}).get("settings") for folder in (first, second))
+    is_known = isinstance(mine, dict) and isinstance(other, dict)
+    found = compare_studies(*studies) | {"settings": differing_settings(mine, other) if is_known else None}
     if out is not None:
         refuse_folder(out)
         save_file(out, comparison_report(finite(found)).encode())
