@@ -1,6 +1,8 @@
 """Rasters of the ground: heights and photos, on local metres."""
 
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import cv2
 import numpy as np
@@ -105,8 +107,8 @@ def text(path):
 
 
 def bare_picture(path):
-    cv2.imwrite(str(path.with_suffix(".png")), np.full((20, 20), 90, np.uint8))
-    return path.with_suffix(".png")
+    cv2.imwrite(str(path), np.full((20, 20), 90, np.uint8))
+    return path
 
 
 BANDS = np.zeros((3, 20, 20), "uint8")
@@ -132,6 +134,80 @@ def test_what_is_no_such_raster_or_lies_elsewhere_is_refused_in_one_line(tmp_pat
     with pytest.raises(InputError, match=words) as error:
         read(path, HERE, origin)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.fixture
+def requests():
+    """The paths that a server was asked for, after its address."""
+    asked: list[str] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_error(404)
+
+        do_HEAD = do_GET  # noqa: N815 (the server's name for it)
+
+        def log_message(self, *args):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        asked.append(f"http://127.0.0.1:{server.server_address[1]}")
+        yield asked
+        server.shutdown()
+        thread.join(10)
+
+
+def vrt(address, side):
+    source = f"<SourceFilename>/vsicurl/{address}</SourceFilename><SourceBand>1</SourceBand>"
+    return (
+        f'<VRTDataset rasterXSize="{side}" rasterYSize="{side}"><SRS>EPSG:32612</SRS><GeoTransform>0,1,0,0,0,-1'
+        '</GeoTransform><VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        f"{source}</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+
+
+def name_overviews(path, address):
+    with rasterio.open(path, "r+") as file:
+        file.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{address}")
+
+
+_BESIDE = '<PAMDataset><Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">/vsicurl/{}</MDI></Metadata></PAMDataset>'
+_LARGE = 4100  # cells a side: more than are read of it
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("text.tif", "cannot be read as a raster"),
+        ("overviews.tif", ""),
+        ("beside.tif", ""),
+        ("inside.tif", "names another file"),
+        ("/vsicurl/{}", "no such file"),
+        ("{}", "no such file"),
+    ],
+)
+def test_a_raster_never_makes_a_request(tmp_path, requests, name, words):
+    address = f"{requests.pop()}/{name.strip('{}/')}"
+    path = tmp_path / name if name.endswith(".tif") else name.format(address)
+    if name == "text.tif":
+        path.write_text(vrt(address, 20))
+    elif name.endswith(".tif"):
+        write(path, np.ones((_LARGE, _LARGE), np.uint8), tiled=True, compress="deflate")
+    if name == "overviews.tif":
+        path.with_suffix(".tif.ovr").write_text(vrt(address, _LARGE // 2))
+    if name == "beside.tif":
+        path.with_suffix(".tif.aux.xml").write_text(_BESIDE.format(address))
+    if name == "inside.tif":
+        name_overviews(path, address)
+    if words:
+        with pytest.raises(InputError, match=words):
+            read_elevation(path, HERE, ORIGIN, 2050)
+    else:
+        assert np.nanmax(read_elevation(path, HERE, ORIGIN, 2050).up_m) == 0
+    assert requests == []
 
 
 def test_without_rasterio_the_extra_is_named(tmp_path, monkeypatch):

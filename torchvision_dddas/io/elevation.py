@@ -25,6 +25,9 @@ MOST_PX = 1600
 Degrees = tuple[float, float] | None
 """Longitude and latitude of the origin of local metres; None where these are a raster's own coordinates."""
 
+_ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
+"""GDAL's settings under which it opens nothing beside a raster: such files may name others, also in the network."""
+
 Grid = tuple[np.ndarray, np.ndarray, float]
 """Values (R, C) or (B, R, C), rows to the north, NaN where a raster has none; place of the first; metres a cell."""
 
@@ -87,7 +90,10 @@ def _known_places(places: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[Any]:
-    """An open raster. Raises InputError where rasterio is missing, the file is no raster, or its CRS does not fit."""
+    """An open GeoTIFF. Nothing else is read, whatever it names: its place and its CRS must be in the file itself.
+
+    Raises InputError where rasterio is missing, the file is no GeoTIFF, or its CRS does not fit.
+    """
     try:
         import rasterio
         from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -95,12 +101,20 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
         raise InputError(
             f"{what} {path} needs rasterio: pip install 'torchvision-dddas[elevation]', or leave it out"
         ) from None
+    if not Path(path).is_file():  # GDAL would take an address, too
+        raise InputError(f"{what} {path} cannot be read as a raster: there is no such file")
     try:
         with warnings.catch_warnings():
             # What it warns of is refused below, in one line.
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            raster = rasterio.open(path)
-        with raster:
+            # By its other drivers GDAL would take text for a raster, a VRT, and fetch what this names.
+            with rasterio.Env(**_ALONE):
+                raster = rasterio.open(Path(path), driver="GTiff")
+        with rasterio.Env(**_ALONE), raster:
+            if raster.tags(ns="OVERVIEWS"):
+                raise InputError(
+                    f"{what} {path} names another file for its overviews; wanted a GeoTIFF that names none"
+                )
             t = raster.transform
             if raster.crs is None and t.is_identity:
                 raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
