@@ -146,7 +146,7 @@ def requests():
             asked.append(self.path)
             self.send_error(404)
 
-        do_HEAD = do_GET  # noqa: N815 (the server's name for it)
+        do_HEAD = do_GET
 
         def log_message(self, *args):
             pass

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,11 @@ class Result:
         """(N, 4) boxes of a frame: the detections, or the tracks' where there are none."""
         if self.detected is not None:
             return self.detected.get(frame, np.zeros((0, 4)))
-        return np.zeros((0, 4)) if self.tracks is None else self.tracks.box_px[self.tracks.frame == frame]
+        return self._tracked.get(frame, np.zeros((0, 4)))
+
+    @cached_property
+    def _tracked(self) -> dict[int, np.ndarray]:
+        return {} if self.tracks is None else self.tracks.boxes_by_frame()
 
     def mask_at(self, frame: int) -> np.ndarray:
         """(H, W) mask of a frame. Raises InputError if it is not there."""

@@ -31,6 +31,9 @@ CLASS = ("class", "class_name", "label")
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
 
+_FILLED = 10
+"""A table has no more than this many times the cells that its lines have."""
+
 REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
 
 SCHEMA = Schema(
@@ -101,9 +104,16 @@ def read_header(path: str | Path) -> list[str]:
 def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
     """The column names and cells of a table that its reader found valid, sorted by frame as readers sort it.
 
-    without: columns to leave out. Raises InputError where it cannot be read.
+    without: columns to leave out. Raises InputError where it cannot be read, or where a few lines have many times the
+    columns of the others, which would all be filled up.
     """
-    (header, _, rows), _ = _read_cells(path)
+    (header, lines, rows), _ = _read_cells(path)
+    counts = [len(row) for row in rows]
+    if len(header) * len(rows) > _FILLED * sum(counts):
+        line = lines[counts.index(max(counts))]
+        raise InputError(
+            f"{path}, line {line}: {max(counts)} columns, over {_FILLED} times those of most lines; wanted as many in each"
+        )
     frame = header.index("frame")
     kept = [place for place, name in enumerate(header) if name not in without]
     rows = [[*row, *[""] * (len(header) - len(row))] for row in sorted(rows, key=lambda row: float(row[frame]))]

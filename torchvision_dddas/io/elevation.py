@@ -112,9 +112,7 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
                 raster = rasterio.open(Path(path), driver="GTiff")
         with rasterio.Env(**_ALONE), raster:
             if raster.tags(ns="OVERVIEWS"):
-                raise InputError(
-                    f"{what} {path} names another file for its overviews; wanted a GeoTIFF that names none"
-                )
+                raise InputError(f"{what} {path} names another file for its overviews; wanted one that does not")
             t = raster.transform
             if raster.crs is None and t.is_identity:
                 raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")

@@ -16,6 +16,7 @@ from torchvision_dddas.evaluation.metrics.truth import (
     Truth,
     check_identities,
     read_text,
+    rows_by_frame,
     split_cells,
     to_number,
 )
@@ -158,9 +159,9 @@ def truth_of(
     if regions is not None and not len(regions.frame):
         regions = None
     if regions is not None:
-        counts = counts.copy()
+        counts, by_frame = counts.copy(), rows_by_frame(table.frame)
         for number, region_px in regions.boxes_by_frame().items():
-            rows = np.flatnonzero(table.frame == number)
+            rows = by_frame.get(number, np.zeros(0, np.int64))
             counts[rows] &= ~lie_within(table.box_px[rows], region_px)
     if not counts.any():
         raise InputError(f"{place} holds no box that counts")

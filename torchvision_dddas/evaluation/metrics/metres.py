@@ -1,5 +1,6 @@
 """How far located targets are from where they truly are, and whether their ellipses say so."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.evaluation.metrics.matching import match
 from torchvision_dddas.evaluation.metrics.pixels import ratio
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, rows_by_frame
 
 INSIDE = 5.991
 """Of chi-square with two degrees of freedom, in 95 %."""
@@ -39,8 +40,7 @@ def located_measures(counts: GroundLocations) -> dict[str, float]:
 def by_boxes(frame: np.ndarray, box_px: np.ndarray, truth: TrackTable) -> np.ndarray:
     """(N,) int64 the row of the true box that each found box is, one to one at an IoU of LEAST_IOU, -1 for none."""
     which = np.full(len(frame), -1)
-    for number in np.intersect1d(frame, truth.frame):
-        rows, true = np.flatnonzero(frame == number), np.flatnonzero(truth.frame == number)
+    for rows, true in _rows_in_both(frame, truth.frame):
         i, j = match(iou(box_px[rows], truth.box_px[true]), LEAST_IOU)
         which[rows[i]] = true[j]
     return which
@@ -54,14 +54,19 @@ def by_places(
     Places further off match none, so that errors are at most `farthest_m`.
     """
     which = np.full(len(frame), -1)
-    for number in np.intersect1d(frame, true_frame):
-        rows, true = np.flatnonzero(frame == number), np.flatnonzero(true_frame == number)
+    for rows, true in _rows_in_both(frame, true_frame):
         away = np.linalg.norm(place_m[rows][:, None] - true_m[true][None], axis=-1)
         worth = np.where(away <= farthest_m, 2 * farthest_m - away, 0.0)
         i, j = linear_sum_assignment(worth, maximize=True)
         hit = worth[i, j] > 0
         which[rows[i[hit]]] = true[j[hit]]
     return which
+
+
+def _rows_in_both(frame: np.ndarray, other: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The rows of each frame in two tables that both have, in order."""
+    mine, others = rows_by_frame(frame), rows_by_frame(other)
+    return ((mine[number], others[number]) for number in mine if number in others)
 
 
 def inside(off_m: np.ndarray, covariance_m2: np.ndarray) -> np.ndarray:

@@ -235,11 +235,36 @@ def read_rows(path: Path, what: str) -> MotRows:
     Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole
     or below 1, an identity that is not whole, a size that is not positive.
     """
+    lines = [(n, line) for n, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1) if line.strip()]
+    table = _read_fast([line for _, line in lines])
+    if table is None:
+        table = _read_slowly(lines, f"{what} {path}")
+    boxes = TrackTable.of(table[:, 0], table[:, 1], table[:, 2:6])
+    return MotRows(boxes, table[:, 6], np.array([number for number, _ in lines], np.int64))
+
+
+def _read_fast(lines: list[str]) -> np.ndarray | None:
+    """The seven columns (N, 7) by NumPy's own reader, ten times as fast; None where anything may be wrong with them."""
+    first = split_cells(lines[0]) if lines else []
+    if len(first) < 6 or (len(first) == 6 and not all(line.count(",") == 5 for line in lines)):
+        return None
+    count, separator = min(len(first), 7), "," if "," in lines[0] else None
+    try:
+        values = np.loadtxt(lines, delimiter=separator, comments=None, usecols=range(count), ndmin=2)
+    except ValueError:
+        return None
+    table = np.column_stack([values, np.ones((len(values), 7 - count))])
+    whole, box = table[:, :2], table[:, 2:6]
+    is_right = (whole == np.floor(whole)).all(axis=1) & (np.abs(whole) <= 2**53).all(axis=1) & (whole[:, 0] >= 1)
+    is_right &= (np.abs(table[:, 2:]) <= FARTHEST).all(axis=1) & (box[:, 2:] > 0).all(axis=1)
+    return table if len(table) == len(lines) and is_right.all() else None
+
+
+def _read_slowly(lines: list[tuple[int, str]], name: str) -> np.ndarray:
+    """The seven columns (N, 7), checked cell by cell."""
     rows = []
-    for number, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1):
-        if not line.strip():
-            continue
-        where, cells = f"{what} {path}, line {number}", split_cells(line)
+    for number, line in lines:
+        where, cells = f"{name}, line {number}", split_cells(line)
         if len(cells) < 6:
             count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
             raise InputError(f"{where}: {count}; wanted frame,id,x,y,w,h[,score]")
@@ -257,10 +282,8 @@ def read_rows(path: Path, what: str) -> MotRows:
             raise InputError(f"{where}: frame is '{cells[0]}'; frames count from 1")
         if min(values[4:6]) <= 0:
             raise InputError(f"{where}: the box is {cells[4]}×{cells[5]} pixels; wanted more than 0")
-        rows.append([*[*values, 1.0][:7], number])
-    table = np.array(rows, float).reshape(-1, 8)
-    boxes = TrackTable.of(table[:, 0], table[:, 1], table[:, 2:6])
-    return MotRows(boxes, table[:, 6], table[:, 7].astype(np.int64))
+        rows.append([*values, 1.0][:7])
+    return np.array(rows, float).reshape(-1, 7)
 
 
 def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:

@@ -115,9 +115,12 @@ def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarr
     out = np.zeros(len(frame), bool)
     if truth.kind != "masks" or not truth.labels.unscored:
         return out
-    for number in np.intersect1d(frame, truth.frames):
-        unknown = truths.labels_of(truth, int(number)) < 0
-        for row in np.flatnonzero(frame == number):
+    labelled = set(truth.frames)
+    for number, rows in truths.rows_by_frame(frame).items():
+        if number not in labelled:
+            continue
+        unknown = truths.labels_of(truth, number) < 0
+        for row in rows.tolist():
             x, y, w, h = (round(float(v)) for v in box_px[row])
             inside = unknown[max(y, 0) : max(y + h, 0), max(x, 0) : max(x + w, 0)]
             out[row] = bool(inside.size) and inside.mean() > WITHIN
@@ -127,8 +130,8 @@ def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarr
 def _ranked(truth: Truth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """(N, 3) score, right or not, frame; see Scored."""
     right = np.full(len(frame), np.nan)
-    for number in np.unique(frame):
-        rows = np.flatnonzero((frame == number) & counts)
+    for number, there in truths.rows_by_frame(frame).items():
+        rows = there[counts[there]]
         true = truth.boxes[number] if truth.kind == "boxes" else boxes.boxes_of(truths.labels_of(truth, number))
         right[rows] = boxes.judged(box_px[rows], score[rows], true)
     return np.stack([score, right, frame], axis=1)

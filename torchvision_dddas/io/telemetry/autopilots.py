@@ -3,11 +3,13 @@
 Both become topics, tables of messages of one kind, from which places, heights, speeds and attitudes are taken.
 """
 
+import binascii
 import contextlib
 import io
 import math
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +58,10 @@ def _note_mount(log: Log) -> None:
 # MAVLink telemetry logs: messages, each after the time at which it was received.
 
 _V1, _V2 = 0xFE, 0xFD
+_MAGIC = re.compile(bytes([0x5B, _V1, _V2, 0x5D]))  # either of them
 _SIGNED = 0x01
+_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+_V2_MIRRORED, _SIGNED_MIRRORED = _MIRROR[_V2], _MIRROR[_SIGNED]
 # Times outside 2000 to 2200 are no clock.
 _CLOCK_US = (946_684_800_000_000, 7_258_118_400_000_000)
 _PLACES = ("GLOBAL_POSITION_INT", "GPS_RAW_INT")
@@ -129,7 +134,8 @@ def _mavlink_topics(log: Log) -> dict[str, Topic]:
     rows: list[tuple[float, Any, int]] = []
     bad: list[int] = []
     count = 0
-    for place, end, number in _frames(log, content, decoder):
+    extras = {number: _MIRROR[kind.crc_extra : kind.crc_extra + 1] for number, kind in dialect.mavlink_map.items()}
+    for place, end, number in _frames(log, content, extras):
         count += 1
         if number in numbers:
             try:
@@ -192,20 +198,24 @@ def looks_like_tlog(head: bytes) -> bool:
     return False
 
 
-def _frames(log: Log, content: bytes, decoder: Any) -> Iterator[tuple[int, int, int]]:
-    """Start (of its time), end and number of each message; other bytes are skipped."""
+def _frames(log: Log, content: bytes, extras: Mapping[int, bytes]) -> Iterator[tuple[int, int, int]]:
+    """Start (of its time), end and number of each message; other bytes are skipped. extras: see `_is_whole`."""
     place, lost, lost_first = 0, 0, 0
+    mirrored = content.translate(_MIRROR)
     while place + 16 <= len(content):
         end = _end(content, place)
         if end is not None and end > len(content):
             break
-        if end is not None and _is_message(content, place, end, decoder):
-            number = content[place + 15 : place + 18] if content[place + 8] == _V2 else content[place + 13 : place + 14]
-            yield place, end, int.from_bytes(number, "little")
-            place = end
-            continue
-        nearest = [found for magic in (_V1, _V2) if (found := content.find(bytes([magic]), place + 9)) >= 0]
-        following = min(nearest, default=len(content) + 8) - 8
+        if end is not None:
+            code = content[place + 15 : place + 18] if content[place + 8] == _V2 else content[place + 13 : place + 14]
+            number = int.from_bytes(code, "little")
+            is_followed = end == len(content) or (end + 8 < len(content) and content[end + 8] in (_V1, _V2))
+            if is_followed or (number in extras and _is_whole(mirrored, place + 8, end, extras[number])):
+                yield place, end, number
+                place = end
+                continue
+        nearest = _MAGIC.search(content, place + 9)
+        following = nearest.start() - 8 if nearest is not None else len(content)
         lost, lost_first = lost + following - place, lost_first or place
         place = following
     if place < len(content):
@@ -225,14 +235,16 @@ def _end(content: bytes, place: int) -> int | None:
     return None
 
 
-def _is_message(content: bytes, place: int, end: int, decoder: Any) -> bool:
-    """Whether another message follows, or the checksum is right."""
-    if end == len(content) or (end + 8 < len(content) and content[end + 8] in (_V1, _V2)):
-        return True
-    try:
-        return "UNKNOWN" not in decoder.decode(bytearray(content[place + 8 : end])).get_type()
-    except Exception:
-        return False
+def _is_whole(mirrored: bytes, begin: int, end: int, extra: bytes) -> bool:
+    """Whether the checksum of a message is right, CRC-16/MCRF4XX.
+
+    mirrored: the log with the bits of each byte in reverse, to which the checksum of `binascii` is the same, and fast:
+    every byte may look like the beginning of a message. extra: what its kind adds to the checksum, in reverse as well.
+    """
+    if mirrored[begin] == _V2_MIRRORED and mirrored[begin + 2] & _SIGNED_MIRRORED:
+        end -= 13
+    found = binascii.crc_hqx(extra, binascii.crc_hqx(mirrored[begin + 1 : end - 2], 0xFFFF))
+    return mirrored[end - 2 : end] == found.to_bytes(2, "big")
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -20,6 +20,8 @@ KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
 # No set of any version is longer; a damaged length would swallow the sets behind it.
 _LONGEST = 1 << 16
 _CHECKSUM, _STAMP = 1, 2
+# No standard has more than some hundred tags. Each byte of an endless one would copy the number so far.
+_LARGEST_TAG = 1 << 21
 
 
 class LocalSet(NamedTuple):
@@ -121,15 +123,17 @@ def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
 def local_sets(content: bytes) -> Iterator[LocalSet]:
     """All that begin with the universal key, in order; one that is cut off or garbled is not whole and has no tags."""
     place = content.find(KEY)
+    sums = _Sums(content)
     while place >= 0:
         following = place + len(KEY)
         tags = None
         size, begin = _length(content, following)
-        if size <= _LONGEST and begin + size <= len(content):
-            tags = _tags(content[begin : begin + size])
-            if tags is not None and not _is_checksum(content[place : begin + size], tags.get(_CHECKSUM)):
+        # The checksum first, which takes the same time for a set of any length: sets may lie in each other.
+        if size <= _LONGEST and begin + size <= len(content) and sums.are_right(place, begin + size):
+            following = begin + size
+            tags = _tags(content[begin:following])
+            if tags is not None and tags.get(_CHECKSUM) != content[following - 2 : following]:
                 tags = None
-            following = begin + size if tags is not None else following
         yield LocalSet(place, tags or {}, tags is not None)
         place = content.find(KEY, following)
 
@@ -145,6 +149,24 @@ def _length(content: bytes, place: int) -> tuple[int, int]:
     return int.from_bytes(content[place + 1 : end], "big"), end
 
 
+class _Sums:
+    """Sums of the bytes at even and at odd places up to each place, modulo 2^16, for checksums of any part."""
+
+    def __init__(self, content: bytes) -> None:
+        self._content = content
+        values = np.frombuffer(content, np.uint8)
+        self._running = []
+        for odd in (0, 1):
+            mine = values.copy()
+            mine[1 - odd :: 2] = 0
+            self._running.append(np.append(np.uint16(0), np.cumsum(mine, dtype=np.uint16)))
+
+    def are_right(self, begin: int, end: int) -> bool:
+        """Whether the two bytes before the end are the sum of all before them: the first, third, ... count 256 fold."""
+        high, low = (int(one[end - 2]) - int(one[begin]) for one in self._running[:: -1 if begin % 2 else 1])
+        return ((high << 8) + low) & 0xFFFF == int.from_bytes(self._content[end - 2 : end], "big")
+
+
 def _tags(content: bytes) -> dict[int, bytes] | None:
     tags: dict[int, bytes] = {}
     place = 0
@@ -156,20 +178,14 @@ def _tags(content: bytes) -> dict[int, bytes] | None:
             tag = tag << 7 | byte & 0x7F
             if byte < 0x80:
                 break
+            if tag > _LARGEST_TAG:
+                return None
         size, begin = _length(content, place)
         if begin + size > len(content):
             return None
         tags[tag] = content[begin : begin + size]
         place = begin + size
     return tags
-
-
-def _is_checksum(packet: bytes, checksum: bytes | None) -> bool:
-    """Whether a checksum is at the packet's end and the 16-bit sum over all before it."""
-    if checksum is None or len(checksum) != 2 or packet[-2:] != checksum:
-        return False
-    total = (sum(packet[0:-2:2]) << 8) + sum(packet[1:-2:2])
-    return total & 0xFFFF == int.from_bytes(checksum, "big")
 
 
 def mapped(value: bytes | None, low: float, high: float, signed: bool = False) -> float:
@@ -236,8 +252,8 @@ def _read_stream(log: Log, content: bytes, size: int, first: int) -> list[Piece]
         elif pid in programmes and starts and metadata is None:
             added = list(_streams(payload))
             streams += added
-            videos = [n for kind, n, _ in streams if kind in _VIDEO_TYPES]
-            video = videos[0] if videos else None
+            if video is None:
+                video = next((n for kind, n, _ in added if kind in _VIDEO_TYPES), None)
             klv = [n for kind, n, text in added if kind == _METADATA_IN_PES or (kind == _PRIVATE and b"KLVA" in text)]
             metadata = klv[0] if klv else None
         elif pid == video and starts:

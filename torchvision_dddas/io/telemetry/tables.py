@@ -111,6 +111,7 @@ _DATE = re.compile(
     r"(\d{4})[./-](\d{1,2})[./-](\d{1,2})[ T]+(\d{1,2}):(\d{1,2}):(\d{1,2})"
     r"(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*(Z|[+-]\d{2}:?\d{2})?"
 )
+_CLOCK = re.compile(r"(\d+):(\d+):(\d+(?:\.\d+)?)")
 # Half the width of the picture whose focal length is given for one 36 mm wide.
 _HALF_WIDTH_MM = 18.0
 
@@ -202,14 +203,17 @@ def _to_float(text: str) -> float:
 # Tables of other programs.
 
 _TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds", "flytime", "elapsed", "elapsedtime"}
+_OPENING, _NOT_IN_NAMES = re.compile(r"[(\[]"), re.compile(r"[\s_-]|^osd\.|(?<=^gimbal)\.")
 _PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
 
 def _plain(name: str) -> tuple[str, str]:
     """A column's name without blanks and capitals, and its unit: `Speed (mph)`, `OSD.height [ft]`, `GIMBAL.pitch`."""
-    found = re.fullmatch(r"(.*?)\s*[(\[](.*?)[)\]]", name)
-    name, unit = (found[1], found[2]) if found else (name, "")
-    return re.sub(r"[\s_-]|^osd\.|(?<=^gimbal)\.", "", name.lower()), unit.lower()
+    # The first bracket is looked for alone: an expression for all of it would try each one in a name full of them.
+    opening, unit = _OPENING.search(name), ""
+    if opening is not None and name.endswith((")", "]")):
+        name, unit = name[: opening.start()].rstrip(), name[opening.end() : -1]
+    return _NOT_IN_NAMES.sub("", name.lower()), unit.lower()
 
 
 def _read_program_table(
@@ -237,10 +241,11 @@ def _read_program_table(
     if {names[i] for i in used} & {"altitude", "alt"}:
         log.note("the file does not say where the altitude is zero; above the sea is assumed")
     optics = [names.index(key) if key in names else None for key in ("focallen", "fnum", "dzoomratio")]
+    wanted = {clock, *used, *(i for i in optics if i is not None)}
     first = begin = math.nan
     is_zoned = False
     for number, row in zip(text.line, text.rows, strict=True):
-        cells = row + [""] * (len(names) - len(row))
+        cells = {i: row[i] if i < len(row) else "" for i in wanted}
         if is_timed:
             moment, has_zone = _moment(cells[clock], units[clock])
             is_zoned = is_zoned or has_zone
@@ -256,7 +261,7 @@ def _read_program_table(
             value = _to_float(cells[i])
             if math.isfinite(value) and (found := convert(names[i], value, units[i])):
                 log.add(found[0], moment - first, found[1], number)
-        hfov = hfov_of_focal(*("" if i is None else cells[i] for i in optics))
+        hfov = hfov_of_focal(*("" if i is None else cells[i] for i in optics)) if optics[0] is not None else None
         if hfov is not None:
             log.add("hfov_rad", moment - first, hfov, number)
             log.note("the field of view is that of a focal length for a picture 36 mm wide")
@@ -271,7 +276,7 @@ def _moment(text: str, unit: str) -> tuple[float, bool]:
     """Seconds of a date, a time of day or a number, and whether they are since 1970 in UTC."""
     if date := parse_date(text):
         return date[0], date[1] or unit == "utc"
-    if clock := re.fullmatch(r"(\d+):(\d+):(\d+(?:\.\d+)?)", text):
+    if clock := _CLOCK.fullmatch(text):
         return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]), False
     value = _to_float(text)
     is_since_1970 = value > 1e9

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterator
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,17 @@ Numbers = list[tuple[float, str]]
 """The numbers in a pair of brackets, each with the letters beside it."""
 
 _TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
-_MARKUP = re.compile(r"<[^>]*>")
+_MARKUP = re.compile(r"<[^<>]*>")
 _NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
-_TUPLE = re.compile(r"([A-Za-z][A-Za-z.]*)\s*:?\s*\(([^)]*)\)?")
-_PAIR = re.compile(
-    rf"([A-Za-z][A-Za-z_.]*)\s*[:=]?\s*({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])",
-    re.IGNORECASE,
+_NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
+# A name, and what follows it: see `_after_names`.
+_TUPLE = re.compile(r"[A-Za-z][A-Za-z.]*"), re.compile(r"\s*(?::\s*)?\(([^)]*)\)?")
+_PAIR = (
+    re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
+    re.compile(rf"\s*(?:[:=]\s*)?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])", re.IGNORECASE),
 )
+# Sentences have 82 characters. The expression that takes them apart needs time as the square of their length.
+_LONGEST_SENTENCE = 1000
 _OPTICS = ("focal_len", "fnum", "dzoom_ratio")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 
@@ -40,11 +45,12 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | 
     dates = [parse_date(words) for *_, words in subtitles]
     first_s, is_zoned = next((date for date in dates if date), (math.nan, False))
     lacking: dict[str, list[int]] = {}
+    timeless: list[int] = []
     for (line, time_s, words), numbers, date in zip(subtitles, tuples, dates, strict=True):
         if math.isnan(time_s):
             time_s = date[0] - first_s if date else math.nan
         if math.isnan(time_s):
-            log.note(f"line {line}: a subtitle without time is left out")
+            timeless.append(line)
             continue
         values = _quantities(log, words, numbers, is_swapped)
         log.moments.append((time_s, 0.0, line))
@@ -53,6 +59,8 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | 
             values[name] = math.nan
         for name, value in values.items():
             log.add(name, time_s, value, line)
+    if timeless:
+        log.note(f"line {timeless[0]}: a subtitle without time is left out, {len(timeless)} in all")
     _note_lacking(log, lacking, subtitles[-1][0] if subtitles else 0, len(subtitles))
     if not is_zoned and zone is not None and math.isfinite(first_s):
         first_s, is_zoned = to_utc(first_s, zone), True
@@ -85,16 +93,39 @@ def _subtitles(text: str) -> list[tuple[int, float, str]]:
     return [(number, time_s, _MARKUP.sub(" ", "\n".join(words))) for number, time_s, words in blocks]
 
 
+def _after_names(text: str, name: re.Pattern[str], value: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str], int]]:
+    """Each name that a value follows, the value, and where the name begins.
+
+    One expression for both would try every part of a long word as a name: time as the square of its length, or worse.
+    """
+    place = 0
+    while (word := name.search(text, place)) is not None:
+        place = word.end()
+        if (found := value.match(text, place)) is not None:
+            yield word[0], found, word.start()
+            place = found.end()
+
+
+def _without_tuples(text: str) -> str:
+    """The text without numbers in brackets and their names."""
+    parts, place = [], 0
+    for _, found, begin in _after_names(text, *_TUPLE):
+        parts.append(text[place:begin])
+        place = found.end()
+    return " ".join([*parts, text[place:]])
+
+
 def _tuples(text: str) -> dict[str, Numbers]:
     """Numbers in brackets by the name before them."""
     found: dict[str, Numbers] = {}
-    for name, inside in _TUPLE.findall(text) if "(" in text else ():
+    for name, brackets, _ in _after_names(text, *_TUPLE) if "(" in text else ():
+        inside = brackets[1]
         cells = re.split(r"[;,]\s+|;", inside) if re.search(r"[;,]\s|;", inside) else inside.split(",")
         if "." not in inside and len(cells) >= 4 and len(cells) == inside.count(",") + 1:
             cells = [",".join(cells[i : i + 2]) for i in range(0, len(cells), 2)]  # decimal commas
-        matches = [re.search(_NUMBER, cell) for cell in cells]
+        matches = [_NUMERAL.search(cell) for cell in cells]
         values = [float(match[0].replace(",", ".")) if match else math.nan for match in matches]
-        letters = [re.sub(rf"{_NUMBER}|[\s:°]", "", cell).upper() for cell in cells]
+        letters = [_NO_LETTERS.sub("", cell).upper() for cell in cells]
         found["gps" if name.lower() == "rtk" else name.lower()] = list(zip(values, letters, strict=True))
     return found
 
@@ -126,7 +157,8 @@ def _quantities(log: Log, text: str, tuples: dict[str, Numbers], is_swapped: boo
             if found := convert(key, value):
                 values[found[0]] = found[1]
     optics: dict[str, str] = {}
-    for key, number, unit in _PAIR.findall(_TUPLE.sub(" ", text) if tuples else text):
+    for key, pair, _ in _after_names(_without_tuples(text) if tuples else text, *_PAIR):
+        number, unit = pair[1], pair[2] or ""
         if key in _OPTICS:
             optics[key] = number
         # Only with a unit the letter h means the height.
@@ -199,12 +231,16 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     bad: list[int] = []
     first_s = last_s = utc_s = math.nan  # times of day of the first and the latest sentence; the clock at the first
     days = 0
+    has_checksums = "*" in text
     for number, line in enumerate(text.splitlines(), 1):
         begin = line.find("$")
         if begin < 0 or line[begin + 3 : begin + 6] not in _KINDS:
             continue
+        if len(line) - begin > _LONGEST_SENTENCE:
+            bad.append(number)
+            continue
         try:
-            sentence = pynmea2.parse(line[begin:].strip(), check="*" in text)
+            sentence = pynmea2.parse(line[begin:].strip(), check=has_checksums)
             time = getattr(sentence, "timestamp", None)
             if time is not None and not isinstance(time, str):
                 now_s = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6

@@ -1,0 +1,155 @@
+"""Files made to keep a reader busy: each costs time in proportion to its length, whatever it holds."""
+
+import signal
+import struct
+
+import numpy as np
+import pytest
+
+from tests.io.flights import packet, sentence
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.evaluate import Result
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, read_rows
+from torchvision_dddas.io import detection_tables
+from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.io.telemetry.misb import KEY, local_sets
+
+SECONDS = 15.0
+"""Processor time after which a reader counts as hung: it needs about a second, and needed minutes."""
+
+SUBTITLES = (
+    "1\n00:00:00,000 --> 00:00:01,000\nGPS (1,2,3) H:5m {}\n\n"
+    "2\n00:00:01,000 --> 00:00:02,000\nGPS (1,2,3) H:5m\n\n3\n00:00:02,000 --> 00:00:03,000\nGPS (1,2,3) H:5m\n"
+)
+RMC = "GPRMC,12003{},A,4807.0380,N,01131.0000,W,10.0,084.4,230394,003.1,W"
+
+
+@pytest.fixture(autouse=True)
+def hang_ends():
+    """Raise TimeoutError where a test takes more than SECONDS of processor time."""
+
+    def stop(*_):
+        raise TimeoutError(f"more than {SECONDS} s of processor time")
+
+    before = signal.signal(signal.SIGVTALRM, stop)
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
+    yield
+    signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    signal.signal(signal.SIGVTALRM, before)
+
+
+def read(path, content):
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_telemetry(path)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["a" * 60_000 + " " * 60_000, "a." * 60_000, "<" * 120_000, "a:" + " " * 120_000, "a(" * 60_000, "-" * 120_000],
+)
+def test_subtitles_with_endless_words_are_read(tmp_path, words):
+    found = read(tmp_path / "a.srt", SUBTITLES.format(words))
+    assert len(found.time_s) == 3 and found.altitude_m[2] == 5
+
+
+def test_many_subtitles_without_a_time_are_noted_once(tmp_path):
+    timeless = "Latitude: 1.5 Longitude: 2.5\n\n" * 40_000
+    with pytest.raises(InputError, match="nothing in it"):
+        read(tmp_path / "b.srt", "GPS (1,2)\n\n" + timeless)
+    dated = "2024-01-01 00:00:00\nGPS (1,2,3) H:5m\n\n"
+    found = read(tmp_path / "c.srt", dated + timeless)
+    assert sum("without time" in note for note in found.notes) == 1
+    assert any("line 4: a subtitle without time is left out, 40000 in all" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("line", ["$GPGGA," + " " * 100_000 + "*X\n", "$GPGGA," + " *" * 50_000 + "\n"])
+def test_an_endless_nmea_sentence_is_left_out(tmp_path, line):
+    pytest.importorskip("pynmea2")
+    found = read(tmp_path / "a.nmea", line.join(f"{sentence(RMC.format(k))}\n" for k in range(3)))
+    assert len(found.time_s) == 3
+    assert any("line 2: not a whole sentence" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("name", ["(" * 120_000, "a" + " " * 120_000 + "b", "[ " * 60_000, "(" * 60_000 + "m"])
+def test_a_table_with_an_endless_name_is_read(tmp_path, name):
+    found = read(tmp_path / "a.csv", f"latitude [deg],longitude,time (ms),{name}\n1,2,0,\n1,2,1000,\n1,2,2000,\n")
+    np.testing.assert_allclose(found.time_s, [0, 1, 2])
+
+
+def test_a_table_of_many_columns_and_many_short_rows_is_read(tmp_path):
+    rows = "".join(f"1,{k}\n" for k in range(150_000))
+    found = read(tmp_path / "a.csv", "height,seconds" + ",a" * 150_000 + "\n" + rows)
+    assert len(found.time_s) == 150_000
+
+
+def nested(count, length, tail=b""):
+    """Sets of which each lies in the one before, up to the longest that may be."""
+    whole = count * 20 + len(tail)
+    lengths = (min(whole - 20 * (k + 1), length) for k in range(count))
+    return b"".join(KEY + b"\x83" + size.to_bytes(3, "big") for size in lengths) + tail
+
+
+@pytest.mark.parametrize("tail", [b"", b"\xff" * 30_000, b"\x05\x00" * 15_000])
+def test_sets_that_lie_in_each_other_are_found_one_by_one(tail):
+    # A length whose bytes are a tag's and its length to the set around it: 117 bytes, to six sets further on.
+    found = list(local_sets(nested(10_000, 0x757F, tail) + packet(0, {5: b"\0\1"})))
+    assert len(found) > 5000 and sum(one.whole for one in found) == 1
+    assert found[-1].whole and found[-1].tags[5] == b"\0\1"
+
+
+def test_programme_tables_without_end_are_read(tmp_path):
+    header = b"\x02\xb0\xb0\0\x01\xc1\0\0\xe1\x01\xf0\0"
+    table = b"G\x41\x00\x10\x00" + header + b"\x1b\xe1\x01\xf0\0" * 34 + b"\0"
+    start = b"G\x40\x00\x10\x00" + b"\0\xb0\x0d\0\x01\xc1\0\0\0\x01\xe1\0" + b"\0" * 171
+    with pytest.raises(InputError, match="carries no KLV metadata; its streams are of the types 0x1b"):
+        read(tmp_path / "a.ts", start + table * 12_000)
+
+
+@pytest.mark.parametrize(("magic", "period"), [(b"\xfe", 12), (b"\xfd", 12), (b"\xfe\x81", 2)])
+def test_a_log_full_of_beginnings_of_messages_is_read(tmp_path, magic, period):
+    mavlink = pytest.importorskip("pymavlink.dialects.v20.all")
+    sender = mavlink.MAVLink(None)
+
+    def message(second):
+        place = mavlink.MAVLink_global_position_int_message(second * 1000, 10**8, 10**8, 5000, 5000, 0, 0, 0, 0)
+        return struct.pack(">Q", 1_700_000_000_000_000 + second * 10**6) + place.pack(sender, force_mavlink1=True)
+
+    size = 6_000_000 if period > len(magic) else 1_000_000
+    rest = magic.ljust(period, b"\x01") * (size // period)
+    found = read(
+        tmp_path / "a.tlog", message(0) + message(1) + message(2) + rest + b"\0" * 300 + message(3) + b"\0" * 9
+    )
+    assert len(found.time_s) >= 3 and found.place[0, 0] == pytest.approx(10)
+    assert any("are no MAVLink messages" in note for note in found.notes)
+
+
+def test_the_boxes_of_many_frames_are_found_by_frame(tmp_path):
+    count = 400_000
+    number = np.arange(1, count + 1)
+    tracks = TrackTable(number, np.ones(count, np.int64), number[:, None] * np.ones(4))
+    result = Result(tmp_path, 0, None, False, "complete", tracks)
+    assert all(result.boxes_at(k)[0, 0] == k for k in range(1, count + 1)) and not len(result.boxes_at(count + 1))
+
+
+@pytest.mark.parametrize("score", [",0.5", ""])
+@pytest.mark.parametrize("separator", [",", " "])
+def test_rows_are_the_same_read_fast_and_cell_by_cell(tmp_path, monkeypatch, score, separator):
+    path = tmp_path / "a.txt"
+    text = "".join(f"{k},2,{k}.25,-1e1,3,4{score}\n\n" for k in range(1, 9)).replace(",", separator)
+    path.write_text(text)
+    fast = read_rows(path, "truth")
+    monkeypatch.setattr("torchvision_dddas.evaluation.metrics.truth._read_fast", lambda lines: None)
+    slow = read_rows(path, "truth")
+    for one, other in zip((*fast.table, *fast[1:]), (*slow.table, *slow[1:]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert fast.line.tolist() == list(range(1, 17, 2)) and fast.mark[0] == (0.5 if score else 1)
+
+
+def test_lines_are_not_all_filled_up_to_the_longest(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("1,1,1,1,1,1\n" * 2000 + "1,1,1,1,1,1" + ",1" * 40_000 + "\n")
+    with pytest.raises(InputError, match=r"line 2001: 40006 columns, over 10 times those of most lines"):
+        detection_tables.read_rows(path)
+    path.write_text("1,1,1,1,1,1\n1,1,1,1,1,1,0.5,-1,-1,-1\n")
+    header, rows = detection_tables.read_rows(path)
+    assert len(header) == 10 and [len(row) for row in rows] == [10, 10]
