@@ -1,18 +1,27 @@
 """Files made to keep a reader busy: each costs time in proportion to its length, whatever it holds."""
 
+import io
 import signal
 import struct
+import zipfile
+import zlib
 
+import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from tests.io.flights import packet, sentence
+from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.evaluate import Result
-from torchvision_dddas.evaluation.metrics.truth import TrackTable, read_rows
+from torchvision_dddas.evaluation.evaluate import Result, load_result
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows
 from torchvision_dddas.io import detection_tables
+from torchvision_dddas.io.images import read_image, size_in_header
+from torchvision_dddas.io.sources import ImageSource
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import KEY, local_sets
+from torchvision_dddas.people.classifiers import read_classifier
 
 SECONDS = 15.0
 """Processor time after which a reader counts as hung: it needs about a second, and needed minutes."""
@@ -148,8 +157,83 @@ def test_rows_are_the_same_read_fast_and_cell_by_cell(tmp_path, monkeypatch, sco
 def test_lines_are_not_all_filled_up_to_the_longest(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("1,1,1,1,1,1\n" * 2000 + "1,1,1,1,1,1" + ",1" * 40_000 + "\n")
-    with pytest.raises(InputError, match=r"line 2001: 40006 columns, over 10 times those of most lines"):
+    with pytest.raises(InputError, match=r"line 2001: 40006 columns, over 10 times those of most"):
         detection_tables.read_rows(path)
     path.write_text("1,1,1,1,1,1\n1,1,1,1,1,1,0.5,-1,-1,-1\n")
     header, rows = detection_tables.read_rows(path)
     assert len(header) == 10 and [len(row) for row in rows] == [10, 10]
+
+
+# --------------------------------------------------------------------------------------------------------------------
+# Files that announce more than memory should hold.
+
+
+def announced(suffix, width, height):
+    """A small picture whose header says another size."""
+    data = cv2.imencode(suffix, np.full((48, 64), 90, np.uint8))[1].tobytes()
+    assert size_in_header(data) == (64, 48)
+    if suffix == ".png":
+        head = data[12:16] + struct.pack(">II", width, height) + data[24:29]
+        return data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:]
+    if suffix == ".bmp":
+        return data[:18] + struct.pack("<ii", width, height) + data[26:]
+    if suffix == ".jpg":
+        return data.replace(struct.pack(">HH", 48, 64), struct.pack(">HH", height, width), 1)
+    if suffix == ".tif":
+        for tag, old, new in ((256, 64, width), (257, 48, height)):
+            data = data.replace(struct.pack("<HHIHH", tag, 3, 1, old, 0), struct.pack("<HHIHH", tag, 3, 1, new, 0))
+        return data
+    return data.replace(b"64 48", f"{width} {height}".encode(), 1)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif", ".pgm"])
+def test_a_picture_of_too_many_pixels_is_refused_by_its_header(tmp_path, monkeypatch, suffix):
+    path = tmp_path / f"1{suffix}"
+    path.write_bytes(announced(suffix, 20_000, 20_000))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    for read_it in (read_image, read_mask, lambda p: ImageSource([p], "clip")):
+        with pytest.raises(InputError, match=r"1.* is 20000x20000 pixels; wanted at most 100,000,000"):
+            read_it(path)
+
+
+def test_the_limit_of_pixels_can_be_set(tmp_path, monkeypatch):
+    path = tmp_path / "1.png"
+    path.write_bytes(announced(".png", 64, 48))
+    monkeypatch.setenv("DDDAS_MOST_PIXELS", "3072")
+    assert np.shape(read_image(path)) == (48, 64)
+    monkeypatch.setenv("DDDAS_MOST_PIXELS", "3071")
+    with pytest.raises(InputError, match="64x48 pixels; wanted at most 3,071"):
+        read_image(path)
+    monkeypatch.setenv("DDDAS_MOST_PIXELS", "many")
+    with pytest.raises(InputError, match="DDDAS_MOST_PIXELS is 'many'"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".jp2", ".gif", ".png", ".bmp", ".jpg", ".tif", ".ppm"])
+def test_the_size_in_a_header_is_the_pictures(suffix):
+    ok, data = cv2.imencode(suffix, np.full((48, 64, 3), 90, np.uint8))
+    assert ok and size_in_header(bytes(data)) == (64, 48)
+
+
+@pytest.mark.parametrize("kind", [".npy", ".npz"])
+def test_an_array_of_too_many_numbers_is_refused_by_its_header(tmp_path, monkeypatch, kind):
+    path, file = tmp_path / f"a{kind}", io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (400_000, 1000)})
+    if kind == ".npy":
+        path.write_bytes(file.getvalue())
+    else:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("weights.npy", file.getvalue())
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was loaded"))
+    with pytest.raises(InputError, match="announces 400000 x 1000 numbers; wanted at most 1,000,000"):
+        read_classifier(path, 3780)
+
+
+def test_a_table_of_too_many_boxes_in_a_frame_is_refused(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("".join(f"{frame},{k + 1},{k},1,1,1,1\n" for frame in (1, 2, 3) for k in range(3001)))
+    for read_it in (detection_tables.read_detections, load_truth, load_result):
+        with pytest.raises(InputError, match="has 3001 boxes in frame 1; wanted at most 3000 in a frame"):
+            read_it(path)
+    result = CliRunner().invoke(app, ["track", "--detections", str(path), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 2 and "3001 boxes" in result.output and "Traceback" not in result.output

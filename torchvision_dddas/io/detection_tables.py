@@ -13,6 +13,7 @@ from torchvision_dddas.io.tables import (
     Column,
     CsvText,
     Schema,
+    check_crowding,
     parse_numbers,
     read_csv,
     read_table,
@@ -66,6 +67,7 @@ def read_detections(path: str | Path) -> DetectionTable:
                 raise InputError(f"detections {path}, line {line}: {count}; wanted frame,id,x,y,w,h[,score]")
         text = CsvText([*MOT_NAMES], text.line, [[*row[:7], ""][:7] for row in text.rows])
     table = read_table(path, SCHEMA, REQUIRED, text=text)
+    check_crowding(table["frame"], f"detections {path}")
     score = np.where(np.isnan(table["score"]), 1.0, table["score"])
     is_outside = (score < 0) | (score > 1)
     # One score of 1.3 among thousands of probabilities must not make all of these certain.
@@ -112,7 +114,7 @@ def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str],
     if len(header) * len(rows) > _FILLED * sum(counts):
         line = lines[counts.index(max(counts))]
         raise InputError(
-            f"{path}, line {line}: {max(counts)} columns, over {_FILLED} times those of most lines; wanted as many in each"
+            f"{path}, line {line}: {max(counts)} columns, over {_FILLED} times those of most; wanted as many in each"
         )
     frame = header.index("frame")
     kept = [place for place, name in enumerate(header) if name not in without]

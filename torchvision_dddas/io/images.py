@@ -1,10 +1,12 @@
 """Pictures in files: reading and decoding them, finding them in folders, and one PNG a frame for masks."""
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,6 +18,10 @@ from torchvision_dddas.types import Scene
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2", ".gif"}
 )
+MOST_PIXELS = 100_000_000
+"""A picture with more is refused: a file of kilobytes may say that it has billions."""
+
+MOST_PIXELS_VARIABLE = "DDDAS_MOST_PIXELS"
 MASK_NAME = re.compile(r"\d{6,}\.png")
 
 # 8, 16 bits and EXIF rotation are kept, alpha is dropped.
@@ -26,7 +32,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 def read_image(file: Path) -> np.ndarray | None:
     """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture."""
     try:
-        return decode_image(file.read_bytes(), _FLAGS)
+        return decode_image(file.read_bytes(), _FLAGS, file)
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
@@ -41,16 +47,92 @@ def read_colour_image(file: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, :3])
 
 
-def decode_image(data: bytes, flags: int) -> np.ndarray | None:
-    """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_..."""
+def decode_image(data: bytes, flags: int, name: object = "a picture") -> np.ndarray | None:
+    """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_...
+
+    Raises InputError, before anything is decoded, where its header says more pixels than `most_pixels`. name: of the
+    file, for the message.
+    """
     if not data or not _is_whole(data):
         return None
+    size = size_in_header(data)
+    if size is not None and size[0] * size[1] > most_pixels():
+        raise InputError(
+            f"{name} is {size[0]}x{size[1]} pixels; wanted at most {most_pixels():,} in all: make it smaller, or set "
+            f"{MOST_PIXELS_VARIABLE} in the environment"
+        )
     with quiet_opencv():
         try:
             image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
         except (cv2.error, MemoryError):  # damaged, or of a size that no memory holds
             return None
     return image
+
+
+def most_pixels() -> int:
+    """The most pixels that a picture may have: MOST_PIXELS, or what the environment says. Raises InputError."""
+    given = os.environ.get(MOST_PIXELS_VARIABLE, "")
+    if given and not (given.isascii() and given.isdigit() and int(given)):
+        raise InputError(f"{MOST_PIXELS_VARIABLE} is '{given}'; wanted a whole number of pixels")
+    return int(given or MOST_PIXELS)
+
+
+def size_in_header(data: bytes) -> tuple[int, int] | None:
+    """(width, height), px, as the beginning of a picture's file says them before any turn; None where it does not."""
+
+    def number(place: int, size: int, order: Literal["big", "little"] = "little") -> int:
+        return int.from_bytes(data[place : place + size], order)
+
+    if data[:8] == _PNG and data[12:16] == b"IHDR" and len(data) >= 24:
+        return number(16, 4, "big"), number(20, 4, "big")
+    if data[:2] == b"BM" and len(data) >= 26:
+        return number(18, 4), abs(int.from_bytes(data[22:26], "little", signed=True))
+    if pnm := re.match(rb"P[1-6](?:\s+|#[^\n]*\n)+([0-9]{1,9})\s+([0-9]{1,9})\s", data[:1000]):
+        return int(pnm[1]), int(pnm[2])
+    if data[:4] == b"GIF8":
+        return number(6, 2), number(8, 2)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        if data[12:16] == b"VP8X":
+            return 1 + number(24, 3), 1 + number(27, 3)
+        if data[12:16] == b"VP8L":
+            return 1 + (number(21, 4) & 0x3FFF), 1 + (number(21, 4) >> 14 & 0x3FFF)
+        return number(26, 2) & 0x3FFF, number(28, 2) & 0x3FFF
+    if data[:2] in (b"II", b"MM"):
+        return _size_in_tiff(data, "little" if data[:1] == b"I" else "big")
+    if data[4:8] == b"jP  " and (place := data.find(b"ihdr", 0, 4096)) >= 0:
+        return number(place + 8, 4, "big"), number(place + 4, 4, "big")
+    return _size_in_jpeg(data) if data[:2] == b"\xff\xd8" else None
+
+
+def _size_in_tiff(data: bytes, order: Literal["big", "little"]) -> tuple[int, int] | None:
+    """Of its first page: two of the entries of a directory, classic or of 8 bytes an offset."""
+    is_big = int.from_bytes(data[2:4], order) == 43
+    start, width, step, at = (8, 8, 20, 12) if is_big else (4, 4, 12, 8)
+    place = int.from_bytes(data[start : start + width], order)
+    count = int.from_bytes(data[place : place + (8 if is_big else 2)], order)
+    place += 8 if is_big else 2
+    found = {}
+    for entry in range(place, min(place + min(count, 4096) * step, len(data)), step):
+        tag, kind = (int.from_bytes(data[entry + k : entry + k + 2], order) for k in (0, 2))
+        if tag in (256, 257):  # in 2, 4 or 8 bytes
+            length = {3: 2, 16: 8}.get(kind, 4)
+            found[tag] = int.from_bytes(data[entry + at : entry + at + length], order)
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _size_in_jpeg(data: bytes) -> tuple[int, int] | None:
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:  # a fill byte
+            place += 1
+            continue
+        # Start of frame, baseline to progressive lossless; C4, C8 and CC are tables.
+        if 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = data[place + 5 : place + 7], data[place + 7 : place + 9]
+            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return None
 
 
 def _is_whole(data: bytes) -> bool:

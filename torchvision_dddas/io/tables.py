@@ -24,6 +24,10 @@ FARTHEST = 1e9
 """No place in pixels or metres, no variance and no score is larger."""
 
 
+MOST_BOXES = 3000
+"""A frame has no more: tracking and scoring compare each box with each of the frame after, or of the truth."""
+
+
 @dataclass(frozen=True)
 class Column:
     """A column of a table.
@@ -291,6 +295,16 @@ def parse_numbers(cells: Sequence[str]) -> np.ndarray:
     except ValueError:
         pass
     return np.array([_parse_number(cell) if cell else math.nan for cell in cells], float)
+
+
+def check_crowding(frame: np.ndarray, name: str) -> None:
+    """Raises InputError where one of the frames (N,) has more than MOST_BOXES rows. name: of the table."""
+    numbers, counts = np.unique(frame, return_counts=True)
+    if len(counts) and counts.max() > MOST_BOXES:
+        crowded = numbers[counts.argmax()]
+        raise InputError(
+            f"{name} has {counts.max()} boxes in frame {crowded:g}; wanted at most {MOST_BOXES} in a frame"
+        )
 
 
 def _parse_number(cell: str) -> float:

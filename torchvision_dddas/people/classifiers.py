@@ -1,7 +1,9 @@
 """Linear SVMs from files: the shipped coefficients, or a user's own as text, NumPy's or OpenCV's."""
 
 import math
+import zipfile
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -37,6 +39,7 @@ _HOG_KEYS = {
     "gamma": "gammaCorrection",
 }
 """Of a HOGDescriptor that OpenCV saved."""
+_MOST_NUMBERS = 1_000_000  # of an array; descriptors have thousands
 _DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
 
 
@@ -124,12 +127,15 @@ def _read_text(path: Path) -> tuple[np.ndarray, Layout]:
 
 def _read_numpy(path: Path) -> tuple[np.ndarray, Layout]:
     try:
+        _check_array_sizes(path)
         with path.open("rb") as file:  # NumPy leaves one that it opened itself open where an archive is broken
             held = np.load(file, allow_pickle=False)
             if isinstance(held, np.ndarray):
                 return held, {}
             with held:
                 content = {name: held[name] for name in held.files}
+    except InputError:
+        raise
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(f"classifier {path} is not an array of numbers in NumPy's format: {error}") from None
     except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
@@ -145,6 +151,25 @@ def _read_numpy(path: Path) -> tuple[np.ndarray, Layout]:
     if text := [name for name, value in stated.items() if value.dtype.kind not in "fiub"]:
         raise InputError(f"classifier {path}: {text[0]} is of type {stated[text[0]].dtype}; wanted numbers")
     return np.concatenate(parts), stated
+
+
+def _check_array_sizes(path: Path) -> None:
+    """Raises InputError where a header announces more than _MOST_NUMBERS, for which NumPy would make room."""
+    with ExitStack() as stack:
+        with path.open("rb") as file:
+            is_archive = file.read(2) == b"PK"
+        if is_archive:
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            files = [stack.enter_context(archive.open(name)) for name in archive.namelist() if name.endswith(".npy")]
+        else:
+            files = [stack.enter_context(path.open("rb"))]
+        for file in files:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, kind = read(file)
+            if math.prod(shape) * max(kind.itemsize // 16, 1) > _MOST_NUMBERS:
+                sides = " x ".join(map(str, shape))
+                raise InputError(f"classifier {path} announces {sides} numbers; wanted at most {_MOST_NUMBERS:,}")
 
 
 def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, natural_order, read_image
+from torchvision_dddas.io.images import IMAGE_SUFFIXES, natural_order, read_image, size_in_header
 from torchvision_dddas.io.sources import VideoSource
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".ts", ".mpg", ".mpeg", ".wmv"})
@@ -161,34 +161,11 @@ def size_of(path: Path) -> tuple[int, int]:
                 head += file.read(65536)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    size = _size_in_header(head)
+    # Exif may say that the picture is to be turned.
+    size = None if b"Exif" in head or head[:2] in (b"II", b"MM") else size_in_header(head)
     if size is not None and min(size) > 0:
         return size
     image = read_image(path)
     if image is None:
         raise InputError(f"{path} is no picture that can be read")
     return image.shape[1], image.shape[0]
-
-
-def _size_in_header(head: bytes) -> tuple[int, int] | None:
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR" and len(head) >= 24:
-        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    if head[:2] == b"BM" and len(head) >= 26:
-        return int.from_bytes(head[18:22], "little"), abs(int.from_bytes(head[22:26], "little", signed=True))
-    if pnm := re.match(rb"P[1-6]\s+([0-9]{1,6})\s+([0-9]{1,6})\s", head):
-        return int(pnm[1]), int(pnm[2])
-    if head[:2] != b"\xff\xd8" or b"Exif" in head:  # Exif may say that the picture is to be turned
-        return None
-
-    place = 2
-    while place + 9 <= len(head) and head[place] == 0xFF:
-        marker = head[place + 1]
-        if marker == 0xFF:  # a fill byte
-            place += 1
-            continue
-        # Start of frame, baseline to progressive lossless; C4, C8 and CC are tables.
-        if 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = head[place + 5 : place + 7], head[place + 7 : place + 9]
-            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
-        place += 2 + int.from_bytes(head[place + 2 : place + 4], "big")
-    return None

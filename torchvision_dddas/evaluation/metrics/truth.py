@@ -11,6 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.images import decode_image
+from torchvision_dddas.io.tables import check_crowding
 
 UNNAMED = 1 << 24
 """The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
@@ -146,7 +147,7 @@ def load_truth(place: Path, first_frame: int | None = None) -> Truth:
 def read_mask(path: Path) -> np.ndarray:
     """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
     try:
-        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path)
     except OSError:
         image = None
     if image is None:
@@ -239,6 +240,7 @@ def read_rows(path: Path, what: str) -> MotRows:
     table = _read_fast([line for _, line in lines])
     if table is None:
         table = _read_slowly(lines, f"{what} {path}")
+    check_crowding(table[:, 0], f"{what} {path}")
     boxes = TrackTable.of(table[:, 0], table[:, 1], table[:, 2:6])
     return MotRows(boxes, table[:, 6], np.array([number for number, _ in lines], np.int64))
 
