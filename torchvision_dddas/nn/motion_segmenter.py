@@ -239,13 +239,13 @@ class MotionSegmenter(nn.Module):
         """
         parameters, size = self.settings.difference, (levels.shape[-2], levels.shape[-1])
         warped: list[Tensor] = []
-        seen: list[tuple[Tensor, Tensor]] = []
+        frame_sizes: list[tuple[int, int]] = []
         for k, neighbour in enumerate(neighbours):
             matrix = neighbour_from_reference[:, k]
             warp = partial(F.warp_perspective, dsize=size, padding_mode="border", inverse_map=True, subpixels=32)
             warped.append(warp(neighbour, matrix, whole=True))
-            frame_size = neighbour.shape[-2], neighbour.shape[-1]
-            seen.append(F.seen_columns(matrix, size, frame_size, parameters.border_px))
+            frame_sizes.append((neighbour.shape[-2], neighbour.shape[-1]))
+        seen = _seen(neighbour_from_reference, size, frame_sizes, parameters.border_px)
         if self.is_normalized and warped:
             light = _fit_light(levels, warped, seen)
         if light is not None and parameters.kind != "between_later":
@@ -415,6 +415,20 @@ def close_masks(mask: Tensor, side: int) -> Tensor:
     out = torch.zeros_like(mask)
     out[..., spans[0], spans[1]] = F.closing(mask[..., spans[0], spans[1]], kernel)
     return out
+
+
+def _seen(
+    neighbour_from_reference: Tensor, size: tuple[int, int], frame_sizes: Sequence[tuple[int, int]], border_px: int
+) -> list[tuple[Tensor, Tensor]]:
+    """`seen_columns` of every neighbour; all of one size at once."""
+    seen: dict[int, tuple[Tensor, Tensor]] = {}
+    for frame_size in dict.fromkeys(frame_sizes):
+        places = [k for k, other in enumerate(frame_sizes) if other == frame_size]
+        matrices = neighbour_from_reference[:, places].flatten(0, 1)
+        edges = F.seen_columns(matrices, size, frame_size, border_px)
+        first, last = (edge.unflatten(0, (-1, len(places))).unbind(1) for edge in edges)
+        seen |= zip(places, zip(first, last, strict=True), strict=True)
+    return [seen[k] for k in range(len(frame_sizes))]
 
 
 def _fit_light(
