@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import torchvision_dddas.functional as F
 from torchvision_dddas.detection import View, match_exposure
 from torchvision_dddas.functional import reflect_index, resize
+from torchvision_dddas.functional.filters import in_strips, is_above, to_bytes
 
 
 @pytest.mark.parametrize(("size", "sigma"), [(1, None), (3, None), (7, None), (9, None), (5, 1.3), (31, 4.0)])
@@ -154,3 +155,43 @@ def test_exposures_are_matched_as_the_onboard_engine_does(texture, gain, offset)
         wanted = match_exposure(*(View(grey[k], grey[k]) for grey in greys))
         for ours, theirs in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(ours[k, 0].numpy(), theirs)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 8, 9, 3000])
+def test_strips_give_what_the_whole_picture_gives(rows):
+    picture = torch.rand(2, 1, rows, 300, generator=torch.Generator().manual_seed(rows))
+
+    def largest(part: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.max_pool2d(part, 5, 1, 2)
+
+    assert torch.equal(in_strips(largest, picture, reach=2), largest(picture))
+
+
+def test_bytes_are_numbers_cut_down_to_whole_ones():
+    whole = torch.arange(256.0)
+    assert torch.equal(to_bytes(whole), whole.byte())
+    assert torch.equal(to_bytes(whole + 0.99), whole.byte())
+
+
+@pytest.mark.parametrize("limit", [-1, 0, 7, 254, 255, 300])
+def test_bytes_are_above_a_limit_as_whole_numbers_are(limit):
+    levels = torch.arange(256)
+    assert torch.equal(is_above(levels.byte(), limit), levels > limit)
+
+
+def test_a_warp_to_bytes_rounds_halves_up(texture):
+    picture, matrix = batch(texture(1, 61, 87)), torch.from_numpy(CAMERA)[None]
+    levels, whole = (
+        F.warp_perspective(picture, matrix, (400, 300), padding_mode="border", subpixels=32, whole=asked)
+        for asked in (False, True)
+    )
+    assert whole.dtype == torch.uint8
+    assert torch.equal(whole, (levels + 0.5).floor().byte())
+
+
+def test_a_masked_median_is_the_lower_one_of_each_row_and_0_of_none():
+    values = torch.tensor([[5.0, 1.0, 9.0, 3.0], [4.0, 2.0, 8.0, 6.0], [7.0, 7.0, 7.0, 7.0]])
+    mask = torch.tensor([[True, True, True, True], [True, False, True, True], [False] * 4])
+    wanted = [[3.0], [6.0], [0.0]]
+    assert F.masked_median(values, mask).tolist() == wanted
+    assert F.masked_median(values.requires_grad_(), mask).tolist() == wanted

@@ -105,7 +105,8 @@ def to_bytes(levels: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
 def is_above(levels: UInt8[Tensor, "*any"], limit: int) -> Bool[Tensor, "*any"]:
     """Where levels are above the limit, in a sixth of the time that torch takes to compare bytes."""
     if is_traced() or not 0 <= limit < 255:
-        return levels > limit
+        # Torch would cut a whole number down to a byte: 300 to 44.
+        return levels > float(limit)
     return levels.clamp(limit, limit + 1).sub_(limit).view(torch.bool)
 
 
