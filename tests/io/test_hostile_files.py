@@ -200,7 +200,7 @@ def test_the_limit_of_pixels_can_be_set(tmp_path, monkeypatch):
     path = tmp_path / "1.png"
     path.write_bytes(announced(".png", 64, 48))
     monkeypatch.setenv("DDDAS_MOST_PIXELS", "3072")
-    assert np.shape(read_image(path)) == (48, 64)
+    assert np.asarray(read_image(path)).shape == (48, 64)
     monkeypatch.setenv("DDDAS_MOST_PIXELS", "3071")
     with pytest.raises(InputError, match="64x48 pixels; wanted at most 3,071"):
         read_image(path)

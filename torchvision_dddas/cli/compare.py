@@ -47,8 +47,8 @@ def compare(
     named = [(read_scores(folder), folder) for folder in (first, second)]
     studies = [replace(study, name=f"{study.name} ({folder})") for study, folder in named]
     mine, other = ((read_run_record(folder) or {}).get("settings") for folder in (first, second))
-    is_known = isinstance(mine, dict) and isinstance(other, dict)
-    found = compare_studies(*studies) | {"settings": differing_settings(mine, other) if is_known else None}
+    differing = differing_settings(mine, other) if isinstance(mine, dict) and isinstance(other, dict) else None
+    found = compare_studies(*studies) | {"settings": differing}
     if out is not None:
         refuse_folder(out)
         save_file(out, comparison_report(finite(found)).encode())

@@ -156,11 +156,12 @@ def _read_numpy(path: Path) -> tuple[np.ndarray, Layout]:
 def _check_array_sizes(path: Path) -> None:
     """Raises InputError where a header announces more than _MOST_NUMBERS, for which NumPy would make room."""
     with ExitStack() as stack:
-        with path.open("rb") as file:
-            is_archive = file.read(2) == b"PK"
+        with path.open("rb") as start:
+            is_archive = start.read(2) == b"PK"
         if is_archive:
             archive = stack.enter_context(zipfile.ZipFile(path))
-            files = [stack.enter_context(archive.open(name)) for name in archive.namelist() if name.endswith(".npy")]
+            names = [name for name in archive.namelist() if name.endswith(".npy")]
+            files: list[IO[bytes]] = [stack.enter_context(archive.open(name)) for name in names]
         else:
             files = [stack.enter_context(path.open("rb"))]
         for file in files:
