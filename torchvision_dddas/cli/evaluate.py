@@ -19,6 +19,7 @@ from torchvision_dddas.cli.options import (
     Quiet,
     Scheduler,
     StudyBackend,
+    WorkerSilent,
     check_interval,
     check_jobs,
     echo,
@@ -63,6 +64,7 @@ def evaluate(
     clips: Clips = None,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
+    worker_silent: WorkerSilent = None,
     cache: CacheFolder = None,
     prune_cache: Annotated[
         float | None, typer.Option(metavar="DAYS", min=0, help="Afterwards remove kept results unused for so long.")
@@ -93,11 +95,11 @@ def evaluate(
     """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean.
 
     With --dataset, the clips of whole data sets are run and scored, and metrics.json, report.html and run.json are
-    written. --clips, --jobs, --scheduler, --cache, --prune-cache, --config, --set and --backend are for --dataset only.
+    written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --config, --set and --backend are for --dataset only.
     """
     if dataset is None:
         study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
-        study |= {"--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
+        study |= {"--worker-silent": worker_silent, "--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
         _refuse(study, "is for a study; give --dataset FILE too")
         if truth is None or result is None:
             raise InputError(
@@ -111,7 +113,7 @@ def evaluate(
             echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
     from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
-    from torchvision_dddas.evaluation.studies.jobs import Workers
+    from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
     from torchvision_dddas.evaluation.studies.runner import write_study
 
     _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
@@ -119,7 +121,7 @@ def evaluate(
     check_interval(interval, 1000)
     folder, base, used = out or Path("dddas-study"), dataset.parent, split_patterns(clips, "--clips")
     spec = change_spec(dataset, config, set_ or [], backend and backend.value, interval)
-    with Workers(jobs, scheduler) as workers, show_progress(quiet) as (begin, advance):
+    with Workers(jobs, scheduler, worker_silent or SILENT_S) as workers, show_progress(quiet) as (begin, advance):
         results, measures = write_study(folder, spec, base, workers, cache, used, advance, begin)
     if not quiet:
         _show_study(results, measures, folder)

@@ -51,6 +51,12 @@ Jobs = Annotated[
 Scheduler = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler such as tcp://host:8786, instead of --jobs.")
 ]
+WorkerSilent = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S", min=1, help="A process of --jobs silent for so long is replaced, its clip left out. [default: 60]"
+    ),
+]
 CacheFolder = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
 ]

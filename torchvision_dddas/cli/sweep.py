@@ -19,6 +19,7 @@ from torchvision_dddas.cli.options import (
     Quiet,
     Scheduler,
     StudyBackend,
+    WorkerSilent,
     check_jobs,
     print_lines,
     report_errors,
@@ -67,6 +68,7 @@ def sweep(
     clips: Clips = None,
     jobs: Jobs = None,
     scheduler: Scheduler = None,
+    worker_silent: WorkerSilent = None,
     cache: CacheFolder = None,
     config: Config = None,
     set_: Overrides = None,
@@ -80,7 +82,7 @@ def sweep(
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.evaluation.studies import sweep as sweeps
-    from torchvision_dddas.evaluation.studies.jobs import Workers
+    from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
     from torchvision_dddas.evaluation.studies.summary import parse_goal
     from torchvision_dddas.io.atomic_files import claimed
 
@@ -106,7 +108,7 @@ def sweep(
             print_now(f"{done} of {total} clips of the next points")
 
     kept = noting(lambda: f"{len(record.trials)} trials are kept in {out}", lambda: record.trials)
-    with claimed(out), kept, Workers(jobs, scheduler) as workers:
+    with claimed(out), kept, Workers(jobs, scheduler, worker_silent or SILENT_S) as workers:
         study = sweeps.StudyMeasure(spec, dataset.parent, goal, workers, cache, on_progress)
         on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
         if optuna is None:

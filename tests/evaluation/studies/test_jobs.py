@@ -203,14 +203,16 @@ def stop_once(job, keys, store, code):
 
 
 @pytest.mark.slow
-def test_the_clip_of_a_worker_that_stops_is_begun_again_by_another(by_name, tmp_path, monkeypatch) -> None:
+def test_a_worker_that_is_stopped_costs_its_clip_and_not_the_study(tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(jobs, "_do_remotely", stop_once)
-    cache = Cache(tmp_path / "cache")
-    with Workers(2, silent_s=5.0) as team:
-        done = run_jobs([by_name["tracks"], by_name["table"]], team, cache)
-    assert (cache.folder / "stopped").exists()
-    assert len(done) == 2 and not any(d.cause for of_case in done.values() for d in of_case)
+    study = read_spec(world.three(tmp_path / "clips"))
+    with Workers(2, silent_s=5.0) as workers:
+        results = run_study(study, tmp_path, workers, tmp_path / "cache")
+    assert (tmp_path / "cache" / "stopped").exists()
+    lost = {case.clip.name: case.cause for case in results.cases if case.cause}
+    assert list(lost.values()) == ["its worker gave no sign for 5 s"]
+    assert len({case.clip.name for case in results.cases}) == 3
 
 
 @pytest.mark.slow

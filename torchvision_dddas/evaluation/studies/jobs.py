@@ -7,6 +7,7 @@ must be shared. Their results come back, and this machine keeps them.
 import logging
 import os
 import queue
+import signal
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -47,9 +48,10 @@ NO_WORKER_S = 30.0
 """How long a scheduler may be without any worker."""
 
 SILENT_S = 60.0
-"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip is begun again."""
+"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip is left out."""
 
 _POLL_S = _REPORT_S = 0.25
+_LONGEST_STEP_S = 1.0  # counted of the time between two polls: longer, and this process was stopped, too
 _TOPIC = "dddas-frames"
 _ONE_THREAD = {
     **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
@@ -211,7 +213,7 @@ class Workers:
 
     jobs: how many; 1 is this process itself; None is one per core, or 1 without Dask. scheduler: the address of a Dask
     scheduler, whose workers are taken instead. Local workers start when they are first needed. silent_s: a local worker
-    that gives no sign for so long is replaced, and its clip is begun again; a scheduler has its own limit. Raises
+    that gives no sign for so long is replaced, and its clip is left out; a scheduler has its own limit. Raises
     InputError if Dask is needed and not installed, or the scheduler does not answer.
     """
 
@@ -228,6 +230,7 @@ class Workers:
             raise InputError(f"--jobs {jobs} needs {_INSTALL}, or take --jobs 1")
         self._jobs, self._scheduler, self._silent_s, self._stack = jobs, scheduler, silent_s, ExitStack()
         self._client: Any = None
+        self._silence: _Silence | None = None
 
     def __enter__(self) -> "Workers":
         if self._scheduler is not None:
@@ -253,7 +256,8 @@ class Workers:
 
     def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
         if self._client is None:
-            self._client = _start_local(self._jobs, self._silent_s, self._stack)
+            self._client = _start_local(self._jobs, self._stack)
+            self._silence = _Silence(self._client.cluster, self._silent_s)
         client, running, news = self._client, dict[Any, Job](), queue.SimpleQueue[Any]()
         client.subscribe_topic(_TOPIC, lambda event: news.put(event[1]))
         alone_since = time.monotonic()
@@ -278,6 +282,10 @@ class Workers:
                     raise InputError(
                         f"the scheduler {self._scheduler} has had no worker for {NO_WORKER_S:g} s; {self._advice()}"
                     )
+                for key in self._silence.end_workers() if self._silence else ():
+                    for future in [future for future in running if future.key == key]:
+                        client.cancel([future], force=True)
+                        on_event(_left_out(running.pop(future), f"its worker gave no sign for {self._silent_s:g} s"))
                 with suppress(queue.Empty):
                     new = news.get(timeout=_POLL_S)
                     if new in running:
@@ -299,8 +307,9 @@ class Workers:
             done, notes, made = future.result()
         except KilledWorker as error:
             deaths = error.allowed_failures + 1
-            cause = f"its worker died {deaths} times; is there memory enough for {job.clip.name} and {job.backend}?"
-            return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
+            return _left_out(
+                job, f"its worker died {deaths} times; is there memory enough for {job.clip.name} and {job.backend}?"
+            )
         except InputError:
             raise
         except Exception as error:  # `do_job` raises none: the worker cannot even start it
@@ -314,6 +323,36 @@ class Workers:
             f"start `dask worker {self._scheduler} --nthreads 1` in this environment, with version {VERSION} of "
             "torchvision-dddas"
         )
+
+
+def _left_out(job: Job, cause: str) -> Event:
+    return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
+
+
+class _Silence:
+    """How long each worker of a local cluster has given no sign: its process is stopped, or hangs in a library."""
+
+    def __init__(self, cluster: Any, limit_s: float) -> None:
+        self._cluster, self._limit_s, self._polled_s = cluster, limit_s, time.monotonic()
+        self._silent: dict[str, tuple[float, float]] = {}  # by address: the time of the last sign, the silence since
+
+    def end_workers(self) -> list[str]:
+        """End workers that were silent for longer than the limit; the keys of their jobs. Dask starts others."""
+        now_s, keys = time.monotonic(), list[str]()
+        step_s, self._polled_s = min(now_s - self._polled_s, _LONGEST_STEP_S), now_s
+        known, self._silent = self._silent, {}
+        for address, worker in list(self._cluster.scheduler.workers.items()):
+            seen, silent_s = known.get(address, (worker.last_seen, 0.0))
+            silent_s = silent_s + step_s if seen == worker.last_seen else 0.0
+            self._silent[address] = (worker.last_seen, silent_s)
+            if silent_s > self._limit_s:
+                keys += [task.key for task in list(worker.processing)]
+                for nanny in list(self._cluster.workers.values()):
+                    if nanny.worker_address == address and nanny.pid:
+                        self._silent.pop(address, None)
+                        with suppress(ProcessLookupError):
+                            os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
+        return keys
 
 
 def _do_remotely(job: Job, keys: Keys, store: Cache, code: str) -> tuple[tuple[Done, ...], str, dict[str, bytes]]:
@@ -346,13 +385,13 @@ def _one_thread(backend: str) -> Iterator[None]:
             set_threads(before)
 
 
-def _start_local(jobs: int, silent_s: float, stack: ExitStack) -> Any:
+def _start_local(jobs: int, stack: ExitStack) -> Any:
     """A client of new processes on this machine, which end with the stack."""
     import dask
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    limits = {"allowed-failures": MAX_DEATHS - 1, "worker-ttl": f"{silent_s} s"}
+    limits = {"allowed-failures": MAX_DEATHS - 1, "worker-ttl": None}  # silent workers are ended here
     with dask.config.set({f"distributed.scheduler.{name}": limit for name, limit in limits.items()}):
         cluster = LocalCluster(
             n_workers=jobs,
