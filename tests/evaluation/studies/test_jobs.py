@@ -207,11 +207,11 @@ def test_a_worker_that_is_stopped_costs_its_clip_and_not_the_study(tmp_path, mon
     pytest.importorskip("distributed")
     monkeypatch.setattr(jobs, "_do_remotely", stop_once)
     study = read_spec(world.three(tmp_path / "clips"))
-    with Workers(2, silent_s=5.0) as workers:
+    with Workers(2, silent_s=15.0) as workers:
         results = run_study(study, tmp_path, workers, tmp_path / "cache")
-    assert (tmp_path / "cache" / "stopped").exists()
+    assert (tmp_path / "cache" / "stopped").exists(), results.cases
     lost = {case.clip.name: case.cause for case in results.cases if case.cause}
-    assert list(lost.values()) == ["its worker gave no sign for 5 s"]
+    assert list(lost.values()) == ["its worker gave no sign for 15 s"]
     assert len({case.clip.name for case in results.cases}) == 3
 
 
