@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.io.atomic_files import (
     ClaimedFolder,
     PartFile,
@@ -80,6 +81,29 @@ def test_a_folder_made_for_nothing_is_not_left_behind(tmp_path):
     with claimed(tmp_path / "deep" / "out"):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+WRITE = """
+import sys
+from pathlib import Path
+from torchvision_dddas.evaluation.studies.cache import Cache
+cache = Cache(Path(sys.argv[1]))
+for _ in range(30):
+    cache.put("ab" * 32, bytes([int(sys.argv[2])]) * 300_000)
+"""
+
+
+def test_two_processes_with_one_cache_tear_no_entry(tmp_path):
+    cache = Cache(tmp_path)
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITE, str(tmp_path), mark], stderr=subprocess.PIPE, cwd=ROOT)
+        for mark in "12"
+    ]
+    while None in [writer.poll() for writer in writers]:
+        assert cache.get("ab" * 32) in (None, b"\1" * 300_000, b"\2" * 300_000)
+    assert [writer.communicate(timeout=60)[1] for writer in writers] == [b"", b""]
+    assert cache.get("ab" * 32) is not None and cache.notes == []
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [cache.path("ab" * 32)]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems take no such names")
