@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torchvision_dddas.errors import InputError, readable, without_secrets
 from torchvision_dddas.io.output.run_record import finite
 
-SIGNS = st.characters(min_codepoint=33, max_codepoint=126)
+SIGNS = st.characters(min_codepoint=32, max_codepoint=126)
 PASSWORDS = st.text(SIGNS, min_size=6).map(lambda text: f"Q{text}Q")
 
 
@@ -28,6 +28,12 @@ def test_no_secret_of_a_query_is_ever_shown(secret, key, before):
     shown = without_secrets(f"cannot open http://10.0.0.1/live{before}{key}={secret}&stream=2 as a stream")
     assert secret not in shown
     assert "http://10.0.0.1/live" in shown and shown.endswith("&stream=2 as a stream")
+
+
+def test_what_was_hidden_once_keeps_the_words_that_follow():
+    name = without_secrets("http://host/live?password=two words")
+    assert name == "http://host/live?password=***"
+    assert str(InputError(f"{name} sent nothing; try again")) == f"{name} sent nothing; try again"
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ _LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=]))[a-z][\w+.-]*:/+|[a-z][\w+.-]*://)(?:
 # user:password@host, as it is written where the scheme is forgotten.
 _BARE_LOGIN = re.compile(r"(?:^|(?<=[\s'\"(]))[^\s/:@'\"(]+:(?!/)[^\s]*@")
 _SECRET_KEY = re.compile(
-    r"(?<=[?&;/])([^\s=?&;/]*(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]*=)[^\s&]+", re.I
+    r"(?<=[?&;/])([^\s=?&;/]*(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]*=)(?!\*\*\*(?:[^\w]|$))[^&]+",
+    re.I,
 )
 _HIDDEN = r"\1***"
 
@@ -22,7 +23,8 @@ _HIDDEN = r"\1***"
 def without_secrets(text: str) -> str:
     """A text without the names and passwords of its addresses: `user:password@` is left out, `?password=` says ***.
 
-    A password may hold any sign. Where it cannot be known whether an @ ends one, all before it is left out.
+    A password may hold any sign. Where it cannot be known whether an @ ends one, all before it is left out, and of a
+    query all from its secret to the next & or the end of the line. What was hidden once keeps the words that follow.
     """
     if "@" not in text and ("://" not in text or "=" not in text):
         return text

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import bad, record
+from tests.evaluation.studies import world
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -111,6 +112,35 @@ def test_signals_leave_whole_outputs_also_several_at_once(clip, tmp_path, number
     assert error.endswith("; results up to here are kept\n") and error.count("\n") == 1
     assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
     assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("line", ["detect {clip} --config fast", "people {clip} --set people.enlarge=4", "evaluate"])
+def test_sigterm_and_sighup_end_each_command_with_whole_outputs(clip, tmp_path, line, number, times):
+    out = tmp_path / "out"
+    if line == "evaluate":
+        words = ["evaluate", "--dataset", str(world.three(tmp_path / "clips")), "--cache", str(tmp_path / "cache")]
+        call, sign = [sys.executable, "-c", MAIN, *words, "--jobs", "1"], "1 of 3"
+    else:
+        program = PROGRAM.replace('print("now", flush=True)', 'print("now", file=sys.stderr, flush=True)')
+        words = [*shlex.split(line.format(clip=clip)), "--quiet"]
+        call, sign = [sys.executable, "-c", f"import sys\n{program}", *words], "now"
+    call += ["--out", str(out)]
+    with subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stderr is not None
+        assert any(sign in said for said in process.stderr)
+        for _ in range(times):
+            process.send_signal(number)
+        error = process.communicate(timeout=120)[1]
+    assert process.returncode == 128 + number, error
+    assert " kept" in error and error.startswith("dddas: ended by ") and error.count("\n") == 1
+    assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
+    assert not [path for path in out.rglob("*") if path.name.startswith(".") or ".part" in path.name]
+    if line != "evaluate":
+        assert record(out)["frames"]["written"] == 3
+        assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
 
 
 def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(clip, tmp_path):

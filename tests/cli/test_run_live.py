@@ -1,11 +1,15 @@
 """`dddas run --live`: streams, the session's own folder, and one line for each mistake."""
 
+import itertools
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import urllib.error
+import urllib.request
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
@@ -13,10 +17,12 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import bad
+from tests.live.streams import FakeStream
 from tests.synthetic_clip import render
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.errors import without_secrets
 from torchvision_dddas.io.run_inputs import prepare_run
+from torchvision_dddas.io.streams.stream import Stream
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.
@@ -128,6 +134,41 @@ def test_a_password_in_an_address_is_written_nowhere():
     assert without_secrets("rtsp://me:secret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
     assert without_secrets("rtsp://me:s@cret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
     assert without_secrets("frames/a@b") == "frames/a@b"
+
+
+def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path, monkeypatch, capfd):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    pages = {}
+
+    def fetch():
+        for path in ("", "metrics", "health.json"):
+            address = f"http://127.0.0.1:{port}/{path}"
+            with suppress(urllib.error.HTTPError), urllib.request.urlopen(address, timeout=60) as page:
+                pages[path] = page.read().decode()
+
+    # The stream is lost once, which is an event with its name.
+    script = iter([*render(0, 8, (240, 180)).images, False, fetch])
+    ended = iter([lambda: os.kill(os.getpid(), signal.SIGTERM)])
+    monkeypatch.setattr(
+        "torchvision_dddas.live.capture.OpenedStream", lambda *_: FakeStream(itertools.chain(script, ended))
+    )
+    source = "rtsp://me:hush1/a@b:hush2@10.0.0.1:554/live?channel=1&password=hush3 hush4"
+    emit = ("--emit", f"mot:{tmp_path}/rows.txt", "--emit", "json:-")
+    done = dddas("run", source, *FAST, *emit, "--serve", port, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert sorted(pages) == ["", "health.json", "metrics"]
+    shown = {path.name: path.read_text() for path in tmp_path.rglob("*") if path.is_file()} | pages
+    shown |= {"stderr": done.stderr, "streams": "".join(capfd.readouterr())}
+    assert len(shown) == 9 and [name for name, text in shown.items() if "hush" in text] == []
+    for name in ("run.json", "", "health.json", "stderr"):
+        assert "rtsp://10.0.0.1:554/live?channel=1" in shown[name].replace("&amp;", "&")
+
+
+@pytest.mark.parametrize("where", ["json:tcp://me:hush@10.0.0.1:9", "cot:udp://me:hu/sh@10.0.0.1:9"])
+def test_a_stream_is_named_without_its_password(where):
+    assert "hu" not in Stream(where, lambda *_: (), None, print).name
+    assert "10.0.0.1:9" in Stream(where, lambda *_: (), None, print).name
 
 
 @pytest.mark.parametrize("pitch_deg", [60.0, None])

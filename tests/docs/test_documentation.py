@@ -1,8 +1,12 @@
 """The README and the pages under docs/ hold: commands, links, files and examples exist and run."""
 
 import csv
+import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -10,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.evaluation.studies.world import three
 from tests.overflight import ORIGIN, Overflight, pictures
 from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app
@@ -131,6 +136,29 @@ def test_the_path_of_a_drones_log_alone_can_be_followed(tmp_path: Path, monkeypa
         for row in found
     ]
     assert len(found) > 20 and np.median(missed) < 3.0
+
+
+@pytest.mark.slow
+def test_the_path_of_a_study_that_was_killed_can_be_followed(tmp_path: Path) -> None:
+    """The commands of that section: the first is killed after a clip, the second keeps it and does the others."""
+    pytest.importorskip("distributed")
+    three(tmp_path / "clips").rename(tmp_path / "STUDY.toml")
+    section = PAGES["datasets.md"].split("A study that was killed")[1]
+    first, second = [shlex.split(line, comments=True)[1:] for line in section.split("```")[1].splitlines()[1:]]
+    environ = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    program = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()"]
+
+    def state() -> str:
+        return str(json.loads((tmp_path / "study/run.json").read_text())["state"])
+
+    with subprocess.Popen([*program, *first], cwd=tmp_path, env=environ, stderr=subprocess.PIPE, text=True) as run:
+        assert run.stderr is not None
+        assert any("1 of 3" in line for line in run.stderr)
+        run.kill()
+    assert state() == "running" and not (tmp_path / "study/metrics.json").exists()
+    done = subprocess.run([*program, *second], cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, state()) == (0, "complete"), done.stderr
+    assert "kept" in done.stderr and (tmp_path / "study/metrics.json").exists()
 
 
 def test_the_readme_is_short_and_its_picture_small() -> None:

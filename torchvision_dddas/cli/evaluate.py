@@ -95,11 +95,13 @@ def evaluate(
     """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean.
 
     With --dataset, the clips of whole data sets are run and scored, and metrics.json, report.html and run.json are
-    written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --config, --set and --backend are for --dataset only.
+    written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --config, --set and --backend are
+    for --dataset only.
     """
     if dataset is None:
         study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
-        study |= {"--worker-silent": worker_silent, "--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
+        study |= {"--worker-silent": worker_silent}
+        study |= {"--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
         _refuse(study, "is for a study; give --dataset FILE too")
         if truth is None or result is None:
             raise InputError(

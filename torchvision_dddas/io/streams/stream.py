@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, without_secrets
 from torchvision_dddas.io.streams.messages import About, CotEvents, json_lines, mot_lines
 from torchvision_dddas.io.streams.outlets import LineOutlet, Outlet, open_datagrams
 from torchvision_dddas.types import FrameResult, TrackedFrame
@@ -33,7 +33,7 @@ _NUMBER = re.compile(r"\d+")
 class Stream:
     """Sends results, given in order. Trouble of the outlet never ends the run: it is reported once and retried later.
 
-    name: as the user wrote it. One thread writes and closes.
+    name: as the user wrote it, without passwords. One thread writes and closes.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Stream:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """retry_s: a broken outlet is tried again after this, then twice that, up to retry_most_s."""
-        self.name = name
+        self.name = without_secrets(name)
         self._encode, self._outlet, self._notify, self._clock = encode, outlet, notify, clock
         self._retry_s, self._retry_most_s = retry_s, retry_most_s
         self._lock = threading.Lock()
