@@ -7,7 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.error
+import threading
+import time
 import urllib.request
 from contextlib import suppress
 from dataclasses import replace
@@ -139,23 +140,28 @@ def test_a_password_in_an_address_is_written_nowhere():
 def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path, monkeypatch, capfd):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    pages = {}
+    pages, over = {}, threading.Event()
 
-    def fetch():
+    def fetch_and_end():
         for path in ("", "metrics", "health.json"):
-            address = f"http://127.0.0.1:{port}/{path}"
-            with suppress(urllib.error.HTTPError), urllib.request.urlopen(address, timeout=60) as page:
-                pages[path] = page.read().decode()
+            for _ in range(600):
+                with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=60) as page:
+                    pages[path] = page.read().decode()
+                    break
+                over.wait(0.05)
+        if not over.is_set():
+            os.kill(os.getpid(), signal.SIGTERM)
 
-    # The stream is lost once, which is an event with its name.
-    script = iter([*render(0, 8, (240, 180)).images, False, fetch])
-    ended = iter([lambda: os.kill(os.getpid(), signal.SIGTERM)])
-    monkeypatch.setattr(
-        "torchvision_dddas.live.capture.OpenedStream", lambda *_: FakeStream(itertools.chain(script, ended))
-    )
+    # The stream is lost once, which is an event; then it goes on until the signal.
+    images = render(0, 8, (240, 180)).images
+    rest = (step for image in itertools.cycle(images) for step in (lambda: time.sleep(0.05), image))
+    script = itertools.chain(images, [False], rest)
+    monkeypatch.setattr("torchvision_dddas.live.capture.OpenedStream", lambda *_: FakeStream(script))
+    threading.Thread(target=fetch_and_end, daemon=True).start()
     source = "rtsp://me:hush1/a@b:hush2@10.0.0.1:554/live?channel=1&password=hush3 hush4"
     emit = ("--emit", f"mot:{tmp_path}/rows.txt", "--emit", "json:-")
     done = dddas("run", source, *FAST, *emit, "--serve", port, "--out", tmp_path / "out")
+    over.set()
     assert done.exit_code == 0, done.output
     assert sorted(pages) == ["", "health.json", "metrics"]
     shown = {path.name: path.read_text() for path in tmp_path.rglob("*") if path.is_file()} | pages
