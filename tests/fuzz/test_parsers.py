@@ -75,7 +75,7 @@ def test_the_same_number_gives_the_same_input_and_another_gives_another() -> Non
 def test_a_refusal_is_one_line_that_a_terminal_shows_however_bad_the_input() -> None:
     error = InputError("a file \x1b[31mred\x07 of \udc80\nlines" + "9" * 10_000 + "; wanted 1 to 5")
     assert str(error).isprintable() and len(str(error)) <= LONGEST
-    assert r"\x1b[31mred\x07 of \udc80 lines" in str(error) and str(error).endswith("; wanted 1 to 5")
+    assert r"\x1b[31mred\x07 of \x80 lines" in str(error) and str(error).endswith("; wanted 1 to 5")
 
 
 # -- What was found ----------------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_a_table_without_rows_is_valid_because_detect_writes_one(read, text):
     ("good", "bad", "refused"), [(4358, 1, True), (199, 1, True), (198, 2, False), (99, 1, False), (0, 2, False)]
 )
 def test_a_few_scores_outside_0_to_1_are_mistakes_and_many_are_another_scale(read, good, bad, refused):
-    text = "1,-1,2,3,4,5,0.5\n" * good + "2,-1,2,3,4,5,1.3\n" * bad
+    text = "".join(f"{1 + k // 1000},-1,2,3,4,5,0.5\n" for k in range(good)) + "9,-1,2,3,4,5,1.3\n" * bad
     if refused:
         with pytest.raises(InputError, match=rf"line {good + 1}: score is 1.3; {bad} of {good + bad} scores lie"):
             read(text)

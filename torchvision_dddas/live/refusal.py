@@ -13,7 +13,7 @@ from torchvision_dddas.io.sources import OpenedStream
 _PORTS = {"rtsp": 554, "http": 80, "https": 443}
 _MOST_BYTES = 65536
 _MEANING = {
-    401: "the name or the password is wrong; give rtsp://NAME:PASSWORD@HOST/...",
+    401: "the name or the password is wrong; give both in the address, before the host",
     403: "it is forbidden to this name",
     404: "there is no such stream; check the path",
 }
