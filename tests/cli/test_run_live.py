@@ -110,7 +110,7 @@ def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
     ready.settimeout(120)
     environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
     with ready, subprocess.Popen([*words, "--out", str(tmp_path / "out")], env=environ, stderr=subprocess.PIPE) as run:
-        assert ready.recv(100) == b"READY=1"
+        assert ready.recv(100).splitlines()[0] == b"READY=1"
         run.send_signal(signal.SIGTERM)
         assert ready.recv(100) == b"STOPPING=1"
         run.communicate(timeout=120)
