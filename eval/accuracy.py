@@ -5,6 +5,9 @@ frames), or boxes_xywh.txt (one target a frame, other movers unlabelled), or nei
 false). Pixel counts are pooled over a clip, boxes match at an IoU of 0.5. Of one labelled target: a hit is a frame in
 which more than a tenth of its box is foreground, an other blob one whose box meets the target's at an IoU below 0.05.
 The figures are the same in every run on one machine.
+
+The source's difference shows a mover where it stands in the middle one of three frames. The column of a configuration
+followed by "at t + Δt" scores its masks there: moved from frame t to frame t + Δt by the registration.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,17 +20,19 @@ import numpy as np
 import plain_chain
 from clips import clips_in
 
-from torchvision_dddas.config import load_config
+from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.metrics import boxes as box_metrics
 from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
+from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.sources import open_source
 
 Found = tuple[np.ndarray, np.ndarray]
 """(H, W) mask and (N, 4) boxes of a frame."""
+Chain = Callable[[Path], Iterator[Found | None]]
 Figures = dict[str, float]
 MEASURES = {"precision": "precision", "recall": "recall", "f": "F", "gmean": "Gmean", "box_f1": "box F1"}
 
@@ -35,13 +40,15 @@ MEASURES = {"precision": "precision", "recall": "recall", "f": "F", "gmean": "Gm
 def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, Figures]]]:
     """Score every clip with the plain chain and with every configuration."""
     cv2.setNumThreads(2)
-    chains: dict[str, Callable[[Path], Iterator[Found]]] = {"plain": run_plain}
+    chains: dict[str, Chain] = {"plain": run_plain}
     chains |= {name: partial(run_ours, config=name, backend=options.backend) for name in options.configs}
+    later = [name for name in options.configs if name != "default" and is_drawn_later(load_config(name))]
+    chains |= {f"{name} at t + Δt": partial(run_moved, config=name, backend=options.backend) for name in later}
     scores: dict[str, dict[str, Figures]] = {}
     for place in clips_in(options.data, options.only):
         scores[place.name] = {}
-        for name, chain in chains.items():
-            scores[place.name][name] = score(place, chain)
+        for name, run in chains.items():
+            scores[place.name][name] = score(place, run)
             bench.log(place.name, name, format_figures(scores[place.name][name]))
     return format_tables(scores, list(chains)), scores
 
@@ -53,6 +60,27 @@ def run_ours(place: Path, config: str, backend: str) -> Iterator[Found]:
         yield scene.mask, scene.detections.box_px
 
 
+def is_drawn_later(settings: Settings) -> bool:
+    """Whether masks show the movers of a later frame than their own."""
+    return settings.difference.kind == "between_later"
+
+
+def run_moved(place: Path, config: str, backend: str) -> Iterator[Found | None]:
+    """Mask and boxes of the reference one interval earlier, moved to every frame; None where there is no such."""
+    scenes = list(detect_motion(open_source(place / "frames"), load_config(config), backend))
+    moved: dict[int, Found] = {}
+    for at, scene in enumerate(scenes):
+        middle, last = at + scene.interval_frames, at + 2 * scene.interval_frames
+        steps = [later.step for later in scenes[at + 1 : middle + 1]]
+        if last >= len(scenes) or not scene.reliable or any(step is None for step in steps):
+            continue
+        later_from_earlier = chain([step.later_from_earlier for step in steps if step is not None])
+        size = scene.mask.shape[1], scene.mask.shape[0]
+        mask = cv2.warpPerspective(scene.mask.astype(np.uint8), later_from_earlier, size, flags=cv2.INTER_NEAREST)
+        moved[middle] = mask > 0, cv2.connectedComponentsWithStats(mask)[2][1:, :4].astype(float)
+    yield from (moved.get(at) for at in range(len(scenes)))
+
+
 def run_plain(place: Path) -> Iterator[Found]:
     """The same by the plain chain on each frame and its next two; the last two frames look back."""
     images = [cv2.imread(str(file)) for file in sorted((place / "frames").iterdir())]
@@ -61,15 +89,19 @@ def run_plain(place: Path) -> Iterator[Found]:
         yield plain_chain.plain_window(images[i], images[i + step], images[i + 2 * step])
 
 
-def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
+def score(place: Path, run: Chain) -> Figures:
     """The figures of one clip: of masks, of one labelled target, or of a clip where nothing moves."""
     truth = truths.load_truth(place) if truths.find_truth(place) else None
-    pixels, boxes, target, blobs, frames = Pixels(), Boxes(), OneTarget(), 0, 0
-    for number, (mask, found) in enumerate(chain(place), 1):
+    pixels, boxes, target, blobs, frames, labelled = Pixels(), Boxes(), OneTarget(), 0, 0, 0
+    for number, both in enumerate(run(place), 1):
+        if both is None:
+            continue
+        mask, found = both
         frames, blobs = number, blobs + len(found)
         if truth is None:
             continue
         if number in truth.masks:
+            labelled += 1
             labels = truths.read_mask(truth.masks[number])
             pixels = add_counts(pixels, pixel_metrics.count(mask, labels))
             boxes = add_counts(boxes, box_metrics.match(found, box_metrics.boxes_of(labels)))
@@ -79,7 +111,7 @@ def score(place: Path, chain: Callable[[Path], Iterator[Found]]) -> Figures:
         return {"frames": frames, "still": blobs / frames}
     if truth.masks:
         box_f1 = box_metrics.measures(boxes)["f1"]
-        return {"frames": len(truth.masks), **pixel_metrics.measures(pixels), "box_f1": box_f1}
+        return {"frames": labelled, **pixel_metrics.measures(pixels), "box_f1": box_f1}
     return {"frames": target.frames, **box_metrics.one_target_measures(target)}
 
 

@@ -50,6 +50,9 @@ class Group(BaseModel):
 EVIDENCE_SCALE, EVIDENCE_CAP = 16.0, 240
 """Evidence is kept in 8-bit maps: in sixteenths of the local noise, clipped at 15 noise units."""
 
+HALF = 127
+"""Above this level a smoothed silhouette of 0 and 255 is set."""
+
 WHITE = 248
 """From this grey level on a pixel may be clipped."""
 
@@ -69,6 +72,10 @@ class RegistrationParameters(Group):
         "homography", "model of the background's motion; affine is the earlier baseline"
     )
     keypoints: int = parameter(500, "largest number of keypoints in a frame (Shi-Tomasi corners)", "points", 50, 5000)
+    corners: Literal["cells", "frame"] = parameter(
+        "cells", "keypoints: the best corner of every grid cell, or the best of the whole frame, as the source has them"
+    )
+    min_distance_px: int = parameter(8, "smallest distance between keypoints (corners = frame)", "px", 1, 100)
     cell_px: int = parameter(
         16, "side of the grid cells, which keep their best point each; grows until `keypoints` suffice", "px", 4, 256
     )
@@ -107,7 +114,11 @@ class IntervalParameters(Group):
     reference_speed_m_s: float = parameter(5.0, "ground speed at which the interval is one frame", "m/s", 0.1, 100)
     reference_rate_hz: float = parameter(10.0, "frame rate at which the interval is one frame", "1/s", 1, 240)
     reference_flow: float = parameter(
-        0.02, "without telemetry: background flow per frame at which the interval is one frame", "widths", 1e-4, 1
+        0.02,
+        "without telemetry: background flow per frame at which the interval is one frame; 0 keeps `frames`",
+        "widths",
+        0,
+        1,
     )
     lowest_speed_m_s: float = parameter(
         0.5, "slower speeds count as this speed, so that hovering gives the longest interval", "m/s", 0.01, 10
@@ -119,11 +130,11 @@ class IntervalParameters(Group):
 class DifferenceParameters(Group):
     """What makes a pixel foreground (appendix B, step S4)."""
 
-    kind: Literal["normalized", "to_reference", "between_later"] = parameter(
+    kind: Literal["normalized", "to_reference", "between_later", "to_next"] = parameter(
         "normalized",
         "normalized: difference to both neighbours in units of local noise, exposure corrected; to_reference: "
         "min(|I(t) - W1|, |I(t) - W2|) in grey levels, clear changes of exposure corrected; between_later: |W2 - "
-        "W1|, the source's eq. 9",
+        "W1|, the source's eq. 9; to_next: |I(t) - W1|, one interval later alone, the source's earlier chain",
     )
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = parameter(
         (1, 2), "distances from the reference frame to its neighbours, on both sides", "frames"
@@ -133,7 +144,10 @@ class DifferenceParameters(Group):
     gradient_share: float = parameter(0.12, "share of the local gradient that counts as registration noise", "-", 0, 2)
     threshold: float = parameter(3.5, "larger differences are foreground; in noise units if normalized", "-", 0.1, 255)
     peak: float = parameter(7.0, "smallest peak difference of a target, same unit as the threshold", "-", 0, 255)
-    blur_px: Odd = parameter(5, "Gaussian kernel applied to the difference, odd; 1 switches it off", "px", 1, 31)
+    blur_px: Odd = parameter(5, "Gaussian kernel of the smoothing, odd; 1 switches it off", "px", 1, 31)
+    blur_of: Literal["difference", "silhouette"] = parameter(
+        "difference", "smooth the difference before the threshold, or as the source does the silhouette after it"
+    )
     border_px: int = parameter(4, "width of the strip along a warped frame's border that is ignored", "px", 0, 50)
     halved: bool = parameter(False, "compare frames at half resolution: faster, coarser outlines (onboard)")
 
@@ -142,6 +156,7 @@ class MorphologyParameters(Group):
     """How the silhouette is cleaned (appendix B, step S5)."""
 
     erode_px: int = parameter(3, "ellipse that erodes the silhouette: precision for recall; 1: off", "px", 1, 31)
+    dilate_px: int = parameter(1, "ellipse that dilates it afterwards: recall for precision; 1: off", "px", 1, 101)
     close_px: int = parameter(25, "ellipse that closes gaps between fragments of one target; 1: off", "px", 1, 101)
     close_m: float = parameter(0.0, "with telemetry: largest gap to close, at most close_px; 0: close_px", "m", 0, 100)
     hull: bool = parameter(True, "replace every blob by its convex hull")

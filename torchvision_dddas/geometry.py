@@ -394,5 +394,12 @@ def later_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int,
     return [] if pair is None else [pair]
 
 
+def next_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
+    """The one frame that a two-frame difference looks at, as a pair of itself: later, else earlier; may be empty."""
+    single = [(at + side * gap, at + side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
+    pair = _first_within(single, first, last)
+    return [] if pair is None else [pair]
+
+
 def _first_within(pairs: Iterable[tuple[int, int]], first: int, last: int) -> tuple[int, int] | None:
     return next((pair for pair in pairs if first <= min(pair) and max(pair) <= last), None)

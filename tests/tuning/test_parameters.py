@@ -56,7 +56,11 @@ def test_a_tuned_value_is_rounded_to_what_its_setting_takes(name: str, value: fl
 
 
 def test_a_group_stands_for_its_tunable_parameters() -> None:
-    assert expand_names(["morphology.*", "morphology.erode_px"]) == ["morphology.erode_px", "morphology.close_px"]
+    assert expand_names(["morphology.*", "morphology.erode_px"]) == [
+        "morphology.erode_px",
+        "morphology.dilate_px",
+        "morphology.close_px",
+    ]
 
 
 @pytest.mark.parametrize("name", ["difference.kind", "difference.treshold", "nonsense", "registration.levels"])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import MorphologyParameters
+from torchvision_dddas.config import HALF, MorphologyParameters
 from torchvision_dddas.geometry import occupied
 
 Box = tuple[int, int, int, int]
@@ -89,6 +89,23 @@ def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
     return out
 
 
+def clean_silhouette(
+    silhouette: np.ndarray, morphology: MorphologyParameters, blur_px: int = 1, close_px: int = 0
+) -> np.ndarray:
+    """Smooth, erode, dilate and close a (H, W) uint8 silhouette of 0 and 255 (appendix B, step S5).
+
+    blur_px: Gaussian kernel of the smoothing, after which half of the full value is the outline; 1: none. close_px: in
+    place of the parameter.
+    """
+    if blur_px > 1:
+        smooth = cv2.GaussianBlur(silhouette, (blur_px, blur_px), 0)
+        silhouette = cv2.threshold(smooth, HALF, 255, cv2.THRESH_BINARY)[1]
+    silhouette = cv2.erode(silhouette, ellipse(morphology.erode_px))
+    if morphology.dilate_px > 1:
+        silhouette = cv2.dilate(silhouette, ellipse(morphology.dilate_px))
+    return close_mask(silhouette, close_px or morphology.close_px)
+
+
 def find_blobs(
     core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool, scale: int = 1
 ) -> list[Blob]:
@@ -161,8 +178,9 @@ def find_weak_blobs(
         return []
     half = cv2.resize(wide[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
     core = cv2.threshold(half, int(threshold), 255, cv2.THRESH_BINARY)[1]
-    core = cv2.erode(core, ellipse(halve_side(parameters.erode_px)))
-    core = close_mask(core, halve_side(parameters.close_px))
+    names = ("erode_px", "dilate_px", "close_px")
+    small = parameters.model_copy(update={name: halve_side(getattr(parameters, name)) for name in names})
+    core = clean_silhouette(core, small)
     others = find_blobs(core, half, threshold, min_area_px, peak, parameters.hull, scale=2)
     return leave_touching(others, found, wide.shape)
 

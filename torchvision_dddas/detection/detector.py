@@ -290,7 +290,7 @@ class MotionDetector:
         elif high is not None and np.isfinite(high.speed_m_s):
             wanted = interval_from_telemetry(high.distance_m, high.speed_m_s, self.rate_hz, parameters)
             cause = f"{describe_distance(high)}, speed {high.speed_m_s:.1f} m/s"
-        elif self._flows:
+        elif self._flows and parameters.reference_flow:
             wanted = interval_from_flow(self._flows, slot.view.size[0], parameters)
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
         if wanted is not None:
@@ -456,7 +456,7 @@ class MotionDetector:
 def _memory_frames(settings: Settings) -> int:
     """How many frames before the observed one a window may use again."""
     parameters, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
-    if parameters.kind == "between_later":
+    if parameters.kind in ("between_later", "to_next"):
         return max(longest, _JUDGED_FRAMES)
     # A window that looks one way only looks twice as far.
     small = settings.small.gap_frames if settings.small.on else 0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
-from torchvision_dddas.geometry import later_pair, near_pairs, pair_about
+from torchvision_dddas.geometry import later_pair, near_pairs, next_pair, pair_about
 from torchvision_dddas.types import Adjustment, Flight
 
 # A smaller relative change of distance does not move the gates.
@@ -57,6 +57,8 @@ def look_ahead(interval: int, settings: Settings) -> int:
     """How many frames ahead of its reference a window looks: at most two intervals, as in the source."""
     if settings.difference.kind == "between_later":
         return 2 * interval
+    if settings.difference.kind == "to_next":
+        return interval
     gap = max(settings.difference.near_frames)
     # At the start of a range the window looks ahead only, as far as the frames of `settling_delay` leave room.
     near = max(gap, min(2 * gap, 2 * interval - (2 if settings.persistence.on else 0)))
@@ -87,6 +89,8 @@ def choose_pairs(
     parameters = settings.difference
     if parameters.kind == "between_later":
         return later_pair(at, interval, first, last), None, None
+    if parameters.kind == "to_next":
+        return next_pair(at, interval, first, last), None, None
     # No further than `look_ahead`, even if more is known: the result must not depend on how frames are batched.
     ahead = min(last, at + look_ahead(interval, settings))
     near = near_pairs(at, parameters.near_frames, first, ahead)

@@ -55,6 +55,7 @@ class OpenCVEngine(Engine):
             return [_register(earlier, later, parameters) for earlier, later in pairs]
         # Search windows keep their size, and so reach twice as far.
         lengths = {"cell_px": max(parameters.cell_px // 2, 4), "ransac_px": parameters.ransac_px / 2}
+        lengths["min_distance_px"] = max(parameters.min_distance_px // 2, 1)
         lengths["forward_backward_px"] = parameters.forward_backward_px / 2
         small = parameters.model_copy(update=lengths)
         steps = [_register(halve_view(earlier), halve_view(later), small) for earlier, later in pairs]
@@ -105,7 +106,7 @@ def halve_settings(settings: Settings) -> Settings:
     difference, morphology, small = settings.difference, settings.morphology, settings.small
     border_px, gradient_share = -(-difference.border_px // 2), difference.gradient_share / 2
     sides = {"blur_px": halve_side(difference.blur_px), "border_px": border_px, "gradient_share": gradient_share}
-    cleaning = {"erode_px": halve_side(morphology.erode_px), "close_px": halve_side(morphology.close_px)}
+    cleaning = {name: halve_side(getattr(morphology, name)) for name in ("erode_px", "dilate_px", "close_px")}
     return settings.model_copy(
         update={
             "difference": difference.model_copy(update=sides),
@@ -191,17 +192,22 @@ def _register(earlier: View, later: View, parameters: RegistrationParameters) ->
 
 
 def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
-    """(N, 2) float32: the strongest corner of each grid cell, where it passes the quality threshold.
+    """(N, 2) float32: the strongest corner of each grid cell or of the whole frame, above the quality threshold.
 
     halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
     """
     height, width = grey.shape
-    cell, factor = parameters.cell_side(width, height), 1
+    cell, factor, apart_px = parameters.cell_side(width, height), 1, parameters.min_distance_px
     if halved and min(width, height) > 1:
         # Half a pixel to the left and top of where the corner stands: a search window does not mind.
         grey = grey[: height // 2 * 2, : width // 2 * 2]  # an odd side would be stretched, and corners moved
         grey, factor = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA), 2
-        cell = max(cell // 2, 1)
+        cell, apart_px = max(cell // 2, 1), max(apart_px // 2, 1)
+    if parameters.corners == "frame":
+        found: np.ndarray | None = cv2.goodFeaturesToTrack(
+            grey, parameters.keypoints, parameters.quality, apart_px, blockSize=parameters.block_px
+        )
+        return np.zeros((0, 2), np.float32) if found is None else factor * found.reshape(-1, 2)
     rows, columns = grey.shape[0] // cell, grey.shape[1] // cell
     if not rows or not columns:
         return np.zeros((0, 2), np.float32)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, DifferenceParameters, Settings, exposure_step
-from torchvision_dddas.detection.blobs import close_mask, ellipse
+from torchvision_dddas.detection.blobs import clean_silhouette, close_mask
 from torchvision_dddas.detection.engine import (
     Foreground,
     Window,
@@ -38,16 +38,19 @@ def find_foreground(window: Window, settings: Settings) -> Foreground:
         weight = cv2.LUT(texture, (EVIDENCE_SCALE / noise).astype(np.float32))
         textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
     neighbours = _Neighbours(window, parameters)
+    blur_px, smooth_px = parameters.blur_px, 1
+    if parameters.blur_of == "silhouette":
+        blur_px, smooth_px = smooth_px, blur_px
 
     def evidence(pair: tuple[int, int]) -> np.ndarray:
         both = neighbours.both(pair)
         z = neighbours.apart(pair) if parameters.kind == "between_later" else neighbours.least(pair)
         if not normalized:
-            z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
+            z = cv2.GaussianBlur(z, (blur_px,) * 2, 0)
             return cv2.bitwise_and(z, both, dst=z)
         z = cv2.multiply(cv2.bitwise_and(z, both), weight, dtype=cv2.CV_8U)
         z = cv2.threshold(z, EVIDENCE_CAP, EVIDENCE_CAP, cv2.THRESH_TRUNC)[1]
-        z = cv2.GaussianBlur(z, (parameters.blur_px,) * 2, 0)
+        z = cv2.GaussianBlur(z, (blur_px,) * 2, 0)
         unit = median_above(z, cv2.bitwise_and(both, textured, dst=both), EVIDENCE_SCALE) / EVIDENCE_SCALE
         return z if unit == 1.0 else cv2.convertScaleAbs(z, alpha=1 / unit)
 
@@ -60,8 +63,7 @@ def find_foreground(window: Window, settings: Settings) -> Foreground:
     wide = near if window.wide is None else evidence(window.wide)
     neighbours.keep_for(window.small)
     core = cv2.threshold(near, int(parameters.threshold * evidence_scale(settings)), 255, cv2.THRESH_BINARY)[1]
-    core = cv2.erode(core, ellipse(settings.morphology.erode_px))
-    core, small = close_mask(core, window.close_px or settings.morphology.close_px), None
+    core, small = clean_silhouette(core, settings.morphology, smooth_px, window.close_px), None
     if window.small is not None:
         small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
         small = cv2.bitwise_and(small, neighbours.both(window.small), dst=small)

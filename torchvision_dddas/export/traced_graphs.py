@@ -93,7 +93,10 @@ PLANES: dict[str, tuple[str, nn.Module]] = {
     "homography.onnx": ("weighted least-squares homographies of sets of landmarks", PlaneHomography()),
     "homography_raw.onnx": ("the same as the source prints it: no weights, no normalisation", RawPlaneHomography()),
 }
-_DIFFERENCE = ("difference.blur_px", "difference.border_px", "morphology.erode_px", "morphology.close_px")
+_DIFFERENCE = (
+    *("difference.blur_px", "difference.blur_of", "difference.border_px"),
+    *("morphology.erode_px", "morphology.dilate_px", "morphology.close_px"),
+)
 _REGISTRATION = ("model", "keypoints", "cell_px", "quality", "block_px", "window_px", "levels", "epsilon_px")
 # What a graph is for, its outputs, and the parameters that are baked in.
 SEGMENTATION: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
@@ -147,6 +150,8 @@ def build_module(name: str, settings: Settings, size: tuple[int, int]) -> nn.Mod
         )
     if name == "warp_difference":
         return WarpDifference(settings).eval()
+    if settings.registration.corners != "cells":
+        raise InputError("the graph step holds registration.corners = cells; got frame. Change it")
     step = Step(size, settings).eval()
     if step.count < LEAST_KEYPOINTS:
         raise InputError(

@@ -36,7 +36,7 @@ from torchvision_dddas.functional.filters import (
 )
 from torchvision_dddas.functional.flow import build_pyramid, forward_backward, lucas_kanade
 from torchvision_dddas.functional.hog_svm import Layout, arrange_weights, hog, svm_scores
-from torchvision_dddas.functional.keypoints import corner_min_eigenvalue, grid_features
+from torchvision_dddas.functional.keypoints import corner_min_eigenvalue, frame_features, grid_features
 from torchvision_dddas.functional.morphology import closing, dilation, erosion, opening, structuring_element
 from torchvision_dddas.functional.plane_maps import (
     MODELS,
@@ -83,6 +83,7 @@ __all__ = [
     "fit_exposure",
     "fit_quantiles",
     "forward_backward",
+    "frame_features",
     "gate_regions",
     "gates_of_pixels",
     "gaussian_blur2d",

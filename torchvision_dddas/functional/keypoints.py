@@ -56,3 +56,36 @@ def grid_features(
     share = torch.as_tensor(quality, dtype=eigen.dtype, device=eigen.device).reshape(-1, 1)
     valid = best > (share * eigen.flatten(1).amax(1, keepdim=True)).clamp(min=least)
     return points, best * valid, valid
+
+
+def frame_features(
+    gray: Float[Tensor, "B 1 H W"],
+    count: int,
+    quality: float = 0.01,
+    min_distance_px: float = 8.0,
+    block: int = 3,
+    least: float = 1e-7,
+) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+    """The best `count` corners of the whole frame, best first, and which there are: cv2.goodFeaturesToTrack.
+
+    A corner is a local maximum (3 x 3) above quality times the frame's maximum and above `least`, away from the frame's
+    outermost pixels; it is left out nearer than min_distance_px to a better one that is kept. Of very many corners only
+    the best 4 x count are looked at.
+    """
+    eigen = corner_min_eigenvalue(gray, block)
+    limit = (quality * eigen.amax((1, 2, 3), keepdim=True)).clamp(min=least)
+    peak = (eigen == functional.max_pool2d(eigen, 3, 1, 1)) & (eigen > limit)
+    inside = torch.zeros_like(peak)
+    inside[..., 1:-1, 1:-1] = True
+    value = torch.where(peak & inside, eigen, 0.0).flatten(1)
+    value, index = value.topk(min(4 * count, value.shape[1]))
+    width = gray.shape[-1]
+    points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
+    is_near = (torch.cdist(points, points) < min_distance_px).tril(-1)  # of a better one
+    found = kept = value > 0
+    while True:  # settled from the best on: every round decides at least one corner more
+        before, kept = kept, found & ~(is_near & kept[:, None]).any(2)
+        if torch.equal(before, kept):
+            break
+    first = kept.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :count]
+    return points.gather(1, first[..., None].expand(-1, -1, 2)), kept.gather(1, first)

@@ -1,6 +1,8 @@
 """Motion segmentation: the torch engine's chain, the model that is tuned, and the graph that is exported, in one.
 
-    warp -> light -> difference -> noise units -> blur -> largest over the pairs -> threshold -> erode -> close
+    warp -> light -> difference -> noise units -> blur -> largest over the pairs -> threshold -> cleaning
+
+The cleaning erodes, dilates and closes; with `difference.blur_of = "silhouette"` the blur stands at its beginning.
 
 Without softness all is computed in bytes, as the OpenCV engine does. With softness, a share of each threshold, the same
 steps have gradients in the parameters. None that can be tuned acts before the differences: registration, warps and
@@ -22,10 +24,11 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
-from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, Settings, exposure_step
+from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, HALF, WHITE, Settings, exposure_step
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.difference import absolute_difference
 from torchvision_dddas.functional.filters import is_above, to_bytes
-from torchvision_dddas.geometry import later_pair, near_pairs
+from torchvision_dddas.geometry import later_pair, near_pairs, next_pair
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
 Values = Mapping[str, float | Tensor]
@@ -248,7 +251,7 @@ class MotionSegmenter(nn.Module):
         seen = _seen(neighbour_from_reference, size, frame_sizes, parameters.border_px)
         if self.is_normalized and warped:
             light = _fit_light(levels, warped, seen)
-        if light is not None and parameters.kind != "between_later":
+        if light is not None and parameters.kind in ("normalized", "to_reference"):
             gains, offsets = (part.to(levels) for part in light)
             lit = zip(warped, gains.unbind(1), offsets.unbind(1), strict=True)
             warped = [_apply_light(levels, picture, gain, offset) for picture, gain, offset in lit]
@@ -296,21 +299,29 @@ class MotionSegmenter(nn.Module):
         return self._rounded(z * per_unit.reshape(-1, 1, 1, 1), is_hard)
 
     def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0, erode_px: int = 0) -> Tensor:
-        """Evidence above the threshold, eroded and closed: bytes of 0 and 255, or a margin in steps where it is soft.
+        """Evidence above the threshold, cleaned: bytes of 0 and 255, or a margin in steps where it is soft.
 
-        close_px, erode_px: in place of the parameters.
+        close_px, erode_px: in place of the parameters. Raises InputError for a soft margin of a smoothed silhouette.
         """
         threshold = self._value("difference.threshold", values)
         limit = threshold if self._unit == 1.0 else threshold * self._unit
         if evidence.dtype == torch.uint8:
             above = evidence > limit if isinstance(limit, Tensor) else is_above(evidence, int(limit))
             margin = above.to(torch.uint8) * 255
+            if self.settings.difference.blur_of == "silhouette":
+                margin = is_above(self._smooth(margin, values), HALF).to(torch.uint8) * 255
         else:
+            check_softness(self.settings)
             margin = evidence - limit
-        erode, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "close"))
+        erode, dilate, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "dilate", "close"))
         erode, close = erode_px or erode, close_px or close
         eroded = F.blend_sizes(erode, lambda side: F.erosion(margin, F.structuring_element("ellipse", side)))
-        return F.blend_sizes(close, lambda side: close_masks(eroded, side))
+
+        def dilated(side: int) -> Tensor:
+            return eroded if side == 1 else F.dilation(eroded, F.structuring_element("ellipse", side))
+
+        wide = F.blend_sizes(dilate, dilated)
+        return F.blend_sizes(close, lambda side: close_masks(wide, side))
 
     def outlined(
         self, core: Core, found: Regions, values: Values | None = None, softness: float | None = None
@@ -342,6 +353,8 @@ class MotionSegmenter(nn.Module):
         """The pairs of frames that a frame is compared with."""
         if self.settings.difference.kind == "between_later":
             return later_pair(at, self.settings.interval.frames, 0, frames - 1)
+        if self.settings.difference.kind == "to_next":
+            return next_pair(at, self.settings.interval.frames, 0, frames - 1)
         return near_pairs(at, self.settings.difference.near_frames, 0, frames - 1)
 
     def _windows(
@@ -374,6 +387,10 @@ class MotionSegmenter(nn.Module):
         return self._setting(name)
 
     def _blurred(self, levels: Tensor, values: Values | None) -> Tensor:
+        """The difference smoothed, where that is what is smoothed."""
+        return levels if self.settings.difference.blur_of == "silhouette" else self._smooth(levels, values)
+
+    def _smooth(self, levels: Tensor, values: Values | None) -> Tensor:
         def of_size(side: int) -> Tensor:
             smooth = F.gaussian_blur2d(levels, side)
             if levels.dtype == torch.uint8 or not self.whole:
@@ -386,6 +403,15 @@ class MotionSegmenter(nn.Module):
         if is_hard:
             return to_bytes(x.round_())
         return F.round_straight_through(x) if self.whole else x
+
+
+def check_softness(settings: Settings) -> None:
+    """Raises InputError for a smoothed silhouette, whose outline at one half is no threshold of evidence."""
+    if settings.difference.blur_of == "silhouette":
+        raise InputError(
+            "difference.blur_of = silhouette has no soft masks and cannot be tuned by gradient; "
+            "set difference.blur_of=difference"
+        )
 
 
 def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: int) -> Float[Tensor, "B 3 3"]:

@@ -77,17 +77,23 @@ class Registration(nn.Module):
     def keypoints(
         self, levels: Float[Tensor, "B 1 H W"], halved: bool | None = None
     ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-        """The best corner of every cell, and where there is one. levels: grey, 0 .. 255.
+        """The best corner of every cell or of the whole frame, and where there is one. levels: grey, 0 .. 255.
 
         halved: search at half the resolution, at a quarter of the cost; by default as the parameter says.
         """
         parameters, step = self.settings, 1
         height, width = levels.shape[-2:]
-        cell = parameters.cell_side(width, height)
+        cell, apart_px = parameters.cell_side(width, height), parameters.min_distance_px
         if (parameters.halved_corners if halved is None else halved) and min(height, width) > 1:
             # Half a pixel to the left and top of where the corner stands: a search window does not mind.
             levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
+            apart_px = max(apart_px // 2, 1)
         least = 1e-7 * LEVEL**2
+        if parameters.corners == "frame":
+            found = F.frame_features(
+                levels, parameters.keypoints, parameters.quality, apart_px, parameters.block_px, least
+            )
+            return step * found[0], found[1]
         points, _, valid = F.grid_features(levels, cell, parameters.quality, parameters.block_px, least=least)
         return step * points, valid
 

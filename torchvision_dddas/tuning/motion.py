@@ -29,6 +29,7 @@ from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values
+from torchvision_dddas.nn.motion_segmenter import check_softness
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.types import Scene
@@ -112,6 +113,7 @@ class MotionFamily(Family):
         """Raises InputError for clips without masks in which something moves, and for halved frames."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
+        check_softness(settings)
         check_masks(clips, still=True)
 
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, LabelledFrames]]:

@@ -84,7 +84,7 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "gradient_share", offset=0.02),
     **_from_settings("motion", "difference", "peak", offset=1.0),
     **_from_settings("motion", "difference", "blur_px", rounding="odd"),
-    **_from_settings("motion", "morphology", "erode_px close_px", rounding="whole"),
+    **_from_settings("motion", "morphology", "erode_px dilate_px close_px", rounding="whole"),
     **_from_settings("motion", "gates", "min_area_px", rounding="whole"),
     **_from_settings("registration", "registration", "ransac_px"),
     **_from_settings("registration", "registration", "forward_backward_px", offset=0.01),
