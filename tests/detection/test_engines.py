@@ -25,7 +25,9 @@ FRAMES = 7
 GAIN = [1.0, 1.0, 1.15, 1.0, 0.85, 1.0, 1.0]
 CONFIGS = [[], ["difference.kind=to_reference", "difference.blur_px=7", "difference.threshold=20.0"]]
 CONFIGS += [["difference.kind=between_later", "difference.threshold=20.0", "registration.model=affine"]]
-IDS = ["normalized", "to_reference", "between_later-affine"]
+CONFIGS += [["difference.kind=between_later", "difference.threshold=20.0", "difference.blur_of=silhouette"]]
+CONFIGS[-1] += ["morphology.dilate_px=9", "morphology.close_px=1", "registration.corners=frame"]
+IDS = ["normalized", "to_reference", "between_later-affine", "source"]
 
 
 @pytest.fixture(autouse=True)

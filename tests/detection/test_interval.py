@@ -159,3 +159,9 @@ def test_windows_stay_in_the_clip_and_within_two_intervals_ahead(name, interval)
 def test_small_targets_need_a_long_interval_and_their_switch(interval, on, pair):
     settings = load_config(overrides=["small.from_interval=3", "small.gap_frames=3", f"small.on={str(on).lower()}"])
     assert windows.choose_pairs(20, interval, 0, 40, settings)[2] == pair
+
+
+def test_two_frames_are_compared_one_interval_apart_and_at_the_end_with_the_earlier() -> None:
+    settings = with_parameters(Settings(), {"difference.kind": "to_next"})
+    assert choose_pairs(3, 2, 0, 9, settings)[0] == [(5, 5)]
+    assert choose_pairs(9, 2, 0, 9, settings)[0] == [(7, 7)]

@@ -51,6 +51,7 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     F.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
     F.solve_linear: (EYES, P[:, :3]),
     F.grid_features: (GREY, 16),
+    F.frame_features: (GREY, 20),
     F.corner_min_eigenvalue: (GREY,),
     F.dilation: (MASK, torch.ones(3, 3)),
     F.erosion: (GREY, F.structuring_element("ellipse", (3, 5))),

@@ -11,6 +11,7 @@ from torchvision_dddas.config import EVIDENCE_SCALE, Settings, with_parameters
 from torchvision_dddas.detection import Window
 from torchvision_dddas.detection.interval import choose_pairs
 from torchvision_dddas.detection.torch_engine import TorchEngine
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import soft
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Registration
 from torchvision_dddas.nn.motion_segmenter import TUNED, chain_motion
@@ -132,9 +133,16 @@ def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
     assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in parameters.values())
 
 
+def test_a_smoothed_silhouette_has_hard_masks_only() -> None:
+    settings = with_parameters(SETTINGS, {"difference.blur_of": "silhouette", "morphology.dilate_px": 3})
+    assert MotionSegmenter(settings, tuned=()).segment(differences()).mask.any()
+    with pytest.raises(InputError, match="blur_of=difference"):
+        MotionSegmenter(settings, softness=0.1).segment(differences())
+
+
 FRAMES, SIZE = 7, (160, 120)
 GAIN = [1.0, 1.0, 1.2, 1.0, 0.8, 1.0, 1.0]
-KINDS = ["normalized", "to_reference", "between_later"]
+KINDS = ["normalized", "to_reference", "between_later", "to_next"]
 
 
 @pytest.fixture(scope="module")
