@@ -163,5 +163,5 @@ def test_small_targets_need_a_long_interval_and_their_switch(interval, on, pair)
 
 def test_two_frames_are_compared_one_interval_apart_and_at_the_end_with_the_earlier() -> None:
     settings = with_parameters(Settings(), {"difference.kind": "to_next"})
-    assert choose_pairs(3, 2, 0, 9, settings)[0] == [(5, 5)]
-    assert choose_pairs(9, 2, 0, 9, settings)[0] == [(7, 7)]
+    assert windows.choose_pairs(3, 2, 0, 9, settings)[0] == [(5, 5)]
+    assert windows.choose_pairs(9, 2, 0, 9, settings)[0] == [(7, 7)]

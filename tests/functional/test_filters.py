@@ -195,6 +195,8 @@ def test_a_masked_median_is_the_lower_one_of_each_row_and_0_of_none():
     wanted = [[3.0], [6.0], [0.0]]
     assert F.masked_median(values, mask).tolist() == wanted
     assert F.masked_median(values.requires_grad_(), mask).tolist() == wanted
+
+
 def test_frame_features_are_those_of_opencv(texture, tensor):
     grey = texture(3, 160, 200)
     wanted = cv2.goodFeaturesToTrack(grey, 60, 0.01, 7, blockSize=5)[:, 0]

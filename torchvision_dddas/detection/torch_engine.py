@@ -180,8 +180,8 @@ def weak_maps(segmenter: MotionSegmenter, wide: Tensor, close_px: int = 0) -> tu
         return None
     half = functional.avg_pool2d(wide.float(), 2).add_(0.5).to(torch.uint8)
     morphology = segmenter.settings.morphology
-    close_px = halve_side(close_px or morphology.close_px)
-    return segmenter.core(half, close_px=close_px, erode_px=halve_side(morphology.erode_px)), half
+    sides = {"erode": morphology.erode_px, "dilate": morphology.dilate_px, "close": close_px or morphology.close_px}
+    return segmenter.core(half, {f"morphology.{name}_px": halve_side(side) for name, side in sides.items()}), half
 
 
 def _apply_in_groups(

@@ -298,10 +298,10 @@ class MotionSegmenter(nn.Module):
             per_unit = F.straight_through(per_unit, slope) if self.whole else slope
         return self._rounded(z * per_unit.reshape(-1, 1, 1, 1), is_hard)
 
-    def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0, erode_px: int = 0) -> Tensor:
+    def core(self, evidence: Tensor, values: Values | None = None, close_px: int = 0) -> Tensor:
         """Evidence above the threshold, cleaned: bytes of 0 and 255, or a margin in steps where it is soft.
 
-        close_px, erode_px: in place of the parameters. Raises InputError for a soft margin of a smoothed silhouette.
+        close_px: in place of the parameter. Raises InputError for a soft margin of a smoothed silhouette.
         """
         threshold = self._value("difference.threshold", values)
         limit = threshold if self._unit == 1.0 else threshold * self._unit
@@ -314,14 +314,13 @@ class MotionSegmenter(nn.Module):
             check_softness(self.settings)
             margin = evidence - limit
         erode, dilate, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "dilate", "close"))
-        erode, close = erode_px or erode, close_px or close
         eroded = F.blend_sizes(erode, lambda side: F.erosion(margin, F.structuring_element("ellipse", side)))
 
         def dilated(side: int) -> Tensor:
             return eroded if side == 1 else F.dilation(eroded, F.structuring_element("ellipse", side))
 
         wide = F.blend_sizes(dilate, dilated)
-        return F.blend_sizes(close, lambda side: close_masks(wide, side))
+        return F.blend_sizes(close_px or close, lambda side: close_masks(wide, side))
 
     def outlined(
         self, core: Core, found: Regions, values: Values | None = None, softness: float | None = None
