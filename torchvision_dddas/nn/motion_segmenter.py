@@ -142,8 +142,9 @@ class MotionSegmenter(nn.Module):
     settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
     gradient checks.
 
-    Nothing is asked of the host on a GPU, with one exception: a size in pixels that is a tensor (blur_px, erode_px,
-    close_px) decides which kernels are built, and is read.
+    Nothing is asked of the host on a GPU, with two exceptions: a size in pixels that is a tensor (blur_px, erode_px,
+    dilate_px, close_px) decides which kernels are built, and is read; and corners of the whole frame
+    (`registration.corners`) are chosen in rounds whose end the host asks for.
     """
 
     def __init__(
