@@ -2,9 +2,9 @@
 
 Every point of a grid is scored on the clips with masks whose name begins with `bms_`: the mask of reference t against
 the truth of frame t + Δt, the middle one of the three, where equation 9 draws a mover (moved to frame t by the
-registration), and against the truth of frame t. The rule of choice (made after an earlier search on the same clips, so that figures of clips left out are a
-little too good): of the points whose mean Gmean at
-t + Δt is at least .90 the one of the best mean F there; where none is, the best mean Gmean. Each clip is also scored
+registration), and against the truth of frame t. The rule of choice: of the points whose mean Gmean at t + Δt is at
+least .90 the one of the best mean F there; where none is, the best mean Gmean. It was made after an earlier search on
+the same clips, so figures of clips left out are a little too good. Each clip is also scored
 with the point that the other clips choose.
 """
 
