@@ -197,3 +197,12 @@ def test_without_a_driver_torch_is_not_asked_for_its_devices(monkeypatch) -> Non
     runtime._has_cuda.cache_clear()
     assert not runtime.wants_torch("auto")
     runtime._has_cuda.cache_clear()
+
+
+@pytest.mark.parametrize("name", ["registration.halved", "difference.halved"])
+def test_half_resolution_is_opencvs_alone(name, monkeypatch) -> None:
+    settings = parameters.with_parameters(parameters.Settings(), {name: True})
+    with pytest.raises(InputError, match=f"no {name}: take the backend onboard"):
+        load_engine("torch", settings)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert load_engine("auto", settings).name == "onboard"

@@ -292,3 +292,32 @@ def test_without_asking_the_host_as_on_a_gpu_or_in_a_trace_the_results_are_the_s
     for one, before in zip((model, softened), wanted, strict=True):
         after = one(clip, motion)
         assert torch.equal(after.mask, before.mask) and torch.equal(after.evidence, before.evidence)
+
+
+@pytest.mark.parametrize(("batch", "frames"), [(1, 1), (2, 1), (0, 3)])
+def test_clips_without_a_step_show_nothing(batch, frames) -> None:
+    found = MotionSegmenter()(torch.rand(batch, frames, 3, 48, 64))
+    assert found.mask.shape == (batch, frames, 1, 48, 64) and not found.mask.any()
+    assert found.later_from_earlier.shape == (batch, frames - 1, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: MotionSegmenter(softness=-1.0), "softness must be 0 or more, got -1"),
+        (lambda: MotionSegmenter(tuned=("registration.ransac_px",)), "no parameter registration.ransac_px; wanted"),
+        (
+            lambda: MotionSegmenter()(torch.rand(2, 3, 48, 64)),
+            r"a clip must be floats .*, got torch.float32 \(2, 3, 48",
+        ),
+        (lambda: MotionSegmenter()(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8)), "got torch.uint8"),
+        (lambda: MotionSegmenter()(torch.rand(1, 3, 1, 48, 64), torch.eye(3).expand(1, 3, 3, 3)), "one matrix a step"),
+        (
+            lambda: MotionSegmenter()(torch.rand(1, 3, 1, 48, 64), None, {"difference.treshold": 9.0}),
+            "treshold; wanted",
+        ),
+    ],
+)
+def test_wrong_arguments_are_one_line(make, words) -> None:
+    with pytest.raises(InputError, match=words):
+        make()

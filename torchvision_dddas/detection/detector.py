@@ -77,8 +77,12 @@ def detect_motion(
 
 
 def load_engine(backend: str, settings: Settings) -> Engine:
-    """The engine `torch` or `onboard`, or that of `auto`. Raises InputError as `wants_torch`."""
-    if not wants_torch(backend):
+    """The engine `torch` or `onboard`, or that of `auto`: onboard for half resolution, which torch does not work at.
+
+    Raises InputError as `wants_torch`, and where torch is asked to work at half resolution.
+    """
+    is_halved = settings.registration.halved or settings.difference.halved
+    if (is_halved and backend == "auto") or not wants_torch(backend):
         return OpenCVEngine(settings)
     from torchvision_dddas.detection.torch_engine import TorchEngine
 

@@ -49,8 +49,11 @@ class TorchEngine(Engine):
         """device: by default the GPU where there is one.
 
         components: who labels regions. torch does so on the device, and whole maps stay there; by default OpenCV for
-        the CPU and torch for others. Raises InputError for Apple's MPS.
+        the CPU and torch for others. Raises InputError for Apple's MPS and for settings at half resolution.
         """
+        for group in ("registration", "difference"):
+            if getattr(settings, group).halved:
+                raise InputError(f"the torch engine has no {group}.halved: take the backend onboard or set it false")
         self.parameters = settings
         self.device = torch.device(device or torch_device())
         if self.device.type == "mps":

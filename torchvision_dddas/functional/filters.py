@@ -16,6 +16,7 @@ from kornia import filters
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.soft import is_traced
 
 # Pixels in work at once on a CPU: temporaries then stay in its cache, and their memory is used again.
@@ -33,7 +34,13 @@ def gaussian_blur2d(
     OpenCV's own weights are binomial for small kernels, the border is mirrored, and pictures may be of any size. Bytes
     stay bytes, halves rounded up: equal to OpenCV's up to a kernel of 9; beyond, OpenCV rounds its weights, and one
     level may differ.
+
+    Raises InputError for an even size, and another border without a sigma.
     """
+    if isinstance(kernel_size, int) and (kernel_size < 1 or kernel_size % 2 == 0):
+        raise InputError(f"kernel_size must be odd and at least 1, got {kernel_size}")
+    if sigma is None and border_type != "reflect":
+        raise InputError(f"border_type must be reflect where no sigma is given, got {border_type}; give a sigma")
     if sigma is not None or not isinstance(kernel_size, int):
         blurred: Tensor = filters.gaussian_blur2d(input, kernel_size, sigma or (0.0, 0.0), border_type)
         return blurred
@@ -85,9 +92,9 @@ def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], block: int = 5) -> Shaped[T
 
     Half of `kornia.filters.sobel` without normalisation, through `box_blur`; rounded to whole numbers and cut off at
     255 before and after the mean, as OpenCV's 8-bit pictures are. Kornia's `sobel` repeats the edge pixel: the rim
-    differs.
+    differs. No gradient passes.
     """
-    padded = pad_reflect(levels, 1, 1, 1, 1)
+    padded = pad_reflect(levels.detach(), 1, 1, 1, 1)
     steep = padded[..., 2:, :] - padded[..., :-2, :]
     smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
     across = smooth[..., 2:] - smooth[..., :-2]

@@ -37,6 +37,13 @@ Pair = tuple[int, int]
 TUNED = ("difference.threshold", "difference.noise_levels", "difference.gradient_share")
 """Parameters that are learned unless others are named."""
 
+TUNABLE = (
+    *TUNED,
+    *("difference.blur_px", "difference.peak", "gates.min_area_px"),
+    *("morphology.erode_px", "morphology.dilate_px", "morphology.close_px"),
+)
+"""Parameters that can be learned or given with a call; `peak` and `min_area_px` act in `outlined` alone."""
+
 # Pixels of more gradient, 4 x grey levels each, have texture: they show how well the registration fits.
 _TEXTURED = 16
 # The exposure is not judged by fewer pixels.
@@ -154,8 +161,14 @@ class MotionSegmenter(nn.Module):
         tuned: Sequence[str] = TUNED,
         whole: bool = True,
     ) -> None:
-        """softness: a share of each threshold; 0 is the engine's hard chain. tuned: names as in `dddas tune`."""
+        """softness: a share of each threshold; 0 is the engine's hard chain. tuned: names of TUNABLE.
+
+        Raises InputError for a negative softness and other names.
+        """
         super().__init__()
+        if softness < 0:
+            raise InputError(f"softness must be 0 or more, got {softness}")
+        _check_names(tuned)
         self.settings, self.softness, self.whole = settings or Settings(), softness, whole
         self.registration = Registration(self.settings.registration)
         self.tuned = {name: name.replace(".", "_") for name in tuned}
@@ -184,12 +197,18 @@ class MotionSegmenter(nn.Module):
         later_from_earlier: px; estimated by default. values: parameters by name, in place of the settings' and the
         module's own. A frame is compared with the neighbours of `difference.near_frames` on both sides; at the ends of
         a clip with the two nearest on one side.
+
+        Raises InputError for clips or motions of another shape or type, and unknown names.
         """
+        _check_clip(clip, later_from_earlier)
+        _check_names(values or ())
         levels = self._levels(clip)
         batch, frames = levels.shape[:2]
         with torch.no_grad():
             inliers = torch.zeros(batch, frames - 1, dtype=torch.int64, device=clip.device)
-            if later_from_earlier is None:
+            if later_from_earlier is None and not batch * (frames - 1):
+                later_from_earlier = torch.zeros(batch, frames - 1, 3, 3, dtype=torch.float64, device=clip.device)
+            elif later_from_earlier is None:
                 earlier, later = (levels[:, part].flatten(0, 1) / LEVEL for part in (slice(-1), slice(1, None)))
                 motion = self.registration(earlier, later)
                 later_from_earlier = motion.later_from_earlier.unflatten(0, (batch, frames - 1))
@@ -200,7 +219,7 @@ class MotionSegmenter(nn.Module):
         mask = [levels.new_zeros(batch, 1, *levels.shape[3:])] * frames
         evidence, margin = list(mask), list(mask)
         for pairs, places in groups.items():
-            if not pairs:
+            if not pairs or not batch:
                 continue
             with torch.no_grad():
                 windows, near = self._windows(levels, later_from_earlier, places, pairs)
@@ -403,6 +422,22 @@ class MotionSegmenter(nn.Module):
         if is_hard:
             return to_bytes(x.round_())
         return F.round_straight_through(x) if self.whole else x
+
+
+def _check_names(names: Iterable[str]) -> None:
+    if unknown := [name for name in names if name not in TUNABLE]:
+        raise InputError(f"MotionSegmenter has no parameter {', '.join(unknown)}; wanted some of {', '.join(TUNABLE)}")
+
+
+def _check_clip(clip: Tensor, later_from_earlier: Tensor | None) -> None:
+    shape = tuple(clip.shape)
+    if clip.dim() != 5 or shape[1] < 1 or shape[2] not in (1, 3) or not clip.is_floating_point():
+        raise InputError(
+            f"a clip must be floats (batch, frames, 1 or 3, height, width) in [0, 1], got {clip.dtype} {shape}"
+        )
+    if later_from_earlier is not None and tuple(later_from_earlier.shape) != (shape[0], shape[1] - 1, 3, 3):
+        wanted, got = (shape[0], shape[1] - 1, 3, 3), tuple(later_from_earlier.shape)
+        raise InputError(f"later_from_earlier must be {wanted}, one matrix a step, got {got}")
 
 
 def check_softness(settings: Settings) -> None:
