@@ -144,22 +144,26 @@ def test_sigterm_and_sighup_end_each_command_with_whole_outputs(clip, tmp_path, 
 
 
 def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(clip, tmp_path):
-    # C's sleep begins again after a signal only where it is called anew, as a library's loop does.
-    deaf = PROGRAM.replace("time.sleep(60)", "deafly()").replace(
-        "import time",
-        "import ctypes\ndef deafly():\n    ctypes.CDLL(None).pthread_join(thread.ident, None)\nimport time",
-    )
-    thread = "import threading\nthread = threading.Thread(target=lambda: time.sleep(60), daemon=True)\nthread.start()\n"
-    deaf = (
-        deaf.replace("@contextmanager", thread + "@contextmanager")
-        .replace("pthread_join(", "pthread_join(ctypes.c_ulong(")
-        .replace("thread.ident,", "thread.ident),")
-    )
+    # A mutex of C that is locked twice waits on after a signal, as a library's loop does.
+    deafly = "library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)"
+    deafly += "; [library.pthread_mutex_lock(mutex) for _ in range(2)]"
+    deaf = PROGRAM.replace("import time", "import ctypes, time").replace("time.sleep(60)", deafly)
     with tracking(clip, tmp_path, "--quiet", program=deaf) as process:
         process.send_signal(signal.SIGTERM)
         _, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
     assert record(tmp_path / "out")["state"] == "interrupted"
+
+
+def test_a_signal_while_whole_outputs_are_closed_leaves_them_and_says_so(clip, tmp_path):
+    closing = "from torchvision_dddas.io.output.run_record import RunRecord\nclose = RunRecord.close\n"
+    closing += "def slow(*words):\n    print('now', flush=True)\n    time.sleep(3)\n    close(*words)\nRunRecord.close = slow\n"
+    program = PROGRAM.replace("count == 3", "False").replace("progress.progress", closing + "progress.progress", 1)
+    with tracking(clip, tmp_path, "--quiet", program=program) as process:
+        process.send_signal(signal.SIGTERM)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("complete", 5)
 
 
 def test_a_second_run_into_the_same_folder_is_refused_in_one_line(clip, tmp_path, dddas):

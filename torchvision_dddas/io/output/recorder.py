@@ -13,6 +13,9 @@ from torchvision_dddas.io.images import MASK_NAME
 from torchvision_dddas.io.interrupts import KEPT, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RunRecord, read_run_record
 
+# A disk or an encoder that takes longer to write or close counts as stuck.
+_WRITING_S = 20.0
+
 Item = TypeVar("Item")
 Whole = TypeVar("Whole")
 _Taken = TypeVar("_Taken", contravariant=True)
@@ -175,14 +178,17 @@ class RunRecorder(Generic[Item]):
             record.problems.append(str(refusal))
             self.discard()
             raise
+        except KeyboardInterrupt as stop:  # came while the files were closed, and waited until they were whole
+            stop.add_note(KEPT)
+            raise
         if error is not None:
             error.add_note(KEPT)
         elif failed := [part.failure for part in self._parts if isinstance(part, _Picture) and part.failure]:
             raise InputError(f"{failed[0]}; all else is in {self.folder}")
 
     def _rescue(self) -> bool:
-        """Close the run from another thread, if the main thread is not writing."""
-        if self._record is None or not self._record.frames or not self._lock.acquire(timeout=1.0):
+        """Close the run from another thread, once the main thread is not writing."""
+        if self._record is None or not self._record.frames or not self._lock.acquire(timeout=_WRITING_S):
             return False
         try:
             self.close(complete=False)
