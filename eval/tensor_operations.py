@@ -77,7 +77,7 @@ def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | N
         ),
         "resize to two thirds": (
             each(lambda picture: cv2.resize(picture, smaller[::-1], interpolation=cv2.INTER_LINEAR_EXACT)),
-            lambda: F.resize(levels, smaller),
+            lambda: F.resize(levels, smaller, rounded=True),
             lambda: kornia.geometry.resize(levels, smaller),
         ),
         "Gaussian 7, floats": (
@@ -146,7 +146,7 @@ def _of_points(batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
     return {
         f"homography of {_POINTS}, weighted (OpenCV: not)": (
             each(lambda p, q: cv2.findHomography(p, q, 0), seen),
-            lambda: F.find_homography_dlt(points, seen, weights),
+            lambda: F.find_homography(points, seen, weights),
             lambda: kornia.geometry.find_homography_dlt(points, seen, weights),
         ),
         f"RANSAC of {_POINTS}, {_WRONG:.0%} wrong": (

@@ -157,7 +157,8 @@ def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(cli
 
 def test_a_signal_while_whole_outputs_are_closed_leaves_them_and_says_so(clip, tmp_path):
     closing = "from torchvision_dddas.io.output.run_record import RunRecord\nclose = RunRecord.close\n"
-    closing += "def slow(*words):\n    print('now', flush=True)\n    time.sleep(3)\n    close(*words)\nRunRecord.close = slow\n"
+    closing += "def slow(*words):\n    print('now', flush=True)\n    time.sleep(3)\n    close(*words)\n"
+    closing += "RunRecord.close = slow\n"
     program = PROGRAM.replace("count == 3", "False").replace("progress.progress", closing + "progress.progress", 1)
     with tracking(clip, tmp_path, "--quiet", program=program) as process:
         process.send_signal(signal.SIGTERM)

@@ -45,7 +45,7 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     F.box_sum: (GREY, 5),
     F.lucas_kanade: (P, [GREY], [GREY.roll(1, -1)]),
     F.forward_backward: (P, [GREY], [GREY.roll(1, -1)]),
-    F.find_homography_dlt: (P, Q, ONES),
+    F.find_homography: (P, Q, ONES),
     F.find_homography_raw: (P, Q),
     plane_maps.four_point: (P[:, :4], Q[:, :4]),
     F.ransac: (P, Q, ONES.bool(), torch.tensor([[[0, 1, 2, 3]]]).expand(BATCH, -1, -1)),
@@ -167,7 +167,7 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         lambda p, q: plane_maps.four_point(p, q)[0],
         (QUAD, QUAD + 5 * double(1, 4, 2)),
     ),
-    "F.find_homography_dlt": (lambda *x: F.find_homography_dlt(*x)[0], (SIX, SEEN, SIX_WEIGHTS)),
+    "F.find_homography": (lambda *x: F.find_homography(*x)[0], (SIX, SEEN, SIX_WEIGHTS)),
     **{
         f"F.find_homography_raw {n}": (lambda *x: F.find_homography_raw(*x)[0], (SIX[:, :n] / 300, SEEN[:, :n] / 300))
         for n in (4, 6)
@@ -185,7 +185,7 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         lambda m, e, a, p: F.gate_regions(m, e, LABELS, 2, a, p, 0.3),
         (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), number(1.5), number(6.0)),
     ),
-    "F.resize": (lambda x: F.resize(x, (9, 4), rounded=False), (255 * double(1, 2, 6, 7),)),
+    "F.resize": (lambda x: F.resize(x, (9, 4)), (255 * double(1, 2, 6, 7),)),
 }
 
 

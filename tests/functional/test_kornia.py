@@ -24,7 +24,6 @@ NAMESAKES = {
     F.resize: kornia.geometry.resize,
     F.build_pyramid: kornia.geometry.build_pyramid,
     F.gaussian_blur2d: kornia.filters.gaussian_blur2d,
-    F.find_homography_dlt: kornia.geometry.find_homography_dlt,
     **{getattr(F, name): getattr(kornia.morphology, name) for name in ("dilation", "erosion", "opening", "closing")},
 }
 
@@ -75,7 +74,7 @@ def test_a_blur_without_sigma_is_kornias_filter_of_opencvs_weights(picture, size
 @pytest.mark.parametrize("size", [(31, 40), (70, 90)])
 def test_resizing_is_kornias_but_for_weights_in_256ths(picture, size):
     levels = picture.float() * 255
-    apart = F.resize(levels, size, rounded=False) - kornia.geometry.resize(levels, size, align_corners=False)
+    apart = F.resize(levels, size) - kornia.geometry.resize(levels, size, align_corners=False)
     steps = max(float(levels.diff(dim=axis).abs().max()) for axis in (-1, -2))
     assert apart.abs().max() <= 2 * steps / 512 + 1e-3
 
@@ -153,7 +152,7 @@ def test_a_homography_is_kornias_fit_of_the_pairs_that_have_a_weight():
     weights = torch.ones(3, 20, dtype=torch.float64)
     seen[:, 15:] += 30
     weights[:, 15:] = 0
-    found, valid = F.find_homography_dlt(points, seen, weights)
+    found, valid = F.find_homography(points, seen, weights)
     assert valid.all()
     torch.testing.assert_close(found, kornia.geometry.find_homography_dlt(points, seen, weights), rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(found, MOTION.expand(3, 3, 3), rtol=1e-6, atol=1e-8)

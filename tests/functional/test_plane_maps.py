@@ -9,7 +9,7 @@ import torch
 
 import torchvision_dddas.functional as F
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional import MODELS, find_homography_dlt, ransac
+from torchvision_dddas.functional import MODELS, find_homography, ransac
 
 PROJECTIVE = torch.tensor(
     [
@@ -112,7 +112,7 @@ def test_an_affine_fit_is_the_least_squares_solution():
 
 def test_a_homography_fit_is_opencvs_and_the_normalized_dlt():
     p, q, _ = pairs(noise=0.5)
-    found, _ = find_homography_dlt(p, q, torch.ones(2, 200))
+    found, _ = find_homography(p, q, torch.ones(2, 200))
     for clip in range(2):
         wanted, _ = cv2.findHomography(p[clip].numpy(), q[clip].numpy(), 0)
         assert corner_error(found[clip], torch.from_numpy(wanted).float()) < 0.1
@@ -138,11 +138,11 @@ def normalized_dlt(p: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
 
 def test_a_fit_leaves_out_pairs_of_weight_zero_even_where_they_hold_no_numbers():
     p, q, right = pairs(wrong=0.3)
-    wanted, _ = find_homography_dlt(p, q, right.float())
+    wanted, _ = find_homography(p, q, right.float())
     assert corner_error(wanted, PROJECTIVE) < 2e-3
     for nonsense in (q + 100, torch.full_like(q, torch.nan), torch.full_like(q, torch.inf)):
         other = torch.where(right[..., None], q, nonsense)
-        found, valid = find_homography_dlt(torch.where(right[..., None], p, nonsense), other, right.float())
+        found, valid = find_homography(torch.where(right[..., None], p, nonsense), other, right.float())
         assert valid.all()
         torch.testing.assert_close(found, wanted)
 
@@ -159,7 +159,7 @@ def test_a_fit_of_too_few_points_or_of_a_line_is_marked(model):
 def test_fit_with_a_point_behind_the_horizon_is_marked():
     p = torch.tensor([[[0.0, 0], [1, 0], [1, 1], [0, 1]]], dtype=torch.float64)
     for tilt, seen in ((-0.999, True), (-1.001, False)):
-        assert find_homography_dlt(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
+        assert find_homography(p, p / (1 + tilt * p[..., :1]), torch.ones(1, 4).double())[1].item() is seen
 
 
 @pytest.mark.parametrize("count", [4, 16])
@@ -170,7 +170,7 @@ def test_fit_gradients_hold_for_landmarks_kilometres_from_the_origin(count):
     there = p[:, :2] + 3  # of pixels, as the matrix itself has entries of all sizes there
     inputs = (p.requires_grad_(), q.requires_grad_(), weight.requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda *x: F.transform_points(find_homography_dlt(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
+        lambda *x: F.transform_points(find_homography(*x)[0], there), inputs, eps=1e-5, atol=1e-4, rtol=1e-3
     )
 
 

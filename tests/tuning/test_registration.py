@@ -14,7 +14,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.truth import labels_of
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.functional import find_homography_dlt as fit
+from torchvision_dddas.functional import find_homography as fit
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.registration import CHECK, RANSAC, RegistrationFamily, TrackedPoints, refit_motion

@@ -209,7 +209,7 @@ def homography_difference_px(files: dict[str, bytes]) -> float:
         # The source's own system is compared where it has digits to compare: about the origin, in units of 10 m.
         near = {"ground": (given["ground"] - given["ground"][:, :1]) / 10, "image": given["image"] / 500 - 1}
         fit, fit_raw = ([torch.from_numpy(array) for array in held.values()] for held in (given, near))
-        results = F.find_homography_dlt(*fit), F.find_homography_raw(*fit_raw)
+        results = F.find_homography(*fit), F.find_homography_raw(*fit_raw)
         for session, held, (wanted, valid), unit in zip(sessions, (given, near), results, (1, 500), strict=True):
             matrix, found_valid = session.run(None, held)
             if not (found_valid.all() and valid.all()):

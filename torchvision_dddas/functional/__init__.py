@@ -5,8 +5,8 @@
 Images are (B, C, H, W) floats, in [0, 1] unless an argument is called levels (0 .. 255); points are (B, N, 2), (u, v)
 in pixels from the centre of the top left one; matrices are named by direction (reference_from_frame). float32, or
 float64 for gradient checks; any device; every shape is fixed by the shapes of the inputs, and what is missing is marked
-by a validity mask. What Kornia has too is named and signed as there, and what only ours has is given by name; what is
-Kornia's own is passed on.
+by a validity mask. What Kornia has too is named as there and takes the same first arguments; what only ours has is
+given by name, what only Kornia's has is refused. What is Kornia's own is passed on.
 
 Each function has one form, chosen on a CPU. `python eval/speed.py operations` times it beside Kornia's and OpenCV's. On
 a GPU the choice was not measured. Engines, modules, tuning and export call these functions and nothing beside them, so
@@ -42,8 +42,9 @@ from torchvision_dddas.functional.plane_maps import (
     MODELS,
     draw_samples,
     find_affine,
-    find_homography_dlt,
+    find_homography,
     find_homography_raw,
+    invert_map,
     ransac,
     refit_map,
     solve_linear,
@@ -54,6 +55,7 @@ from torchvision_dddas.functional.soft import (
     blend_sizes,
     gate_regions,
     gates_of_pixels,
+    is_traced,
     may_branch,
     round_straight_through,
     step,
@@ -78,7 +80,7 @@ __all__ = [
     "draw_samples",
     "erosion",
     "find_affine",
-    "find_homography_dlt",
+    "find_homography",
     "find_homography_raw",
     "fit_exposure",
     "fit_quantiles",
@@ -89,6 +91,8 @@ __all__ = [
     "gaussian_blur2d",
     "grid_features",
     "hog",
+    "invert_map",
+    "is_traced",
     "level_quantiles",
     "log_partition",
     "lucas_kanade",

@@ -2,11 +2,11 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from torchvision_dddas.functional.filters import is_above
-from torchvision_dddas.functional.soft import all_true, may_branch
+from torchvision_dddas.functional.soft import all_true, is_traced, may_branch
 
 
 def fit_exposure(
@@ -19,8 +19,8 @@ def fit_exposure(
 
     Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
     whose error is at most max(floor, 3.7 x the median error) and fits them again, until the fit is settled to floor/30,
-    a tenth of a grey level. Without inside pixels, or on a frame
-    of one single grey, the gain stays 1 (and the offset is the difference of the means).
+    a tenth of a grey level. Without inside pixels, or on a frame of one single grey, the gain stays 1 (and the offset
+    is the difference of the means).
     """
     wanted, given = reference.flatten(1), warped.flatten(1)
     seen = inside.expand_as(reference).flatten(1)
@@ -81,7 +81,7 @@ def level_quantiles(levels: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 33"]:
     counts.scatter_add_(1, sample + 1, torch.ones_like(sample, dtype=torch.float64))
     below = counts.cumsum(1) / sample.shape[1]
     shares = torch.linspace(0.02, 0.98, 33, dtype=torch.float64, device=levels.device).expand(len(levels), -1)
-    place = torch.searchsorted(below, shares.contiguous(), right=True).clamp(1, 256)
+    place = _count_at_most(below, shares).clamp(1, 256)
     low, high = below.gather(1, place - 1), below.gather(1, place)
     return place - 1.5 + (shares - low) / (high - low)
 
@@ -121,6 +121,13 @@ def _middle(values: Float[Tensor, "B N"], kept: Bool[Tensor, "B N"]) -> Float[Te
     ordered, count = values.masked_fill(~kept, torch.inf).sort(1).values, kept.sum(1, keepdim=True)
     pair = ordered.gather(1, torch.cat([(count - 1).clamp(min=0) // 2, count // 2], 1).clamp(max=values.shape[1] - 1))
     return torch.where(count[:, 0] > 0, pair.mean(1), torch.zeros_like(values[:, 0]))
+
+
+def _count_at_most(rising: Float[Tensor, "B N"], values: Float[Tensor, "B M"]) -> Int64[Tensor, "B M"]:
+    """How many numbers of each rising row are at most each value."""
+    if is_traced():  # a graph has no search
+        return (rising[:, None] <= values[..., None]).sum(-1)
+    return torch.searchsorted(rising, values.contiguous(), right=True)
 
 
 def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
@@ -165,5 +172,5 @@ def noise_units(
     counts.scatter_add_(1, torch.where(seen, level.long(), 256), torch.ones_like(level, dtype=torch.int64))
     ranks = torch.stack([(total - 1).clamp(min=0) // 2, total // 2], 1)
     # The mean of the two in the middle, as NumPy takes it.
-    median = torch.searchsorted(counts.cumsum(1), ranks, right=True).double().mean(1)
+    median = _count_at_most(counts.cumsum(1), ranks).double().mean(1)
     return torch.where(is_high, (median / scale).clamp(min=1.0), units)

@@ -56,7 +56,7 @@ def gaussian_blur2d(
     unit = {3: 4, 5: 16, 7: 64, 9: 256}[kernel_size]
     whole = [round(weight * unit) for weight in weights]
     across = _weighted(pad_reflect(input, *border).to(torch.int16 if kernel_size < 9 else torch.int32), whole, -1)
-    if kernel_size > 5:
+    if kernel_size > 5 or is_traced():
         return to_bytes(_weighted(across.float(), whole, -2).mul_(1.0 / unit**2).add_(0.5))
     # A sum of up to 65280 wraps into the sign of 16 bits; its high byte, which is what is wanted, does not care.
     down = _weighted(across, whole, -2)

@@ -29,7 +29,8 @@ def build_pyramid(
     """`max_level` pictures, full size first, each half the one before: cv2.buildOpticalFlowPyramid (5-tap binomial).
 
     kornia.geometry.build_pyramid smooths alike, at the same border (`reflect`), then interpolates between pixels; here
-    every other pixel is taken. Kornia's takes 5 to 11 times as long on a CPU (`python eval/speed.py operations`).
+    every other pixel is taken, and odd sides are rounded up. Kornia's takes 5 to 11 times as long on a CPU
+    (`python eval/speed.py operations`).
     """
     pictures = [input]
     for _ in range(max_level - 1):

@@ -1,4 +1,6 @@
-"""Erosion and dilation with Kornia's signature, bit-exact with OpenCV (appendix B, step S5), hard or soft.
+"""Erosion and dilation by Kornia's names, bit-exact with OpenCV (appendix B, step S5), hard or soft.
+
+Kernels are flat, about their middle.
 
 On a CPU kornia.morphology takes 7 to 34 times as long (`python eval/speed.py operations`) and does not take bytes;
 here a running maximum doubles its span over flat shifts. Integer and Boolean masks keep their type; floats work too and
@@ -50,7 +52,8 @@ def dilation(
 ) -> Shaped[Tensor, "B C H W"]:
     """Maximum where the kernel is not 0, around its middle (h // 2, w // 2).
 
-    softness: above 0, in the units of the mask, gives softness x log-sum-exp(mask / softness).
+    softness: above 0, in the units of the mask, gives softness x log-sum-exp(mask / softness). Values below -1e4 then
+    count as -1e4, as in Kornia.
     """
     if softness == 0.0:
         return _extremum(tensor, kernel, highest=False)

@@ -78,7 +78,7 @@ def three_point(
     return _or_identity(_with_last_row(torch.cat([right.mT, shift[..., None]], -1)), valid), valid
 
 
-def find_homography_dlt(
+def find_homography(
     points1: Float[Tensor, "B N 2"], points2: Float[Tensor, "B N 2"], weights: Float[Tensor, "B N"] | None = None
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
     """The homographies from points1 to points2, as in Kornia, and which are valid.
@@ -121,7 +121,7 @@ def find_affine(
     return _or_identity(matrix, valid).to(p.dtype), valid
 
 
-HOMOGRAPHY = PlaneModel(4, four_point, find_homography_dlt)
+HOMOGRAPHY = PlaneModel(4, four_point, find_homography)
 MODELS = {"homography": HOMOGRAPHY, "affine": PlaneModel(3, three_point, find_affine)}
 """By the names that registration.model takes."""
 
@@ -162,6 +162,14 @@ def draw_samples(
             number = number + (number >= taken)
         drawn.append(number)
     return torch.stack(drawn, -1)
+
+
+def invert_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The inverse by cofactors: a graph has no `torch.linalg.inv`. A singular matrix gives what is not finite."""
+    a, b, c = matrix.unbind(-2)
+    cross = torch.linalg.cross
+    columns = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -1)
+    return columns / (a * columns[..., 0]).sum(-1)[..., None, None]
 
 
 def ransac(

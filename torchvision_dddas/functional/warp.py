@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64, Shaped
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.filters import strip_rows, to_bytes
+from torchvision_dddas.functional.plane_maps import invert_map
 from torchvision_dddas.functional.soft import is_traced
 
 
@@ -26,15 +28,18 @@ def warp_perspective(
 ) -> Shaped[Tensor, "B C h w"]:
     """`kornia.geometry.warp_perspective`: the picture where M takes its pixels, (u, v) from the first one's centre.
 
-    dsize: (height, width). Places are as with Kornia's align_corners=True, which is not asked for. padding_mode: zeros,
-    or border, whose edge pixels continue outside; Kornia's fill is not there. inverse_map: M takes
+    dsize: (height, width). Places are as with Kornia's align_corners=True. padding_mode: zeros, or border, whose edge
+    pixels continue outside. inverse_map: M takes
     pixels of the result to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px,
     32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
-    whole: return bytes, halves rounded up; the pictures are grey levels up to 255.
+    whole: return bytes, halves rounded up; the pictures are grey levels up to 255. Raises InputError for another
+    padding_mode.
     """
+    if padding_mode not in ("zeros", "border"):
+        raise InputError(f"padding_mode must be zeros or border, got {padding_mode}; Kornia's function has others")
     height, width = src.shape[-2:]
     rows, columns = dsize
-    matrix = M.double() if inverse_map else torch.linalg.inv_ex(M.double())[0]
+    matrix = M.double() if inverse_map else invert_map(M.double())
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
     # Row y is the first of these rows plus y times the second; along it are u, v, u, v, ...: what `grid_sample` reads.
     start = matrix[:, :, 0, None] * u + matrix[:, :, 2:]
@@ -109,18 +114,18 @@ def resize(
     *,
     rows: Int64[Tensor, "h"] | None = None,
     columns: Int64[Tensor, "w"] | None = None,
-    rounded: bool = True,
+    rounded: bool = False,
 ) -> Float[Tensor, "B C h w"]:
-    """The pictures in another size, (height, width), as by OpenCV's INTER_LINEAR_EXACT on 8-bit levels, bit for bit.
+    """The pictures in another size, (height, width), as `kornia.geometry.resize` without antialiasing.
 
-    `kornia.geometry.resize` without antialiasing is the same but for rounding; outside both repeat the edge pixel.
+    Rounded, as by OpenCV's INTER_LINEAR_EXACT on 8-bit levels, bit for bit. Outside the edge pixel is repeated.
     The pyramid of a HOG detector is made so: its weights are rounded to 1/256, and plain interpolation moves the scores
     of a trained detector by up to 0.15.
 
-    input: levels 0 .. 255. rows, columns: those of the result that are wanted, in any order and number; all by default.
-    rounded: to whole levels, halves up. Of whole levels every sum is a whole number of 1/65536 below 256, which float32
-    holds exactly: the result is OpenCV's on every device. Gradients go to the levels, and pass the rounding as if it
-    were not there; not rounded, the result is linear in the levels.
+    rows, columns: those of the result that are wanted, in any order and number; all by default.
+    rounded: input is levels 0 .. 255, the result whole levels, halves up. Of whole levels every sum is a whole number
+    of 1/65536 below 256, which float32 holds exactly: the result is OpenCV's on every device. Gradients go
+    to the levels, and pass the rounding as if it were not there; not rounded, the result is linear in the levels.
     """
     height, width = input.shape[-2:]
     found = _rows(input, *_taps(height, size[0]), rows)

@@ -71,7 +71,7 @@ def load_solver(backend: str) -> PlaneSolver:
     def on_arrays(function: Callable[..., Any]) -> Callable[..., Solution]:
         return lambda *arrays: tuple(result.numpy() for result in function(*map(torch.from_numpy, arrays)))
 
-    return PlaneSolver(on_arrays(F.find_homography_dlt), on_arrays(F.find_homography_raw))
+    return PlaneSolver(on_arrays(F.find_homography), on_arrays(F.find_homography_raw))
 
 
 @cache

@@ -457,7 +457,7 @@ def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: 
     )
     for step in range(low, high):
         matrix = later_from_earlier[:, step] @ matrix
-    matrix = matrix if end >= start else torch.linalg.inv_ex(matrix)[0]
+    matrix = matrix if end >= start else F.invert_map(matrix)
     return matrix / matrix[:, 2:, 2:]
 
 

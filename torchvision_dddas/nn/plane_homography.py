@@ -7,10 +7,10 @@ import torchvision_dddas.functional as F
 
 
 class PlaneHomography(nn.Module):
-    """`functional.find_homography_dlt`, from ground to image."""
+    """`functional.find_homography`, from ground to image."""
 
     def forward(
         self, ground: Float[Tensor, "B n 2"], image: Float[Tensor, "B n 2"], weight: Float[Tensor, "B n"]
     ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
         """image_from_ground, and which could be solved. weight: of each landmark's squared error; 0 leaves it out."""
-        return F.find_homography_dlt(ground, image, weight)
+        return F.find_homography(ground, image, weight)

@@ -8,6 +8,7 @@ in a trace both are done for every pair, and the result chosen there: the host i
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
@@ -209,8 +210,7 @@ class Registration(nn.Module):
         if count < model.size:
             return _identities(start)
         if samples is None:
-            drawn = F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, model.size)
-            samples = drawn.to(start.device).expand(batch, -1, -1)
+            samples = _drawn(hypotheses, count, model.size).to(start.device).expand(batch, -1, -1)
         gates_px = [share * ransac_px for share in shares]
         samples = samples[..., : model.size]
         return F.ransac(start.double(), end.double(), tracked, samples, model, ransac_px, gates_px)[0]
@@ -234,6 +234,14 @@ class _Frames(NamedTuple):
         earlier, later = ([level[chosen] for level in pyramid] for pyramid in (self.earlier, self.later))
         samples = None if self.samples is None else self.samples[chosen]
         return _Frames(self.points[chosen], self.valid[chosen], earlier, later, samples)
+
+
+def _drawn(hypotheses: int, count: int, size: int) -> Int64[Tensor, "1 S size"]:
+    """The same numbers of keypoints in every call."""
+    if F.is_traced():  # a graph holds no generator: the numbers are its constants
+        numbers = np.random.default_rng(0).permuted(np.tile(np.arange(count), (hypotheses, 1)), axis=1)
+        return torch.tensor(numbers[None, :, :size].tolist())
+    return F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, size)
 
 
 def _identities(like: Tensor) -> Tensor:

@@ -77,7 +77,7 @@ class TorchScorer:
         width, height = part.level
         rows = F.reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
         columns = F.reflect_index(torch.arange(part.x - 1, part.x + part.width + 1, device=levels.device), width)
-        return self.model.score(F.resize(levels, (height, width), rows=rows, columns=columns))
+        return self.model.score(F.resize(levels, (height, width), rows=rows, columns=columns, rounded=True))
 
 
 def layout(parameters: PeopleParameters) -> F.Layout:

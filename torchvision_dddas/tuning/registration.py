@@ -144,7 +144,7 @@ def refit_motion(
     """The motion of the points that agree with a guess and were tracked there and back.
 
     tolerance_px, check_px: the parameters ransac_px and forward_backward_px, the latter None without a check. fit: as
-    `functional.find_homography_dlt`. softness: a share of each. The guess gets no gradient: a refit forgets it.
+    `functional.find_homography`. softness: a share of each. The guess gets no gradient: a refit forgets it.
     """
     earlier, later = points.earlier_px[None], points.later_px[None]
     trusted = torch.ones_like(earlier[..., 0])
