@@ -21,12 +21,15 @@ from itertools import groupby
 from typing import Literal
 
 import cv2
+import numpy as np
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 from torch.nn import functional
 
 Extremum = Callable[[Tensor, Tensor], Tensor]
+Kernel = Shaped[Tensor, "h w"] | Shaped[np.ndarray, "h w"]
+"""Where it is not 0, pixels are looked at. In a trace, which knows no values of tensors, an array of NumPy."""
 Run = tuple[int, int, int]
 """Of a kernel's row the columns [first, last) that are set."""
 
@@ -48,7 +51,7 @@ def structuring_element(
 
 
 def dilation(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Shaped[Tensor, "h w"], *, softness: float = 0.0
+    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
 ) -> Shaped[Tensor, "B C H W"]:
     """Maximum where the kernel is not 0, around its middle (h // 2, w // 2).
 
@@ -59,12 +62,12 @@ def dilation(
         return _extremum(tensor, kernel, highest=False)
     rows, columns = tensor.shape[-2:]
     padded = functional.pad(tensor / softness, _margins(kernel), value=_NOTHING / softness)
-    shifted = [padded[..., row : row + rows, at : at + columns] for row, at in kernel.nonzero().tolist()]
+    shifted = [padded[..., row : row + rows, at : at + columns] for row, at in np.argwhere(np.asarray(kernel)).tolist()]
     return torch.stack(shifted).logsumexp(0) * softness
 
 
 def erosion(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Shaped[Tensor, "h w"], *, softness: float = 0.0
+    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
 ) -> Shaped[Tensor, "B C H W"]:
     """Minimum where the kernel is not 0. softness: as in `dilation`."""
     if softness == 0.0:
@@ -73,20 +76,20 @@ def erosion(
 
 
 def opening(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Shaped[Tensor, "h w"], *, softness: float = 0.0
+    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
 ) -> Shaped[Tensor, "B C H W"]:
     """Erosion, then dilation: takes away what is smaller than the kernel."""
     return dilation(erosion(tensor, kernel, softness=softness), kernel, softness=softness)
 
 
 def closing(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Shaped[Tensor, "h w"], *, softness: float = 0.0
+    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
 ) -> Shaped[Tensor, "B C H W"]:
     """Dilation, then erosion: fills what is smaller than the kernel."""
     return erosion(dilation(tensor, kernel, softness=softness), kernel, softness=softness)
 
 
-def _runs(kernel: Tensor) -> list[Run]:
+def _runs(kernel: Kernel) -> list[Run]:
     """The kernel as runs (row, first, last) of columns [first, last)."""
     runs = []
     for row, line in enumerate(kernel.tolist()):
@@ -98,13 +101,13 @@ def _runs(kernel: Tensor) -> list[Run]:
     return runs
 
 
-def _margins(kernel: Tensor) -> tuple[int, int, int, int]:
+def _margins(kernel: Kernel) -> tuple[int, int, int, int]:
     height, width = kernel.shape
     left, above = width // 2, height // 2
     return left, width - 1 - left, above, height - 1 - above
 
 
-def _extremum(mask: Tensor, kernel: Tensor, highest: bool) -> Tensor:
+def _extremum(mask: Tensor, kernel: Kernel, highest: bool) -> Tensor:
     """Minimum (highest = True: outside counts as the highest value) or maximum under the kernel."""
     height, width = kernel.shape
     better = torch.minimum if highest else torch.maximum
@@ -144,7 +147,7 @@ def _running(flat: Tensor, lengths: Sequence[int], stride: int, better: Extremum
     return found
 
 
-def _gather_extremum(x: Tensor, kernel: Tensor, highest: bool) -> Tensor:
+def _gather_extremum(x: Tensor, kernel: Kernel, highest: bool) -> Tensor:
     """As `_extremum`, by finding the pixel that decides, to which the gradient goes.
 
     A chain of maxima would keep every step of itself for the gradient: hundreds of pictures for a large ellipse. Here
