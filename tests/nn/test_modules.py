@@ -8,9 +8,11 @@ import torch
 import torchvision_dddas.functional as F
 from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas.config import PaperParameters, RegistrationParameters
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.nn import HistogramAffinity, HOGDescriptor, PersonScorer, PlaneHomography, Registration
 from torchvision_dddas.tracking import rgb_histograms, source_tracker
 
+NONE = torch.zeros(1, 0, 2)
 LAYOUT = F.Layout((32, 64), 4, 8, 4)
 
 
@@ -88,3 +90,24 @@ def test_a_plane_homography_leaves_out_what_has_no_weight():
     found, valid = PlaneHomography()(ground, image, weight)
     assert valid.all()
     torch.testing.assert_close(found, true, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: PersonScorer(torch.zeros(7), 0.0), r"weights must be 3780 numbers, got \(7,\)"),
+        (
+            lambda: HistogramAffinity().affinity(
+                torch.ones(4, 2, 5), torch.ones(4, 2).bool(), torch.zeros(1, 4, dtype=torch.int64)
+            ),
+            r"windows must be \(W, 2\) or \(W, 3\) places of frames, got \(1, 4\)",
+        ),
+        (
+            lambda: F.ransac(NONE, NONE, torch.ones(1, 0).bool(), torch.zeros(1, 3, 4).long()),
+            "RANSAC needs 4 pairs of points, got none",
+        ),
+    ],
+)
+def test_shapes_that_no_module_takes_are_refused_in_one_line(call, words):
+    with pytest.raises(InputError, match=words):
+        call()

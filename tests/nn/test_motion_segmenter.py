@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.synthetic_clip import render
-from torchvision_dddas.config import EVIDENCE_SCALE, Settings, with_parameters
+from torchvision_dddas.config import EVIDENCE_SCALE, Settings, load_config, with_parameters
 from torchvision_dddas.detection import Window
 from torchvision_dddas.detection.interval import choose_pairs
 from torchvision_dddas.detection.torch_engine import TorchEngine
@@ -321,3 +321,25 @@ def test_clips_without_a_step_show_nothing(batch, frames) -> None:
 def test_wrong_arguments_are_one_line(make, words) -> None:
     with pytest.raises(InputError, match=words):
         make()
+
+
+@pytest.mark.slow
+def test_the_exported_graph_gives_the_same_masks_for_clips_it_was_not_made_with() -> None:
+    runtime = pytest.importorskip("onnxruntime")
+    model = MotionSegmenter(load_config("fast")).eval()
+
+    class Masks(torch.nn.Module):
+        def forward(self, clip: torch.Tensor, later_from_earlier: torch.Tensor) -> torch.Tensor:
+            return model(clip, later_from_earlier).mask
+
+    clips = [np.stack(render(seed, 3, (128, 96)).images) for seed in (0, 1)]
+    frames = [torch.from_numpy(clip).permute(0, 3, 1, 2)[None] / 255 for clip in clips]
+    step = torch.eye(3, dtype=torch.float64).repeat(1, 2, 1, 1)
+    program = torch.onnx.export(Masks(), (frames[0], step), dynamo=True, optimize=False, verbose=False)
+    assert program is not None
+    session = runtime.InferenceSession(program.model_proto.SerializeToString())
+    names = [one.name for one in session.get_inputs()]
+    for clip in frames:
+        (found,) = session.run(None, dict(zip(names, (clip.numpy(), step.numpy()), strict=True)))
+        wanted = model(clip, step).mask
+        assert wanted.any() and (found != wanted.numpy()).mean() < 1e-4

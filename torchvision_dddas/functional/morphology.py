@@ -50,9 +50,7 @@ def structuring_element(
     return torch.from_numpy(cv2.getStructuringElement(_SHAPES[shape], size))
 
 
-def dilation(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
-) -> Shaped[Tensor, "B C H W"]:
+def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
     """Maximum where the kernel is not 0, around its middle (h // 2, w // 2).
 
     softness: above 0, in the units of the mask, gives softness x log-sum-exp(mask / softness). Values below -1e4 then
@@ -66,25 +64,19 @@ def dilation(
     return torch.stack(shifted).logsumexp(0) * softness
 
 
-def erosion(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
-) -> Shaped[Tensor, "B C H W"]:
+def erosion(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
     """Minimum where the kernel is not 0. softness: as in `dilation`."""
     if softness == 0.0:
         return _extremum(tensor, kernel, highest=True)
     return -dilation(-tensor, kernel, softness=softness)
 
 
-def opening(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
-) -> Shaped[Tensor, "B C H W"]:
+def opening(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
     """Erosion, then dilation: takes away what is smaller than the kernel."""
     return dilation(erosion(tensor, kernel, softness=softness), kernel, softness=softness)
 
 
-def closing(
-    tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0
-) -> Shaped[Tensor, "B C H W"]:
+def closing(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
     """Dilation, then erosion: fills what is smaller than the kernel."""
     return erosion(dilation(tensor, kernel, softness=softness), kernel, softness=softness)
 

@@ -186,7 +186,10 @@ def ransac(
     The best of all hypotheses at once, then least squares on its inliers, ever more strictly (appendix B, step S3).
     Hypotheses are ranked by their truncated squared error, which ranks those with equally many inliers. samples: from
     `draw_samples`; numbers are spread over the valid points when some are not. When nothing fits: identity, not valid.
+    Raises InputError without any points.
     """
+    if not p.shape[1]:
+        raise InputError(f"RANSAC needs {model.size} pairs of points, got none")
     tolerance = torch.as_tensor(tolerance_px, dtype=p.dtype, device=p.device).reshape(-1, 1)
     chosen = _ranks_to_points(valid, samples).flatten(1)[..., None].expand(-1, -1, 2)
     shape = (*samples.shape, 2)

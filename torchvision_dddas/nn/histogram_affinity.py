@@ -5,6 +5,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.errors import InputError
 
 # Pixels of boxes that are read at once, at about 100 bytes each, and affinities computed at once.
 _PIXELS, _AFFINITIES = 1 << 20, 1 << 21
@@ -52,7 +53,12 @@ class HistogramAffinity(nn.Module):
     def affinity(
         self, feature: Float[Tensor, "T N D"], valid: Bool[Tensor, "T N"], windows: Int64[Tensor, "W K"]
     ) -> Float[Tensor, "W N N *N"]:
-        """As `forward`, of any non-negative features of the boxes: histograms, or their centres in pixels."""
+        """As `forward`, of any non-negative features of the boxes: histograms, or their centres in pixels.
+
+        Raises InputError for windows of other than two or three frames.
+        """
+        if windows.dim() != 2 or windows.shape[1] not in (2, 3):
+            raise InputError(f"windows must be (W, 2) or (W, 3) places of frames, got {tuple(windows.shape)}")
         count, size = feature.shape[1], windows.shape[1]
         of_frames = F.pair_affinity if size == 2 else F.triplet_affinity
         made = []

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.errors import InputError
 
 
 class HOGDescriptor(nn.Module):
@@ -33,9 +34,14 @@ class PersonScorer(nn.Module):
     def __init__(
         self, weights: Float[Tensor, " D"], bias: float, layout: F.Layout | None = None, window_stride_px: int = 8
     ) -> None:
-        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window."""
+        """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window.
+
+        Raises InputError for another number of weights.
+        """
         super().__init__()
         self.descriptor, self.window_stride_px = HOGDescriptor(layout), window_stride_px
+        if tuple(weights.shape) != (self.descriptor.layout.features,):
+            raise InputError(f"weights must be {self.descriptor.layout.features} numbers, got {tuple(weights.shape)}")
         arranged = F.arrange_weights(weights.detach(), self.descriptor.layout).contiguous()
         self.weights = nn.Parameter(arranged)
         self.bias = nn.Parameter(torch.tensor(bias, dtype=weights.dtype))
