@@ -313,7 +313,8 @@ def write_study(
                 with suppress(OSError):
                     _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
             if isinstance(error, KeyboardInterrupt) and finished:
-                error.add_note(f"{finished} finished clips are kept in {place}; the same command goes on from there")
+                clips = "1 finished clip is" if finished == 1 else f"{finished} finished clips are"
+                error.add_note(f"{clips} kept in {place}; the same command goes on from there")
             if isinstance(error, OSError):
                 raise cannot_write(folder / "run.json", error) from error
             raise
