@@ -877,6 +877,21 @@ class Confirmation:
 
 
 @dataclass(frozen=True)
+class AppearanceUse:
+    """Whether the association of a frame looked at the targets' appearance, and the reason.
+
+    weight: of their locations in the source's association; NaN in the default one, where appearance adds to scores.
+    location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN where not computed.
+    """
+
+    looked: bool
+    cause: str
+    weight: float = float("nan")
+    location_dispersion: float = float("nan")
+    appearance_dispersion: float = float("nan")
+
+
+@dataclass(frozen=True)
 class Tracks(Boxes):
     """The targets of one frame with identities, one row per target.
 
@@ -884,6 +899,7 @@ class Tracks(Boxes):
     row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
     link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
     could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
+    appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
     """
 
     frame: int
@@ -892,6 +908,7 @@ class Tracks(Boxes):
     score: np.ndarray = field(default_factory=lambda: np.zeros(0))
     row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     link: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    appearance: AppearanceUse | None = None
 
     def __post_init__(self) -> None:
         if len(self.link) == 0 < len(self.identity):
