@@ -194,7 +194,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
     )
     """Files of a run that locates nothing."""
     files: ClassVar[tuple[str, ...]] = (
-        *(*found_files, "landmarks.csv", "confirmed.csv"),
+        *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
     saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
@@ -217,6 +217,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
                 "positions": PartOf(tables.aerial_tables(folder, has_degrees), _locations),
                 **({"landmarks": tables.landmark_table(folder, names, has_degrees)} if names else {}),
                 "confirmed": tables.confirmed_positions(folder, has_degrees),
+                "crowds": tables.crowd_table(folder, has_degrees),
             }
         parts |= {
             "detections": PartOf(detection_tables(folder), _scene),

@@ -8,6 +8,7 @@ from typing import Any, Generic
 
 import numpy as np
 
+from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.io.atomic_files import remove
 from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
@@ -317,6 +318,31 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> OptionalTable[FrameR
     return OptionalTable(
         folder / "confirmed.csv", Schema("positions", *_position_columns(has_degrees), *CONFIRMATION), rows
     )
+
+
+def crowd_table(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
+    """crowds.csv, of crowds as ground vehicles see them; no file if none was seen."""
+    own = (Column("people", "d"), *_VELOCITY, Column("seen_by"), Column("steers", "d"))
+    schema = Schema("crowds", FRAME, TARGET, *EAST_NORTH, *(DEGREES if has_degrees else ()), *own)
+
+    def rows(result: FrameResult) -> Rows | None:
+        crowds, located = result.crowds, result.locations
+        if crowds is None or located is None or not len(crowds):
+            return None
+        origin = located.positions.origin_deg
+        degrees = np.full((len(crowds), 2), np.nan) if origin is None else lonlat(crowds.east_north_m, origin)
+        return {
+            **_named(EAST_NORTH, crowds.east_north_m),
+            **_named(DEGREES, degrees),
+            **_named(_VELOCITY, crowds.velocity_m_s),
+            "frame": located.frame,
+            "target": crowds.target,
+            "people": crowds.people,
+            "seen_by": crowds.seen_by,
+            "steers": crowds.steers,
+        }
+
+    return OptionalTable(folder / "crowds.csv", schema, rows)
 
 
 def appearance_table(folder: Path) -> OptionalTable[TrackedFrame]:
