@@ -877,6 +877,45 @@ class Confirmation:
 
 
 @dataclass(frozen=True)
+class GroundCrowds(Table):
+    """The crowds of one frame by the people that ground vehicles see, one row a crowd that was looked at.
+
+    target: (N,) int64 as in Positions. east_north_m: (N, 2) the people's centroid, local metres. velocity_m_s: (N, 2)
+    east, north, NaN if unknown. people: (N,) int64, the most that one picture shows. seen_by: (N,) str, the vehicles,
+    separated by semicolons. steers: (N,) bool, the air did not locate the crowd, so that this steers.
+    """
+
+    target: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    velocity_m_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    people: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    seen_by: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    steers: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    def __post_init__(self) -> None:
+        if len(self.steers) == 0 < len(self.target):
+            object.__setattr__(self, "steers", np.zeros(len(self.target), bool))
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+
+@dataclass(frozen=True)
+class AppearanceUse:
+    """Whether the association of a frame looked at the targets' appearance, and the reason.
+
+    weight: of their locations in the source's association; NaN in the default one, where appearance adds to scores.
+    location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN where not computed.
+    """
+
+    looked: bool
+    cause: str
+    weight: float = float("nan")
+    location_dispersion: float = float("nan")
+    appearance_dispersion: float = float("nan")
+
+
+@dataclass(frozen=True)
 class Tracks(Boxes):
     """The targets of one frame with identities, one row per target.
 
@@ -884,6 +923,7 @@ class Tracks(Boxes):
     row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
     link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
     could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
+    appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
     """
 
     frame: int
@@ -892,6 +932,7 @@ class Tracks(Boxes):
     score: np.ndarray = field(default_factory=lambda: np.zeros(0))
     row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     link: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    appearance: AppearanceUse | None = None
 
     def __post_init__(self) -> None:
         if len(self.link) == 0 < len(self.identity):
@@ -970,6 +1011,7 @@ class FrameResult:
     sighted_by: (n,) how each landmark of locations.marks was seen: motion, colour or table.
     mark_lonlat_deg: (n, 2) positions of the landmarks; None without a geographic origin.
     confirmed: the UGVs' verdict on each row of locations.positions; None without UGV cameras.
+    crowds: by the people that the UGVs see; None without UGV cameras.
     command: the order to the vehicles after this frame; None: no change.
     """
 
@@ -979,6 +1021,7 @@ class FrameResult:
     mark_lonlat_deg: np.ndarray | None = None
     confirmed: Confirmation | None = None
     command: "Command | None" = None
+    crowds: GroundCrowds | None = None
 
     @property
     def frame(self) -> Frame | None:

@@ -248,6 +248,22 @@ def test_a_clip_with_a_table_gives_a_film_of_the_sampled_frames(dddas, clip, tab
     assert (kept["interval_frames"], kept["backend"], kept["clip"]["size"]) == (2, "onboard", [64, 48])
 
 
+@pytest.mark.parametrize("config", [(), ("--config", "paper")])
+def test_whether_appearance_was_looked_at_is_recorded_with_its_cause(dddas, clip, table, tmp_path, config):
+    given = table(walker(range(1, 6)) + walker(range(1, 6), x=12))
+    result = dddas("track", clip, "--detections", given, *config, "--out", tmp_path / "out", "--save", "none")
+    assert "tracks.csv, tracks.txt, appearance.csv, run.json" in result.stdout
+    kept, decisions = record(tmp_path / "out"), rows(tmp_path / "out/appearance.csv")
+    assert [row["frame"] for row in decisions] == list("2345") and all(row["cause"] for row in decisions)
+    looked = sum(row["looked"] == "1" for row in decisions)
+    assert (kept["appearance"]["decisions"], kept["appearance"]["looked_at"]) == (4, looked)
+    assert looked and sum(kept["appearance"]["causes"].values()) == 4
+    (moved,) = (kept["adjustments"][k] for k in range(1))
+    assert (moved["knob"], moved["frame"]) == ("paper.weight" if config else "appearance.looked", 2)
+    assert moved["cause"] == decisions[0]["cause"]
+    assert (decisions[0]["weight"] == "") == (not config)
+
+
 def test_the_sources_association_gives_the_same_tracks_by_either_back_end(dddas, clip, table, tmp_path):
     given = table(walker(range(1, 6)) + walker(range(1, 6), x=12))
     for backend in ("onboard", "torch"):

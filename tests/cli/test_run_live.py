@@ -63,6 +63,11 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
     assert record["state"] == "complete"
     assert record["counts"]["results"] == record["counts"]["looked_at"] == FRAMES
     assert record["seconds"]["latency"]["p50"] > 0
+    uses = [line["appearance"] for line in results if line["appearance"] is not None]
+    assert uses and all(use["cause"] for use in uses)
+    looked = sum(use["looked"] for use in uses)
+    counts = record["counts"]
+    assert (counts["appearance_decisions"], counts["appearance_looked_at"]) == (len(uses), looked)
     assert "results of 14 pictures, 0 dropped" in done.stderr
 
 

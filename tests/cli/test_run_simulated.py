@@ -60,6 +60,10 @@ def test_log_and_record_tell_what_the_run_noticed_and_how_good_it_was(made):
     assert "noticed" in (folder / "report.html").read_text()
     kept = record(folder)
     assert kept["state"] == "complete" and kept["frames"]["written"] == 24 and kept["truth_score"]
+    decisions = rows(folder / "appearance.csv")
+    assert kept["appearance"]["decisions"] == len(decisions) > 0
+    moved = [row for row in kept["adjustments"] if row["knob"] == "appearance.looked"]
+    assert moved and all(row["cause"] in log for row in moved)
     assert "crowds: " in said
 
 

@@ -7,10 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import GroundParameters
-from torchvision_dddas.control.ground_confirmation import drop_fast_targets, expected_regions
+from torchvision_dddas.config import GroundParameters, Settings
+from torchvision_dddas.control import ground_confirmation
+from torchvision_dddas.control.ground_confirmation import GroundConfirmation, drop_fast_targets, expected_regions
+from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.people.confirmation import GroundObservation
-from torchvision_dddas.types import Camera
+from torchvision_dddas.types import (
+    AerialLocations,
+    Camera,
+    Fix,
+    GroundPicture,
+    LandmarkObservations,
+    People,
+    Positions,
+)
 
 CAMERA = Camera("", (640, 480), (600.0, 600.0), (319.5, 239.5), height_m=1.3, position_sigma_m=0.1)
 HEADING = math.radians(60)
@@ -21,6 +31,33 @@ def test_people_beside_the_way_of_a_car_do_not_make_it_human_and_its_empty_view_
     seen = GroundObservation(np.ones(4, bool), np.array([3, 3, 0, 2]), apart, apart, np.full(4, 0.9))
     velocity = np.array([[5.0, 0.0], [1.2, 0.3], [0.0, 7.0], [np.nan, np.nan]])
     assert drop_fast_targets(seen, velocity).looked.tolist() == [False, True, True, True]
+
+
+def test_a_target_that_the_air_missed_is_found_by_its_people_and_nothing_is_concluded_of_it(monkeypatch):
+    """Five people 12 m ahead of a vehicle; the air locates another target, to the side of its view."""
+    ahead, right = np.array([math.sin(HEADING), math.cos(HEADING)]), np.array([math.cos(HEADING), -math.sin(HEADING)])
+    at = [(12.0, side) for side in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+    boxes = np.array([box_of(CAMERA, *place, 1.75) for place in at])
+    people = People(boxes, np.full(5, 0.97), np.ones(5), np.zeros(5, bool), boxes)
+    monkeypatch.setattr(ground_confirmation, "detect_people", lambda *given: [people])
+    picture = GroundPicture("ugv1", 4, np.zeros((480, 640, 3), np.uint8), replace(CAMERA, heading_rad=HEADING))
+    positions = Positions(np.array([4]), np.array([2]), np.array([-30.0 * ahead]), np.eye(2)[None], np.ones(1))
+    nowhere, row, marks = np.full((1, 2), np.nan), np.zeros(1, np.int64), LandmarkObservations()
+    box_px, fix = np.zeros((1, 4)), Fix(4, "pose")
+    located = AerialLocations(4, 0.3, positions, row, np.eye(2)[None], nowhere, box_px, fix, marks)
+    yes, no, one = np.ones(1, bool), np.zeros(1, bool), np.ones(1)
+    missing = Prediction(
+        *(np.array([1]), np.array([12.5 * ahead + 0.5 * right]), np.zeros((1, 2)), 2 * one, 0.99 * one, no, yes),
+        *(one, np.array([2]), yes, no),
+    )
+    for expected, found in ((None, []), (missing, [1])):
+        confirmation = GroundConfirmation(Settings(), lambda *given: None)
+        confirmation.take([picture])
+        confirmed, crowds = confirmation.confirm(located, np.full(1, 2.0), expected)
+        assert confirmed.kind == ("unseen",) and confirmed.people.tolist() == [0]
+        assert crowds.target.tolist() == found
+    assert (crowds.people.tolist(), crowds.seen_by.tolist()) == ([5], ["ugv1"])
+    np.testing.assert_allclose(crowds.east_north_m[0], 12.0 * ahead, atol=0.5)
 
 
 def regions(camera, *targets):

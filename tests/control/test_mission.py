@@ -89,6 +89,17 @@ def test_reports_are_taken_as_they_come_and_targets_are_judged_by_what_ground_ve
     assert len(places) > 20 and np.median(np.linalg.norm(here - (-1.0, 0.0), axis=1)) < 3.0
 
 
+def test_crowds_are_where_ground_vehicles_see_their_people_and_steer_only_where_the_air_locates_nothing(flown):
+    origin, seen = flown.mission.watch.locator.site.origin_deg, 0
+    for result in flown.results:
+        crowds, located = result.crowds, result.locations
+        assert not np.isin(crowds.target[crowds.steers], located.positions.target).any()
+        for place in east_north(lonlat(crowds.east_north_m, origin), flown.source.origin_deg):
+            assert np.linalg.norm(place - (located.time_s - 3.0, 0.0)) < 2.0  # where the crowd walks
+            seen += 1
+    assert seen
+
+
 def test_what_goes_wrong_is_noticed_and_dropped_frames_are_scenes_without_targets(flown):
     said = {frame: text for frame, text in flown.noticed if "camera" in text}
     # Frames 11 to 13 show frame 10 again; reports of the lost vehicle end at frame 3.

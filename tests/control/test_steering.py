@@ -17,6 +17,7 @@ from torchvision_dddas.types import (
     Confirmation,
     Fix,
     Flight,
+    GroundCrowds,
     LandmarkObservations,
     Positions,
     Registration,
@@ -90,6 +91,7 @@ class World:
         self.kinds, self.altitude_m, self.pitch_deg = kinds, altitude_m, pitch_deg
         self.reporting: slice | list[int] = slice(None)
         self.hidden = self.silent = False
+        self.by_ground = False  # whether ground vehicles see what the air does not
         self.steering = steering(len(team), **parameters)
         self.now_s, self.looked, self.rng = 0.0, np.zeros(2), np.random.default_rng(7)
         self.commands, self.made, self.frames = [], [], []
@@ -123,7 +125,12 @@ class World:
             marks = team_at(self.team + self.rng.normal(0, 0.5, self.team.shape), self.reporting)
             confirmed = judged(settled.frame, kinds) if kinds else None
             flight = None if self.silent else flown(self.pose)
-            command, made = self.steering.update(settled, confirmed, self.now_s, marks, flight)
+            missing = self.steering.missing(settled)
+            at = self.targets[missing.target - 1] - self.velocity[missing.target - 1]  # it settled a second late
+            count, by = np.full(len(missing), 5), np.full(len(missing), "ugv1;ugv2", object)
+            crowds = GroundCrowds(missing.target, at, self.velocity[missing.target - 1], count, by, by == by)
+            crowds = crowds if self.by_ground else None
+            command, made = self.steering.update(settled, confirmed, self.now_s, marks, flight, None, crowds)
             self.commands.append(command)
             self.made.extend(made)
             self._obey(command)
@@ -181,6 +188,32 @@ def test_where_nothing_is_found_any_more_it_sees_more_from_higher_and_goes_back_
     lost.hidden, lost.looked = False, lost.targets[0].copy()
     lost.run(10)
     assert lost.inside(lost.targets).all() and len(lost.ordered()) == 4
+
+
+def test_a_crowd_that_only_ground_vehicles_see_is_followed_and_the_log_says_so():
+    """As one that stops, or walks under trees, while the air sees nothing of it for longer than a target is kept."""
+    ways = {}
+    for by_ground in (False, True):
+        w = World([[0, 0]], (1.0, 0.0), ("human",)).run(12)
+        w.hidden, w.by_ground, w.velocity = True, by_ground, np.array([[0.0, 1.0]])
+        ways[by_ground] = w.run(25)
+    lost, kept = ways[False], ways[True]
+    assert np.linalg.norm(lost.looked - lost.targets[0]) > 15 and not lost.ordered()
+    assert np.linalg.norm(kept.looked - kept.targets[0]) < 8 and kept.ordered() == set(NAMES[:4])
+    assert np.linalg.norm(kept.team - kept.targets[0], axis=1).max() < 20
+    kept.hidden = False
+    began, ended = kept.run(3).changes("team.by_ground")
+    assert (began.new, ended.new) == (1, 0)
+    assert began.cause.startswith("target 1 is not located from the air: 5 of its people seen by ugv1 and ugv2 about")
+    assert began.cause.endswith("going at 1.0 m/s") and ended.cause == "target 1 is located from the air again"
+
+
+def test_a_target_that_goes_on_under_another_number_is_not_looked_for():
+    one = steering()
+    for frame in range(1, 6):
+        one.update(located(frame, [[0, 0], [20, 0]]), None, frame / RATE_HZ, team_at(SQUARE), None)
+    assert one.missing(located(6, [[20, 0]], targets=[2])).target.tolist() == [1]
+    assert one.missing(located(6, [[0, 1], [20, 0]], targets=[3, 2])).target.tolist() == []
 
 
 def test_a_target_that_is_not_human_is_given_up_and_followed_until_then():

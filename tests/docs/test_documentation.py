@@ -51,6 +51,26 @@ def test_every_command_exists_with_its_options(line: str) -> None:
     assert [word for word in words if word.startswith("--") and word not in result.output] == []
 
 
+def test_the_table_from_equation_to_file_names_code_that_the_product_runs() -> None:
+    package = ROOT / "torchvision_dddas"
+    table = PAGES["method.md"].partition("## Beyond")[0]
+    files = set(re.findall(r"`((?:\w+/)*\w+\.py)`", table))
+    # Tuning and export repeat steps, and a room's list of names runs nothing.
+    users = {
+        path: path.read_text(encoding="utf-8")
+        for path in package.rglob("*.py")
+        if path.name != "__init__.py" and path.parent.name not in ("tuning", "export")
+    }
+    assert len(files) > 40
+    for name in sorted(files):
+        own = package / name
+        public = re.findall(r"^(?:def|class) ([A-Za-z]\w*)", own.read_text(encoding="utf-8"), re.MULTILINE)
+        used = re.compile(rf"\b(?:{'|'.join(public)})\b")
+        assert any(used.search(text) for path, text in users.items() if path != own), f"nothing uses {name}"
+    settings = re.findall(r"`--set ([^`]+)`", table)
+    assert len(settings) > 3 and load_config(None, settings)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_every_link_and_picture_leads_to_a_file(page: str) -> None:
     home = ROOT if page == "README.md" else ROOT / "docs"

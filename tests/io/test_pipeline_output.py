@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import record, rows
+from torchvision_dddas.geometry import east_north
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.output import PROBLEM, PipelineRecorder, Site
 from torchvision_dddas.io.output.tables import landmark_table
@@ -21,6 +22,7 @@ from torchvision_dddas.types import (
     Fix,
     Frame,
     FrameResult,
+    GroundCrowds,
     LandmarkObservations,
     Order,
     Positions,
@@ -114,6 +116,31 @@ def test_what_ground_vehicles_say_is_a_table_and_counted(tmp_path):
     assert kept["kinds"] == {"unseen": 1, "human": 1, "not_human": 1} and kept["rows_looked_at"] == 2
     assert "it was told human before" in log(tmp_path)[-1]
     assert "kinds" not in run(tmp_path, [located(1)]) and not (tmp_path / "confirmed.csv").exists()
+
+
+@pytest.mark.parametrize("geographic", [False, True])
+def test_crowds_that_ground_vehicles_see_are_a_table_and_without_any_there_is_none(tmp_path, geographic):
+    site = Site(NAMES, ORIGIN if geographic else None)
+    place, velocity = np.array([[2.0, 1.0], [9.0, 9.0]]), np.array([[0.5, -0.5], [np.nan, np.nan]])
+    by, steers = np.array(["blue;red", "red"], object), np.array([True, False])
+    seen = GroundCrowds(np.array([3, 5]), place, velocity, np.array([4, 1]), by, steers)
+    results = [located(k, geographic=geographic) for k in (1, 2, 3)]
+    at = [replace(one.locations.positions, origin_deg=site.origin_deg) for one in results]
+    there = [replace(one.locations, positions=where) for one, where in zip(results, at, strict=True)]
+    crowds = (GroundCrowds(), seen, None)
+    frames = [replace(*one[:1], locations=one[1], crowds=one[2]) for one in zip(results, there, crowds, strict=True)]
+    run(tmp_path, frames, site=site)
+    one, other = rows(tmp_path / "crowds.csv")
+    names = ("frame", "target", "people", "seen_by", "steers")
+    assert [one[name] for name in names] == ["2", "3", "4", "blue;red", "1"]
+    assert (one["east_m"], one["north_m"], one["velocity_east_m_s"]) == ("2.0000", "1.0000", "0.5000")
+    assert (other["target"], other["velocity_east_m_s"], other["steers"]) == ("5", "", "0")
+    assert ("longitude_deg" in one) == geographic
+    if geographic:
+        degrees = np.array([[float(one["longitude_deg"]), float(one["latitude_deg"])]])
+        np.testing.assert_allclose(east_north(degrees, ORIGIN)[0], place[0], atol=0.01)
+    run(tmp_path, frames[2:], site=site)
+    assert not (tmp_path / "crowds.csv").exists()
 
 
 # --------------------------------------------------------------------------------------------------------------------

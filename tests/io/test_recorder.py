@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,14 @@ from torchvision_dddas.io.output import (
     PeopleRecorder,
     PipelineRecorder,
     Site,
+    TrackRecorder,
     parse_save,
 )
 from torchvision_dddas.io.output.run_record import Durations, finite
 from torchvision_dddas.io.tables import TableFiles
 from torchvision_dddas.types import (
     Adjustment,
+    AppearanceUse,
     Detections,
     Frame,
     FrameResult,
@@ -143,6 +146,44 @@ def test_the_record_has_causes_adjustments_durations_and_versions(tmp_path, adju
     assert record["seconds"]["stages"]["track"]["total"] == pytest.approx(0.04)
     assert record["settings"] == {"points": 5}
     assert {"torchvision_dddas", "python", "numpy", "cv2"} <= set(record["versions"])
+
+
+def test_the_record_lists_the_first_thousand_changes_of_a_parameter_and_counts_the_others(tmp_path):
+    def changes(number):
+        rare = [Adjustment(number, "interval.frames", 1, 2, "flow")] if number in (1, 2500) else []
+        return (*rare, Adjustment(number, "appearance.looked", number % 2, 1 - number % 2, "a rival"))
+
+    fill(tmp_path, (make_scene(n, 0, adjustments=changes(n)) for n in range(1, 2501)), save=())
+    kept = run_json(tmp_path)
+    assert kept["adjustments_made"] == {"interval.frames": 2, "appearance.looked": 2500}
+    frames = [row["frame"] for row in kept["adjustments"] if row["knob"] == "appearance.looked"]
+    assert frames == list(range(1, 1001))
+    assert [row["frame"] for row in kept["adjustments"] if row["knob"] == "interval.frames"] == [1, 2500]
+
+
+def test_decisions_on_appearance_are_a_table_and_a_summary_and_without_any_there_is_neither(tmp_path):
+    uses = [None, AppearanceUse(False, "locations 0.900, above 0.65", 1.0, 0.9)]
+    uses += [AppearanceUse(True, f"locations {d}, of appearances 0.70", 0.0, d, 0.7) for d in (0.5, 0.3)]
+    folder = tmp_path / "out"
+    for given in (uses, [None]):
+        with TrackRecorder(folder, ()) as output:
+            output.begin({}, 10, (80, 60))
+            for number, use in enumerate(given, 1):
+                item = tracked(number)
+                output.write(replace(item, tracks=replace(item.tracks, appearance=use)))
+        if len(given) == 1:
+            break
+        assert (folder / "appearance.csv").read_text().splitlines() == [
+            "frame,looked,weight,location_dispersion,appearance_dispersion,cause",
+            '2,0,1,0.9000,,"locations 0.900, above 0.65"',
+            '3,1,0,0.5000,0.7000,"locations 0.5, of appearances 0.70"',
+            '4,1,0,0.3000,0.7000,"locations 0.3, of appearances 0.70"',
+        ]
+        assert run_json(folder)["appearance"] == {
+            "decisions": 3, "looked_at": 2, "causes": {"locations #, above #": 1, "locations #, of appearances #": 2},
+            "location_dispersion": [0.3, 0.9], "appearance_dispersion": [0.7, 0.7],
+        }  # fmt: skip
+    assert not (folder / "appearance.csv").exists() and "appearance" not in run_json(folder)
 
 
 def test_a_second_run_replaces_the_first_and_foreign_files_stay(tmp_path):

@@ -17,7 +17,7 @@ from tests.io.streamed import ABOUT, located, tracked
 from torchvision_dddas.io.maps.formats import cot
 from torchvision_dddas.io.streams import About
 from torchvision_dddas.io.streams.messages import PEOPLE_FROM, CotEvents, json_lines, mot_lines
-from torchvision_dddas.types import Adjustment, FrameResult, TrackedFrame, Tracks
+from torchvision_dddas.types import Adjustment, AppearanceUse, FrameResult, TrackedFrame, Tracks
 
 PAGE = (Path(__file__).parents[2] / "docs" / "stream.md").read_text(encoding="utf-8")
 
@@ -51,6 +51,8 @@ def example():
     fix = replace(frame.locations.fix, state=states, changes=("bravo excluded: 9.1 px off",))
     ground = replace(frame.locations, marks=marks, fix=fix)
     frame = replace(frame, locations=ground, tracked=replace(frame.tracked, adjustments=(moved,)))
+    use = AppearanceUse(True, "a track has several likely detections")
+    frame = replace(frame, tracked=replace(frame.tracked, tracks=replace(frame.tracks, appearance=use)))
     return json_lines(ABOUT, frame, tracked(42, 0, kind="person", rate=30.0), 0.0612)[0].decode()
 
 
@@ -65,10 +67,12 @@ def test_the_page_names_every_field_and_no_other():
     sent = set()
     for fields in map(strict, [*json_lines(ABOUT, located(), tracked(), most_bytes=512), example()]):
         sent |= set(fields) | {f"targets[].{name}" for row in fields["targets"] for name in row}
-        sent |= {f"ground.{name}" for name in fields.get("ground") or {}}
+        sent |= {f"{part}.{name}" for part in ("ground", "appearance") for name in fields.get(part) or {}}
     assert {name for name in sent if not name.startswith(("ground.landmarks", "adjustments"))} <= named
     first = {row.split("`")[1] for row in rows}
-    assert {name for name in first if re.fullmatch(r"[a-z]+_?[a-z]*|targets\[\]\..*|ground\.[a-z_]*", name)} <= sent
+    assert {
+        name for name in first if re.fullmatch(r"[a-z]+_?[a-z]*|targets\[\]\..*|(ground|appearance)\.[a-z_]*", name)
+    } <= sent
 
 
 def test_a_target_has_its_identity_its_box_and_its_place():

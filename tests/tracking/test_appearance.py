@@ -7,9 +7,9 @@ import pytest
 from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking.appearance import (
     SIGNATURE,
+    ambiguity,
     appearance_scores,
     blend_histograms,
-    is_ambiguous,
     similarity,
     strip_histograms,
 )
@@ -90,7 +90,7 @@ BOTH = histograms(2)
     ],
 )
 def test_links_are_ambiguous_with_two_likely_ones_or_without_a_histogram(links, known, ambiguous):
-    assert is_ambiguous(np.array(links), known) == ambiguous
+    assert bool(ambiguity(np.array(links), known)) == ambiguous
 
 
 def test_the_first_histogram_is_taken_whole_and_an_unknown_one_changes_nothing():

@@ -84,6 +84,26 @@ def test_identities_after_frames_in_disorder_a_miss_and_a_target_that_leaves(fra
     assert found[-1] == last
 
 
+@pytest.mark.parametrize(
+    ("frame", "levels", "values", "weight", "cause"),
+    [
+        (at((20, 40), (100, 100), (400, 300)), None, {}, 1.0, "dispersion of locations 1.000, above 0.65"),
+        (at((400, 300), (404, 300)), (1, 200), {}, 0.0, "locations 0.000, of appearances 1.000: only the latter above"),
+        (at((400, 300), (404, 300)), (9, 9), {}, 0.5, "locations 0.000, of appearances 0.000: neither above 0.65"),
+        (at((400, 300), (404, 300)), None, {}, 1.0, "dispersion of locations 0.000, and a frame has no picture"),
+        (at((400, 300), (404, 300)), (9, 9), {"rule": "fixed", "weight": 0.7}, 0.7, "paper.rule is fixed"),
+    ],
+)
+def test_each_association_says_its_weight_its_dispersions_and_why(frame, levels, values, weight, cause):
+    tracker = SourceTracker(with_parameters(Settings(), {f"paper.{k}": v for k, v in values.items()}), 1)
+    pictures = coloured(*levels) if levels else None
+    (first,), (use,) = ([t.appearance for t in tracker.feed(n, frame, None, pictures)] for n in (1, 2))
+    assert first is None and use is not None  # one frame alone has nothing to link
+    assert cause in use.cause and (use.weight, use.looked) == (weight, weight < 1)
+    assert use.location_dispersion == (1.0 if len(frame) == 3 else 0.0)
+    assert np.isfinite(use.appearance_dispersion) == ("of appearances" in cause)
+
+
 def test_histograms_are_computed_only_once_and_only_where_targets_are_close():
     scattered, close = at((20, 40), (100, 100), (400, 300)), at((400, 300), (404, 300), (100, 100))
     tracked([scattered] * 4, [never] * 4)

@@ -200,6 +200,35 @@ def test_both_modes_track_a_walker_in_pictures_and_settle_every_frame_once(mode)
     assert {int(i) for t in tracks for i in t.identity} == {1}
 
 
+@pytest.mark.parametrize(("mode", "knob"), [("default", "appearance.looked"), ("paper", "paper.weight")])
+def test_every_change_of_whether_appearance_is_looked_at_is_an_adjustment_with_its_cause(mode, knob):
+    """Two walkers meet: apart, no link is in doubt and locations are dispersed."""
+    settings = load_config(overrides=[f"track.mode={mode}"])
+    scenes = []
+    for frame in Clip(30):
+        x = abs(frame.number - 15) * 8.0
+        boxes, unknown = (
+            np.array([(20, 20, 12, 40), (160 - x, 140, 12, 40), (164 + x, 141, 12, 40.0)]),
+            np.full(3, np.nan),
+        )
+        given = Detections(boxes, np.ones(3), np.full(3, 480.0), unknown, unknown)
+        scenes.append(scene_of(frame, given))
+    frames = list(track_scenes(scenes, settings, 1, SIZE))
+    uses = {f.number: f.tracks.appearance for f in frames if f.tracks.appearance is not None}
+    assert set(uses) == set(range(2, 31))
+    looked = [number for number, use in uses.items() if use.looked]
+    assert 15 in looked and 30 not in looked and all(use.cause for use in uses.values())
+    moved = [a for f in frames for a in f.adjustments]
+    assert {a.parameter for a in moved} == {knob}
+    value = {"default": lambda use: float(use.looked), "paper": lambda use: use.weight}[mode]
+    now, told = {"default": 0.0, "paper": 1.0}[mode], {a.frame: a for a in moved}
+    for number, use in uses.items():  # the changes tell the state at each frame
+        if number in told:
+            assert (told[number].old, told[number].cause) == (now, use.cause) and told[number].new != now
+            now = told[number].new
+        assert value(use) == now
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

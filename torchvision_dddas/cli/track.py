@@ -105,7 +105,7 @@ def track(
             record.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
     counts = record.counts
     found = f"{record.frames} frames, {record.targets} detections, {counts.get('identities', 0)} identities"
-    files = ["tracks.csv", "tracks.txt", *(f"{name}.mp4" for name in names), "run.json"]
+    files = [name for name in TrackRecorder.files if (out / name).exists() and (name != "overlay.mp4" or names)]
     print_lines(
         closing_lines(f"{found}, {counts.get('untracked', 0)} detections without one", record, out, files), quiet
     )

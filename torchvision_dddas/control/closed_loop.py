@@ -11,7 +11,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.control.footprint import CameraMount, ground_in_middle, inside, update_mount
 from torchvision_dddas.control.ground_confirmation import GroundConfirmation
-from torchvision_dddas.control.prediction import Prediction, TargetPredictor
+from torchvision_dddas.control.prediction import MISSED, Prediction, TargetPredictor
 from torchvision_dddas.control.rules import AdjustmentLog, every_least, every_wanted, sampled
 from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
 from torchvision_dddas.control.uav_commands import UavSteering
@@ -33,6 +33,7 @@ from torchvision_dddas.types import (
     Flight,
     Frame,
     FrameResult,
+    GroundCrowds,
     GroundPicture,
     LandmarkObservations,
     Landmarks,
@@ -50,8 +51,6 @@ _PERIOD_S = 0.2
 _ALERT_S = 4.0
 # Fewer frames are processed only this time after the last change.
 _CALM_S = 3.0
-# A target is lost once this many frames in a row do not show it.
-_MISSED = 2
 # A registration is weak if a smaller share of its points agrees.
 _WEAK = 0.5
 
@@ -193,24 +192,27 @@ class Mission:
         if located is None:
             return result
         seconds, locator, adjustments = dict(located.seconds), self.watch.locator, located.adjustments
-        confirmed, command = None, None
+        confirmed, command, crowds = None, None, None
         if self._confirmation is not None:
             start = time.perf_counter()
             radius = np.nan_to_num(locator.ground_radii(located.fix, located.box_px[located.row]))
-            confirmed = self._confirmation.confirm(located, radius)
+            missing = None if self._steering is None else self._steering.missing(located)
+            confirmed, crowds = self._confirmation.confirm(located, radius, missing)
+            if missing is not None:
+                crowds = replace(crowds, steers=np.isin(crowds.target, missing.target[missing.is_human]))
             seconds["people"] = time.perf_counter() - start
         if self._steering is not None:
             start = time.perf_counter()
             now = self.source.last
             now_s = (now - 1) / self.source.rate_hz
             marks, flight = locator.landmarks_at(now), locator.telemetry_at(now_s)
-            command, made = self._steering.update(located, confirmed, now_s, marks, flight, step)
+            command, made = self._steering.update(located, confirmed, now_s, marks, flight, step, crowds)
             command = self._in_degrees(command)
             self.source.steer(command)
             adjustments = (*adjustments, *made)
             seconds["steer"] = time.perf_counter() - start
         located = replace(located, adjustments=adjustments, seconds=seconds)
-        return replace(result, locations=located, confirmed=confirmed, command=command)
+        return replace(result, locations=located, confirmed=confirmed, command=command, crowds=crowds)
 
     def _in_degrees(self, command: Command) -> Command:
         origin = self._origin
@@ -236,6 +238,7 @@ class Steering:
         self._command, self._steered_s = Command(), -np.inf
         self._every, self._every_changed_s, self._last_frame = 1, -np.inf, 0
         self._alert_s, self._alert = -np.inf, ""
+        self._by_ground: list[int] = []  # targets that only ground vehicles see
 
     def begin(self, flight: Flight | None) -> Command:
         """The command before anything is found: process as many frames as show a walker at this altitude."""
@@ -245,6 +248,10 @@ class Steering:
         self._command = Command(self._every)
         return self._command
 
+    def missing(self, located: AerialLocations) -> Prediction:
+        """The known targets that a frame did not locate; call it before `update`."""
+        return self._predictor.missing(located)
+
     def update(
         self,
         located: AerialLocations,
@@ -253,17 +260,19 @@ class Steering:
         marks: LandmarkObservations,
         flight: Flight | None,
         step: Registration | None = None,
+        crowds: GroundCrowds | None = None,
     ) -> tuple[Command, tuple[Adjustment, ...]]:
         """The command after a frame was located, its places in local metres, and what of it is new with its causes.
 
         confirmed: row = that of located.positions. now_s: of the newest frame read; the located one is older. marks,
         flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
-        while silent. step: how the background moved up to the located frame.
+        while silent. step: how the background moved up to the located frame. crowds: seen from the ground at it.
         """
         parameters = self.settings.steering
         self._log.begin(located.frame)
         now_s = max(now_s, located.time_s)
-        prediction = self._predictor.update(located, confirmed, now_s)
+        prediction = self._predictor.update(located, confirmed, now_s, crowds)
+        self._note_ground(prediction, crowds)
         mount = self._mount = update_mount(flight, located.fix, self._mount, self.camera)
         if parameters.sampling:
             self._choose_frames(located, prediction, now_s, flight, step)
@@ -288,6 +297,21 @@ class Steering:
         self._command = Command(self._every, fly_to, look_at, altitude_m, orders)
         return self._command, self._log.made()
 
+    def _note_ground(self, prediction: Prediction, crowds: GroundCrowds | None) -> None:
+        """Log how many targets ground vehicles alone see, when that changes."""
+        before, self._by_ground = self._by_ground, prediction.target[prediction.by_ground].tolist()
+        if new := [target for target in self._by_ground if target not in before]:
+            assert crowds is not None
+            row = crowds.target.tolist().index(new[0])
+            (east, north), speed = crowds.east_north_m[row], float(np.linalg.norm(crowds.velocity_m_s[row]))
+            cause = f"target {new[0]} is not located from the air: {crowds.people[row]} of its people seen by "
+            cause += f"{crowds.seen_by[row].replace(';', ' and ')} about ({east:.0f}, {north:.0f}) m"
+            cause += f", going at {speed:.1f} m/s" if np.isfinite(speed) else ""
+        else:
+            gone = next((target for target in before if target not in self._by_ground), 0)
+            cause = f"target {gone} is {'located from the air again' if gone in prediction.target else 'lost'}"
+        self._log.set("team.by_ground", len(self._by_ground), cause)
+
     def _least_every(self, flight: Flight) -> float:
         scale = pixels_per_metre(flight.distance_m, self.camera.focal_px[0])
         return every_least(scale, self.rate_hz, self.settings.steering)
@@ -303,7 +327,7 @@ class Steering:
         """Of how many frames one is processed."""
         frame, parameters, interval = located.frame, self.settings.steering, self.settings.interval
         between, self._last_frame = max(frame - self._last_frame, 1), frame
-        lost = np.flatnonzero(prediction.wanted & (prediction.missed == _MISSED))
+        lost = np.flatnonzero(prediction.wanted & (prediction.missed == MISSED))
         if located.fix.pose is not None and len(lost):  # a target that left the picture is not lost
             lost = lost[inside(prediction.east_north_m[lost], located.fix.pose, self.camera) > 0]
         if len(lost):
@@ -322,7 +346,7 @@ class Steering:
             else:
                 return
             # A target that is missed for a moment still counts.
-            seen = prediction.missed <= _MISSED
+            seen = prediction.missed <= MISSED
             speed, size = prediction.speed_m_s[seen], 2 * prediction.radius_m[seen]
             wanted, limit = every_wanted(wanted, self.rate_hz, speed, size, parameters)
             why += limit

@@ -1,4 +1,4 @@
-"""Pictures from ground vehicles: people found in them confirm which of the aerial camera's targets are human."""
+"""Pictures from ground vehicles: people found in them confirm which targets are human, and show where crowds are."""
 
 import math
 from dataclasses import replace
@@ -7,10 +7,12 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import GroundParameters, Settings
+from torchvision_dddas.control.ground_crowds import CrowdLooks
+from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.geo.ranging import range_people
 from torchvision_dddas.people.confirmation import Beliefs, GroundObservation, field_of_view, observe_ground, summarize
 from torchvision_dddas.people.detector import WindowScorer, detect_people
-from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundPicture, Poses
+from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundCrowds, GroundPicture, Poses
 
 # Nobody runs faster.
 _RUNNING_M_S = 4.0
@@ -23,37 +25,68 @@ _MARGIN_M = 0.5
 _SLOPE_RAD = math.radians(5)
 # Half the width of a body's box over its height: a region holds whole boxes.
 _HALF_WIDE = 0.17
+# Standard deviation of the predicted place of a target that the air did not locate.
+_PREDICTED_M = 1.0
 
 
 class GroundConfirmation:
-    """What is believed of each target, as pictures from the ground come in."""
+    """What is believed of each target, and where its people are, as pictures from the ground come in."""
 
     def __init__(self, settings: Settings, scorer: WindowScorer) -> None:
         self._settings, self._scorer = settings, scorer
-        self._beliefs = Beliefs(settings.confirm)
+        self._beliefs, self._looks = Beliefs(settings.confirm), CrowdLooks()
         self._waiting: list[GroundPicture] = []
 
     def take(self, pictures: list[GroundPicture]) -> None:
         """Pictures of the frames to come, as targets are located some frames later."""
         self._waiting += pictures
 
-    def confirm(self, located: AerialLocations, extent_m: np.ndarray) -> Confirmation:
-        """The confirmation of the targets of a frame, by the pictures taken at it and before.
+    def confirm(
+        self, located: AerialLocations, extent_m: np.ndarray, missing: Prediction | None = None
+    ) -> tuple[Confirmation, GroundCrowds]:
+        """The confirmation of a frame's targets, by the pictures taken at it and before, and the crowds seen at it.
 
-        extent_m: (P,) radius of each located target: its people mount about its middle.
+        extent_m: (P,) radius of each located target: its people mount about its middle. missing: targets that were not
+        located in the frame, as predicted for it: they are looked for, and nothing is concluded where nobody is.
         """
-        looks = [(p.vehicle, self._look(p, located, extent_m)) for p in self._waiting if p.frame == located.frame]
+        positions = located.positions
+        targets, count = positions.target, len(positions)
+        place, covariance, velocity = positions.east_north_m, positions.covariance_m2, located.velocity_m_s
+        if missing is not None and len(missing):
+            targets = np.concatenate([targets, missing.target])
+            place = np.concatenate([place, missing.east_north_m])
+            guess = np.tile(_PREDICTED_M**2 * np.eye(2), (len(missing), 1, 1))
+            covariance = np.concatenate([covariance, guess])
+            velocity = np.concatenate([velocity, missing.velocity_m_s])
+            extent_m = np.concatenate([extent_m, missing.radius_m])
+        looks = []
+        for picture in self._waiting:
+            if picture.frame == located.frame:
+                seen, person_m = self._look(picture, positions.origin_deg, place, covariance, extent_m, velocity)
+                self._looks.add(
+                    located.time_s, picture.vehicle, np.where(seen.blob >= 0, targets[seen.blob], 0), person_m
+                )
+                looks.append((picture.vehicle, _of_first(count, seen)))
         self._waiting = [picture for picture in self._waiting if picture.frame > located.frame]
-        targets = located.positions.target.tolist()
-        self._beliefs.add(targets, looks)
-        return summarize(located.frame, slice(0, len(targets)), targets, self._beliefs, looks)
+        names = positions.target.tolist()
+        self._beliefs.add(names, looks)
+        confirmed = summarize(located.frame, slice(0, count), names, self._beliefs, looks)
+        return confirmed, self._looks.crowds(located.time_s)
 
-    def _look(self, picture: GroundPicture, located: AerialLocations, extent_m: np.ndarray) -> GroundObservation:
-        settings, camera, positions = self._settings, picture.camera, located.positions
-        target_m, covariance, heading = positions.east_north_m, positions.covariance_m2, camera.heading_rad
-        place = np.array([camera.place], float)
-        if positions.origin_deg is not None:
-            place = geometry.east_north(place, positions.origin_deg)
+    def _look(
+        self,
+        picture: GroundPicture,
+        origin_deg: tuple[float, float] | None,
+        target_m: np.ndarray,
+        covariance: np.ndarray,
+        extent_m: np.ndarray,
+        velocity_m_s: np.ndarray,
+    ) -> tuple[GroundObservation, np.ndarray]:
+        """What a picture says of targets, and (M, 2) the places of its people."""
+        settings, camera = self._settings, picture.camera
+        heading, place = camera.heading_rad, np.array([camera.place], float)
+        if origin_deg is not None:
+            place = geometry.east_north(place, origin_deg)
         # Locations from the air give where to search, and how large people are there.
         regions = expected_regions(target_m, covariance, extent_m, camera, place[0], heading, settings.ground)
         (people,) = detect_people([picture.image], self._scorer, settings.people, [regions])
@@ -68,13 +101,20 @@ class GroundConfirmation:
         person_m, person_m2 = seen.east_north_m[known], seen.covariance_m2[known]
         scores = people.score[known]
         found = observe_ground(target_m, spread, person_m, person_m2, scores, [view], settings.confirm)
-        return drop_fast_targets(found, located.velocity_m_s)
+        return drop_fast_targets(found, velocity_m_s), person_m
+
+
+def _of_first(count: int, seen: GroundObservation) -> GroundObservation:
+    """What was seen of the first targets."""
+    rows = {name: getattr(seen, name)[:count] for name in ("looked", "people", "nearest_m", "nearest_sigmas", "best")}
+    return replace(seen, **rows)
 
 
 def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
     """The look without the people at targets faster than people, (N, 2): they stand beside its way."""
     fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
-    return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)))
+    blob = np.where(np.isin(seen.blob, np.flatnonzero(fast)), -1, seen.blob)
+    return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)), blob=blob)
 
 
 def expected_regions(

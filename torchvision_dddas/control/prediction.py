@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.types import AerialLocations, Camera, Confirmation
+from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundCrowds, Table
 
 # A target counts only after this many locations over this time: most false alarms are gone by then.
 _SIGHTINGS, _LASTING_S = 3, 0.8
@@ -19,18 +19,20 @@ _KEPT_S, _HORIZON_S = 8.0, 3.0
 _RENAMED_M = 3.0
 # A target is given up below the first probability of being human, and taken up again above the second.
 _GIVEN_UP, _TAKEN_UP = 0.2, 0.5
+MISSED = 2
+"""A target is lost once this many frames in a row do not show it."""
 # Half of a target's width where no box gives it.
 _RADIUS_M = 1.0
 
 
 @dataclass(frozen=True)
-class Prediction:
+class Prediction(Table):
     """The established targets as predicted for now, one row a target.
 
     target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
     probability: (N,) of being human. unseen: (N,) bool, no ground vehicle could tell. wanted: (N,) bool, human or
     unseen. lost_s: (N,) since it was last located, by the clock of the frames. missed: (N,) of the latest frames.
-    steady: (N,) bool, its velocity is known.
+    steady: (N,) bool, its velocity is known. by_ground: (N,) bool, it was last seen from the ground, not from the air.
     """
 
     target: np.ndarray
@@ -43,9 +45,15 @@ class Prediction:
     lost_s: np.ndarray
     missed: np.ndarray
     steady: np.ndarray
+    by_ground: np.ndarray
 
     def __len__(self) -> int:
         return len(self.target)
+
+    @property
+    def is_human(self) -> np.ndarray:
+        """(N,) bool, ground vehicles saw it and take it for human."""
+        return ~self.unseen & (self.probability >= _TAKEN_UP)
 
     @property
     def speed_m_s(self) -> np.ndarray:
@@ -69,8 +77,15 @@ class _Target:
     human: bool = True
     fast: bool = False
     steady: bool = False
+    by_ground: bool = False
 
     def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
+        """Take over where the air located it."""
+        self.correct(place_m, velocity_m_s, time_s)
+        self.radius_m += _BELIEVED * (radius_m - self.radius_m)
+        self.missed, self.sightings, self.by_ground = 0, self.sightings + 1, False
+
+    def correct(self, place_m: np.ndarray, velocity_m_s: np.ndarray, time_s: float) -> None:
         predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
         off = place_m - predicted
         self.place_m = predicted + (_BELIEVED * off if np.linalg.norm(off) < _FAR_M else off)
@@ -78,8 +93,7 @@ class _Target:
             gain = _BELIEVED if self.steady else 1.0
             self.velocity_m_s = self.velocity_m_s + gain * (velocity_m_s - self.velocity_m_s)
             self.steady = True
-        self.radius_m += _BELIEVED * (radius_m - self.radius_m)
-        self.seen_s, self.missed, self.sightings = time_s, 0, self.sightings + 1
+        self.seen_s = time_s
         self.fast = bool(np.linalg.norm(self.velocity_m_s) > (_WALKING_M_S if self.fast else _RUNNING_M_S))
 
     @property
@@ -99,8 +113,29 @@ class TargetPredictor:
         self.camera = camera
         self._known: dict[int, _Target] = {}
 
-    def update(self, located: AerialLocations, confirmed: Confirmation | None, now_s: float) -> Prediction:
-        """The targets as expected at now_s, after a frame was located; confirmed: row = that of its positions."""
+    def missing(self, located: AerialLocations) -> Prediction:
+        """The established targets that a frame did not locate, as expected at its time; call it before `update`."""
+        seen, here = located.positions.target, located.positions.east_north_m
+        expected = self._predict(located.time_s, located.time_s)
+        rows = [
+            row
+            for row, target in enumerate(expected.target.tolist())
+            if target not in seen and not _is_renamed(expected.east_north_m[row], expected.radius_m[row], here)
+        ]
+        return expected[np.array(rows, np.int64)]
+
+    def update(
+        self,
+        located: AerialLocations,
+        confirmed: Confirmation | None,
+        now_s: float,
+        crowds: GroundCrowds | None = None,
+    ) -> Prediction:
+        """The targets as expected at now_s, after a frame was located.
+
+        confirmed: row = that of its positions. crowds: seen from the ground at the frame. Their rows of `steers` are
+        taken for targets that the air did not locate, which knows a place better.
+        """
         time_s, targets = located.time_s, located.positions.target.tolist()
         for row, radius in enumerate(self._radii_m(located).tolist()):
             place = located.positions.east_north_m[row]
@@ -116,7 +151,15 @@ class TargetPredictor:
                         known.human = False
                     elif kind != "not_human" or probability >= _TAKEN_UP:
                         known.human = True
+        if crowds is not None:
+            for row in np.flatnonzero(crowds.steers).tolist():
+                if (lost := self._known.get(int(crowds.target[row]))) is not None:
+                    lost.correct(crowds.east_north_m[row], crowds.velocity_m_s[row], time_s)
+                    lost.by_ground = True
         self._forget(set(targets), time_s)
+        return self._predict(time_s, now_s)
+
+    def _predict(self, time_s: float, now_s: float) -> Prediction:
         rows = {target: known for target, known in self._known.items() if known.established}
 
         def column(name: str, kind: type = float) -> np.ndarray:
@@ -135,6 +178,7 @@ class TargetPredictor:
             time_s - column("seen_s"),
             column("missed", np.int64),
             column("steady", bool),
+            column("by_ground", bool),
         )
 
     def _forget(self, seen: set[int], time_s: float) -> None:
@@ -144,7 +188,7 @@ class TargetPredictor:
             known.missed += 1
             gone_s = time_s - known.seen_s
             place = known.place_m + known.velocity_m_s * min(gone_s, _HORIZON_S)
-            renamed = len(here) and np.linalg.norm(here - place, axis=1).min() < _RENAMED_M + known.radius_m
+            renamed = _is_renamed(place, known.radius_m, here)
             if gone_s > _KEPT_S or renamed or (not known.established and known.missed > 2):
                 del self._known[target]
 
@@ -157,3 +201,8 @@ class TargetPredictor:
         depth = (np.c_[places, np.zeros(len(places))] - pose.place_m) @ pose.axes[:, 2]
         scale = pose.focal * float(np.mean(self.camera.focal_px))
         return boxes[:, 2:].mean(axis=1) / 2 * np.maximum(depth, 1.0) / scale
+
+
+def _is_renamed(place_m: np.ndarray, radius_m: float, here_m: np.ndarray) -> bool:
+    """Whether a target (2,) that is not located goes on as one that is, of those at (N, 2)."""
+    return len(here_m) > 0 and bool(np.linalg.norm(here_m - place_m, axis=1).min() < _RENAMED_M + radius_m)

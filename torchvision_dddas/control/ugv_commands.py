@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.control.footprint import CameraMount
-from torchvision_dddas.control.prediction import Prediction
+from torchvision_dddas.control.prediction import MISSED, Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import LandmarkObservations, Order
@@ -323,10 +323,14 @@ def _need(prediction: Prediction) -> np.ndarray:
 
 
 def _is_sure(prediction: Prediction, row: int, now: bool) -> bool:
-    """Whether a target counts as surely human or surely not; now: whether it did."""
+    """Whether a target counts as surely human or surely not, and the air sees it; now: whether it did."""
     surely = abs(float(prediction.probability[row]) - 0.5) + 0.5
-    return not bool(prediction.unseen[row]) and surely > (_UNSURE if now else _SURE)
+    known = not prediction.unseen[row] and prediction.missed[row] < MISSED
+    return bool(known) and surely > (_UNSURE if now else _SURE)
 
 
 def _describe(prediction: Prediction, row: int) -> str:
-    return "nobody has seen it" if prediction.unseen[row] else f"human with {prediction.probability[row]:.2f}"
+    if prediction.unseen[row]:
+        return "nobody has seen it"
+    missed = ", missed from the air" if prediction.missed[row] >= MISSED else ""
+    return f"human with {prediction.probability[row]:.2f}{missed}"

@@ -183,6 +183,9 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
     if people is not None:
         health.gauge("people", len(people.tracks))
     health.count("unreliable", int(bool(located.tracked.cause)))
+    if (use := located.tracks.appearance) is not None:
+        health.count("appearance_decisions")
+        health.count("appearance_looked_at", int(use.looked))
     health.result()
 
 

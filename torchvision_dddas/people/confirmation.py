@@ -65,7 +65,7 @@ class GroundObservation:
     people: (N,) int64, recognized at it; a blob may be a crowd. nearest_m, nearest_sigmas: (N,) to the nearest person,
     infinite without any; in boxes NaN. best: (N,) highest probability of those at it, 0 without any; where it is below
     confirm.least_score they are in doubt, and so is the blob. places: (N,) people that fit into the blob side by side,
-    1 or more; None: one each.
+    1 or more; None: one each. blob: (M,) int64, the blob of each probable person, -1 for others.
     """
 
     looked: np.ndarray
@@ -74,6 +74,7 @@ class GroundObservation:
     nearest_sigmas: np.ndarray
     best: np.ndarray
     places: np.ndarray | None = None
+    blob: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 def observe_ground(
@@ -102,13 +103,14 @@ def observe_ground(
     both = blob_m2[:, None] + person_m2[None] + max(parameters.spread_m, 1e-6) ** 2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
     inside = sigmas <= math.sqrt(-2 * math.log(1 - parameters.gate_probability))  # chi-square of two degrees of freedom
-    people, best = _assigned(sigmas, inside, score, parameters)
+    people, best, blob = _assigned(sigmas, inside, score, parameters)
     clear = np.zeros(len(blob_m), bool)
     for view in views:
         clear |= _is_clear(blob_m, blob_m2, person_m, view, parameters)
     nearest_m = np.linalg.norm(apart, axis=-1).min(axis=1, initial=np.inf)
     nearest_sigmas = sigmas.min(axis=1, initial=np.inf)
-    return GroundObservation((people > 0) | (clear & ~inside.any(axis=1)), people, nearest_m, nearest_sigmas, best)
+    looked = (people > 0) | (clear & ~inside.any(axis=1))
+    return GroundObservation(looked, people, nearest_m, nearest_sigmas, best, blob=blob)
 
 
 def observe_picture(
@@ -129,7 +131,7 @@ def observe_picture(
     common = shared_px(blob_px[:, None], person_px)
     areas = blob_px[:, None, 2:].prod(axis=-1), person_px[:, 2:].prod(axis=-1)
     inside = common >= parameters.share * np.minimum(*areas)
-    people, best = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, parameters)
+    people, best, _ = _assigned(-common / np.maximum(areas[0] + areas[1] - common, 1e-9), inside, score, parameters)
     clear = (blob_px[:, 3] >= least_px) & ~inside.any(axis=1)
     unknown = np.full(len(blob_px), np.nan)
     places = np.maximum(blob_px[:, 2] / np.maximum(aspect * blob_px[:, 3], 1e-9), 1.0)
@@ -194,17 +196,23 @@ def _assigned(
     inside: Bool[np.ndarray, "N M"],
     score: Float[np.ndarray, "M"],
     parameters: ConfirmParameters,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Each person to the nearest blob whose gate they are in: (N,) probable people, (N,) the highest score of any."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each person to the nearest blob whose gate they are in.
+
+    (N,) probable people, (N,) the highest score of any, (M,) the blob of each probable person, -1 for others.
+    """
     people, best = np.zeros(len(distance), np.int64), np.zeros(len(distance))
-    ours = inside.any(axis=0)
-    if not ours.any():
-        return people, best
+    blob = np.full(distance.shape[1], -1)
+    ours = np.flatnonzero(inside.any(axis=0))
+    if not len(ours):
+        return people, best, blob
     nearest = np.where(inside, distance, np.inf).argmin(axis=0)[ours]
     known = np.nan_to_num(np.asarray(score, float)[ours], nan=1.0)
-    np.add.at(people, nearest[known >= parameters.least_score], 1)
+    probable = known >= parameters.least_score
+    np.add.at(people, nearest[probable], 1)
     np.maximum.at(best, nearest, known)
-    return people, best
+    blob[ours[probable]] = nearest[probable]
+    return people, best, blob
 
 
 def _is_clear(

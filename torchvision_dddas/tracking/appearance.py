@@ -83,20 +83,20 @@ def appearance_scores(similarity: np.ndarray, visible: np.ndarray, parameters: T
     return functions.where(is_known, functions.clip(score, _WORST, None) * functions.sqrt(visible)[..., None, :], 0.0)
 
 
-def is_ambiguous(score: np.ndarray, signature: np.ndarray) -> bool:
-    """Whether appearance may decide, from scores (N, M) without it and histograms (N, D) of the tracks.
+def ambiguity(score: np.ndarray, signature: np.ndarray) -> str:
+    """Why appearance may decide, from scores (N, M) without it and histograms (N, D) of the tracks; empty: it may not.
 
     It may where a track or a detection has two likely links, and where a likely link is of a track without histogram.
     """
     if not score.size:
-        return False
+        return ""
     likely = score > _LEAST_SCORE
-    for axis in (1, 0):
+    for axis, one, others in ((1, "a track", "detections"), (0, "a detection", "tracks")):
         rivals = likely & (score > score.max(axis=axis, keepdims=True) - _CLEAR_LEAD)
         if (rivals.sum(axis=axis) > 1).any():
-            return True
+            return f"{one} has several likely {others}"
     unknown = ~np.any(signature, axis=1) if signature.shape[1] else np.ones(len(score), bool)
-    return bool(likely[unknown].any())
+    return "a likely link is of a track without a histogram" if likely[unknown].any() else ""
 
 
 def blend_histograms(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:

@@ -10,9 +10,9 @@ from torchvision_dddas.config import Settings, TrackParameters
 from torchvision_dddas.geometry import best_pairs, namespace
 from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.appearance import (
+    ambiguity,
     appearance_scores,
     blend_histograms,
-    is_ambiguous,
     similarity,
     visible_shares,
 )
@@ -28,7 +28,7 @@ from torchvision_dddas.tracking.scores import (
     newborn_scores,
 )
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
-from torchvision_dddas.types import Detections, Table, Tracks
+from torchvision_dddas.types import AppearanceUse, Detections, Table, Tracks
 
 _RECENT = 3  # looks in which a track must have been seen to show how targets move
 _LEAVING_FRAMES, _LEAVING_LOOKS = 15, 3  # for which a target is predicted to go on; later it may have stopped or turned
@@ -73,7 +73,8 @@ class _Sample:
     """A frame and those of its detections that count. row: of the frame's detections. step: motion from the one before.
 
     begins: (M,) which may begin a track. appearance: gives the (M, D) histograms. time: in looks. look: its number.
-    signature: the histograms, (M, 0) until needed. visible: share of each box.
+    examined: why the histograms were computed; empty until then. signature: they, (M, 0) until needed. visible: share
+    of each box.
     """
 
     frame: int
@@ -85,13 +86,15 @@ class _Sample:
     appearance: Callable[[], np.ndarray] | None
     time: float
     look: int
+    examined: str = ""
 
     def __post_init__(self) -> None:
         self.signature, self.visible = np.zeros((len(self.row), 0), np.float32), np.ones(len(self.row))
 
-    def examine(self) -> None:
+    def examine(self, cause: str) -> None:
         """Compute the histograms, once."""
         if self.appearance is not None and len(self.row):
+            self.examined = cause
             self.signature, self.visible = self.appearance()[self.row], visible_shares(self.box_px)
         self.appearance = None
 
@@ -139,6 +142,7 @@ class ScoreTracker:
         self._waiting: _Sample | None = None
         self._doubts = DoubtRule(settings.track)
         self._confirmed = confirmed
+        self._uses: dict[int, AppearanceUse] = {}  # of appearance, by frame, of those that are not settled
         self._seen = self._lone = 0  # detections, and those of them that were followed by nothing
 
     def feed(
@@ -161,21 +165,25 @@ class ScoreTracker:
         time, self._looks = frame / self.interval, self._looks + 1
         sample = _Sample(frame, box, score, row, begins[row], now_from_before, wanted, time, self._looks)
         if self.parameters.appearance == "always":
-            sample.examine()
+            sample.examine("track.appearance is always")
         if not self.parameters.look_ahead:
             self._decide(sample, None)
         else:
             if self._waiting is not None:
                 self._decide(self._waiting, sample)
             self._waiting = sample
-        return self.smoother.settle()
+        return self._settle()
 
     def end(self) -> list[Tracks]:
         """The frames that were still waiting."""
         if self._waiting is not None:
             self._decide(self._waiting, None)
             self._waiting = None
-        return self.smoother.settle(everything=True)
+        return self._settle(everything=True)
+
+    def _settle(self, everything: bool = False) -> list[Tracks]:
+        settled = self.smoother.settle(everything)
+        return [replace(tracks, appearance=self._uses.pop(tracks.frame, None)) for tracks in settled]
 
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
         """Link a frame's detections to the tracks, in view of the next frame where there is one."""
@@ -183,10 +191,12 @@ class ScoreTracker:
         self._follow_camera(now)
         score = self._scores(self.tracks, now, box)
         unexamined = [near for near in (now, ahead) if near is not None and near.appearance is not None]
-        if unexamined and is_ambiguous(score, self.tracks.signature):
+        if unexamined and (cause := ambiguity(score, self.tracks.signature)):
             for near in unexamined:
-                near.examine()
+                near.examine(cause if near is now else f"already compared with frame {now.frame}, where {cause}")
             score = self._scores(self.tracks, now, box)
+        if score.size and (now.examined or now.appearance is not None):
+            self._uses[now.frame] = AppearanceUse(bool(now.examined), now.examined or "no link is in doubt")
         tracks, detections = plausible_links(score)
         at_border = is_near_border(box, self.size)
         # Tracks that would begin with each detection, without numbers yet, and those that would go on by each link.

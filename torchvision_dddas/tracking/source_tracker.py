@@ -20,7 +20,7 @@ from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.tracking.dual_ascent import add_lone_targets, assign_triplets
-from torchvision_dddas.types import Detections, Float, Int, Tracks
+from torchvision_dddas.types import AppearanceUse, Detections, Float, Int, Tracks
 
 Feature = Literal["location", "appearance"]
 
@@ -330,6 +330,27 @@ def weigh(window: Sequence[Features], parameters: PaperParameters) -> tuple[floa
     return weight, location, found
 
 
+def explain_weight(
+    window: Sequence[Features], weight: float, location: float, appearance: float | None, parameters: PaperParameters
+) -> AppearanceUse:
+    """What `weigh` found, and why."""
+    lowest, found = parameters.lowest_dispersion, f"dispersion of locations {location:.3f}"
+    has_pictures = all(frame.has_picture or not len(frame) for frame in window)
+    if parameters.rule == "fixed":
+        cause = "paper.rule is fixed"
+    elif location > lowest:
+        cause = f"{found}, above {lowest:g}"
+    elif appearance is not None:
+        cause = f"{found}, of appearances {appearance:.3f}: {'only the latter' if weight == 0 else 'neither'}"
+        cause += f" above {lowest:g}"
+    else:
+        cause = found
+    if not has_pictures and weight == 1:
+        cause += ", and a frame has no picture"
+    shown = float("nan") if appearance is None else appearance
+    return AppearanceUse(weight < 1, cause, weight, location, shown)
+
+
 # -- association -------------------------------------------------------------------------------------------------------
 
 
@@ -433,9 +454,12 @@ class SourceTracker:
         affinities: Mapping[Feature, np.ndarray] | None = None,
     ) -> Tracks:
         """The identities of the newest frame of a window. affinities: as for `associate`."""
-        identity = np.zeros(len(detections), np.int64)
+        identity, use = np.zeros(len(detections), np.int64), None
         if len(window) > 1:
-            rows = associate(window, self.parameters, affinities).rows
+            found = associate(window, self.parameters, affinities)
+            rows = found.rows
+            dispersions = found.location_dispersion, found.appearance_dispersion
+            use = explain_weight(window, found.weight, *dispersions, self.parameters)
             # The newest link counts: i to j, or i to k where j is the dummy, unless another target has that identity by
             # its own link to j.
             for older, known in enumerate(self.identities, 1):
@@ -447,7 +471,8 @@ class SourceTracker:
         identity[new] = self.next_identity + np.arange(len(new))
         self.next_identity += len(new)
         self.identities.appendleft(identity)
-        return Tracks(frame, identity, detections.box_px, detections.score, np.arange(len(detections)))
+        row = np.arange(len(detections))
+        return Tracks(frame, identity, detections.box_px, detections.score, row, appearance=use)
 
     def end(self) -> list[Tracks]:
         """Nothing: no frame waits."""

@@ -29,6 +29,11 @@ from torchvision_dddas.types import (
 
 MOTION = "moving"
 """The kind of detections that the motion detector makes."""
+WEIGHT, LOOKED = "paper.weight", "appearance.looked"
+"""What the association adjusts: the source's weight of location; in the default one, whether appearance is looked at.
+
+The latter is no parameter, but named like one in the record.
+"""
 
 
 class Tracker:
@@ -197,6 +202,11 @@ class FrameTracker:
         self.interval, self.pictures = interval, pictures
         self.tracker = Tracker(settings, interval, size, motion, certain, backend)
         self._waiting: deque[TrackedFrame] = deque()
+        paper = settings.paper
+        self._in_force = {  # by what an Adjustment calls it
+            WEIGHT: paper.weight if paper.rule == "fixed" else 1.0,
+            LOOKED: float(settings.track.appearance == "always"),
+        }
 
     def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
         """Add a frame, whose tracks are not known yet; yields the frames that are settled by it."""
@@ -217,7 +227,17 @@ class FrameTracker:
 
     def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
         for tracks in settled:
-            yield replace(self._waiting.popleft(), tracks=tracks)
+            given = self._waiting.popleft()
+            yield replace(given, tracks=tracks, adjustments=given.adjustments + self._changes(tracks))
+
+    def _changes(self, tracks: Tracks) -> tuple[Adjustment, ...]:
+        """What is new in how a frame used appearance."""
+        use = tracks.appearance
+        if use is None:
+            return ()
+        name, new = (LOOKED, float(use.looked)) if np.isnan(use.weight) else (WEIGHT, use.weight)
+        old, self._in_force[name] = self._in_force[name], new
+        return () if new == old else (Adjustment(tracks.frame, name, old, new, use.cause),)
 
 
 def without_picture(frame: Frame) -> Frame:

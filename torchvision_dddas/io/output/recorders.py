@@ -1,7 +1,9 @@
 """What each command writes into its output folder."""
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +14,14 @@ from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
 from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder
 from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
-from torchvision_dddas.io.output.run_record import NO_POSE, RUN_JSON, RunRecord, Spans, describe_nothing_located
+from torchvision_dddas.io.output.run_record import (
+    NO_POSE,
+    RUN_JSON,
+    RunRecord,
+    Spans,
+    describe_nothing_located,
+    without_numbers,
+)
 from torchvision_dddas.io.output.run_report import REPORT
 from torchvision_dddas.io.overlay import LIKELY, RunPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
@@ -51,7 +60,7 @@ class DetectionRecorder(RunRecorder[Scene]):
 class TrackRecorder(RunRecorder[TrackedFrame]):
     """The folder of `dddas track`: tables, overlay."""
 
-    files = ("tracks.txt", "tracks.csv", "overlay.mp4", RUN_JSON)
+    files = ("tracks.csv", "tracks.txt", "appearance.csv", "overlay.mp4", RUN_JSON)
     saved = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> RunRecord:
@@ -59,6 +68,7 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
         pictures = RunPictures(size)
         parts: dict[str, Part[TrackedFrame]] = {
             "tables": tables.track_tables(self.folder),
+            "appearance": tables.appearance_table(self.folder),
             "overlay": OverlayVideo(self.folder, rate_hz, lambda tracked: pictures(FrameResult(tracked))),
         }
         return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
@@ -179,11 +189,12 @@ class PipelineRecorder(RunRecorder[FrameResult]):
     """The folder of `dddas run`: tables, overlay, log, and where targets are located maps and a report of them."""
 
     found_files: ClassVar[tuple[str, ...]] = (
-        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", LOG_TXT, REPORT, "overlay.mp4", RUN_JSON),
+        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", "appearance.csv"),
+        *(LOG_TXT, REPORT, "overlay.mp4", RUN_JSON),
     )
     """Files of a run that locates nothing."""
     files: ClassVar[tuple[str, ...]] = (
-        *(*found_files, "landmarks.csv", "confirmed.csv"),
+        *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
     saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
@@ -205,11 +216,13 @@ class PipelineRecorder(RunRecorder[FrameResult]):
                 "maps": PartOf(maps, _locations),
                 "positions": PartOf(tables.aerial_tables(folder, has_degrees), _locations),
                 **({"landmarks": tables.landmark_table(folder, names, has_degrees)} if names else {}),
-                "confirmed": tables.ConfirmedPositions(folder, has_degrees),
+                "confirmed": tables.confirmed_positions(folder, has_degrees),
+                "crowds": tables.crowd_table(folder, has_degrees),
             }
         parts |= {
             "detections": PartOf(detection_tables(folder), _scene),
-            "tracks": PartOf(tables.track_tables(folder), lambda result: result.tracked),
+            "tracks": PartOf(tables.track_tables(folder), _tracked),
+            "appearance": PartOf(tables.appearance_table(folder), _tracked),
             "overlay": OverlayVideo(folder, rate_hz, pictures),
             "story": self.story,
         }
@@ -245,10 +258,23 @@ class PipelineRecorder(RunRecorder[FrameResult]):
 
 
 def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
-    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity."""
+    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity.
+
+    Of the decisions whether to look at appearance: how many there were, by their causes, and the range of dispersions.
+    """
     counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
     counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
     counts["untracked"] = counts.get("untracked", 0) + len(tracked.untracked)
+    if (use := tracked.tracks.appearance) is not None:
+        kept = counts.setdefault("appearance", {"decisions": 0, "looked_at": 0, "causes": {}})
+        kept["decisions"] += 1
+        kept["looked_at"] += use.looked
+        cause = without_numbers(use.cause)
+        kept["causes"][cause] = kept["causes"].get(cause, 0) + 1
+        for name, value in asdict(use).items():
+            if name.endswith("dispersion") and math.isfinite(value):
+                low, high = kept.get(name, (value, value))
+                kept[name] = [min(low, value), max(high, value)]
 
 
 def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
@@ -335,6 +361,10 @@ def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:
 def _locations(result: FrameResult) -> AerialLocations:
     assert result.locations is not None
     return result.locations
+
+
+def _tracked(result: FrameResult) -> TrackedFrame:
+    return result.tracked
 
 
 def _scene(result: FrameResult) -> Scene:

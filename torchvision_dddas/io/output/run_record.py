@@ -27,6 +27,7 @@ RUN_JSON = "run.json"
 NO_POSE = "the camera's pose is unknown"
 """The cause of a frame that is not located and says nothing of why."""
 _STEP = math.log(1.01)
+_MOST_CHANGES = 1000  # of a parameter that run.json lists; the others are counted
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -52,6 +53,11 @@ class Durations:
         return math.exp(bins[int(np.searchsorted(count, (count[-1] + 1) // 2))] * _STEP)
 
 
+def without_numbers(text: str) -> str:
+    """A text with # for each number."""
+    return _NUMBER.sub("#", text)
+
+
 class Spans:
     """Remarks on frames. The same remark on successive frames is one row, with the first and the last of them.
 
@@ -65,7 +71,7 @@ class Spans:
 
     def add(self, frame: int, before: int, text: str, **cells: Any) -> None:
         """Add a remark on a frame. before: the number of the frame that came before it. cells: further ones."""
-        key = text if self._is_exact else _NUMBER.sub("0", f"{text} {cells}")
+        key = text if self._is_exact else without_numbers(f"{text} {cells}")
         row = self._open.get(key)
         if row is not None and row["last"] in (before, frame):
             row["last"] = frame
@@ -101,7 +107,8 @@ class RunRecord:
         self._begun = time.perf_counter()
         self._stages: dict[str, Durations] = {}
         self.frames = self.targets = self.unreliable_frames = 0
-        self.adjustments: list[dict[str, Any]] = []
+        self.adjustments: list[dict[str, Any]] = []  # the first _MOST_CHANGES of each parameter
+        self._changes: Counter[str] = Counter()
         self.unreliable = Spans(is_exact=True)
         self.problems: list[str] = []
         self.notes: list[str] = []
@@ -128,9 +135,11 @@ class RunRecord:
         self.targets += targets
         for stage, spent in seconds.items():
             self._stages.setdefault(stage, Durations()).add(spent)
-        self.adjustments += [
-            {"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause} for a in adjustments
-        ]
+        for a in adjustments:
+            self._changes[a.parameter] += 1
+            if self._changes[a.parameter] <= _MOST_CHANGES:
+                row = {"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause}
+                self.adjustments.append(row)
         if cause is not None:
             self.unreliable_frames += 1
             self.unreliable.add(number, self.last_frame, cause)
@@ -161,6 +170,7 @@ class RunRecord:
             "problems": self.problems,
             "unreliable": self.unreliable.rows,
             "adjustments": self.adjustments,
+            "adjustments_made": dict(self._changes),
             "seconds": {"wall": round(time.perf_counter() - self._begun, 3), "stages": stages},
         }
         write_run_record(self._path, state, record)

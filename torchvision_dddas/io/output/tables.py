@@ -1,12 +1,14 @@
 """The tables that runs write: their schemas, and their rows for one frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 
+from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.io.atomic_files import remove
 from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
@@ -24,9 +26,11 @@ from torchvision_dddas.io.tables import (
     SCORE,
     TARGET,
     Column,
+    Item,
     Rows,
     Schema,
     TableFiles,
+    TextFiles,
     compass_deg,
     mot_rows,
 )
@@ -78,6 +82,13 @@ SIGHTINGS = Schema(
     *(FRAME, Column("camera"), TARGET, *BOX, PRECISE_SCORE, Column("cut", "d"), Column("by")),
     *(Column("distance_m", ".4f"), Column("bearing_deg", ".4f"), *EAST_NORTH, *COVARIANCE),
 )
+
+APPEARANCE = Schema(
+    "decisions",
+    *(FRAME, Column("looked", "d"), Column("weight", ".4g")),
+    *(Column("location_dispersion", ".4f"), Column("appearance_dispersion", ".4f"), Column("cause")),
+)
+"""appearance.csv: a row for each frame in which it was decided whether to look at appearance; as AppearanceUse."""
 
 CONFIRMATION = (
     *(KIND, Column("probability", ".4f"), Column("seen_by"), Column("people", "d")),
@@ -271,33 +282,77 @@ def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequenc
     return TableFiles({folder / "confirmed.csv": (schema, rows)})
 
 
-class ConfirmedPositions(TableFiles[FrameResult]):
-    """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
+class OptionalTable(Generic[Item]):
+    """A table of the items that have something for it; no file if none has."""
 
-    def __init__(self, folder: Path, has_degrees: bool) -> None:
-        self._path, self._is_written = folder / "confirmed.csv", False
-        schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION)
-        super().__init__({self._path: (schema, self._rows)})
+    def __init__(self, path: Path, schema: Schema, rows: Callable[[Item], Rows | None]) -> None:
+        """rows: of an item; None: it has nothing for the table."""
+        self._path, self._schema, self._rows = path, schema, rows
+        self._file, self._is_written = TextFiles({path: schema.header}), False
+        self.discard = self._file.discard
 
-    def write(self, item: FrameResult) -> None:
-        """Add the targets of a frame."""
-        if item.confirmed is not None and item.locations is not None:
+    def write(self, item: Item) -> None:
+        """Add what an item has. Raises OSError if the disk refuses."""
+        if (rows := self._rows(item)) is not None:
             self._is_written = True
-            super().write(item)
+            self._file.write(self._schema.format_rows(rows))
 
     def close(self, complete: bool = True) -> None:
-        """Put the table in its place, or remove that of an earlier run."""
+        """Put the table in its place, or remove that of an earlier run. Raises OSError if it cannot be written."""
         if self._is_written:
-            super().close(complete)
+            self._file.close()
         else:
             remove(self._path)
 
-    @staticmethod
-    def _rows(result: FrameResult) -> Rows:
-        assert result.confirmed is not None
-        assert result.locations is not None
-        own, rows = _position_rows(result.locations.positions), result.confirmed.row
-        return {name: np.asarray(values)[rows] for name, values in own.items()} | _confirmation_rows(result.confirmed)
+
+def confirmed_positions(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
+    """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
+
+    def rows(result: FrameResult) -> Rows | None:
+        confirmed, located = result.confirmed, result.locations
+        if confirmed is None or located is None:
+            return None
+        own = _position_rows(located.positions)
+        return {name: np.asarray(values)[confirmed.row] for name, values in own.items()} | _confirmation_rows(confirmed)
+
+    return OptionalTable(
+        folder / "confirmed.csv", Schema("positions", *_position_columns(has_degrees), *CONFIRMATION), rows
+    )
+
+
+def crowd_table(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
+    """crowds.csv, of crowds as ground vehicles see them; no file if none was seen."""
+    own = (Column("people", "d"), *_VELOCITY, Column("seen_by"), Column("steers", "d"))
+    schema = Schema("crowds", FRAME, TARGET, *EAST_NORTH, *(DEGREES if has_degrees else ()), *own)
+
+    def rows(result: FrameResult) -> Rows | None:
+        crowds, located = result.crowds, result.locations
+        if crowds is None or located is None or not len(crowds):
+            return None
+        origin = located.positions.origin_deg
+        degrees = np.full((len(crowds), 2), np.nan) if origin is None else lonlat(crowds.east_north_m, origin)
+        return {
+            **_named(EAST_NORTH, crowds.east_north_m),
+            **_named(DEGREES, degrees),
+            **_named(_VELOCITY, crowds.velocity_m_s),
+            "frame": located.frame,
+            "target": crowds.target,
+            "people": crowds.people,
+            "seen_by": crowds.seen_by,
+            "steers": crowds.steers,
+        }
+
+    return OptionalTable(folder / "crowds.csv", schema, rows)
+
+
+def appearance_table(folder: Path) -> OptionalTable[TrackedFrame]:
+    """appearance.csv; no file if nothing was decided, as without pictures."""
+
+    def rows(tracked: TrackedFrame) -> Rows | None:
+        use = tracked.tracks.appearance
+        return None if use is None else {"frame": tracked.number, **asdict(use)}
+
+    return OptionalTable(folder / "appearance.csv", APPEARANCE, rows)
 
 
 def _confirmation_rows(confirmed: Confirmation) -> dict[str, Any]:

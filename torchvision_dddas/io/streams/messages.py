@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from torchvision_dddas.io.maps.formats import STALE_S, event, event_uid
 from torchvision_dddas.io.maps.ground_tracks import iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
 from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
-from torchvision_dddas.types import FrameResult, TrackedFrame
+from torchvision_dddas.types import AppearanceUse, FrameResult, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
 """Added to the identities of people, who are tracked apart from targets: MOT text has no column for a kind."""
@@ -84,6 +84,7 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
         "targets": None if result is None else _targets(result),
         "people": None if people is None else list(_boxes(people)),
         "ground": None if result is None else _ground(result, about),
+        "appearance": None if result is None else _appearance(result.tracks.appearance),
         "adjustments": [
             {
                 "frame": one.frame,
@@ -161,6 +162,12 @@ def _ground(result: FrameResult, about: About) -> dict[str, Any] | None:
         "changes": list(fix.changes),
         "landmarks": landmarks,
     }
+
+
+def _appearance(use: AppearanceUse | None) -> dict[str, Any] | None:
+    if use is None:
+        return None
+    return {name: _number(value, 4) if isinstance(value, float) else value for name, value in asdict(use).items()}
 
 
 def _number(value: float, digits: int) -> float | None:
