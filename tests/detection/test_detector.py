@@ -3,7 +3,7 @@
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
 from types import SimpleNamespace
 
 import cv2
@@ -195,7 +195,8 @@ def test_the_interval_decides_what_is_found(config, film):
 @pytest.mark.parametrize(("cost", "interval"), [(1.0, 5), (2.0, 10), (0.0, 10)])
 def test_looks_that_take_long_lengthen_the_interval_if_their_cost_is_measured(cost, interval, film, monkeypatch):
     """By a clock on which a look takes 0.2 s: two frames at the reference rate."""
-    readings = chain.from_iterable((second, second + 0.2 / 6) for second in count())  # begin and end of its six stages
+    # The begin and the end of its six stages.
+    readings = chain.from_iterable((second, second + 0.2 / 6) for second in range(1000))
     clock = SimpleNamespace(perf_counter=lambda: next(readings))
     monkeypatch.setattr("torchvision_dddas.detection.detector.time", clock)
     settings = with_parameters(load_config(), {"interval.cost": cost, "interval.maximum_frames": 20})

@@ -115,8 +115,7 @@ def choose_pairs(
         return next_pair(at, interval, first, last), None, None
     # No further than `look_ahead`, even if more is known: the result must not depend on how frames are batched.
     ahead = min(last, at + look_ahead(interval, settings))
-    gaps = near_gaps(parameters.near_frames, parameters.wide_frames, interval)
-    near = near_pairs(at, gaps, first, ahead)
+    near = near_pairs(at, near_gaps(parameters.near_frames, parameters.wide_frames, interval), first, ahead)
     wide = None
     if parameters.wide_frames and near:
         forward = min(parameters.wide_frames, max(2 * interval - 2, 0), ahead - at)
