@@ -2,6 +2,7 @@
 
 python eval/simulated.py altitude     errors of crowds from video to metres by altitude (appendix A, Fig. 7)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
+python eval/simulated.py interval     what the detection interval buys (appendix B, eq. 2)
 python eval/simulated.py whole        whole scenarios in the closed loop
 
 Figures are mean ± standard error (range) over seeds. --cache FILE keeps finished cases.
@@ -25,8 +26,11 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control import StartedSource, build_mission, fit_settings
 from torchvision_dddas.control.rules import every_least
-from torchvision_dddas.detection import detect_motion, load_engine, pixels_per_metre
+from torchvision_dddas.detection import MotionDetector, detect_motion, load_engine, pixels_per_metre
+from torchvision_dddas.evaluation.metrics import boxes as box_metrics
+from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer, TrueFrame
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
@@ -318,13 +322,17 @@ def measure_loop(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_loop(case: Case) -> Case:
-    """One run."""
-    cv2.setNumThreads(1)
+    """One run of a shipped scenario."""
     scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
-    source = SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"])
-    parameters = {name: value for name, value in case["set"].items() if name != "every"}
+    return fly(SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"]), case["set"])
+
+
+def fly(source: SimulatorSource, changed: Case) -> Case:
+    """One run with changed settings; `every` of them: look at every so many frames."""
+    cv2.setNumThreads(1)
+    parameters = {name: value for name, value in changed.items() if name != "every"}
     settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
-    timed: Any = TimedSource(source, case["set"].get("every", 1))
+    timed: Any = TimedSource(source, changed.get("every", 1))
     started = StartedSource(timed)
     mission = build_mission(started, settings, "onboard")
     engine = load_engine("onboard", mission.settings)
@@ -340,6 +348,93 @@ def fly_loop(case: Case) -> Case:
     cpu = (bench.now()[1] - start - judging - timed.spent_s) / source.scenario.clip.seconds
     aerial = cpu * (1 - stages.get("people", 0.0) / max(sum(stages.values()), 1e-9))
     return {"score": scorer.score().by_name(), "cpu": float(cpu), "aerial": float(aerial)}
+
+
+# -- the detection interval ------------------------------------------------------------------------------------------
+
+ALTITUDES_M, SPEEDS_M_S = (50.0, 100.0, 200.0), (2.0, 5.0, 10.0)
+INTERVALS = (1, 2, 3, 5, 8)
+LOOKED: dict[str, Case] = {
+    "closed loop": {"steering.follow": False, "steering.look": False},
+    **{str(every): {"steering.on": False, "interval.rule": False, "every": every} for every in INTERVALS},
+}
+COMPARED: dict[str, Case] = {
+    "by the rule": {"interval.rule": True},
+    **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
+}
+MEASURED = {"patrol": ("F1 of boxes", "box_f1"), "source": ("F of pixels", "f")}
+"""What is measured of a configuration: boxes of crowds, or the people in them where boxes are not a crowd's."""
+
+
+def measure_interval(options: bench.Options) -> tuple[str, Any]:
+    """Accuracy against processor time by detection interval: its rules beside fixed ones, by altitude and speed.
+
+    First table: one of so many frames is looked at; to how many metres every crowd is known at every moment (10 m where
+    nothing is known), and processor time a second of clip. The closed loop chooses the frames; vehicles fly as planned,
+    with exact instruments, so that the error is that of detection and of the time between looks. Other tables: every
+    frame is looked at, and the interval says how far apart the frames are that are compared; ms of processor a frame.
+    """
+    cases = [
+        {"altitude_m": altitude, "speed_m_s": speed, "seed": seed, "seconds": options.seconds}
+        for altitude in ALTITUDES_M
+        for speed in SPEEDS_M_S
+        for seed in range(options.seeds)
+    ]
+    results = bench.run_cases(cases, fly_intervals, options.jobs, options.cache)
+    flights = {f"{a:g} m, {s:g} m/s": (a, s) for a in ALTITUDES_M for s in SPEEDS_M_S}
+    tables = []
+    for study, what, ways, digits in (
+        ("looked", "known to within m / s a s", LOOKED, 2),
+        *((config, f"`{config}`: {word} / ms", COMPARED, 0) for config, (word, _) in MEASURED.items()),
+    ):
+        rows = []
+        for flight, of in {**flights, "all": None}.items():
+            here = [
+                result[study]
+                for case, result in zip(cases, results, strict=True)
+                if of in (None, (case["altitude_m"], case["speed_m_s"]))
+            ]
+            pairs = ([Spread(one[way][k] for one in here) for k in (0, 1)] for way in ways)
+            cells = (f"{a.text(spread=False)} / {b.text(digits, spread=False)}" for a, b in pairs)
+            rows.append([flight, *cells])
+        tables.append(bench.format_table([what, *ways], rows))
+    return "\n\n".join([*tables, f"{options.seeds} seeds, {options.seconds:g} s each: means."]), results
+
+
+def fly_intervals(case: Case) -> Case:
+    """Accuracy and time of one flight, to and fro over two crowds, by what is varied and by interval."""
+    uav = {"altitude_m": case["altitude_m"], "speed_m_s": case["speed_m_s"]}
+    uav |= {"start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
+    uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
+    scenario = walking(
+        case["seed"], case["seconds"], uav=uav, team={"ugvs": 0},
+        clip={"seconds": case["seconds"], "located_by": "telemetry"},
+    )  # fmt: skip
+    found: Case = {"looked": {}} | {config: {} for config in MEASURED}
+    for way, changed in LOOKED.items():
+        run = fly(SimulatorSource(scenario), changed)
+        found["looked"][way] = [run["score"]["knowledge_m"], run["cpu"]]
+    source = SimulatorSource(scenario)
+    frames, truths = list(source), source.truths()
+    for way, changed in COMPARED.items():
+        for config, (_, measure) in MEASURED.items():
+            settings = with_parameters(fit_settings(load_config(config), source), changed)
+            detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
+            start = bench.now()[1]
+            scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
+            spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
+            found[config][way] = [score_scenes(scenes, truths)[measure], spent_ms]
+    return found
+
+
+def score_scenes(scenes: list[Scene], truths: list[Truth]) -> dict[str, float]:
+    """Measures of masks, and the F1 of boxes at an IoU of 0.5."""
+    pixels, boxes = pixel_metrics.Pixels(), box_metrics.Boxes()
+    for scene, truth in zip(scenes, truths, strict=True):
+        pixels = add_counts(pixels, pixel_metrics.count(scene.mask, truth.mask))
+        true = box_metrics.boxes_of(truth.mask)
+        boxes = add_counts(boxes, box_metrics.match(scene.detections.box_px, true))
+    return {**pixel_metrics.measures(pixels), "box_f1": box_metrics.measures(boxes)["f1"]}
 
 
 def measure_whole(options: bench.Options) -> tuple[str, Any]:
@@ -380,6 +475,7 @@ if __name__ == "__main__":
     studies = {
         "altitude": (measure_altitude, common | altitudes),
         "loop": (measure_loop, common | loop),
+        "interval": (measure_interval, common | {"--seeds": 2, "--seconds": 5.0}),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
     }
     bench.main(__doc__, studies)

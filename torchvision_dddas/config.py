@@ -123,8 +123,16 @@ class IntervalParameters(Group):
     lowest_speed_m_s: float = parameter(
         0.5, "slower speeds count as this speed, so that hovering gives the longest interval", "m/s", 0.01, 10
     )
-    cost: float = parameter(1.0, "cost of one step relative to its reference (O in eq. 2)", "-", 0.1, 10)
-    memory_frames: int = parameter(9, "steps over which the median of the background flow is taken", "frames", 1, 100)
+    cost: float = parameter(
+        1.0,
+        "time of a look, in frames at the reference rate (O in eq. 2); 0: measured; 1 is measured too by `run --live`",
+        "frames",
+        0,
+        10,
+    )
+    memory_frames: int = parameter(
+        9, "looks over which the medians of the background flow and of a look's time are taken", "frames", 1, 100
+    )
 
 
 class DifferenceParameters(Group):
@@ -137,7 +145,9 @@ class DifferenceParameters(Group):
         "W1|, the source's eq. 9; to_next: |I(t) - W1|, one interval later alone, the source's earlier chain",
     )
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = parameter(
-        (1, 2), "distances from the reference frame to its neighbours, on both sides", "frames"
+        (1, 2),
+        "distances to the neighbours on both sides; without a wide pair the longest follows the interval, this at 3",
+        "frames",
     )
     wide_frames: int = parameter(6, "distance of the pair of frames that fills large targets; 0: off", "frames", 0, 60)
     noise_levels: float = parameter(4.0, "noise of a flat region (normalized)", "grey levels", 0.1, 50)

@@ -20,6 +20,8 @@ _BLOCK_PX = 16
 DEGREE_M = 111_320.0
 # So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
 _PART = 1 << 14
+# The detection interval that distances to near frames are meant for.
+_NEAR_INTERVAL = 3
 
 Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
 """Longitude and latitude."""
@@ -376,14 +378,26 @@ def pair_about(at: int, gap: int, first: int, last: int) -> tuple[int, int] | No
     return _first_within([(at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap)], first, last)
 
 
+def near_gaps(near_frames: Sequence[int], wide_frames: int, interval: int) -> list[int]:
+    """Distances to the frames that a frame is compared with at a detection interval.
+
+    Without a wide pair the longest, which is meant for 3 frames, follows the interval in proportion, up to its length.
+    """
+    if wide_frames:
+        return list(near_frames)
+    longest = max(near_frames)
+    far = min(max(round(longest * interval / _NEAR_INTERVAL), 1), max(longest, interval))
+    return [far if gap == longest else gap for gap in near_frames]
+
+
 def near_pairs(at: int, gaps: Sequence[int], first: int, last: int) -> list[tuple[int, int]]:
     """The pairs of frames that a frame is compared with, within first..last; may be empty."""
-    near = list(dict.fromkeys(pair for gap in gaps if (pair := pair_about(at, gap, first, last))))
-    if not near and (pair := pair_about(at, 1, first, last)):
-        near = [pair]
-    # One-sided pairs show a target's next places too, the more of them the longer the gap: only the closest is used,
-    # and only where no pair looks both ways.
-    return [pair for pair in near if pair[0] < at < pair[1]] or near[:1]
+    # Near an end gaps shrink, so that pairs look both ways. At the end itself one looks one way only, to the closest
+    # frames: it shows a target's next places too, the more of them the longer its gap.
+    if room := min(at - first, last - at):
+        return list(dict.fromkeys((at - min(gap, room), at + min(gap, room)) for gap in gaps))
+    pair = pair_about(at, 1, first, last)
+    return [] if pair is None else [pair]
 
 
 def later_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:

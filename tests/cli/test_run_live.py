@@ -71,6 +71,15 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
     assert "results of 14 pictures, 0 dropped" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "cost"), [((), 1.0), (("live.pace=50",), 0.0), (("live.pace=50", "interval.cost=2"), 2.0)]
+)
+def test_the_cost_of_a_look_is_measured_where_frames_do_not_wait_unless_it_is_set(words, cost, dddas, frames, tmp_path):
+    changed = [word for change in words for word in ("--set", change)]
+    assert dddas("run", frames, *FAST, *changed, "--out", tmp_path).exit_code == 0
+    assert session(tmp_path)[1]["settings"]["interval"]["cost"] == cost
+
+
 def test_notes_on_the_files_are_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
     def noting(*given):
         return replace(prepare_run(*given), notes=["bravo has no colour"])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import Settings, SteeringParameters
+from torchvision_dddas.config import IntervalParameters, Settings, SteeringParameters
 from torchvision_dddas.control import Steering
 from torchvision_dddas.geo.landmark_trajectories import best_spread, spread_m2
 from torchvision_dddas.geo.projection import axes_of, project
@@ -270,13 +270,14 @@ def test_a_vehicle_that_falls_silent_is_counted_on_for_a_while_and_then_the_othe
     assert len(w.run(1).ordered()) == 4 and len(w.changes("team.vehicles")) == 2
 
 
-def sampled_by(targets, velocity=0.0, speed_m_s=0.5, misses=(), step=None):
+def sampled_by(targets, velocity=0.0, speed_m_s=0.5, misses=(), step=None, look_s=0.1, cost=1.0):
     """`every` after each frame, and the adjustments, for a flight over targets that stand or walk."""
-    one, every, made = steering(rate_hz=SAMPLED_HZ, sampling=True), [], []
+    settings = Settings(steering=SteeringParameters(sampling=True), interval=IntervalParameters(cost=cost))
+    one, every, made = Steering(settings, CAMERA, SAMPLED_HZ, NAMES[:4]), [], []
     flight = flown(pose_at((0, 0)), speed_m_s)
     for frame in range(1, 110):
         here = np.array(targets, float)[: 0 if frame in misses else None] + np.array(velocity) * frame / SAMPLED_HZ
-        seen = located(frame, here, velocity, rate_hz=SAMPLED_HZ)
+        seen = replace(located(frame, here, velocity, rate_hz=SAMPLED_HZ), seconds={"detect": look_s})
         command, new = one.update(seen, None, frame / SAMPLED_HZ + 1, team_at(SQUARE), flight, step)
         every.append(command.every)
         made += [change for change in new if change.parameter == "sampling.every"]
@@ -291,6 +292,13 @@ def test_frames_are_left_out_by_height_and_speed_but_while_a_target_is_lost_or_t
     assert (made[0].new, made[0].cause) == (5.0, "altitude 50.0 m, speed 0.5 m/s")
     assert [change.cause for change in made if change.new == 1] == ["target 1 was lost"]
     assert set(sampled_by([], step=Registration(np.eye(3), 200, 40, 0.3, 0.2))[0]) == {1}
+
+
+def test_looks_that_take_long_leave_out_more_frames_if_their_cost_is_measured():
+    """As above 2.4 frames; 3.6 where a look takes 1.5 times as long as a frame at the reference rate."""
+    for look_s, cost, wanted in ((0.15, 0.0, 4), (0.15, 1.0, 2), (0.02, 0.0, 2)):
+        every, made = sampled_by([[0, 0]], speed_m_s=1.3, look_s=look_s, cost=cost)
+        assert every[-1] == wanted and ("a look takes" in made[-1].cause) == (cost == 0)
 
 
 def test_no_picture_is_wanted_of_what_is_out_of_reach():

@@ -3,6 +3,8 @@
 import weakref
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -178,6 +180,31 @@ def test_the_interval_adapts_to_the_telemetry_and_the_change_is_recorded(film):
     assert (moved.frame, moved.old, moved.new) == (9, 3, 5)
     assert "altitude 100.0 m" in moved.cause
     assert [a.frame for s in scenes for a in s.adjustments if a.parameter == "gates.max_size_px"] == [1, 9]
+
+
+@pytest.mark.parametrize("config", [None, "fast", "half", "source", "two_frames"])
+def test_the_interval_decides_what_is_found(config, film):
+    found = []
+    for frames in (1, 8):
+        changed = {"interval.rule": False, "interval.frames": frames, "gates.min_area_px": 20}
+        found.append(detect(frames_of(film.images), with_parameters(load_config(config), changed)))
+    assert any(scene.mask.any() for scene in found[0]) and any(scene.mask.any() for scene in found[1])
+    assert not all(np.array_equal(one.mask, other.mask) for one, other in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize(("cost", "interval"), [(1.0, 5), (2.0, 10), (0.0, 10)])
+def test_looks_that_take_long_lengthen_the_interval_if_their_cost_is_measured(cost, interval, film, monkeypatch):
+    """By a clock on which a look takes 0.2 s: two frames at the reference rate."""
+    # The begin and the end of its six stages.
+    readings = chain.from_iterable((second, second + 0.2 / 6) for second in range(1000))
+    clock = SimpleNamespace(perf_counter=lambda: next(readings))
+    monkeypatch.setattr("torchvision_dddas.detection.detector.time", clock)
+    settings = with_parameters(load_config(), {"interval.cost": cost, "interval.maximum_frames": 20})
+    telemetry = flight(np.arange(64) / 10, 100.0)
+    scenes = list(detect_motion(Film(film.images * 4), settings, "onboard", telemetry))
+    assert scenes[-1].interval_frames == interval
+    causes = [a.cause for s in scenes for a in s.adjustments if a.parameter == "interval.frames"]
+    assert ("a look takes 200 ms" in causes[-1]) == (cost == 0)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import IntervalParameters, Settings, load_config, with_parameters
+from torchvision_dddas.config import IntervalParameters, Settings, config_folder, load_config, with_parameters
 from torchvision_dddas.detection import interval as windows
 from torchvision_dddas.detection.interval import (
     DistanceSettings,
@@ -12,11 +12,14 @@ from torchvision_dddas.detection.interval import (
     follow_distance,
     interval_from_flow,
     interval_from_telemetry,
+    look_cost,
     settings_at,
 )
 from torchvision_dddas.types import Flight
 
 PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
+# The source compares other frames at each interval.
+WIDE = with_parameters(Settings(interval=PARAMETERS), {"difference.kind": "between_later"})
 
 
 BASE = load_config(
@@ -33,14 +36,17 @@ BASE = load_config(
     [(20, 5, 10, 1), (40, 5, 10, 2), (20, 2.5, 10, 2), (20, 5, 30, 3), (60, 10, 20, 3)],
 )
 def test_the_interval_is_proportional_to_altitude_and_rate_over_speed(altitude, speed, rate, interval):
-    assert interval_from_telemetry(altitude, speed, rate, PARAMETERS) == pytest.approx(interval)
+    for cost in (1.0, 1.5):
+        wanted = interval_from_telemetry(altitude, speed, rate, cost, PARAMETERS)
+        assert wanted == pytest.approx(cost * interval)
 
 
 @pytest.mark.parametrize(
     ("flows", "width", "factor"), [([12.8], 640, 1), ([6.4], 640, 2), ([25.6], 1280, 1), ([12.8] * 4 + [300], 640, 1)]
 )
 def test_the_interval_is_inverse_to_the_median_flow_in_picture_widths(flows, width, factor):
-    assert interval_from_flow(flows, width, PARAMETERS) == pytest.approx(factor * PARAMETERS.reference_flow / 0.02)
+    wanted = factor * PARAMETERS.reference_flow / 0.02
+    assert interval_from_flow(flows, width, 1.0, PARAMETERS) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize(
@@ -51,19 +57,44 @@ def test_the_interval_is_inverse_to_the_median_flow_in_picture_widths(flows, wid
         (3.6, 4),
         (500, 12),
         (1e30, 12),
-        (interval_from_telemetry(100, 0.0, 10, PARAMETERS), 12),  # hovering
-        (interval_from_flow([0.0], 640, PARAMETERS), 12),  # a still camera
+        (interval_from_telemetry(100, 0.0, 10, 1.0, PARAMETERS), 12),  # hovering
+        (interval_from_flow([0.0], 640, 1.0, PARAMETERS), 12),  # a still camera
     ],
 )
 def test_the_interval_is_rounded_and_bounded(wanted, interval):
-    assert adjust_interval(1, 7, wanted, "", PARAMETERS)[0] == interval
+    assert adjust_interval(1, 7, wanted, "", WIDE)[0] == interval
 
 
 def test_noise_between_two_intervals_changes_nothing():
     current = 3
     for k in range(40):
-        current, records = adjust_interval(k, current, 3.5 + 0.2 * (-1) ** k, "", PARAMETERS)
+        current, records = adjust_interval(k, current, 3.5 + 0.2 * (-1) ** k, "", WIDE)
         assert not records
+
+
+def test_an_interval_at_which_the_same_frames_are_compared_is_no_adjustment():
+    """At 3 and 4 frames `fast` compares a frame with its two neighbours, at 5 with those two frames away."""
+    settings = load_config("fast")
+    assert adjust_interval(1, 3, 4.0, "", settings) == (3, ())
+    (record,) = adjust_interval(1, 3, 5.0, "slow", settings)[1]
+    assert (record.old, record.new, record.cause) == (3, 5, "slow")
+    assert adjust_interval(1, 3, 4.0, "", Settings())[0] == 4
+
+
+@pytest.mark.parametrize("name", [None, *sorted(path.stem for path in config_folder().glob("*.toml"))])
+def test_every_shipped_configuration_compares_other_frames_at_another_interval(name):
+    settings = load_config(name)
+    reach = [max(map(max, windows.compared_frames(interval, settings))) for interval in (1, 3, 8)]
+    assert reach[0] < reach[2] and reach == sorted(reach)
+
+
+def test_the_cost_of_a_look_is_its_median_time_in_frames_of_the_reference_rate_unless_it_is_stated():
+    measured = PARAMETERS.model_copy(update={"cost": 0.0})
+    cost, words = look_cost([0.2, 0.25, 9.0], measured)
+    assert cost == pytest.approx(2.5) and words == ", a look takes 250 ms"
+    assert look_cost([0.02], measured)[0] == 1.0  # a fast computer compares frames no closer together
+    assert look_cost([], measured) == (1.0, "")
+    assert look_cost([0.25], PARAMETERS.model_copy(update={"cost": 2.0})) == (2.0, "")
 
 
 @pytest.mark.parametrize(
@@ -159,6 +190,21 @@ def test_windows_stay_in_the_clip_and_within_two_intervals_ahead(name, interval)
 def test_small_targets_need_a_long_interval_and_their_switch(interval, on, pair):
     settings = load_config(overrides=["small.from_interval=3", "small.gap_frames=3", f"small.on={str(on).lower()}"])
     assert windows.choose_pairs(20, interval, 0, 40, settings)[2] == pair
+
+
+@pytest.mark.parametrize(
+    ("near", "interval", "gaps"),
+    [((1,), 1, {1}), ((1,), 8, {3}), ((1, 2), 1, {1}), ((1, 2), 3, {1, 2}), ((1, 2), 8, {1, 5}), ((4,), 8, {8})],
+)
+def test_without_a_wide_pair_the_longest_near_one_follows_the_interval(near, interval, gaps):
+    settings = with_parameters(Settings(), {"difference.near_frames": near, "difference.wide_frames": 0})
+    assert {b - 50 for _, b in windows.choose_pairs(50, interval, 0, 100, settings)[0]} == gaps
+
+
+def test_near_the_ends_of_a_clip_pairs_still_look_both_ways_where_they_can():
+    settings = with_parameters(load_config("fast"), {"interval.frames": 8})
+    pairs = [windows.choose_pairs(at, 8, 0, 20, settings)[0] for at in (0, 1, 2, 3, 20)]
+    assert pairs == [[(1, 2)], [(0, 2)], [(0, 4)], [(0, 6)], [(19, 18)]]
 
 
 def test_two_frames_are_compared_one_interval_apart_and_at_the_end_with_the_earlier() -> None:

@@ -1,6 +1,7 @@
 """The closed loop: reports come in, results go out as commands to the aerial vehicle and the ground vehicles."""
 
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
@@ -16,7 +17,13 @@ from torchvision_dddas.control.rules import AdjustmentLog, every_least, every_wa
 from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
 from torchvision_dddas.control.uav_commands import UavSteering
 from torchvision_dddas.control.ugv_commands import UgvTeam
-from torchvision_dddas.detection import describe_distance, interval_from_flow, interval_from_telemetry, pixels_per_metre
+from torchvision_dddas.detection import (
+    describe_distance,
+    interval_from_flow,
+    interval_from_telemetry,
+    look_cost,
+    pixels_per_metre,
+)
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
@@ -239,6 +246,7 @@ class Steering:
         self._every, self._every_changed_s, self._last_frame = 1, -np.inf, 0
         self._alert_s, self._alert = -np.inf, ""
         self._by_ground: list[int] = []  # targets that only ground vehicles see
+        self._costs: deque[float] = deque(maxlen=settings.interval.memory_frames)  # seconds that looks took
 
     def begin(self, flight: Flight | None) -> Command:
         """The command before anything is found: process as many frames as show a walker at this altitude."""
@@ -327,6 +335,8 @@ class Steering:
         """Of how many frames one is processed."""
         frame, parameters, interval = located.frame, self.settings.steering, self.settings.interval
         between, self._last_frame = max(frame - self._last_frame, 1), frame
+        self._costs.append(sum(located.seconds.values()))
+        cost, measured = look_cost(self._costs, interval)
         lost = np.flatnonzero(prediction.wanted & (prediction.missed == MISSED))
         if located.fix.pose is not None and len(lost):  # a target that left the picture is not lost
             lost = lost[inside(prediction.east_north_m[lost], located.fix.pose, self.camera) > 0]
@@ -338,10 +348,10 @@ class Steering:
         wanted, why = 1.0, self._alert
         if now_s >= self._alert_s:
             if flight is not None and np.isfinite([flight.altitude_m, flight.speed_m_s]).all():
-                wanted = interval_from_telemetry(flight.distance_m, flight.speed_m_s, self.rate_hz, interval)
+                wanted = interval_from_telemetry(flight.distance_m, flight.speed_m_s, self.rate_hz, cost, interval)
                 why = f"{describe_distance(flight)}, speed {flight.speed_m_s:.1f} m/s"
             elif step is not None and step.reliable:
-                wanted = interval_from_flow([step.flow_px / between], self.camera.size_px[0], interval)
+                wanted = interval_from_flow([step.flow_px / between], self.camera.size_px[0], cost, interval)
                 why = f"background flow {step.flow_px / between:.2f} px a frame"
             else:
                 return
@@ -349,7 +359,7 @@ class Steering:
             seen = prediction.missed <= MISSED
             speed, size = prediction.speed_m_s[seen], 2 * prediction.radius_m[seen]
             wanted, limit = every_wanted(wanted, self.rate_hz, speed, size, parameters)
-            why += limit
+            why += measured + limit
         if flight is not None and flight.altitude_m > 0:
             wanted = max(wanted, self._least_every(flight))
         every, made = sampled(frame, self._every, wanted, why, parameters)

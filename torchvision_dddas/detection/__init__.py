@@ -15,6 +15,7 @@ from torchvision_dddas.detection.interval import (
     describe_distance,
     interval_from_flow,
     interval_from_telemetry,
+    look_cost,
     pixels_per_metre,
 )
 from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
@@ -40,6 +41,7 @@ __all__ = [
     "interval_from_flow",
     "interval_from_telemetry",
     "load_engine",
+    "look_cost",
     "match_exposure",
     "pixels_per_metre",
     "track_both_ways",

@@ -20,6 +20,7 @@ from torchvision_dddas.detection.interval import (
     interval_from_flow,
     interval_from_telemetry,
     look_ahead,
+    look_cost,
     settings_at,
     settling_delay,
 )
@@ -28,7 +29,7 @@ from torchvision_dddas.detection.observation import Observation, Target, build_d
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import chain
+from torchvision_dddas.geometry import chain, near_gaps
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry
 
@@ -157,6 +158,7 @@ class MotionDetector:
         self._skipped = 0  # frames skipped on purpose so far
         self._ended = False
         self._flows: deque[float] = deque(maxlen=self.settings.interval.memory_frames)
+        self._costs: deque[float] = deque(maxlen=self.settings.interval.memory_frames)  # seconds that looks took
         self._flow = DenseFlow()
         self._small_tracks = SmallTracks(self.settings.small)
         self._distance = DistanceSettings(self.settings)
@@ -289,17 +291,19 @@ class MotionDetector:
         if slot.step is not None and slot.step.reliable:
             self._flows.append(slot.step.flow_px / (self._at(index + 1).frame.skipped + 1))
         wanted, cause = None, ""
+        cost, measured = look_cost(self._costs, parameters)
         if not parameters.rule:
             pass
         elif high is not None and np.isfinite(high.speed_m_s):
-            wanted = interval_from_telemetry(high.distance_m, high.speed_m_s, self.rate_hz, parameters)
+            wanted = interval_from_telemetry(high.distance_m, high.speed_m_s, self.rate_hz, cost, parameters)
             cause = f"{describe_distance(high)}, speed {high.speed_m_s:.1f} m/s"
         elif self._flows and parameters.reference_flow:
-            wanted = interval_from_flow(self._flows, slot.view.size[0], parameters)
+            wanted = interval_from_flow(self._flows, slot.view.size[0], cost, parameters)
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
         if wanted is not None:
             wanted /= slot.frame.skipped + 1
-            self.interval, moved = adjust_interval(number, self.interval, wanted, cause, parameters)
+            used = self._distance.settings
+            self.interval, moved = adjust_interval(number, self.interval, wanted, cause + measured, used)
             slot.adjustments += moved
         slot.interval = self.interval
 
@@ -416,6 +420,7 @@ class MotionDetector:
         self._last_number = until
 
     def _build_scene(self, slot: _Slot, index: int) -> Scene:
+        self._costs.append(sum(slot.seconds.values()))
         targets = slot.observation.targets
         targets = targets + self._small_targets(index, targets)
         if slot.frame.skipped:  # what moved from look to look, per frame
@@ -462,7 +467,8 @@ def _memory_frames(settings: Settings) -> int:
     parameters, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
     if parameters.kind in ("between_later", "to_next"):
         return max(longest, _JUDGED_FRAMES)
-    # A window that looks one way only looks twice as far.
+    # A wide or small window that looks one way only looks twice as far.
     small = settings.small.gap_frames if settings.small.on else 0
-    widest = 2 * max(parameters.wide_frames, *parameters.near_frames, small)
-    return max(min(widest, longest), parameters.wide_frames, 2 * max(parameters.near_frames), _JUDGED_FRAMES)
+    widest = 2 * max(parameters.wide_frames, small)
+    near = near_gaps(parameters.near_frames, parameters.wide_frames, longest // 2)
+    return max(min(widest, longest), parameters.wide_frames, *near, _JUDGED_FRAMES)

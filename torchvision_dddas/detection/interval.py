@@ -6,51 +6,74 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
-from torchvision_dddas.geometry import later_pair, near_pairs, next_pair, pair_about
+from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.types import Adjustment, Flight
 
 # A smaller relative change of distance does not move the gates.
 _DISTANCE_STEP = 0.2
+# More frames than any window spans.
+_FAR = 1000
 
 Pair = tuple[int, int]
 
 
+def look_cost(seconds: Sequence[float], parameters: IntervalParameters) -> tuple[float, str]:
+    """O of eq. 2, and what it was measured from in words, "" where it is stated.
+
+    seconds: time that the latest looks took. Measured it is their median in frames at the reference rate, at least one:
+    the calibration of the other terms holds where a look takes no longer, and a fast computer must not bring the
+    compared frames closer together. The lowest value is ours.
+    """
+    if parameters.cost or not seconds:
+        return parameters.cost or 1.0, ""
+    median = float(np.median(seconds))
+    return max(1.0, median * parameters.reference_rate_hz), f", a look takes {1000 * median:.0f} ms"
+
+
 def interval_from_telemetry(
-    distance_m: float, speed_m_s: float, rate_hz: float, parameters: IntervalParameters
+    distance_m: float, speed_m_s: float, rate_hz: float, cost: float, parameters: IntervalParameters
 ) -> float:
     """The detection interval in frames before rounding and bounds: (A / 20) (5 / S) (R / 10) O.
 
     Source: appendix B, eq. 2, calibrated to one frame at 20 m, 5 m/s and 10 Hz. Its A, the altitude of a camera that
     looks straight down, is the distance to the ground along the view. The lowest speed, which keeps the interval of a
-    hovering vehicle finite, is ours.
+    hovering vehicle finite, is ours. cost: O, as of `look_cost`.
     """
     speed = max(speed_m_s, parameters.lowest_speed_m_s)
     by_distance = distance_m / parameters.reference_altitude_m * parameters.reference_speed_m_s / speed
-    return by_distance * rate_hz / parameters.reference_rate_hz * parameters.cost
+    return by_distance * rate_hz / parameters.reference_rate_hz * cost
 
 
-def interval_from_flow(flows_px: Sequence[float], width: int, parameters: IntervalParameters) -> float:
+def interval_from_flow(flows_px: Sequence[float], width: int, cost: float, parameters: IntervalParameters) -> float:
     """The same without telemetry: the background flow is proportional to S / (A R), so its inverse replaces A R / S.
 
     flows_px: median background flow of the latest steps, pixels a frame. width: of the picture, pixels.
     """
     flow = float(np.median(flows_px)) / width
-    return parameters.reference_flow / max(flow, 1e-4) * parameters.cost
+    return parameters.reference_flow / max(flow, 1e-4) * cost
 
 
 def adjust_interval(
-    frame: int, current: int, wanted: float, cause: str, parameters: IntervalParameters
+    frame: int, current: int, wanted: float, cause: str, settings: Settings
 ) -> tuple[int, tuple[Adjustment, ...]]:
     """The interval from this frame on, rounded and within its bounds, and the record of its change, if any.
 
     A change by one frame happens only when the rule is a quarter of a frame past the middle, so that noise does not
-    make the interval flutter.
+    make the interval flutter. The interval stays where the new one compares the same frames.
     """
-    least = parameters.minimum_frames
+    parameters, least = settings.interval, settings.interval.minimum_frames
     new = int(np.clip(round(min(wanted, 1e6)), least, parameters.maximum_frames))
     if new == current or (abs(new - current) == 1 and abs(wanted - current) < 0.75 and least <= current):
         return current, ()
+    if compared_frames(new, settings) == compared_frames(current, settings):
+        return current, ()
     return new, (Adjustment(frame, "interval.frames", current, new, cause),)
+
+
+def compared_frames(interval: int, settings: Settings) -> list[Pair]:
+    """The pairs of frames that are compared, counted from the reference frame, far from the ends of a clip."""
+    near, wide, small = choose_pairs(0, interval, -_FAR, _FAR, settings)
+    return [pair for pair in [*near, wide, small] if pair]
 
 
 def look_ahead(interval: int, settings: Settings) -> int:
@@ -59,9 +82,8 @@ def look_ahead(interval: int, settings: Settings) -> int:
         return 2 * interval
     if settings.difference.kind == "to_next":
         return interval
-    gap = max(settings.difference.near_frames)
-    # At the start of a range the window looks ahead only, as far as the frames of `settling_delay` leave room.
-    near = max(gap, min(2 * gap, 2 * interval - (2 if settings.persistence.on else 0)))
+    # At the start of a range the window looks ahead only, to the next two frames.
+    near = max(2, *near_gaps(settings.difference.near_frames, settings.difference.wide_frames, interval))
     wide = min(settings.difference.wide_frames, max(2 * interval - 2, 0))
     return max(near, wide, _small_gap(interval, settings))
 
@@ -93,7 +115,7 @@ def choose_pairs(
         return next_pair(at, interval, first, last), None, None
     # No further than `look_ahead`, even if more is known: the result must not depend on how frames are batched.
     ahead = min(last, at + look_ahead(interval, settings))
-    near = near_pairs(at, parameters.near_frames, first, ahead)
+    near = near_pairs(at, near_gaps(parameters.near_frames, parameters.wide_frames, interval), first, ahead)
     wide = None
     if parameters.wide_frames and near:
         forward = min(parameters.wide_frames, max(2 * interval - 2, 0), ahead - at)

@@ -68,6 +68,8 @@ def run_live(
         raise InputError(f"--wait is for a camera or a stream, and {clip} is none; leave it out")
     if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
         backend = "onboard"
+    if settings.live.pace:  # without a pace frames wait, and every run has the same results
+        settings = with_measured_cost(settings)
     health, supervisor, live = Health(), Supervisor(), settings.live
     for name in _COUNTED:  # a count that is there from the start can be distinguished from a missing one
         health.count(name, 0)
@@ -178,6 +180,13 @@ def run_live(
     if failure:
         return HUNG
     return 0 if signals.signal in (None, signal.SIGTERM) else 128 + signals.signal
+
+
+def with_measured_cost(settings: Settings) -> Settings:
+    """The settings with O of the interval rule measured, unless another value than the default is set."""
+    if settings.interval.cost != Settings().interval.cost:
+        return settings
+    return with_parameters(settings, {"interval.cost": 0.0})
 
 
 class _Located:

@@ -30,7 +30,7 @@ from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, HALF, WHITE, 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.difference import absolute_difference
 from torchvision_dddas.functional.filters import is_above, to_bytes
-from torchvision_dddas.geometry import later_pair, near_pairs, next_pair
+from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
 Values = Mapping[str, float | Tensor]
@@ -376,7 +376,9 @@ class MotionSegmenter(nn.Module):
             return later_pair(at, self.settings.interval.frames, 0, frames - 1)
         if self.settings.difference.kind == "to_next":
             return next_pair(at, self.settings.interval.frames, 0, frames - 1)
-        return near_pairs(at, self.settings.difference.near_frames, 0, frames - 1)
+        difference = self.settings.difference
+        gaps = near_gaps(difference.near_frames, difference.wide_frames, self.settings.interval.frames)
+        return near_pairs(at, gaps, 0, frames - 1)
 
     def _windows(
         self, levels: Tensor, later_from_earlier: Tensor, places: list[int], pairs: tuple[Pair, ...]
