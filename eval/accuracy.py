@@ -162,7 +162,9 @@ def format_six(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> 
         for name in chains:
             if "f" not in (found := by[name]):
                 continue
-            cells = [f"{found[m]:.3f} ({found.get(f'{m}_sd', np.nan):.3f})" for m in SIX]
+            cells = [
+                f"{found[m]:.3f} ({found[f'{m}_sd']:.3f})" if found["frames"] > 1 else f"{found[m]:.3f}" for m in SIX
+            ]
             rows.append([clip, name, str(found["frames"]), *cells])
     head = ["clip", "chain", "frames", *SIX.values()]
     table = bench.format_table(head, rows, words=2)

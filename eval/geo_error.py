@@ -219,11 +219,15 @@ def format_main(rows: list[Row]) -> str:
 
 
 def format_methods(rows: list[Row]) -> str:
-    """A row a method; mean errors all over the disc at the two altitudes of the source."""
+    """A row a method; mean and median errors all over the disc at the two altitudes of the source."""
     cases, lines = [(g, n) for g in ("exact", "3.5 m") for n in (4, 6)], []
     at = {(row["gps"], row["landmarks"], row["altitude_m"]): row for row in rows if "paper" in row}
     for method, needs in NEEDS.items():
-        cells = [" / ".join(metres(at[g, n, h][method]["disc"]["mean"]) for h in PUBLISHED_M) for g, n in cases]
+        cells = []
+        for g, n in cases:
+            discs = [at[g, n, h][method]["disc"] for h in PUBLISHED_M]
+            mean, median = (" / ".join(metres(disc[key]) for disc in discs) for key in ("mean", "median"))
+            cells.append(f"{mean} ({median})")
         found = [at[g, n, h][method]["disc"]["answered"] for g, n in cases for h in PUBLISHED_M]
         lines.append([*needs, *cells, percent(float(np.mean(found)))])
     published = " / ".join(f"{far:g}" for far in PUBLISHED_M.values())
@@ -269,7 +273,7 @@ def measure_errors(options: bench.Options) -> tuple[str, Any]:
     cases = list_methods() if options.methods else list_cases(options.quick)
     found = bench.run_cases(cases, work, options.jobs)
     heights = " / ".join(f"{h:g}" for h in PUBLISHED_M)
-    methods = f"Mean error in metres, all over the disc, at {heights} m:\n\n{format_methods(found)}"
+    methods = f"Mean (median) error in metres, all over the disc, at {heights} m:\n\n{format_methods(found)}"
     if options.methods:
         return methods, {"seeds": options.seeds, "methods": found}
     bench.draw(options.plot, panels(found), columns=3)
