@@ -279,8 +279,9 @@ def _pairs(found: dict[str, dict[str, float]]) -> list[str]:
 
 
 def _clip_words(clips: dict[str, list[Labelled]]) -> str:
-    frames = sum(frame.where == "middle" for of_clip in clips.values() for frame in of_clip)
-    return f"Means over {len(clips)} BMS clips with {frames} labelled frames"
+    there = [frame.where for of_clip in clips.values() for frame in of_clip]
+    counts = f"{there.count('middle')} labelled frames at t + Δt, {there.count('reference')} at t"
+    return f"Means over {len(clips)} BMS clips ({counts})"
 
 
 if __name__ == "__main__":
