@@ -55,11 +55,12 @@ Scores = dict[tuple[Point, str, str], dict[str, float]]
 
 @dataclass(frozen=True)
 class Labelled:
-    """A difference of eq. 9, (H, W) uint8, and the truth in the frame of its reference."""
+    """A difference of eq. 9, (H, W) uint8, and the truth of a frame, by number, in the frame of its reference."""
 
     difference: np.ndarray
     truth: np.ndarray
     where: str
+    number: int
 
 
 def search(options: bench.Options) -> tuple[str, dict[str, dict[str, float]]]:
@@ -113,7 +114,7 @@ def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
                     for m in (labels.astype(np.int16), known)
                 ]
                 labels = np.where(moved[1] > 0, moved[0], -1)
-            yield Labelled(found.evidence, labels, where)
+            yield Labelled(found.evidence, labels, where, number)
 
 
 def score(frames: Sequence[Labelled], settings: Settings) -> dict[str, dict[str, float]]:
@@ -227,7 +228,10 @@ def measure_kernels(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_steps(options: bench.Options) -> tuple[str, Any]:
-    """What each step of `--config source` does to specificity, recall and Gmean, at t and at t + Δt, by interval."""
+    """What each step of `--config source` does to specificity, recall and Gmean, at t and at t + Δt, by interval.
+
+    Only labelled frames count that can be both.
+    """
     base = load_config("source")
     bare = {"difference.blur_px": 1, "morphology.erode_px": 1, "morphology.dilate_px": 1, "gates.min_area_px": 1}
     shipped = base.model_dump()
@@ -240,7 +244,7 @@ def measure_steps(options: bench.Options) -> tuple[str, Any]:
     rows, figures, whole, counted = [], {}, [], ""
     for interval in INTERVALS:
         settings = with_parameters(base, {"interval.frames": interval})
-        clips = _read_clips(options.data, settings)
+        clips = {name: _keep_both(frames) for name, frames in _read_clips(options.data, settings).items()}
         for word, parameters in steps.items():
             found = figures[f"interval {interval}, {word}"] = _score_clips(clips, with_parameters(settings, parameters))
             if interval == base.interval.frames:
@@ -261,6 +265,12 @@ def _read_clips(data: Path, settings: Settings) -> dict[str, list[Labelled]]:
     """The differences of each clip at the settings' interval."""
     cv2.setNumThreads(1)
     return {place.name: list(labelled_frames(place, settings)) for place in clips_in(data, "bms_")}
+
+
+def _keep_both(frames: list[Labelled]) -> list[Labelled]:
+    """Those whose labels are compared with at the reference and in the middle."""
+    at, middle = ({frame.number for frame in frames if frame.where == where} for where in ("reference", "middle"))
+    return [frame for frame in frames if frame.number in at & middle]
 
 
 def _score_clips(clips: dict[str, list[Labelled]], settings: Settings) -> dict[str, dict[str, float]]:
