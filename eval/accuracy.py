@@ -8,6 +8,8 @@ The figures are the same in every run on one machine.
 
 The source's difference shows a mover where it stands in the middle one of three frames. The column of a configuration
 followed by "at t + Δt" scores its masks there: moved from frame t to frame t + Δt by the registration.
+
+--six adds the source's six measures of each clip (appendix B, Table 1 and Fig. 7a).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -35,6 +37,14 @@ Found = tuple[np.ndarray, np.ndarray]
 Chain = Callable[[Path], Iterator[Found | None]]
 Figures = dict[str, float]
 MEASURES = {"precision": "precision", "recall": "recall", "f": "F", "gmean": "Gmean", "box_f1": "box F1"}
+SIX = {
+    "accuracy": "accuracy",
+    "specificity": "specificity",
+    "precision": "precision",
+    "recall": "recall",
+    "f": "F",
+    "gmean": "Gmean",
+}
 
 
 def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, Figures]]]:
@@ -50,7 +60,8 @@ def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, F
         for name, run in chains.items():
             scores[place.name][name] = score(place, run)
             bench.log(place.name, name, format_figures(scores[place.name][name]))
-    return format_tables(scores, list(chains)), scores
+    text = format_tables(scores, list(chains))
+    return f"{text}\n\n{format_six(scores, list(chains))}" if options.six else text, scores
 
 
 def run_ours(place: Path, config: str, backend: str) -> Iterator[Found]:
@@ -92,7 +103,8 @@ def run_plain(place: Path) -> Iterator[Found]:
 def score(place: Path, run: Chain) -> Figures:
     """The figures of one clip: of masks, of one labelled target, or of a clip where nothing moves."""
     truth = truths.load_truth(place) if truths.find_truth(place) else None
-    pixels, boxes, target, blobs, frames, labelled = Pixels(), Boxes(), OneTarget(), 0, 0, 0
+    pixels, boxes, target, blobs, frames = Pixels(), Boxes(), OneTarget(), 0, 0
+    of_frames = []
     for number, both in enumerate(run(place), 1):
         if both is None:
             continue
@@ -101,17 +113,20 @@ def score(place: Path, run: Chain) -> Figures:
         if truth is None:
             continue
         if number in truth.masks:
-            labelled += 1
             labels = truths.read_mask(truth.masks[number])
-            pixels = add_counts(pixels, pixel_metrics.count(mask, labels))
+            of_frames.append(pixel_metrics.count(mask, labels))
             boxes = add_counts(boxes, box_metrics.match(found, box_metrics.boxes_of(labels)))
         elif number in truth.boxes:
             target = add_counts(target, box_metrics.one_target(mask, found, truth.boxes[number][0]))
     if truth is None:
         return {"frames": frames, "still": blobs / frames}
     if truth.masks:
+        for counts in of_frames:
+            pixels = add_counts(pixels, counts)
+        each = [pixel_metrics.measures(counts) for counts in of_frames]
+        spread = {f"{m}_sd": float(np.nanstd([one[m] for one in each], ddof=1)) for m in SIX} if len(each) > 1 else {}
         box_f1 = box_metrics.measures(boxes)["f1"]
-        return {"frames": labelled, **pixel_metrics.measures(pixels), "box_f1": box_f1}
+        return {"frames": len(each), **pixel_metrics.measures(pixels), "box_f1": box_f1, **spread}
     return {"frames": target.frames, **box_metrics.one_target_measures(target)}
 
 
@@ -140,6 +155,22 @@ def format_tables(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) 
     return "\n\n".join(parts)
 
 
+def format_six(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> str:
+    """The six measures of each clip with masks, pooled over its labelled frames, and their spread over these."""
+    rows = []
+    for clip, by in scores.items():
+        for name in chains:
+            if "f" not in (found := by[name]):
+                continue
+            cells = [
+                f"{found[m]:.3f} ({found[f'{m}_sd']:.3f})" if found["frames"] > 1 else f"{found[m]:.3f}" for m in SIX
+            ]
+            rows.append([clip, name, str(found["frames"]), *cells])
+    head = ["clip", "chain", "frames", *SIX.values()]
+    table = bench.format_table(head, rows, words=2)
+    return f"The six measures, in brackets their standard deviation over the labelled frames:\n\n{table}"
+
+
 def format_figures(figures: Figures) -> str:
     """A clip's figures in a cell."""
     if "still" in figures:
@@ -156,4 +187,5 @@ def two(value: float) -> str:
 
 if __name__ == "__main__":
     options = {"data": Path, "--configs": ["default", "fast", "source"], "--backend": "onboard", "--only": ""}
+    options |= {"--six": False}
     bench.main(__doc__, {"": (measure_accuracy, options)})

@@ -1,15 +1,17 @@
 """The source's association of targets, and our tracker, on true boxes without identities.
 
-python eval/association.py ratio DATA        accuracy ratio of whole tracks over all windows: ours and the source's
-python eval/association.py weight DATA       AR_K against the weight of location (appendix C, Fig. 4a)
+python eval/association.py ratio DATA        accuracy ratio of whole tracks over all windows: the source's, ours, plain
+python eval/association.py clusters DATA     the clusters of the frame with the most targets (appendix C, Fig. 2)
+python eval/association.py examples DATA     windows such as those of Fig. 3, 4b and 5: dispersions, AR_3 by weight
+python eval/association.py weight DATA       AR_K against the weight of location (Fig. 4a)
 python eval/association.py threshold DATA    AR_2 against threshold × weight (Fig. 6)
-python eval/association.py dispersion DATA   the dispersions and the weight that they choose (Fig. 3, 4b, 5)
+python eval/association.py dispersion DATA   the dispersions of all windows and the weight that they choose
 python eval/association.py scale DATA        AR_2 and AR_3 by the scale of the histograms' dissimilarity
-python eval/association.py cuts DATA         AR_2 by the dispersions, with clusters that end earlier or later (Fig. 2)
+python eval/association.py cuts DATA         AR_2 by the dispersions, with clusters that end earlier or later
 
-DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Except for `ratio`, identities are found
-again in single windows of two or three frames, `--interval` frames apart; figures are mean / standard deviation over
-the windows in percent.
+DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Except for `ratio` and `clusters`,
+identities are found again in single windows of two or three frames, `--interval` frames apart; figures are mean /
+standard deviation over the windows in percent.
 """
 
 from collections.abc import Iterable
@@ -22,6 +24,7 @@ import clips
 import cv2
 import numpy as np
 import torch
+from scipy.cluster import hierarchy
 
 from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
@@ -29,6 +32,7 @@ from torchvision_dddas.evaluation.metrics import tracking
 from torchvision_dddas.evaluation.metrics.matching import pair
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.nn import HistogramAffinity
 from torchvision_dddas.tracking import CameraMotion, FrameTracker, rgb_histograms
@@ -40,11 +44,14 @@ from torchvision_dddas.tracking.source_tracker import (
     histogram_cut,
     location_weight,
     normalize_channels,
+    normalized_entropy,
+    similarity,
 )
 from torchvision_dddas.types import Detections, TrackedFrame, Tracks
 
 SAME_IOU = 0.9
 PAPER = ("track.mode=paper",)
+PLAIN = "plain, nearest centres"
 TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
     "default, with the clip": (True, ()),
     "default, boxes alone": (False, ()),
@@ -58,7 +65,34 @@ TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
 """Whether the tracker has the clip's pictures, and its settings."""
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
 LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.125, 0.17, 0.25, 0.296, 0.375)
+"""About the shipped ones, `paper.location_cut` and `paper.appearance_cut`."""
 SCALES = (1.0, 0.75, 0.57, 0.5, 0.4, 0.33)
+"""Values of `paper.histogram_scale`; 1 is the source's formula as printed."""
+SHOWN = (0.0, 0.3, 0.5, 0.7, 1.0)
+"""The weights in the table of examples."""
+WORST = 9
+"""So many windows of TUD-Stadtmitte are in the source's Fig. 4b."""
+
+
+@dataclass(frozen=True)
+class Quoted:
+    """What the source says of a window in Fig. 5, oldest frame first; NaN where it gives no value."""
+
+    figure: str
+    sequence: str
+    targets: tuple[int, int, int]
+    location: float
+    appearance: float
+    weight: float
+
+
+QUOTED = (
+    Quoted("5a", "a UAV's video, not published", (4, 5, 5), 0.31, np.nan, 0.0),
+    Quoted("5b", "PETS09-S2L1", (7, 7, 7), 0.52, 0.90, 0.0),
+    Quoted("5c", "TUD-Stadtmitte", (6, 7, 7), np.nan, 0.59, 0.5),
+    Quoted("5d", "PETS09-S2L2", (15, 15, 16), 0.78, np.nan, 1.0),
+)
+"""Appendix C, section IV, the paragraph on Fig. 5 and its caption: targets, dispersions and the weight that follows."""
 
 
 # -- whole tracks ----------------------------------------------------------------------------------------------------
@@ -68,7 +102,8 @@ def measure_ratio(options: bench.Options) -> tuple[str, Any]:
     """AR_2 and AR_3 of whole tracks over all windows of all phases of an interval.
 
     An interval of D has D phases: frames 1, 1 + D, ...; 2, 2 + D, ... Each is tracked by itself. Switches and IDF1 (in
-    percent, matched at an IoU of 0.9) are the mean over the phases and the worst.
+    percent, matched at an IoU of 0.9) are the mean over the phases and the worst. plain: each box goes on as the box of
+    the look before with the nearest centre, by the least sum of distances, none further than its height.
     """
     cv2.setNumThreads(1)
     head = [f"interval {options.interval}", "tracker", "windows of 3", "AR_2", "AR_3", "switches", "IDF1"]
@@ -78,6 +113,11 @@ def measure_ratio(options: bench.Options) -> tuple[str, Any]:
         if film is None or options.only not in place.name:
             continue
         truth = clips.truth_of(place).tracks
+        if PLAIN.startswith(options.tracker):
+            rows.append(
+                [place.name, PLAIN, *score_phases(truth, track_nearest(truth, options.interval), options.interval)]
+            )
+            bench.log(*rows[-1])
         for name, (has_clip, overrides) in TRACKERS.items():
             if name.startswith(options.tracker):
                 settings = load_config(overrides=overrides)
@@ -124,6 +164,27 @@ def track_phases(truth: TrackTable, film: Path | None, interval: int, settings: 
     for phase, tracker in enumerate(trackers):
         settled[phase] += [f.tracks for f in tracker.flush()]
     return [join_tracks(tracks) for tracks in settled]
+
+
+def track_nearest(truth: TrackTable, interval: int) -> list[TrackTable]:
+    """The tracks of each phase by the nearest centres of two successive looks."""
+    found = []
+    for phase in range(interval):
+        of_phase, before, following = [], (np.zeros((0, 4)), np.zeros(0, np.int64)), 1
+        for number in range(phase + 1, int(truth.frame.max()) + 1, interval):
+            box = true_detections(truth, number).box_px
+            apart = np.linalg.norm(centres(box)[:, None] - centres(before[0])[None], axis=2)
+            most = box[:, 3:]
+            rows, columns = cheapest(np.where(apart <= most, apart, 1e6))
+            identity = np.zeros(len(box), np.int64)
+            linked = (apart <= most)[rows, columns]
+            identity[rows[linked]] = before[1][columns[linked]]
+            new = np.flatnonzero(identity == 0)
+            identity[new], following = following + np.arange(len(new)), following + len(new)
+            of_phase.append(Tracks(number, identity, box, np.ones(len(box)), np.arange(len(box))))
+            before = box, identity
+        found.append(join_tracks(of_phase))
+    return found
 
 
 def true_detections(truth: TrackTable, frame: int) -> Detections:
@@ -239,12 +300,23 @@ def window_ratios(windows: Windows, parameters: PaperParameters, weight: float |
 def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
     """The weight of location that the source's rule gives each window."""
     found = []
-    for of_frames, known in zip(windows.dispersions.tolist(), windows.identities, strict=True):
-        counts = [len(k) for k in known]
-        considered = of_frames[: frames_considered(counts, parameters)]
-        location, appearance = (min(frame[n] for frame in considered) for n in (0, 1))
+    for row in range(len(windows.frames)):
+        location, appearance = considered_dispersions(windows, row, parameters)
         found.append(location_weight(location, lambda a=appearance: a, parameters.lowest_dispersion)[0])
     return np.array(found)
+
+
+def considered_dispersions(windows: Windows, row: int, parameters: PaperParameters) -> tuple[float, float]:
+    """The dispersions of locations and of histograms by which the rule decides in a window."""
+    counts = [len(known) for known in windows.identities[row]]
+    location, appearance = windows.dispersions[row, : frames_considered(counts, parameters)].min(axis=0).tolist()
+    return location, appearance
+
+
+def select_windows(windows: Windows, rows: list[int]) -> Windows:
+    """Some of the windows."""
+    lists = [[of[row] for row in rows] for of in (windows.identities, windows.location, windows.appearance)]
+    return Windows(windows.frames[rows], *lists, windows.dispersions[rows])
 
 
 def measure_weight(options: bench.Options) -> tuple[str, Any]:
@@ -269,7 +341,7 @@ def measure_weight(options: bench.Options) -> tuple[str, Any]:
 
 def measure_threshold(options: bench.Options) -> tuple[str, Any]:
     """Mean AR_2 in percent against threshold (rows) × weight of location (columns)."""
-    parts, found = [], {}
+    parts, found, panels = [], {}, []
     for name, sequence in _sequences(options):
         windows, rows = build_windows(sequence, 2, options.interval), []
         for threshold in WEIGHTS:
@@ -279,7 +351,147 @@ def measure_threshold(options: bench.Options) -> tuple[str, Any]:
         head = [f"{name}: threshold", *(f"w = {w:g}" for w in WEIGHTS)]
         cells = [[f"{t:g}", *(f"{v:.1f}" for v in row)] for t, row in zip(WEIGHTS, rows, strict=True)]
         parts.append(bench.format_table(head, cells))
+        lines = {f"w = {w:g}": {"x": WEIGHTS, "y": [row[n] for row in rows]} for n, w in enumerate(WEIGHTS)}
+        panels.append({"title": name, "xlabel": "threshold", "ylabel": "AR_2, %", "lines": lines})
+    bench.draw(options.plot, panels)
     return "\n\n".join(parts), found
+
+
+def measure_examples(options: bench.Options) -> tuple[str, Any]:
+    """Windows of three frames such as those that the source shows: their dispersions, their weight, AR_3 by weight.
+
+    3a, 3b: of the windows of four targets the one with the least dispersion of locations, and the one with the
+    greatest; of several that whose histograms are furthest apart, and nearest. 4b: the windows of the lowest AR_3, on
+    average over the weights, whose AR_3 depends on the weight. 5: the windows with as many targets as the source's, the
+    one nearest to the dispersions that it quotes; the range is that of all those windows. By the shipped scale of the
+    histograms' dissimilarity and by 1, as printed. Where a window's frames have the same number of targets, the
+    dispersions are those of its newest frame.
+    """
+    rows, quoted, panels, figures = [], [], [], []
+    sequences = dict(_sequences(options))
+    for name, sequence in sequences.items():
+        windows = build_windows(sequence, 3, options.interval)
+        for scale in (PaperParameters().histogram_scale, 1.0):
+            parameters = PaperParameters.model_validate({"histogram_scale": scale})
+            spread = measure_dispersions(sequence, windows.frames, parameters.location_cut, histogram_cut(parameters))
+            scaled, lines = replace(windows, dispersions=spread), {}
+            known = np.array([considered_dispersions(scaled, row, parameters) for row in range(len(scaled.frames))])
+            for figure, row in choose_examples(name, scaled, known, parameters):
+                one = select_windows(scaled, [row])
+                ratios = [100 * float(window_ratios(one, parameters, weight)[0]) for weight in WEIGHTS]
+                weight = float(choose_weights(one, parameters)[0])
+                frames = ", ".join(map(str, one.frames[0, ::-1]))
+                targets = ", ".join(str(len(of)) for of in one.identities[0][::-1])
+                cells = [_two(known[row, 0]), _two(known[row, 1]), f"{weight:g}"]
+                shown = [f"{ratios[WEIGHTS.index(w)]:.0f}" for w in SHOWN]
+                rows.append([figure, f"{scale:g}", name, frames, targets, *cells, *shown])
+                figures.append([*rows[-1][:8], ratios])
+                lines[figure] = {"x": WEIGHTS, "y": ratios}
+            of = [one for one in QUOTED if one.sequence == name]
+            quoted += [_quote(one, f"{scale:g}", known[_as_many(scaled, one.targets)]) for one in of]
+            title, label = f"{name}, scale {scale:g}", "weight of location"
+            panels.append({"title": title, "xlabel": label, "ylabel": "AR_3, %", "lines": lines})
+    quoted += [_quote(one, "–", np.zeros((0, 2))) for one in QUOTED if one.sequence not in sequences]
+    bench.draw(options.plot, panels, columns=2)
+    head = ["Fig.", "scale", "sequence", "frames", "targets", "Ndm of locations", "of histograms", "weight by the rule"]
+    text = bench.format_table([*head, *(f"AR_3 at {w:g}" for w in SHOWN)], rows, words=5)
+    head = ["Fig.", "sequence", "targets", "quoted: locations", "histograms", "weight", "scale", "windows here"]
+    table = bench.format_table([*head, "locations", "histograms"], quoted, words=3)
+    return f"{text}\n\nQuoted by the source, and the range over the windows with as many targets here:\n\n{table}", {
+        "examples": figures,
+        "quoted": quoted,
+    }
+
+
+def choose_examples(
+    name: str, windows: Windows, known: np.ndarray, parameters: PaperParameters
+) -> list[tuple[str, int]]:
+    """Figure and row of the windows to show. known: (W, 2) the dispersions by which the rule decides."""
+    chosen = []
+    four = _as_many(windows, (4, 4, 4))
+    if len(four):
+        location, appearance = known[four].T
+        chosen.append(("3a", int(four[np.lexsort([-appearance, location])[0]])))
+        chosen.append(("3b", int(four[np.lexsort([appearance, -location])[0]])))
+    for one in QUOTED:
+        same = _as_many(windows, one.targets)
+        if one.sequence == name and len(same):
+            off = np.nansum((known[same] - (one.location, one.appearance)) ** 2, axis=1)
+            chosen.append((one.figure, int(same[off.argmin()])))
+    if name == "TUD-Stadtmitte":
+        by_weight = np.array([window_ratios(windows, parameters, weight) for weight in WEIGHTS])
+        varied = np.flatnonzero(np.ptp(by_weight, axis=0) > 0)
+        worst = varied[by_weight.mean(axis=0)[varied].argsort(kind="stable")[:WORST]]
+        chosen += [(f"4b, {k}", row) for k, row in enumerate(sorted(worst.tolist()), 1)]
+    return chosen
+
+
+def _as_many(windows: Windows, targets: tuple[int, ...]) -> np.ndarray:
+    """The windows of so many targets, oldest frame first."""
+    counts = np.array([[len(known) for known in of] for of in windows.identities])
+    return np.flatnonzero((counts == targets[::-1]).all(axis=1))
+
+
+def _quote(one: Quoted, scale: str, here: np.ndarray) -> list[str]:
+    values = [_two(one.location), _two(one.appearance), f"{one.weight:g}", scale, str(len(here))]
+    ranges = [f"{v.min():.2f} to {v.max():.2f}" for v in here.T] if len(here) else ["–", "–"]
+    return [one.figure, one.sequence, ", ".join(map(str, one.targets)), *values, *ranges]
+
+
+def _two(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.2f}"
+
+
+def measure_clusters(options: bench.Options) -> tuple[str, Any]:
+    """The clusters of the targets in the frame of a sequence that has the most, by locations and by histograms.
+
+    Average linkage on the dissimilarity, that of histograms scaled by `paper.histogram_scale`; the trees end at the
+    cuts. --plot draws the trees.
+    """
+    parameters, rows, trees = PaperParameters(), [], []
+    for name, sequence in _sequences(options):
+        seen = np.array(sorted(sequence.seen))
+        frame = int(seen[np.argmax([len(sequence.rows(int(number))) for number in seen])])
+        here = sequence.rows(frame)
+        identity = sequence.identity[here]
+        features = {
+            "locations": (centres(sequence.box_px)[here], 1.0, parameters.location_cut),
+            "histograms": (sequence.histogram[here], parameters.histogram_scale, parameters.appearance_cut),
+        }
+        for feature, (values, scale, cut) in features.items():
+            apart = scale * (1 - similarity(values, values))
+            tree = hierarchy.linkage(apart[np.triu_indices(len(apart), 1)], "average")
+            cluster = hierarchy.fcluster(tree, cut, "distance")
+            members = [sorted(identity[cluster == k].tolist()) for k in np.unique(cluster)]
+            words = " ".join("{" + ", ".join(map(str, one)) + "}" for one in sorted(members, key=len, reverse=True))
+            entropy = normalized_entropy(cluster)
+            rows.append(
+                [name, feature, str(frame), str(len(here)), f"{cut:g}", str(len(members)), f"{entropy:.2f}", words]
+            )
+            trees.append((f"{name}, frame {frame}: {feature}", tree, cut, identity))
+    if options.plot:
+        draw_trees(options.plot, trees)
+    head = ["sequence", "feature", "frame", "targets", "cut", "clusters", "Ndm", "identities in each"]
+    return bench.format_table(head, rows, words=2), rows
+
+
+def draw_trees(path: str, trees: list[tuple[str, np.ndarray, float, np.ndarray]]) -> None:
+    """Draw dendrograms with their cuts into a PNG."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    count = -(-len(trees) // 2)
+    figure, axes = plt.subplots(count, 2, figsize=(11, 4 * count), squeeze=False, layout="constrained")
+    for axis, (title, tree, cut, identity) in zip(axes.ravel(), trees, strict=False):
+        hierarchy.dendrogram(
+            tree, ax=axis, labels=identity.tolist(), color_threshold=cut, above_threshold_color="#888888"
+        )
+        axis.axhline(cut, color="#d9730d", linestyle="--")
+        axis.set(title=title, xlabel="target", ylabel="dissimilarity")
+    figure.savefig(path, dpi=110)
+    bench.log(f"{path}: drawn")
 
 
 def measure_scale(options: bench.Options) -> tuple[str, Any]:
@@ -380,8 +592,10 @@ if __name__ == "__main__":
     common = {"data": Path, "--interval": 5, "--only": ""}
     studies = {
         "ratio": (measure_ratio, common | {"--tracker": ""}),
+        "clusters": (measure_clusters, common | {"--plot": None}),
+        "examples": (measure_examples, common | {"--plot": None}),
         "weight": (measure_weight, common | {"--every": 1, "--plot": None}),
-        "threshold": (measure_threshold, common),
+        "threshold": (measure_threshold, common | {"--plot": None}),
         "dispersion": (measure_dispersion, common | {"--plot": None}),
         "scale": (measure_scale, common | {"--every": 1}),
         "cuts": (measure_cuts, common),

@@ -1,14 +1,15 @@
 """Errors of targets located from the air by landmarks, beside the Cramér-Rao bound; simulated, no data needed.
 
-python eval/geo_error.py [--seeds 200] [--quick]
+python eval/geo_error.py [--seeds 200] [--quick] [--methods]
 
 1080p, a lens of 70 degrees; telemetry with errors of 1 % in the focal length, 1° of tilt, 5° of heading, 2 % of the
 altitude and a GPS of 3.5 m in 95 %. Landmarks stand in a disc of 25 m radius (geo_scene.py), targets within 10 m of its
 middle (crowd) or all over it (disc). Every frame stands alone.
 
 pose: the camera's, by landmarks and telemetry; homography: by landmarks alone, weighted, in metres; paper: the source's
-normal equations in raw degrees. Ellipses are those of 95 %. An error is that of the place relative to the team; an
-error that all receivers share comes on top.
+normal equations in raw degrees; findHomography, solvePnP: OpenCV's on the landmarks alone, in metres, the latter with
+the lens as the telemetry has it. Ellipses are those of 95 %. An error is that of the place relative to the team; an
+error that all receivers share comes on top. --methods: only the table of methods (appendix A, Tables I and II).
 """
 
 from dataclasses import asdict, replace
@@ -16,10 +17,12 @@ from functools import partial
 from typing import Any
 
 import bench
+import cv2
 import numpy as np
 from geo_scene import (
     BOUNDS,
     CAMERA,
+    FOCAL_PX,
     GPS,
     LAYOUTS,
     Case,
@@ -35,6 +38,16 @@ from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.types import Fix, Flight, LandmarkObservations
 
 METHODS = ("pose", "homography", "paper")
+NEEDS = {
+    "paper": ("source: plane homography in raw degrees", "4", "no", "no"),
+    "findHomography": ("OpenCV: findHomography, in metres", "4", "no", "no"),
+    "solvePnP": ("OpenCV: solvePnP, POSIT's successor", "4", "yes", "no"),
+    "homography": ("ours, `aerial.mode=homography`", "4", "no", "no"),
+    "pose": ("ours, default: the camera's pose", "0", "yes", "yes"),
+}
+"""By method: its name, how many landmarks it needs, whether the lens and telemetry."""
+PUBLISHED_M = {50.0: 1.3, 200.0: 3.5}
+"""The source's mean errors with four landmarks of exact places (appendix A, Fig. 7), from video with found targets."""
 ORIGIN = (-110.9, 32.2)
 CHI2_95 = 5.991
 """Of chi2 with two degrees of freedom."""
@@ -87,6 +100,29 @@ def locate(batch: Scenes, method: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array(off), np.array(inside)
 
 
+def locate_by_opencv(batch: Scenes, method: str) -> np.ndarray:
+    """(S, T) errors of the targets in metres by an OpenCV function, NaN where it finds nothing."""
+    errors = np.full(batch.targets_px.shape[:2], np.nan)
+    inverse_lens = np.array([[1 / FOCAL_PX, 0, -CAMERA.centre_px[0] / FOCAL_PX], [0, 1 / FOCAL_PX, 0], [0, 0, 1]])
+    inverse_lens[1, 2] = -CAMERA.centre_px[1] / FOCAL_PX
+    for s in range(len(batch)):
+        ground, image, targets = batch.marks[s], batch.marks_px[s], batch.targets_px[s]
+        if method == "findHomography":
+            image_from_ground, _ = cv2.findHomography(ground, image)
+        else:
+            solid = np.c_[ground, np.zeros(len(ground))]
+            lens = np.linalg.inv(inverse_lens)
+            known, turn, shift = cv2.solvePnP(solid, image, lens, None, flags=cv2.SOLVEPNP_IPPE)
+            image_from_ground = None
+            if known:
+                turn, shift = cv2.solvePnPRefineLM(solid, image, lens, None, turn, shift)
+                image_from_ground = lens @ np.c_[cv2.Rodrigues(turn)[0][:, :2], shift]
+        if image_from_ground is not None:
+            found = cv2.perspectiveTransform(targets[None], np.linalg.inv(image_from_ground))[0]
+            errors[s] = np.linalg.norm(found - batch.true_targets[s] - batch.common_m[s], axis=1)
+    return errors
+
+
 def judge(fix: Fix, targets_px: np.ndarray, true_m: np.ndarray, pixel_sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Error of each target, (T, 2), and whether its ellipse holds that, (T,); NaN where there is no place."""
     if fix.by == "":
@@ -115,6 +151,9 @@ def compare_methods(case: Case, seeds: int) -> Row:
         far, inside = locate(batch, method)
         bound = mean_length(BOUNDS[method](batch)) if method in BOUNDS else np.full(inside.shape, np.nan)
         row[method] = {where: summarize(far[:, part], inside[:, part], bound[:, part]) for where, part in PARTS.items()}
+    for method in ("findHomography", "solvePnP") if plain else ():
+        far = locate_by_opencv(batch, method)
+        row[method] = {where: summarize(far[:, part], np.full(1, np.nan)) for where, part in PARTS.items()}
     return row
 
 
@@ -128,6 +167,11 @@ def summarize(far: np.ndarray, inside: np.ndarray, bound: np.ndarray | float = n
         "inside": float(np.nanmean(inside)) if np.isfinite(inside).any() else np.nan,
         "answered": len(known) / far.size,
     }
+
+
+def list_methods() -> list[Case]:
+    """The cases of the table of methods."""
+    return [Case(gps=g, landmarks=n, altitude_m=h) for g in ("exact", "3.5 m") for n in (4, 6) for h in PUBLISHED_M]
 
 
 def list_cases(quick: bool) -> list[Case]:
@@ -174,6 +218,24 @@ def format_main(rows: list[Row]) -> str:
     return f"{tables[0]}\n\nIn raw degrees; disc, mean error in metres:\n\n{tables[1]}"
 
 
+def format_methods(rows: list[Row]) -> str:
+    """A row a method; mean and median errors all over the disc at the two altitudes of the source."""
+    cases, lines = [(g, n) for g in ("exact", "3.5 m") for n in (4, 6)], []
+    at = {(row["gps"], row["landmarks"], row["altitude_m"]): row for row in rows if "paper" in row}
+    for method, needs in NEEDS.items():
+        cells = []
+        for g, n in cases:
+            discs = [at[g, n, h][method]["disc"] for h in PUBLISHED_M]
+            mean, median = (" / ".join(metres(disc[key]) for disc in discs) for key in ("mean", "median"))
+            cells.append(f"{mean} ({median})")
+        found = [at[g, n, h][method]["disc"]["answered"] for g, n in cases for h in PUBLISHED_M]
+        lines.append([*needs, *cells, percent(float(np.mean(found)))])
+    published = " / ".join(f"{far:g}" for far in PUBLISHED_M.values())
+    lines.append(["source, published, from found targets", "4", "no", "no", published, "–", "–", "–", "–"])
+    head = ["method", "landmarks", "lens", "telemetry", *(f"{g}, {n} landmarks" for g, n in cases), "places found"]
+    return bench.format_table(head, lines, words=4)
+
+
 def percent(share: float) -> str:
     """With a digit."""
     return "–" if np.isnan(share) else f"{100 * share:.1f} %"
@@ -206,15 +268,21 @@ def panels(rows: list[Row]) -> list[dict[str, Any]]:
 
 def measure_errors(options: bench.Options) -> tuple[str, Any]:
     """Simulate all cases."""
+    cv2.setNumThreads(1)
     work = partial(compare_methods, seeds=options.seeds)
-    found = bench.run_cases(list_cases(options.quick), work, options.jobs)
+    cases = list_methods() if options.methods else list_cases(options.quick)
+    found = bench.run_cases(cases, work, options.jobs)
+    heights = " / ".join(f"{h:g}" for h in PUBLISHED_M)
+    methods = f"Mean (median) error in metres, all over the disc, at {heights} m:\n\n{format_methods(found)}"
+    if options.methods:
+        return methods, {"seeds": options.seeds, "methods": found}
     bench.draw(options.plot, panels(found), columns=3)
-    return f"Every frame by itself; mean error in metres:\n\n{format_main(found)}", {
+    return f"Every frame by itself; mean error in metres:\n\n{format_main(found)}\n\n{methods}", {
         "seeds": options.seeds,
         "main": found,
     }
 
 
 if __name__ == "__main__":
-    options = {"--seeds": 200, "--quick": False, "--jobs": 1, "--plot": None}
+    options = {"--seeds": 200, "--quick": False, "--methods": False, "--jobs": 1, "--plot": None}
     bench.main(__doc__, {"": (measure_errors, options)})

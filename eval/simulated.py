@@ -1,6 +1,8 @@
 """Studies on rendered video with known truth; no data needed.
 
-python eval/simulated.py altitude     errors of crowds from video to metres by altitude (appendix A, Fig. 7)
+python eval/simulated.py altitude     errors of crowds from video to metres by altitude, and from the ground
+                                      (appendix A, Fig. 7)
+python eval/simulated.py landmarks    four landmarks or six, by the centres of their colours or of motion (Fig. 8, 9)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
 python eval/simulated.py interval     what the detection interval buys (appendix B, eq. 2)
 python eval/simulated.py whole        whole scenarios in the closed loop
@@ -11,9 +13,10 @@ Figures are mean ± standard error (range) over seeds. --cache FILE keeps finish
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +34,25 @@ from torchvision_dddas.evaluation.metrics import boxes as box_metrics
 from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer, TrueFrame
 from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, Targets, build_site, group_crowds, to_local
+from torchvision_dddas.geo import (
+    AerialLocator,
+    GroundLocator,
+    LandmarkWatch,
+    Site,
+    Targets,
+    build_site,
+    group_crowds,
+    to_local,
+)
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.geo.projection import shift_origin
+from torchvision_dddas.people import PersonDetector
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.simulation.cameras import view_from_pose
 from torchvision_dddas.simulation.sensors import SIGMAS_95, Receivers
-from torchvision_dddas.types import Command, Frame, FrameResult, Landmarks, Scene, TrackedFrame, Tracks, Truth
+from torchvision_dddas.types import Command, Frame, FrameResult, Landmarks, Order, Scene, TrackedFrame, Tracks, Truth
 
 CONFIG = "patrol"
 """The shipped configuration of a team that watches crowds."""
@@ -49,20 +62,33 @@ Case = dict[str, Any]
 # -- one clip, located in several ways ------------------------------------------------------------------------------
 
 
-def usual(source: SimulatorSource) -> Settings:
-    """The settings of `dddas run sim:`."""
-    return fit_settings(load_config(CONFIG, (), scenario_settings(source.scenario)), source)
+@dataclass(frozen=True)
+class Way:
+    """How a clip is located. config: of detection and location, parameters: set in it.
+
+    gps95_m: error of the landmarks' receivers in 95 %, added to the reports. used: rows of the landmarks whose reports
+    are used; empty: all.
+    """
+
+    gps95_m: float
+    config: str = CONFIG
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    used: tuple[int, ...] = ()
+
+
+def usual(source: SimulatorSource, config: str = CONFIG, parameters: Mapping[str, object] | None = None) -> Settings:
+    """The settings of `dddas run sim: --config CONFIG`, some of them changed."""
+    settings = fit_settings(load_config(config, (), scenario_settings(source.scenario)), source)
+    return with_parameters(settings, parameters or {})
 
 
 class ClipLocator:
-    """Locates the scenes of a clip, and scores that. Targets are those of single frames, without tracks.
+    """Locates the scenes of a clip, and scores that. Targets are those of single frames, without tracks."""
 
-    gps95_m: error of the landmarks' receivers in 95 %, added to the reports.
-    """
-
-    def __init__(self, source: SimulatorSource, gps95_m: float) -> None:
-        self._source, self._gps95_m, self._settings = source, gps95_m, usual(source)
-        self._error_m = receiver_errors(source.scenario, gps95_m, len(source.names), source.count or 0)
+    def __init__(self, source: SimulatorSource, way: Way) -> None:
+        self._source, self._way, self._gps95_m = source, way, way.gps95_m
+        self._settings = usual(source, way.config, way.parameters)
+        self._error_m = receiver_errors(source.scenario, way.gps95_m, len(source.names), source.count or 0)
         self._local = partial(geometry.east_north, origin_deg=source.scenario.world.origin_deg)
         self._watch: LandmarkWatch | None = None
 
@@ -70,8 +96,8 @@ class ClipLocator:
         """A new one in the truth's metres."""
         return CrowdScorer(self._local)
 
-    def locate(self, scene: Scene, scorer: CrowdScorer, truth: Truth) -> float:
-        """Locate the targets of the next scene; the truth of its frame has been fed to the scorer.
+    def locate(self, scene: Scene, scorers: Sequence[CrowdScorer], truth: Truth) -> float:
+        """Locate the targets of the next scene; the truth of its frame has been fed to the scorers.
 
         Returns the error of the picture on the ground, m: mean over the crowds of the distance between their middle and
         the place to which its pixel is projected; NaN where that is not known.
@@ -96,7 +122,8 @@ class ClipLocator:
         located = locator.locate_targets(watched.fixed, targets)
         tracks = Tracks(scene.frame.number, rows + 1, found.box_px, found.score, rows)
         tracked = TrackedFrame(scene.frame.number, scene.frame, found, tracks)
-        scorer.feed(FrameResult(tracked, located, watched.sighted_by))
+        for scorer in scorers:
+            scorer.feed(FrameResult(tracked, located, watched.sighted_by))
         return self._picture_error(truth, locator, watched.fixed.fix)
 
     def _picture_error(self, truth: Truth, locator: AerialLocator, fix: Any) -> float:
@@ -125,6 +152,8 @@ class ClipLocator:
         """The landmarks' reports with the receivers' errors; without planned waypoints."""
         table = self._source.landmarks()
         kept = ~table.planned
+        if self._way.used:
+            kept &= np.isin(table.landmark, self._way.used)
         frame, which, place, sigma = table.frame[kept], table.landmark[kept], table.place[kept], table.sigma_m[kept]
         if self._gps95_m:
             metres = self._local(place) + self._error_m[np.round(frame).astype(int) - 1, which]
@@ -148,12 +177,23 @@ def receiver_errors(scenario: Scenario, gps95_m: float, count: int, frames: int)
     return np.array(errors).reshape(frames, count, 2)
 
 
-def locate_clip(scenario: Scenario, gps95_m: Mapping[str, float]) -> Case:
-    """The scores with each error of the receivers, in the same detections."""
+def locate_clip(scenario: Scenario, ways: Mapping[str, Way]) -> Case:
+    """The scores of each way; ways of one configuration have the same detections.
+
+    seconds: for each second of the clip the number of located targets, their mean error and that of the picture, m.
+    """
+    found: Case = {}
+    for config in dict.fromkeys(way.config for way in ways.values()):
+        found |= _locate_clip(scenario, config, {name: way for name, way in ways.items() if way.config == config})
+    return {name: found[name] for name in ways}
+
+
+def _locate_clip(scenario: Scenario, config: str, ways: Mapping[str, Way]) -> Case:
     source = SimulatorSource(scenario)
-    locators = {name: ClipLocator(source, error) for name, error in gps95_m.items()}
+    locators = {name: ClipLocator(source, way) for name, way in ways.items()}
     scorers, errors = {name: one.scorer() for name, one in locators.items()}, {name: [] for name in locators}
-    truths, settings, started = {}, usual(source), StartedSource(source)
+    by_second: dict[str, dict[int, tuple[CrowdScorer, list[float]]]] = {name: {} for name in locators}
+    truths, settings, started = {}, usual(source, config), StartedSource(source)
     # As many frames are left out as the closed loop leaves out before anything is found.
     scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
     least = every_least(scale, source.rate_hz, settings.steering)
@@ -165,11 +205,94 @@ def locate_clip(scenario: Scenario, gps95_m: Mapping[str, float]) -> Case:
             continue
         true = TrueFrame(truth)
         for name, one in locators.items():
-            scorers[name].feed(true)
-            errors[name].append(one.locate(scene, scorers[name], truth))
+            now = by_second[name].setdefault(int(truth.time_s), (one.scorer(), []))
+            for scorer in (scorers[name], now[0]):
+                scorer.feed(true)
+            error = one.locate(scene, (scorers[name], now[0]), truth)
+            errors[name].append(error)
+            now[1].append(error)
     return {
-        name: scorer.score().by_name() | {"picture_m": float(np.nanmean(errors[name]))}
+        name: scorer.score().by_name()
+        | {"picture_m": _mean(errors[name]), "seconds": [_second(*now) for now in by_second[name].values()]}
         for name, scorer in scorers.items()
+    }
+
+
+def _second(scorer: CrowdScorer, picture_m: list[float]) -> tuple[int, float, float]:
+    error = scorer.score().target_error_m
+    return error.count, error.mean, _mean(picture_m)
+
+
+def _mean(values: list[float]) -> float:
+    """NaN without a finite value."""
+    known = np.array(values)[np.isfinite(values)]
+    return float(known.mean()) if len(known) else math.nan
+
+
+# -- from the ground -------------------------------------------------------------------------------------------------
+
+LOOK_S = 0.5
+"""Each vehicle takes a picture this often."""
+BESIDE_M = 3.0
+"""People located further than this outside of every crowd are counted as elsewhere."""
+GROUND_WAYS: dict[str, tuple[bool, Case]] = {
+    "each vehicle alone, as printed": (False, {"ground.mode": "paper"}),
+    "each vehicle alone": (False, {}),
+    "all vehicles fused": (True, {}),
+}
+"""Whether the sightings of all vehicles are fused, and the settings."""
+
+
+def locate_from_ground(scenario: Scenario) -> Case:
+    """Errors of crowds located by the people that the ground vehicles see, for each way; no picture from the air.
+
+    Each vehicle's camera is turned to the middle of the nearest crowd; it drives as planned. A crowd's place is the
+    mean of the people located within its radius and BESIDE_M.
+    """
+    source, settings = SimulatorSource(scenario), load_config(CONFIG, (), scenario_settings(scenario))
+    detector, local = PersonDetector(settings, "onboard"), partial(geometry.east_north, origin_deg=source.origin_deg)
+    found: dict[str, list[float]] = {name: [] for name in GROUND_WAYS}
+    counts, every = Counter[str](), round(LOOK_S * source.rate_hz)
+    for _ in source:
+        (truth,) = source.truths()
+        bodies = truth.bodies
+        person = bodies.kind == "person"
+        crowds = [bodies.place_m[person & (bodies.target == n), :2] for n in np.unique(bodies.target[person])]
+        middle = np.array([one.mean(axis=0) for one in crowds])
+        radius = np.array([np.linalg.norm(one - m, axis=1).max() for one, m in zip(crowds, middle, strict=True)])
+        pictures = source.pictures()
+        people = detector([picture.image for picture in pictures]) if pictures else []
+        counts.update(pictures=len(pictures), people=sum(map(len, people)))
+        for name, (fused, parameters) in GROUND_WAYS.items():
+            chosen = with_parameters(settings, parameters)
+            groups = (
+                [slice(0, len(pictures))] if fused and pictures else [slice(k, k + 1) for k in range(len(pictures))]
+            )
+            for group in groups:
+                cameras = [picture.camera for picture in pictures[group]]
+                located = GroundLocator(cameras, chosen).locate(people[group], truth.frame).positions
+                place = local(located.lonlat_deg) if len(located) else np.zeros((0, 2))
+                apart = np.linalg.norm(place[:, None] - middle, axis=2)
+                nearest = apart.argmin(axis=1)
+                inside = apart[np.arange(len(place)), nearest] <= radius[nearest] + BESIDE_M
+                counts.update({f"{name}: located": len(place), f"{name}: elsewhere": int((~inside).sum())})
+                for n in np.unique(nearest[inside]):
+                    off = place[inside & (nearest == n)].mean(axis=0) - middle[n]
+                    found[name].append(float(np.linalg.norm(off)))
+        vehicles = bodies.place_m[bodies.kind == "ugv", :2]
+        aims = middle[np.linalg.norm(vehicles[:, None] - middle, axis=2).argmin(axis=1)]
+        aims = geometry.lonlat(aims, source.origin_deg)
+        unchanged = np.full(2, np.nan)
+        orders = [Order(name, unchanged, 0.0, aim, True) for name, aim in zip(source.names, aims, strict=True)]
+        source.steer(Command(every=every, orders=tuple(orders)))
+    return {
+        name: {
+            "crowd_m": _mean(errors),
+            "crowds": len(errors),
+            "elsewhere": counts[f"{name}: elsewhere"] / max(counts[f"{name}: located"], 1),
+            "people_a_picture": counts["people"] / max(counts["pictures"], 1),
+        }
+        for name, errors in found.items()
     }
 
 
@@ -208,6 +331,14 @@ def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str
 # -- altitude and landmarks ------------------------------------------------------------------------------------------
 
 GPS = {"exact": 0.0, "3.5 m": 3.5}
+RAW: Case = {"aerial.mode": "paper"}
+CHAINS: dict[str, tuple[str, Case]] = {
+    "ours": (CONFIG, {}),
+    "ours, homography in metres": (CONFIG, {"aerial.mode": "homography"}),
+    "ours, raw degrees": (CONFIG, RAW),
+    "source, raw degrees": ("source", RAW),
+}
+"""Configuration and settings: `ours` locates by the camera's pose."""
 SOURCE_M = {50.0: 1.3, 200.0: 3.5}
 """The source's mean errors by altitude, simulated (appendix A, Fig. 7)."""
 
@@ -216,7 +347,8 @@ def measure_altitude(options: bench.Options) -> tuple[str, Any]:
     """Errors of crowds located from rendered video, with exact places of four landmarks and receivers of 3.5 m.
 
     targets: of each located target from the people in its box. crowds: of each crowd from what was located of it.
-    picture: of the picture on the ground where the crowds are, by landmarks and telemetry alone.
+    picture: of the picture on the ground where the crowds are, by landmarks and telemetry alone. From the ground: by
+    the people whom the same ground vehicles see when their cameras are turned to the nearest crowd.
     """
     cases = [
         {"seed": seed, "altitude_m": altitude, "seconds": options.seconds, "size": bench.parse_size(options.size)}
@@ -224,35 +356,127 @@ def measure_altitude(options: bench.Options) -> tuple[str, Any]:
         for altitude in options.altitudes
     ]
     results = bench.run_cases(cases, fly_altitude, options.jobs, options.cache)
-    errors, seen = [], []
+    errors, seen, panels = [], [], []
     for altitude in options.altitudes:
         here = [r for c, r in zip(cases, results, strict=True) if c["altitude_m"] == altitude]
-        for gps in GPS:
-            of = [result[gps] for result in here]
+        for chain, gps in product(CHAINS, GPS):
+            of = [result[f"{chain}, {gps}"] for result in here]
             target = [Spread(r["target_error_m"][key] for r in of) for key in ("mean", "median", "p95")]
             cells = [target[0].text(), *(one.text(spread=False) for one in target[1:])]
             cells += [Spread(r["inside"] for r in of).text(0, 100, spread=False)]
             cells += [Spread(r["crowd_error_m"]["mean"] for r in of).text(), Spread(r["picture_m"] for r in of).text()]
-            source = f"{SOURCE_M[altitude]:g}" if altitude in SOURCE_M and gps == "exact" else "–"
-            errors.append([f"{altitude:g}", gps, *cells, source])
-        of = [result["exact"] for result in here]
-        cells = [Spread(r[key] for r in of).text(1, 100) for key in ("recall", "recall_moving", "detected")]
-        cells += [Spread(r[key] for r in of).text() for key in ("false_blobs", "landmark_blobs")]
-        seen.append([f"{altitude:g}", *cells])
-    head = ["AGL m", "GPS", "targets: mean error m", "median", "95 %", "in 95 % ellipses, %", "crowds: mean error m"]
-    text = bench.format_table([*head, "picture m", "source"], errors, words=2)
-    head = ["AGL m", "recall %", "of moving crowds %", "detected %", "false blobs a frame", "landmarks as targets"]
-    return f"{text}\n\n{bench.format_table(head, seen)}\n\n{about(options)}", results
+            source = (
+                f"{SOURCE_M[altitude]:g}"
+                if altitude in SOURCE_M and gps == "exact" and CHAINS[chain][0] == "source"
+                else "–"
+            )
+            errors.append([f"{altitude:g}", chain, gps, *cells, source])
+        lines = {chain: _by_second([r[f"{chain}, exact"] for r in here], 1) for chain in CHAINS}
+        panels.append({"title": f"{altitude:g} m, exact GPS", "xlabel": "s", "ylabel": "targets, m", "lines": lines})
+        for chain in ("ours", "source, raw degrees"):
+            of = [result[f"{chain}, exact"] for result in here]
+            cells = [Spread(r[key] for r in of).text(1, 100) for key in ("recall", "recall_moving", "detected")]
+            cells += [Spread(r[key] for r in of).text() for key in ("false_blobs", "landmark_blobs")]
+            seen.append([f"{altitude:g}", chain.partition(",")[0], *cells])
+    ground = [r for c, r in zip(cases, results, strict=True) if c["altitude_m"] == options.altitudes[0]]
+    rows = []
+    for way, gps in product(GROUND_WAYS, GPS):
+        of = [r[f"ground, {gps}"][way] for r in ground]
+        cells = [Spread(r["crowd_m"] for r in of).text(), f"{sum(r['crowds'] for r in of)}"]
+        rows.append([way, gps, *cells, Spread(r["elsewhere"] for r in of).text(1, 100, spread=False)])
+    bench.draw(options.plot, panels)
+    head = ["AGL m", "chain", "GPS", "targets: mean error m", "median", "95 %", "in 95 % ellipses, %"]
+    text = bench.format_table([*head, "crowds: mean error m", "picture m", "published"], errors, words=3)
+    head = ["AGL m", "chain", "recall %", "of moving crowds %", "detected %", "false blobs a frame"]
+    text += f"\n\n{bench.format_table([*head, 'landmarks as targets'], seen, words=2)}"
+    head = ["from the ground", "GPS", "crowds: mean error m", "crowds located", "people located elsewhere, %"]
+    return f"{text}\n\n{bench.format_table(head, rows, words=2)}\n\n{about(options)}", results
 
 
 def fly_altitude(case: Case) -> Case:
-    """One clip, located in both ways."""
+    """One clip, located in all ways."""
+    cv2.setNumThreads(1)
     width, height = case["size"]
-    scenario = walking(
-        case["seed"], case["seconds"], uav={"altitude_m": case["altitude_m"]},
-        camera={"width_px": width, "height_px": height},
-    )  # fmt: skip
-    return locate_clip(scenario, GPS)
+    tables = {"uav": {"altitude_m": case["altitude_m"]}, "camera": {"width_px": width, "height_px": height}}
+    scenario = walking(case["seed"], case["seconds"], **tables)
+    ways = {
+        f"{chain}, {gps}": Way(error95_m, config, parameters)
+        for (chain, (config, parameters)), (gps, error95_m) in product(CHAINS.items(), GPS.items())
+    }
+    found = locate_clip(scenario, ways)
+    for gps, error95_m in GPS.items():
+        own = walking(case["seed"], case["seconds"], **tables, gps={"error95_m": error95_m})
+        found[f"ground, {gps}"] = locate_from_ground(own)
+    return found
+
+
+def _by_second(of: list[Case], column: int) -> dict[str, Any]:
+    """A line of the mean over seeds, for each second of a clip; of targets (column 1) or of the picture (2)."""
+    columns = list(zip_longest(*(r["seconds"] for r in of), fillvalue=(0, math.nan, math.nan)))
+    return {"x": list(range(len(columns))), "y": [Spread(one[column] for one in second).mean for second in columns]}
+
+
+SIX, FOUR = (), (0, 1, 3, 4)
+"""Of six that stand in a ring four are a rectangle."""
+SLOW_S = 15
+"""When the vehicles slow down, in the source (appendix A, section V) and in `team.patrol = gather`."""
+PARTS = {"fast": slice(0, SLOW_S), "slow": slice(SLOW_S, None)}
+LANDMARK_CHAINS = ("ours", "ours, raw degrees", "source, raw degrees")
+SOURCE_LANDMARKS_M = {4: 2.24, 6: 2.49}
+"""The source's mean errors by motion, fast and slow together (appendix A, section V, the text on Fig. 8)."""
+
+
+def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
+    """Errors with four landmarks or six, whose image places are the centres of their colours or of what moves there.
+
+    Six ground vehicles gather about two crowds, fast until t = 15 s and slow from then on, with exact places unless
+    --gps95 says otherwise. With four, the reports of two are not used. targets, picture: as of `altitude`; means over
+    the seconds, over which the plot shows them.
+    """
+    cases = [
+        {"seed": seed, "altitude_m": options.altitude, "seconds": options.seconds, "gps95_m": options.gps95}
+        for seed in range(options.seeds)
+    ]
+    results = bench.run_cases(cases, fly_landmarks, options.jobs, options.cache)
+    rows, panels = [], []
+    for chain in LANDMARK_CHAINS:
+        lines = {}
+        for centre, count in product(("colour", "motion"), (4, 6)):
+            of = [result[f"{chain}, {centre}, {count}"] for result in results]
+            cells = [_part(of, part, column).text() for column in (1, 2) for part in PARTS.values()]
+            whole = _part(of, slice(None), 1)
+            published = f"{SOURCE_LANDMARKS_M[count]:g}" if centre == "motion" and chain.startswith("source") else "–"
+            rows.append([chain, centre, str(count), *cells, whole.text(), published])
+            lines[f"{centre}, {count}"] = _by_second(of, 1)
+        panels.append({"title": chain, "xlabel": "s", "ylabel": "targets, m", "lines": lines})
+    bench.draw(options.plot, panels)
+    head = ["chain", "centres", "landmarks", *(f"{of}, {part}: m" for of in ("targets", "picture") for part in PARTS)]
+    text = bench.format_table([*head, "targets, all: m", "published"], rows, words=2)
+    return f"{text}\n\nAt {options.altitude:g} m, receivers of {options.gps95:g} m in 95 %; {about(options)}", results
+
+
+def fly_landmarks(case: Case) -> Case:
+    """One clip, located in all ways."""
+    cv2.setNumThreads(1)
+    team = {"ugvs": 6, "patrol": "gather", "ring_m": 18.0}
+    scenario = walking(case["seed"], case["seconds"], uav={"altitude_m": case["altitude_m"]}, team=team)
+    ways = {}
+    for chain, centre, (count, used) in product(LANDMARK_CHAINS, ("colour", "motion"), ((4, FOUR), (6, SIX))):
+        config, parameters = CHAINS[chain]
+        parameters = {**parameters, "landmarks.centre": centre}
+        ways[f"{chain}, {centre}, {count}"] = Way(case["gps95_m"], config, parameters, used)
+    return locate_clip(scenario, ways)
+
+
+def _part(of: list[Case], part: slice, column: int) -> Spread:
+    """The mean over some seconds of each clip; of targets weighted by how many were located."""
+    values = []
+    for result in of:
+        seconds = np.array(result["seconds"], float)[part]
+        known = seconds[np.isfinite(seconds[:, column])]
+        weight = known[:, 0] if column == 1 else np.ones(len(known))
+        values.append(float(np.average(known[:, column], weights=weight)) if weight.sum() else math.nan)
+    return Spread(values)
 
 
 # -- the loop --------------------------------------------------------------------------------------------------------
@@ -470,10 +694,12 @@ def about(options: bench.Options) -> str:
 if __name__ == "__main__":
     common = {"--seeds": 20, "--jobs": 1, "--cache": None}
     scenarios = ["joining", "splitting", "crossing", "random", "border50", "border100", "border200"]
-    altitudes = {"--seconds": 6.0, "--altitudes": [50.0, 100.0, 200.0], "--size": "640x480"}
+    altitudes = {"--seconds": 6.0, "--altitudes": [50.0, 100.0, 200.0], "--size": "640x480", "--plot": None}
+    landmarks = {"--seconds": 19.0, "--altitude": 50.0, "--gps95": 0.0, "--plot": None}
     loop = {"--seconds": 0.0, "--seeds": 10, "--scenarios": ["leaving"], "--plot": None}
     studies = {
         "altitude": (measure_altitude, common | altitudes),
+        "landmarks": (measure_landmarks, common | landmarks),
         "loop": (measure_loop, common | loop),
         "interval": (measure_interval, common | {"--seeds": 2, "--seconds": 5.0}),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),

@@ -1,17 +1,20 @@
-"""The constants that the source's text leaves open: `python eval/source_search.py DATA`.
+"""The source's chain of detection (`--config source`) step by step, on the clips whose name begins with `bms_`.
 
-Every point of a grid is scored on the clips with masks whose name begins with `bms_`: the mask of reference t against
-the truth of frame t + Δt, the middle one of the three, where equation 9 draws a mover (moved to frame t by the
-registration), and against the truth of frame t. The rule of choice: of the points whose mean Gmean at t + Δt is at
-least .90 the one of the best mean F there; where none is, the best mean Gmean. It was made after an earlier search on
-the same clips, so figures of clips left out are a little too good. Each clip is also scored
-with the point that the other clips choose.
+python eval/source_search.py search DATA     the constants that the source's text leaves open
+python eval/source_search.py kernels DATA    the six measures by smoothing, erosion, dilation, and by the last two at
+                                             once (appendix B, Fig. 8)
+python eval/source_search.py steps DATA      Gmean after each step, at t and at t + Δt, by interval
+
+The mask of reference t is scored against the truth of frame t + Δt, the middle one of the three, where equation 9 draws
+a mover (moved to frame t by the registration), and against the truth of frame t. Pixel counts are pooled over a clip;
+figures are means over the clips.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Any
 
 import bench
 import cv2
@@ -37,6 +40,14 @@ GRID: dict[str, tuple[int, ...]] = {
     "gates.min_area_px": (1, 200),
 }
 LEAST_GMEAN = 0.90
+MEASURES = ("accuracy", "specificity", "precision", "recall", "f", "gmean")
+NAMES = ("accuracy", "specificity", "precision", "recall", "F", "Gmean")
+KERNELS: dict[str, tuple[int, ...]] = {
+    "difference.blur_px": (1, 3, 5, 7, 9),
+    "morphology.erode_px": (1, 2, 3, 4, 5),
+    "morphology.dilate_px": (1, 5, 9, 13, 17, 25),
+}
+INTERVALS = (1, 2, 3, 4)
 Point = tuple[int, ...]
 Scores = dict[tuple[Point, str, str], dict[str, float]]
 """Measures by point, clip, and frame of the truth: middle or reference."""
@@ -44,15 +55,21 @@ Scores = dict[tuple[Point, str, str], dict[str, float]]
 
 @dataclass(frozen=True)
 class Labelled:
-    """A difference of eq. 9, (H, W) uint8, and the truth in the frame of its reference."""
+    """A difference of eq. 9, (H, W) uint8, and the truth of a frame, by number, in the frame of its reference."""
 
     difference: np.ndarray
     truth: np.ndarray
     where: str
+    number: int
 
 
 def search(options: bench.Options) -> tuple[str, dict[str, dict[str, float]]]:
-    """Score the grid, choose, and leave each clip out in turn."""
+    """The constants that the source's text leaves open, searched on a grid.
+
+    The rule of choice: of the points whose mean Gmean at t + Δt is at least .90 the one of the best mean F there; where
+    none is, the best mean Gmean. It was made after an earlier search on the same clips, so figures of clips left out
+    are a little too good. Each clip is also scored with the point that the other clips choose.
+    """
     cv2.setNumThreads(1)
     base = load_config("source")
     places = clips_in(options.data, "bms_")
@@ -97,7 +114,7 @@ def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
                     for m in (labels.astype(np.int16), known)
                 ]
                 labels = np.where(moved[1] > 0, moved[0], -1)
-            yield Labelled(found.evidence, labels, where)
+            yield Labelled(found.evidence, labels, where, number)
 
 
 def score(frames: Sequence[Labelled], settings: Settings) -> dict[str, dict[str, float]]:
@@ -160,5 +177,128 @@ def report(scores: Scores, clips: Sequence[str]) -> tuple[str, dict[str, dict[st
     return "\n\n".join(parts), figures
 
 
+# -- kernels and steps -----------------------------------------------------------------------------------------------
+
+
+def measure_kernels(options: bench.Options) -> tuple[str, Any]:
+    """The six measures at t + Δt by kernel of smoothing, erosion, dilation, and by the last two at once.
+
+    A kernel is varied about the constants of `--config source`; 1 is none. The table of both at once has F and Gmean,
+    the result and the plot all six.
+    """
+    base, clips = load_config("source"), _read_clips(options.data, load_config("source"))
+    rows, figures, panels = [], {}, []
+    for name, sizes in KERNELS.items():
+        by_size = []
+        for size in sizes:
+            found = _score_clips(clips, with_parameters(base, {name: size}))
+            by_size.append(found["middle"])
+            shipped = size == getattr(base, name.split(".")[0]).model_dump()[name.split(".")[1]]
+            rows.append([f"`{name}`", f"{size}{' (shipped)' * shipped}", *_cells(found)])
+            figures[f"{name}={size}"] = found
+        lines = {word: {"x": sizes, "y": [of[m] for of in by_size]} for m, word in zip(MEASURES, NAMES, strict=True)}
+        panels.append({"title": name, "xlabel": "kernel, px", "ylim": (0, 1.02), "lines": lines})
+    erosions, dilations = KERNELS["morphology.erode_px"], KERNELS["morphology.dilate_px"]
+    grid = {
+        (erode, dilate): _score_clips(
+            clips, with_parameters(base, {"morphology.erode_px": erode, "morphology.dilate_px": dilate})
+        )
+        for erode, dilate in product(erosions, dilations)
+    }
+    figures |= {f"morphology.erode_px={e}, morphology.dilate_px={d}": found for (e, d), found in grid.items()}
+    both = []
+    for measure, word in zip(MEASURES, NAMES, strict=True):
+        lines = {
+            f"erosion {e}": {"x": dilations, "y": [grid[e, d]["middle"][measure] for d in dilations]} for e in erosions
+        }
+        panels.append({"title": f"{word} by both", "xlabel": "dilation, px", "lines": lines})
+        if measure in ("f", "gmean"):  # the parameters of the highest F and Gmean are the source's choice
+            both += [
+                [f"{word}, erosion {e}", *(f"{grid[e, d]['middle'][measure]:.3f}" for d in dilations)] for e in erosions
+            ]
+    bench.draw(options.plot, panels, columns=3)
+    head = ["kernel", "px", *NAMES, "F at t", "Gmean at t"]
+    parts = [
+        f"{_clip_words(clips)}, at t + Δt unless the column says t:",
+        bench.format_table(head, rows),
+        "Erosion and dilation at once, at t + Δt:",
+        bench.format_table(["measure", *(f"dilation {d}" for d in dilations)], both),
+    ]
+    return "\n\n".join(parts), figures
+
+
+def measure_steps(options: bench.Options) -> tuple[str, Any]:
+    """What each step of `--config source` does to specificity, recall and Gmean, at t and at t + Δt, by interval.
+
+    Only labelled frames count that can be both.
+    """
+    base = load_config("source")
+    bare = {"difference.blur_px": 1, "morphology.erode_px": 1, "morphology.dilate_px": 1, "gates.min_area_px": 1}
+    shipped = base.model_dump()
+    steps, kept = {"threshold": dict(bare)}, dict(bare)
+    words = ("smoothing", "erosion", "dilation", "smallest area: the mask")
+    for name, word in zip(bare, words, strict=True):
+        group, key = name.split(".")
+        kept[name] = shipped[group][key]
+        steps[word] = dict(kept)
+    rows, figures, whole, counted = [], {}, [], ""
+    for interval in INTERVALS:
+        settings = with_parameters(base, {"interval.frames": interval})
+        clips = {name: _keep_both(frames) for name, frames in _read_clips(options.data, settings).items()}
+        for word, parameters in steps.items():
+            found = figures[f"interval {interval}, {word}"] = _score_clips(clips, with_parameters(settings, parameters))
+            if interval == base.interval.frames:
+                rows.append([word, *_pairs(found)])
+                counted = _clip_words(clips)
+        whole.append([f"{interval}{' (shipped)' * (interval == base.interval.frames)}", *_pairs(found)])
+    head = [f"{word} at {at}" for word in ("specificity", "recall", "Gmean") for at in ("t", "t + Δt")]
+    parts = [
+        f"{counted}; after each step at the shipped Δt:",
+        bench.format_table(["after", *head], rows),
+        "The mask by Δt:",
+        bench.format_table(["Δt, frames", *head], whole),
+    ]
+    return "\n\n".join(parts), figures
+
+
+def _read_clips(data: Path, settings: Settings) -> dict[str, list[Labelled]]:
+    """The differences of each clip at the settings' interval."""
+    cv2.setNumThreads(1)
+    return {place.name: list(labelled_frames(place, settings)) for place in clips_in(data, "bms_")}
+
+
+def _keep_both(frames: list[Labelled]) -> list[Labelled]:
+    """Those whose labels are compared with at the reference and in the middle."""
+    at, middle = ({frame.number for frame in frames if frame.where == where} for where in ("reference", "middle"))
+    return [frame for frame in frames if frame.number in at & middle]
+
+
+def _score_clips(clips: dict[str, list[Labelled]], settings: Settings) -> dict[str, dict[str, float]]:
+    """Means of the measures over the clips, by frame of the truth."""
+    found = [score(frames, settings) for frames in clips.values()]
+    return {w: {m: float(np.mean([one[w][m] for one in found])) for m in MEASURES} for w in ("middle", "reference")}
+
+
+def _cells(found: dict[str, dict[str, float]]) -> list[str]:
+    values = [found["middle"][m] for m in MEASURES] + [found["reference"][m] for m in ("f", "gmean")]
+    return [f"{value:.3f}" for value in values]
+
+
+def _pairs(found: dict[str, dict[str, float]]) -> list[str]:
+    return [f"{found[w][m]:.3f}" for m in ("specificity", "recall", "gmean") for w in ("reference", "middle")]
+
+
+def _clip_words(clips: dict[str, list[Labelled]]) -> str:
+    there = [frame.where for of_clip in clips.values() for frame in of_clip]
+    counts = f"{there.count('middle')} labelled frames at t + Δt, {there.count('reference')} at t"
+    return f"Means over {len(clips)} BMS clips ({counts})"
+
+
 if __name__ == "__main__":
-    bench.main(__doc__, {"": (search, {"data": Path})})
+    kernels = {"data": Path, "--plot": None}
+    studies = {
+        "search": (search, {"data": Path}),
+        "kernels": (measure_kernels, kernels),
+        "steps": (measure_steps, {"data": Path}),
+    }
+    bench.main(__doc__, studies)
