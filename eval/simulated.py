@@ -586,7 +586,7 @@ COMPARED: dict[str, Case] = {
     "by the rule": {"interval.rule": True},
     **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
 }
-MEASURED = {"patrol": ("F1 of boxes", "box_f1"), "source": ("F of pixels", "f")}
+MEASURED = {"source": ("F of pixels", "f"), "patrol": ("F1 of boxes", "box_f1")}
 """What is measured of a configuration: boxes of crowds, or the people in them where boxes are not a crowd's."""
 
 
@@ -598,56 +598,61 @@ def measure_interval(options: bench.Options) -> tuple[str, Any]:
     with exact instruments, so that the error is that of detection and of the time between looks. Other tables: every
     frame is looked at, and the interval says how far apart the frames are that are compared; ms of processor a frame.
     """
+    flights = [(altitude, speed) for altitude in ALTITUDES_M for speed in SPEEDS_M_S]
+    studies = {"looked": [[way] for way in LOOKED], **{config: [list(COMPARED)] for config in options.configs}}
     cases = [
-        {"altitude_m": altitude, "speed_m_s": speed, "seed": seed, "seconds": options.seconds}
-        for altitude in ALTITUDES_M
-        for speed in SPEEDS_M_S
+        {"study": study, "ways": ways, "altitude_m": a, "speed_m_s": s, "seed": seed, "seconds": options.seconds}
+        for study, parts in studies.items()
+        for a, s in flights
         for seed in range(options.seeds)
+        for ways in parts
     ]
-    results = bench.run_cases(cases, fly_intervals, options.jobs, options.cache)
-    flights = {f"{a:g} m, {s:g} m/s": (a, s) for a in ALTITUDES_M for s in SPEEDS_M_S}
+    results = bench.run_cases(cases, fly_interval, options.jobs, options.cache)
     tables = []
-    for study, what, ways, digits in (
-        ("looked", "known to within m / s a s", LOOKED, 2),
-        *((config, f"`{config}`: {word} / ms", COMPARED, 0) for config, (word, _) in MEASURED.items()),
-    ):
+    for study in studies:
+        ways, digits, what = LOOKED, 2, "known to within m / s a s"
+        if study != "looked":
+            ways, digits, what = COMPARED, 0, f"`{study}`: {MEASURED[study][0]} / ms"
         rows = []
-        for flight, of in {**flights, "all": None}.items():
+        for of in (*flights, None):
             here = [
-                result[study]
+                result
                 for case, result in zip(cases, results, strict=True)
-                if of in (None, (case["altitude_m"], case["speed_m_s"]))
+                if case["study"] == study and of in (None, (case["altitude_m"], case["speed_m_s"]))
             ]
-            pairs = ([Spread(one[way][k] for one in here) for k in (0, 1)] for way in ways)
-            cells = (f"{a.text(spread=False)} / {b.text(digits, spread=False)}" for a, b in pairs)
-            rows.append([flight, *cells])
+            cells = []
+            for way in ways:
+                a, b = (Spread(result[way][k] for result in here if way in result) for k in (0, 1))
+                cells.append(f"{a.text(spread=False)} / {b.text(digits, spread=False)}")
+            rows.append(["all" if of is None else "{:g} m, {:g} m/s".format(*of), *cells])
         tables.append(bench.format_table([what, *ways], rows))
-    return "\n\n".join([*tables, f"{options.seeds} seeds, {options.seconds:g} s each: means."]), results
+    return "\n\n".join([*tables, f"Flights of {options.seconds:g} s, {options.seeds} a row."]), results
 
 
-def fly_intervals(case: Case) -> Case:
-    """Accuracy and time of one flight, to and fro over two crowds, by what is varied and by interval."""
+def fly_interval(case: Case) -> Case:
+    """[accuracy, time] in some ways to choose the interval, on one flight to and fro over two crowds."""
     uav = {"altitude_m": case["altitude_m"], "speed_m_s": case["speed_m_s"]}
     uav |= {"start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
     uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
-    scenario = walking(
-        case["seed"], case["seconds"], uav=uav, team={"ugvs": 0},
-        clip={"seconds": case["seconds"], "located_by": "telemetry"},
+    source = SimulatorSource(
+        walking(
+            case["seed"], case["seconds"], uav=uav, team={"ugvs": 0},
+            clip={"seconds": case["seconds"], "located_by": "telemetry"},
+        )
     )  # fmt: skip
-    found: Case = {"looked": {}} | {config: {} for config in MEASURED}
-    for way, changed in LOOKED.items():
-        run = fly(SimulatorSource(scenario), changed)
-        found["looked"][way] = [run["score"]["knowledge_m"], run["cpu"]]
-    source = SimulatorSource(scenario)
-    frames, truths = list(source), source.truths()
-    for way, changed in COMPARED.items():
-        for config, (_, measure) in MEASURED.items():
-            settings = with_parameters(fit_settings(load_config(config), source), changed)
-            detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
-            start = bench.now()[1]
-            scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
-            spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
-            found[config][way] = [score_scenes(scenes, truths)[measure], spent_ms]
+    if case["study"] == "looked":
+        (way,) = case["ways"]
+        run = fly(source, LOOKED[way])
+        return {way: [run["score"]["knowledge_m"], run["cpu"]]}
+    cv2.setNumThreads(1)
+    frames, truths, found = list(source), source.truths(), {}
+    for way in case["ways"]:
+        settings = with_parameters(fit_settings(load_config(case["study"]), source), COMPARED[way])
+        detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
+        start = bench.now()[1]
+        scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
+        spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
+        found[way] = [score_scenes(scenes, truths)[MEASURED[case["study"]][1]], spent_ms]
     return found
 
 
@@ -701,7 +706,7 @@ if __name__ == "__main__":
         "altitude": (measure_altitude, common | altitudes),
         "landmarks": (measure_landmarks, common | landmarks),
         "loop": (measure_loop, common | loop),
-        "interval": (measure_interval, common | {"--seeds": 2, "--seconds": 5.0}),
+        "interval": (measure_interval, common | {"--seeds": 1, "--seconds": 5.0, "--configs": list(MEASURED)}),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
     }
     bench.main(__doc__, studies)
