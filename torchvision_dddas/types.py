@@ -882,7 +882,7 @@ class GroundCrowds(Table):
 
     target: (N,) int64 as in Positions. east_north_m: (N, 2) the people's centroid, local metres. velocity_m_s: (N, 2)
     east, north, NaN if unknown. people: (N,) int64, the most that one picture shows. seen_by: (N,) str, the vehicles,
-    separated by semicolons. steers: (N,) bool, the air did not locate the crowd, so that this steers.
+    separated by semicolons. steers: (N,) bool, the air has lost the crowd, so that this steers.
     """
 
     target: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))

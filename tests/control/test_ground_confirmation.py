@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,7 @@ def test_a_target_that_the_air_missed_is_found_by_its_people_and_nothing_is_conc
     at = [(12.0, side) for side in (-1.0, -0.5, 0.0, 0.5, 1.0)]
     boxes = np.array([box_of(CAMERA, *place, 1.75) for place in at])
     people = People(boxes, np.full(5, 0.97), np.ones(5), np.zeros(5, bool), boxes)
+    scorer: Any = None
     monkeypatch.setattr(ground_confirmation, "detect_people", lambda *given: [people])
     picture = GroundPicture("ugv1", 4, np.zeros((480, 640, 3), np.uint8), replace(CAMERA, heading_rad=HEADING))
     positions = Positions(np.array([4]), np.array([2]), np.array([-30.0 * ahead]), np.eye(2)[None], np.ones(1))
@@ -51,7 +53,7 @@ def test_a_target_that_the_air_missed_is_found_by_its_people_and_nothing_is_conc
         *(one, np.array([2]), yes, no),
     )
     for expected, found in ((None, []), (missing, [1])):
-        confirmation = GroundConfirmation(Settings(), lambda *given: None)
+        confirmation = GroundConfirmation(Settings(), scorer)
         confirmation.take([picture])
         confirmed, crowds = confirmation.confirm(located, np.full(1, 2.0), expected)
         assert confirmed.kind == ("unseen",) and confirmed.people.tolist() == [0]

@@ -14,7 +14,7 @@ _BELIEVED, _FAR_M = 0.4, 5.0
 # Speeds above which a target is fast and below which it is so no more; a fast target must be this surely human.
 _RUNNING_M_S, _WALKING_M_S, _SURE = 4.5, 3.5, 0.95
 # A lost target is kept for the first time, and moved on by its velocity for the second.
-_KEPT_S, _HORIZON_S = 8.0, 3.0
+_KEPT_S, LOST_S = 8.0, 3.0
 # A lost target is dropped where another one is within this distance: it goes on as that one.
 _RENAMED_M = 3.0
 # A target is given up below the first probability of being human, and taken up again above the second.
@@ -31,7 +31,7 @@ class Prediction(Table):
 
     target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
     probability: (N,) of being human. unseen: (N,) bool, no ground vehicle could tell. wanted: (N,) bool, human or
-    unseen. lost_s: (N,) since it was last located, by the clock of the frames. missed: (N,) of the latest frames.
+    unseen. lost_s: (N,) since the air last located it, by the clock of the frames. missed: (N,) of the latest frames.
     steady: (N,) bool, its velocity is known. by_ground: (N,) bool, it was last seen from the ground, not from the air.
     """
 
@@ -78,12 +78,14 @@ class _Target:
     fast: bool = False
     steady: bool = False
     by_ground: bool = False
+    located_s: float = 0.0
 
     def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
         """Take over where the air located it."""
         self.correct(place_m, velocity_m_s, time_s)
         self.radius_m += _BELIEVED * (radius_m - self.radius_m)
         self.missed, self.sightings, self.by_ground = 0, self.sightings + 1, False
+        self.located_s = time_s
 
     def correct(self, place_m: np.ndarray, velocity_m_s: np.ndarray, time_s: float) -> None:
         predicted = self.place_m + self.velocity_m_s * (time_s - self.seen_s)
@@ -114,13 +116,16 @@ class TargetPredictor:
         self._known: dict[int, _Target] = {}
 
     def missing(self, located: AerialLocations) -> Prediction:
-        """The established targets that a frame did not locate, as expected at its time; call it before `update`."""
+        """The established targets that are lost for longer than their course is trusted, as expected at a frame's time.
+
+        Call it before `update`. A shorter gap is bridged better by the course than by what vehicles see.
+        """
         seen, here = located.positions.target, located.positions.east_north_m
         expected = self._predict(located.time_s, located.time_s)
         rows = [
             row
-            for row, target in enumerate(expected.target.tolist())
-            if target not in seen and not _is_renamed(expected.east_north_m[row], expected.radius_m[row], here)
+            for row in np.flatnonzero((expected.lost_s > LOST_S) & ~np.isin(expected.target, seen)).tolist()
+            if not _is_renamed(expected.east_north_m[row], expected.radius_m[row], here)
         ]
         return expected[np.array(rows, np.int64)]
 
@@ -166,7 +171,7 @@ class TargetPredictor:
             return np.array([getattr(known, name) for known in rows.values()], kind)
 
         place, velocity = (column(name).reshape(-1, 2) for name in ("place_m", "velocity_m_s"))
-        ahead_s = np.clip(now_s - column("seen_s"), 0, _HORIZON_S)
+        ahead_s = np.clip(now_s - column("seen_s"), 0, LOST_S)
         return Prediction(
             np.array(list(rows), np.int64),
             place + velocity * ahead_s[:, None],
@@ -175,7 +180,7 @@ class TargetPredictor:
             column("probability"),
             column("unseen", bool),
             column("wanted", bool),
-            time_s - column("seen_s"),
+            time_s - column("located_s"),
             column("missed", np.int64),
             column("steady", bool),
             column("by_ground", bool),
@@ -187,7 +192,7 @@ class TargetPredictor:
             known = self._known[target]
             known.missed += 1
             gone_s = time_s - known.seen_s
-            place = known.place_m + known.velocity_m_s * min(gone_s, _HORIZON_S)
+            place = known.place_m + known.velocity_m_s * min(gone_s, LOST_S)
             renamed = _is_renamed(place, known.radius_m, here)
             if gone_s > _KEPT_S or renamed or (not known.established and known.missed > 2):
                 del self._known[target]

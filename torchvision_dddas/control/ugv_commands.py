@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.control.footprint import CameraMount
-from torchvision_dddas.control.prediction import MISSED, Prediction
+from torchvision_dddas.control.prediction import LOST_S, Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import LandmarkObservations, Order
@@ -325,12 +325,12 @@ def _need(prediction: Prediction) -> np.ndarray:
 def _is_sure(prediction: Prediction, row: int, now: bool) -> bool:
     """Whether a target counts as surely human or surely not, and the air sees it; now: whether it did."""
     surely = abs(float(prediction.probability[row]) - 0.5) + 0.5
-    known = not prediction.unseen[row] and prediction.missed[row] < MISSED
+    known = not prediction.unseen[row] and prediction.lost_s[row] <= LOST_S
     return bool(known) and surely > (_UNSURE if now else _SURE)
 
 
 def _describe(prediction: Prediction, row: int) -> str:
     if prediction.unseen[row]:
         return "nobody has seen it"
-    missed = ", missed from the air" if prediction.missed[row] >= MISSED else ""
+    missed = ", missed from the air" if prediction.lost_s[row] > LOST_S else ""
     return f"human with {prediction.probability[row]:.2f}{missed}"
