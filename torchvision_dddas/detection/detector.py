@@ -82,8 +82,7 @@ def load_engine(backend: str, settings: Settings) -> Engine:
 
     Raises InputError as `wants_torch`, and where torch is asked to work at half resolution.
     """
-    is_halved = settings.registration.halved or settings.difference.halved
-    if (is_halved and backend == "auto") or not wants_torch(backend):
+    if not wants_torch(backend) or (backend == "auto" and (settings.registration.halved or settings.difference.halved)):
         return OpenCVEngine(settings)
     from torchvision_dddas.detection.torch_engine import TorchEngine
 
