@@ -23,7 +23,17 @@ import bench
 import clips
 import cv2
 import numpy as np
-import torch
+from association_windows import (
+    Windows,
+    build_windows,
+    choose_weights,
+    considered_dispersions,
+    mean_sd,
+    measure_dispersions,
+    open_sequences,
+    select_windows,
+    window_ratios,
+)
 from scipy.cluster import hierarchy
 
 from torchvision_dddas.config import PaperParameters, Settings, load_config
@@ -34,16 +44,10 @@ from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.nn import HistogramAffinity
-from torchvision_dddas.tracking import CameraMotion, FrameTracker, rgb_histograms
+from torchvision_dddas.tracking import CameraMotion, FrameTracker
 from torchvision_dddas.tracking.source_tracker import (
-    assign,
     centres,
-    dispersion,
-    frames_considered,
     histogram_cut,
-    location_weight,
-    normalize_channels,
     normalized_entropy,
     similarity,
 )
@@ -201,135 +205,20 @@ def join_tracks(frames: Iterable[Tracks]) -> TrackTable:
     return TrackTable(number, np.concatenate([t.identity for t in frames]), np.concatenate([t.box_px for t in frames]))
 
 
-# -- windows ---------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """True boxes (pixels from 1) with identities and histograms (R, 768), a row a box, and the frames with pictures."""
-
-    frame: np.ndarray
-    identity: np.ndarray
-    box_px: np.ndarray
-    histogram: np.ndarray
-    seen: frozenset[int]
-
-    def rows(self, frame: int) -> np.ndarray:
-        """Where the boxes of a frame are."""
-        return np.flatnonzero(self.frame == frame)
-
-
-@dataclass(frozen=True)
-class Windows:
-    """All windows of a sequence: frames (W, K), newest first, and per window what the association needs.
-
-    location, appearance: affinities with a dummy at index 0. dispersions: (W, K, 2), of locations and histograms.
-    """
-
-    frames: np.ndarray
-    identities: list[list[np.ndarray]]
-    location: list[np.ndarray]
-    appearance: list[np.ndarray]
-    dispersions: np.ndarray
-
-
-def read_sequence(place: Path) -> Sequence:
-    """Read the true boxes of a sequence and their histograms, each channel's sum 1."""
-    table = clips.truth_of(place).tracks
-    histogram, seen = np.zeros((len(table.frame), 768)), set()
-    for number, image in clips.frames_of(place, "video"):
-        rows = np.flatnonzero(table.frame == number)
-        histogram[rows] = rgb_histograms(image, table.box_px[rows] - (1, 1, 0, 0))
-        seen.add(number)
-    return Sequence(table.frame, table.identity, table.box_px, normalize_channels(histogram), frozenset(seen))
-
-
-def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1) -> Windows:
-    """The windows of `count` frames, one ending at each frame that has its older ones; one window in `every`."""
-    last = int(sequence.frame.max())
-    rows = {number: sequence.rows(number) for number in range(1, last + 1)}
-    ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
-    whole = [f for f in ends if sequence.seen.issuperset(f) and any(len(rows[t]) for t in f)]
-    if not whole:
-        raise SystemExit(f"no {count} frames {interval} apart with boxes; give a shorter --interval")
-    frames = np.array(whole[::every], int)
-    most = max(len(r) for r in rows.values())
-    valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
-    sizes, parts = [tuple(len(rows[t]) for t in f) for f in frames], []
-    for feature in (centres(sequence.box_px), sequence.histogram):
-        padded = np.zeros((last + 1, most, feature.shape[1]))
-        for number, which in rows.items():
-            padded[number, : len(which)] = feature[which]
-        tables = [torch.from_numpy(table) for table in (padded, valid, frames)]
-        found = HistogramAffinity().affinity(*tables).numpy()
-        parts.append(
-            [np.pad(one[tuple(map(slice, size))], ((1, 0),) * count) for one, size in zip(found, sizes, strict=True)]
-        )
-    identities = [[sequence.identity[rows[t]] for t in f] for f in frames]
-    parameters = PaperParameters()
-    spread = measure_dispersions(sequence, frames, parameters.location_cut, histogram_cut(parameters))
-    return Windows(frames, identities, parts[0], parts[1], spread)
-
-
-def measure_dispersions(
-    sequence: Sequence, frames: np.ndarray, location_cut: float, histogram_cut: float
-) -> np.ndarray:
-    """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts.
-
-    histogram_cut: of dissimilarities as printed.
-    """
-    centre, found = centres(sequence.box_px), {}
-    for t in np.unique(frames).tolist():
-        rows = sequence.rows(t)
-        found[t] = dispersion(centre[rows], location_cut), dispersion(sequence.histogram[rows], histogram_cut)
-    return np.array([[found[t] for t in f] for f in frames.tolist()]).reshape(*frames.shape, 2)
-
-
-def window_ratios(windows: Windows, parameters: PaperParameters, weight: float | None) -> np.ndarray:
-    """AR_K of every window; weight None: as the dispersions choose it."""
-    chosen = choose_weights(windows, parameters) if weight is None else np.full(len(windows.frames), weight)
-    parts = zip(windows.location, windows.appearance, windows.identities, chosen, strict=True)
-    return np.array(
-        [
-            tracking.accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
-            for location, appearance, identities, w in parts
-        ]
-    )
-
-
-def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
-    """The weight of location that the source's rule gives each window."""
-    found = []
-    for row in range(len(windows.frames)):
-        location, appearance = considered_dispersions(windows, row, parameters)
-        found.append(location_weight(location, lambda a=appearance: a, parameters.lowest_dispersion)[0])
-    return np.array(found)
-
-
-def considered_dispersions(windows: Windows, row: int, parameters: PaperParameters) -> tuple[float, float]:
-    """The dispersions of locations and of histograms by which the rule decides in a window."""
-    counts = [len(known) for known in windows.identities[row]]
-    location, appearance = windows.dispersions[row, : frames_considered(counts, parameters)].min(axis=0).tolist()
-    return location, appearance
-
-
-def select_windows(windows: Windows, rows: list[int]) -> Windows:
-    """Some of the windows."""
-    lists = [[of[row] for row in rows] for of in (windows.identities, windows.location, windows.appearance)]
-    return Windows(windows.frames[rows], *lists, windows.dispersions[rows])
+# -- windows --------------------------------------------------------------------------------------------------------
 
 
 def measure_weight(options: bench.Options) -> tuple[str, Any]:
     """AR_K against the weight of location, with a gate and without, and by the source's rule."""
     rows, found, panels = [], {}, []
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         lines = {}
         for count in (2, 3):
             windows = build_windows(sequence, count, options.interval, options.every if count == 3 else 1)
             for gate in ("one_dummy", "off"):
                 parameters = PaperParameters.model_validate({"window": count, "gate": gate})
                 values = [window_ratios(windows, parameters, weight) for weight in [*WEIGHTS, None]]
-                rows.append([name, count, gate, len(windows.frames), *map(_mean_sd, values)])
+                rows.append([name, count, gate, len(windows.frames), *map(mean_sd, values)])
                 means = [100 * float(v.mean()) for v in values]
                 found[f"{name}, K = {count}, {gate}"] = means
                 lines[f"K = {count}, gate {gate}"] = {"x": WEIGHTS, "y": means[:-1]}
@@ -342,7 +231,7 @@ def measure_weight(options: bench.Options) -> tuple[str, Any]:
 def measure_threshold(options: bench.Options) -> tuple[str, Any]:
     """Mean AR_2 in percent against threshold (rows) × weight of location (columns)."""
     parts, found, panels = [], {}, []
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         windows, rows = build_windows(sequence, 2, options.interval), []
         for threshold in WEIGHTS:
             parameters = PaperParameters.model_validate({"window": 2, "threshold": threshold})
@@ -368,7 +257,7 @@ def measure_examples(options: bench.Options) -> tuple[str, Any]:
     dispersions are those of its newest frame.
     """
     rows, quoted, panels, figures = [], [], [], []
-    sequences = dict(_sequences(options))
+    sequences = dict(open_sequences(options))
     for name, sequence in sequences.items():
         windows = build_windows(sequence, 3, options.interval)
         for scale in (PaperParameters().histogram_scale, 1.0):
@@ -449,7 +338,7 @@ def measure_clusters(options: bench.Options) -> tuple[str, Any]:
     cuts. --plot draws the trees.
     """
     parameters, rows, trees = PaperParameters(), [], []
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         seen = np.array(sorted(sequence.seen))
         frame = int(seen[np.argmax([len(sequence.rows(int(number))) for number in seen])])
         here = sequence.rows(frame)
@@ -502,7 +391,7 @@ def measure_scale(options: bench.Options) -> tuple[str, Any]:
     """
     found: dict[str, dict[float, list[float]]] = {}
     cells: dict[str, dict[float, list[str]]] = {}
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         windows = {k: build_windows(sequence, k, options.interval, options.every if k == 3 else 1) for k in (2, 3)}
         found[name], cells[name] = {}, {}
         for scale in SCALES:
@@ -541,7 +430,7 @@ def measure_dispersion(options: bench.Options) -> tuple[str, Any]:
     """The dispersions of windows of two frames, the weight that follows, and AR_2 by that and by fixed weights."""
     rows, panels = [], []
     parameters = PaperParameters.model_validate({"window": 2})
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         windows = build_windows(sequence, 2, options.interval)
         chosen, ruled = choose_weights(windows, parameters), window_ratios(windows, parameters, None)
         fixed = np.stack([window_ratios(windows, parameters, weight) for weight in WEIGHTS])
@@ -549,8 +438,8 @@ def measure_dispersion(options: bench.Options) -> tuple[str, Any]:
         smallest = windows.dispersions.min(axis=1)
         spreads = [f"{v.mean():.2f} ({v.min():.2f} to {v.max():.2f})" for v in smallest.T]
         shares = " / ".join(f"{100 * (chosen == w).mean():.0f}" for w in (1.0, 0.5, 0.0))
-        best_fixed = f"{_mean_sd(fixed[best])} (w = {WEIGHTS[best]:g})"
-        rows.append([name, *spreads, shares, _mean_sd(ruled), best_fixed, _mean_sd(fixed.max(axis=0))])
+        best_fixed = f"{mean_sd(fixed[best])} (w = {WEIGHTS[best]:g})"
+        rows.append([name, *spreads, shares, mean_sd(ruled), best_fixed, mean_sd(fixed.max(axis=0))])
         frames = windows.frames[:, 0].tolist()
         lines = {"locations": smallest[:, 0], "histograms": smallest[:, 1], "weight": chosen}
         drawn = {label: {"x": frames, "y": values.tolist(), "style": "-"} for label, values in lines.items()}
@@ -564,28 +453,16 @@ def measure_cuts(options: bench.Options) -> tuple[str, Any]:
     """AR_2 by the rule for cuts of the clusters of locations (rows) and of histograms (columns)."""
     parts = []
     parameters = PaperParameters.model_validate({"window": 2})
-    for name, sequence in _sequences(options):
+    for name, sequence in open_sequences(options):
         windows, rows = build_windows(sequence, 2, options.interval), []
         for location_cut in LOCATION_CUTS:
             cuts = [cut / parameters.histogram_scale for cut in APPEARANCE_CUTS]
             spreads = [measure_dispersions(sequence, windows.frames, location_cut, cut) for cut in cuts]
             found = [window_ratios(replace(windows, dispersions=at), parameters, None) for at in spreads]
-            rows.append([f"{location_cut:g}", *map(_mean_sd, found)])
+            rows.append([f"{location_cut:g}", *map(mean_sd, found)])
         head = [f"{name}: cut of locations", *(f"of histograms {cut:g}" for cut in APPEARANCE_CUTS)]
         parts.append(bench.format_table(head, rows))
     return "\n\n".join(parts), None
-
-
-def _sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    for place in clips.sequences(options.data):
-        if options.only in place.name and clips.has_pictures(place, "video"):
-            yield place.name, read_sequence(place)
-
-
-def _mean_sd(values: np.ndarray) -> str:
-    return f"{100 * values.mean():.1f}/{100 * values.std(ddof=1):.1f}"
 
 
 if __name__ == "__main__":

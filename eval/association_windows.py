@@ -1,0 +1,154 @@
+"""Windows of two or three frames of a sequence, and how the source's association links their targets."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import bench
+import clips
+import cv2
+import numpy as np
+import torch
+
+from torchvision_dddas.config import PaperParameters
+from torchvision_dddas.evaluation.metrics import tracking
+from torchvision_dddas.nn import HistogramAffinity
+from torchvision_dddas.tracking import rgb_histograms
+from torchvision_dddas.tracking.source_tracker import (
+    assign,
+    centres,
+    dispersion,
+    frames_considered,
+    histogram_cut,
+    location_weight,
+    normalize_channels,
+)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """True boxes (pixels from 1) with identities and histograms (R, 768), a row a box, and the frames with pictures."""
+
+    frame: np.ndarray
+    identity: np.ndarray
+    box_px: np.ndarray
+    histogram: np.ndarray
+    seen: frozenset[int]
+
+    def rows(self, frame: int) -> np.ndarray:
+        """Where the boxes of a frame are."""
+        return np.flatnonzero(self.frame == frame)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """All windows of a sequence: frames (W, K), newest first, and per window what the association needs.
+
+    location, appearance: affinities with a dummy at index 0. dispersions: (W, K, 2), of locations and histograms.
+    """
+
+    frames: np.ndarray
+    identities: list[list[np.ndarray]]
+    location: list[np.ndarray]
+    appearance: list[np.ndarray]
+    dispersions: np.ndarray
+
+
+def read_sequence(place: Path) -> Sequence:
+    """Read the true boxes of a sequence and their histograms, each channel's sum 1."""
+    table = clips.truth_of(place).tracks
+    histogram, seen = np.zeros((len(table.frame), 768)), set()
+    for number, image in clips.frames_of(place, "video"):
+        rows = np.flatnonzero(table.frame == number)
+        histogram[rows] = rgb_histograms(image, table.box_px[rows] - (1, 1, 0, 0))
+        seen.add(number)
+    return Sequence(table.frame, table.identity, table.box_px, normalize_channels(histogram), frozenset(seen))
+
+
+def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1) -> Windows:
+    """The windows of `count` frames, one ending at each frame that has its older ones; one window in `every`."""
+    last = int(sequence.frame.max())
+    rows = {number: sequence.rows(number) for number in range(1, last + 1)}
+    ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
+    whole = [f for f in ends if sequence.seen.issuperset(f) and any(len(rows[t]) for t in f)]
+    if not whole:
+        raise SystemExit(f"no {count} frames {interval} apart with boxes; give a shorter --interval")
+    frames = np.array(whole[::every], int)
+    most = max(len(r) for r in rows.values())
+    valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
+    sizes, parts = [tuple(len(rows[t]) for t in f) for f in frames], []
+    for feature in (centres(sequence.box_px), sequence.histogram):
+        padded = np.zeros((last + 1, most, feature.shape[1]))
+        for number, which in rows.items():
+            padded[number, : len(which)] = feature[which]
+        tables = [torch.from_numpy(table) for table in (padded, valid, frames)]
+        found = HistogramAffinity().affinity(*tables).numpy()
+        parts.append(
+            [np.pad(one[tuple(map(slice, size))], ((1, 0),) * count) for one, size in zip(found, sizes, strict=True)]
+        )
+    identities = [[sequence.identity[rows[t]] for t in f] for f in frames]
+    parameters = PaperParameters()
+    spread = measure_dispersions(sequence, frames, parameters.location_cut, histogram_cut(parameters))
+    return Windows(frames, identities, parts[0], parts[1], spread)
+
+
+def measure_dispersions(
+    sequence: Sequence, frames: np.ndarray, location_cut: float, histogram_cut: float
+) -> np.ndarray:
+    """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts.
+
+    histogram_cut: of dissimilarities as printed.
+    """
+    centre, found = centres(sequence.box_px), {}
+    for t in np.unique(frames).tolist():
+        rows = sequence.rows(t)
+        found[t] = dispersion(centre[rows], location_cut), dispersion(sequence.histogram[rows], histogram_cut)
+    return np.array([[found[t] for t in f] for f in frames.tolist()]).reshape(*frames.shape, 2)
+
+
+def window_ratios(windows: Windows, parameters: PaperParameters, weight: float | None) -> np.ndarray:
+    """AR_K of every window; weight None: as the dispersions choose it."""
+    chosen = choose_weights(windows, parameters) if weight is None else np.full(len(windows.frames), weight)
+    parts = zip(windows.location, windows.appearance, windows.identities, chosen, strict=True)
+    return np.array(
+        [
+            tracking.accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
+            for location, appearance, identities, w in parts
+        ]
+    )
+
+
+def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
+    """The weight of location that the source's rule gives each window."""
+    found = []
+    for row in range(len(windows.frames)):
+        location, appearance = considered_dispersions(windows, row, parameters)
+        found.append(location_weight(location, lambda a=appearance: a, parameters.lowest_dispersion)[0])
+    return np.array(found)
+
+
+def considered_dispersions(windows: Windows, row: int, parameters: PaperParameters) -> tuple[float, float]:
+    """The dispersions of locations and of histograms by which the rule decides in a window."""
+    counts = [len(known) for known in windows.identities[row]]
+    location, appearance = windows.dispersions[row, : frames_considered(counts, parameters)].min(axis=0).tolist()
+    return location, appearance
+
+
+def select_windows(windows: Windows, rows: list[int]) -> Windows:
+    """Some of the windows."""
+    lists = [[of[row] for row in rows] for of in (windows.identities, windows.location, windows.appearance)]
+    return Windows(windows.frames[rows], *lists, windows.dispersions[rows])
+
+
+def open_sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
+    """The sequences of the data whose names hold `--only` and that have pictures."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    for place in clips.sequences(options.data):
+        if options.only in place.name and clips.has_pictures(place, "video"):
+            yield place.name, read_sequence(place)
+
+
+def mean_sd(values: np.ndarray) -> str:
+    """Mean / standard deviation in percent."""
+    return f"{100 * values.mean():.1f}/{100 * values.std(ddof=1):.1f}"
