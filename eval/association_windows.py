@@ -1,5 +1,6 @@
 """Windows of two or three frames of a sequence, and how the source's association links their targets."""
 
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,9 +145,13 @@ def open_sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
     """The sequences of the data whose names hold `--only` and that have pictures."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    for place in clips.sequences(options.data):
-        if options.only in place.name and clips.has_pictures(place, "video"):
-            yield place.name, read_sequence(place)
+    places = [place for place in clips.sequences(options.data) if options.only in place.name]
+    places = [place for place in places if clips.has_pictures(place, "video")]
+    if not places:
+        named = f" whose name holds {options.only}" if options.only else ""
+        sys.exit(f"{options.data} holds no sequence with a video{named}; nothing was measured")
+    for place in places:
+        yield place.name, read_sequence(place)
 
 
 def mean_sd(values: np.ndarray) -> str:

@@ -232,3 +232,12 @@ def test_a_link_of_half_alike_histograms_passes_the_threshold_only_where_dissimi
     appearance[1, 1] = 0.5
     rows = [assign(None, appearance, 0.0, parameters(window=2, histogram_scale=s)).tolist() for s in (0.5, 1.0)]
     assert rows == [[[1, 1]], [[0, 1], [1, 0]]]
+
+
+@pytest.mark.parametrize("rule", ["dispersion", "fixed"])
+def test_without_something_to_link_nothing_is_decided(rule):
+    tracker = SourceTracker(with_parameters(Settings(), {"paper.rule": rule}), 1)
+    one = Detections(np.array([[10.0, 10, 20, 40]]), np.ones(1))
+    none = Detections(np.zeros((0, 4)), np.zeros(0))
+    fed = [tracker.feed(n, given, None, None) for n, given in enumerate((none, none, one, none, none, none, one), 1)]
+    assert [settled[0].appearance for settled in fed] == [None] * 7

@@ -301,6 +301,7 @@ class MotionDetector:
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
         if wanted is not None:
             wanted /= slot.frame.skipped + 1
+            cause += f", one of {slot.frame.skipped + 1} frames looked at" if slot.frame.skipped else ""
             used = self._distance.settings
             self.interval, moved = adjust_interval(number, self.interval, wanted, cause + measured, used)
             slot.adjustments += moved

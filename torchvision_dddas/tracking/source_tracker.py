@@ -458,8 +458,9 @@ class SourceTracker:
         if len(window) > 1:
             found = associate(window, self.parameters, affinities)
             rows = found.rows
-            dispersions = found.location_dispersion, found.appearance_dispersion
-            use = explain_weight(window, found.weight, *dispersions, self.parameters)
+            if len(window[0]) and any(map(len, window[1:])):  # else there was nothing to link, nor to decide
+                dispersions = found.location_dispersion, found.appearance_dispersion
+                use = explain_weight(window, found.weight, *dispersions, self.parameters)
             # The newest link counts: i to j, or i to k where j is the dummy, unless another target has that identity by
             # its own link to j.
             for older, known in enumerate(self.identities, 1):

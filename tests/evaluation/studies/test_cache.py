@@ -171,3 +171,11 @@ def test_changed_code_changes_the_digests_of_what_imports_it_and_no_others(monke
     monkeypatch.setattr(cache, "_file_digest", lambda read: "other" if read == changed_file else real(read))
     changed = {name for name, found in digests().items() if found != before[name]}
     assert changed >= changes and not changed & leaves
+
+
+def test_entries_written_after_a_time_are_told_from_older_ones(tmp_path):
+    cache = Cache(tmp_path)
+    assert not cache.has_newer(0.0)
+    cache.put("0123", {"a": np.zeros(1)})
+    written_s = next(tmp_path.glob("*/*.npz")).stat().st_mtime
+    assert cache.has_newer(written_s - 1) and not cache.has_newer(written_s)

@@ -132,6 +132,12 @@ class Cache:
         """The file of a key."""
         return self.folder / key[:2] / f"{key}.npz"
 
+    def has_newer(self, since_s: float) -> bool:
+        """Whether an entry was written after a time, as `time.time` gives it."""
+        with suppress(OSError):
+            return any(entry.stat().st_mtime > since_s for entry in self.folder.glob("*/*.npz"))
+        return False
+
     def has(self, key: str) -> bool:
         """Whether there is a whole entry. A damaged one is noted and removed."""
         content = self.read(key)

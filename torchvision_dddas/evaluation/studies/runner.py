@@ -271,7 +271,7 @@ def write_study(
     run.json says whether the study is running, complete or interrupted. Raises InputError as `run_study` does, and if
     the disk refuses; bad input leaves the files of an earlier study in the folder as they were.
     """
-    start_s, place = time.perf_counter(), cache or cache_folder()
+    start_s, begun_s, place = time.perf_counter(), time.time(), cache or cache_folder()
     has_begun, finished = False, 0
 
     def count(event: Event) -> None:
@@ -312,9 +312,10 @@ def write_study(
             if has_begun:
                 with suppress(OSError):
                     _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
-            if isinstance(error, KeyboardInterrupt) and finished:
+            if isinstance(error, KeyboardInterrupt) and (finished or Cache(place).has_newer(begun_s)):
                 clips = "1 finished clip is" if finished == 1 else f"{finished} finished clips are"
-                error.add_note(f"{clips} kept in {place}; the same command goes on from there")
+                kept = clips if finished else "finished stages are"
+                error.add_note(f"{kept} kept in {place}; the same command goes on from there")
             if isinstance(error, OSError):
                 raise cannot_write(folder / "run.json", error) from error
             raise
