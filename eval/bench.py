@@ -197,7 +197,7 @@ class Spread:
         if not len(self.values):
             return "–"
         mean, low, high = (f"{factor * v:.{digits}f}" for v in (self.mean, self.values.min(), self.values.max()))
-        return f"{mean} ± {factor * self.error:.{digits}f} ({low}–{high})" if spread else mean
+        return f"{mean} ± {factor * self.error:.{digits}f} ({low}–{high})" if spread and len(self.values) > 1 else mean
 
 
 def format_gain(gains: Sequence[float] | np.ndarray, digits: int = 2) -> str:

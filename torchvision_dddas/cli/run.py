@@ -89,7 +89,8 @@ def run(
     Places come from what the vehicle reports (--telemetry), from landmarks of known place (--landmarks), or from both.
 
     Writes the tables of `dddas detect`, `dddas track` and `dddas locate aerial`, landmarks.csv (where they were seen),
-    overlay.mp4, maps, a report and run.json under --out.
+    overlay.mp4, maps, a report and run.json under --out; of a simulation also crowds.csv (crowds as ground vehicles see
+    them).
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.run_inputs import AerialInput

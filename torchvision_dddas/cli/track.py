@@ -48,9 +48,10 @@ def track(
 ) -> None:
     """Give targets lasting identities: those detected in a clip, or those of a table, with or without its clip.
 
-    Writes tracks.txt (MOTChallenge), tracks.csv, overlay.mp4 if there is a clip, and run.json under --out. With a clip
-    --backend chooses the engine of detection and registration, and with --config paper of the source's histograms and
-    affinities; the default association has none in torch.
+    Writes tracks.txt (MOTChallenge), tracks.csv, run.json, and if there is a clip overlay.mp4 and appearance.csv (why
+    the association looked at appearance, or not) under --out. With a clip --backend chooses the engine of detection and
+    registration, and with --config paper of the source's histograms and affinities; the default association has none in
+    torch.
     """
     from torchvision_dddas import open_video
     from torchvision_dddas.config import load_config

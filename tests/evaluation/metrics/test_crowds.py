@@ -101,7 +101,7 @@ def test_targets_found_in_their_places_score_full():
         "error of a crowd's place: mean 0.00 m, median 0.00, 95 % 0.00",
         "error of a target from its people: mean 0.00 m, median 0.00",
         "95 % ellipses hold the truth in 100.0 %",
-        "what is known of all crowds at all times: 0.00 m off, 10 where nothing is",
+        "mean error of the known places of all crowds over the whole time: 0.00 m; 10 m where no place is known",
     ]
 
 

@@ -313,8 +313,8 @@ class CrowdScore:
         if self.kinds:
             lines.append(f"human or not: right for {100 * self.kind_right:.1f} % of {self.kinds} targets seen close up")
         if not math.isnan(self.knowledge_m):
-            known = f"{self.knowledge_m:.2f} m off, {CAP_M:g} where nothing is"
-            lines.append(f"what is known of all crowds at all times: {known}")
+            known = f"{self.knowledge_m:.2f} m; {CAP_M:g} m where no place is known"
+            lines.append(f"mean error of the known places of all crowds over the whole time: {known}")
         return lines
 
 
