@@ -320,7 +320,7 @@ class PaperParameters(Group):
     )
     threshold: float = parameter(0.4, "a dummy's entry is raised if all real ones are below 1 - threshold", "-", 0, 1)
     dummy: Literal["zero", "formula"] = parameter(
-        "zero", "affinity with a dummy before the gate: zero, or eq. 4 and 5 with a zero vector"
+        "formula", "affinity with a dummy before the gate: eq. 4 and 5 with a zero vector, or zero as the text says"
     )
     histogram: Literal["channel", "count"] = parameter(
         "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"

@@ -65,6 +65,14 @@ LEAVING = [at((100, 100), (400, 300)), at((105, 100), (410, 300)), at((110, 100)
 SHUFFLED = [at((100, 100), (400, 300)), at((410, 300), (105, 100)), at((110, 100), (420, 300))]
 
 
+@pytest.mark.parametrize(("values", "linked"), [({"window": 2}, True), ({}, True), ({"dummy": "zero"}, False)])
+def test_a_target_that_enters_in_the_middle_frame_is_linked_unless_a_dummy_is_worth_nothing(values, linked):
+    # Its true link with the dummy before is worth 0 then, and false ones, at least 0.6, keep the gate from raising it.
+    entering = [at((300, 200)), at((310, 200), (500, 300)), at((320, 200), (510, 300))]
+    _, before, last = tracked(entering, **values)
+    assert (before[1] == last[1]) is linked
+
+
 @pytest.mark.parametrize(
     ("frames", "values", "last"),
     [
@@ -73,8 +81,9 @@ SHUFFLED = [at((100, 100), (400, 300)), at((410, 300), (105, 100)), at((110, 100
         (MISSED, {"window": 2}, [3, 2]),
         (MISSED, {"window": 3}, [1, 2]),  # three frames bridge one that missed a target
         # The true triplet is worth 1, but each false one leaves two dummies worth 0.6 behind.
-        (LEAVING, {}, [3]),
-        (LEAVING, {"gate": "off"}, [1]),
+        (LEAVING, {"dummy": "zero"}, [3]),
+        (LEAVING, {"dummy": "zero", "gate": "off"}, [1]),
+        (LEAVING, {}, [1]),
         (LEAVING, {"window": 2}, [1]),
     ],
 )

@@ -91,6 +91,7 @@ Rescue = Callable[[], bool]
 """Makes the outputs of an open run whole, from another thread; returns whether there are any."""
 
 _rescues: list[Rescue] = []
+_heard = threading.Event()  # the main thread knows of a signal, and acts on it when it may
 
 
 @contextmanager
@@ -109,16 +110,19 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
     Where that thread is stuck in a library, open outputs are made whole beside it, and then `end` is called in another
     thread with the signal, and whether anything was kept; it ends the process.
     """
-    noticed = threading.Event()
+    taken, is_rescued = threading.Lock(), threading.Event()  # taken: by the thread that ends the run
+    _heard.clear()
 
     def notice(number: int, frame: FrameType | None) -> None:
-        if not noticed.is_set():
-            noticed.set()
+        _heard.set()
+        if taken.acquire(blocking=False):
             raise Stopped(number)
+        if is_rescued.is_set():  # this thread was stuck, and the other one is about to end the process
+            time.sleep(_DEAF_S)
 
     def ask(number: int) -> None:
-        if not noticed.wait(_DEAF_S):
-            noticed.set()
+        if not _heard.wait(_DEAF_S) and taken.acquire(blocking=False):
+            is_rescued.set()
             kept = [rescue() for rescue in reversed(_rescues)]
             end(number, any(kept))
 
@@ -132,11 +136,20 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     held: list[int] = []
-    before = {number: signal.signal(number, lambda number, frame: held.append(number)) for number in SIGNALS}
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        _heard.set()
+        held.append(number)
+
+    before = {number: signal.signal(number, hold) for number in SIGNALS}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
-    if held:
+    if not held:
+        return
+    if callable(handler := before[held[0]]):
+        handler(held[0], None)  # not by a signal of our own, which would count as the user's second
+    else:
         signal.raise_signal(held[0])

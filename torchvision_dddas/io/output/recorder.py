@@ -196,6 +196,7 @@ class RunRecorder(Generic[Item]):
             self.discard()
             return False
         finally:
+            self._claim.release()
             self._lock.release()
         return True
 
