@@ -153,6 +153,7 @@ def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(cli
         _, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
     assert record(tmp_path / "out")["state"] == "interrupted"
+    assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
 
 
 def test_a_signal_while_whole_outputs_are_closed_leaves_them_and_says_so(clip, tmp_path):
