@@ -125,11 +125,10 @@ def walk(steps: ArrayLike, growth: float = 0.0) -> np.ndarray:
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.sets(st.integers(0, 9), min_size=3), st.floats(-3, 12), st.floats(-0.1, 0.1))
+@given(st.sets(st.integers(0, 9), min_size=2), st.floats(-3, 12), st.floats(-0.1, 0.1))
 def test_a_straight_walk_is_hardly_changed_whatever_is_missing(seen, at, growth):
     steps = np.array(sorted(seen), float)
     near = np.clip(at, steps[0], steps[-1])
-    # The tolerance is for the faint pull to no slope, where the steps are few and all on one side. Two steps alone, far
-    # apart, miss by up to 1.3 px.
+    # The tolerance is for the faint pull to no slope, which moves two steps alone most where they are far apart.
     found = smooth_boxes(walk(steps, growth), steps - near, np.array([0]))
-    np.testing.assert_allclose(found, walk([near], growth), atol=0.6)
+    np.testing.assert_allclose(found, walk([near], growth), atol=0.4 if len(steps) > 2 else 1.5)

@@ -37,7 +37,14 @@ from torchvision_dddas.functional.filters import (
 from torchvision_dddas.functional.flow import build_pyramid, forward_backward, lucas_kanade
 from torchvision_dddas.functional.hog_svm import Layout, arrange_weights, hog, svm_scores
 from torchvision_dddas.functional.keypoints import corner_min_eigenvalue, frame_features, grid_features
-from torchvision_dddas.functional.morphology import closing, dilation, erosion, opening, structuring_element
+from torchvision_dddas.functional.morphology import (
+    closing,
+    dilation,
+    erosion,
+    kernel_array,
+    opening,
+    structuring_element,
+)
 from torchvision_dddas.functional.plane_maps import (
     MODELS,
     draw_samples,
@@ -93,6 +100,7 @@ __all__ = [
     "hog",
     "invert_map",
     "is_traced",
+    "kernel_array",
     "level_quantiles",
     "log_partition",
     "lucas_kanade",

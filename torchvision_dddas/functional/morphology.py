@@ -42,12 +42,17 @@ _SHAPES = {"rectangle": cv2.MORPH_RECT, "ellipse": cv2.MORPH_ELLIPSE}
 
 
 @cache
+def kernel_array(shape: Literal["rectangle", "ellipse"], size_px: int | tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
+    """cv2.getStructuringElement, uint8, made once. size_px: (width, height), or one number for both."""
+    size = (size_px, size_px) if isinstance(size_px, int) else size_px
+    return cv2.getStructuringElement(_SHAPES[shape], size)
+
+
 def structuring_element(
     shape: Literal["rectangle", "ellipse"], size_px: int | tuple[int, int]
 ) -> Shaped[Tensor, "h w"]:
-    """cv2.getStructuringElement as a kernel, uint8 on the CPU. size_px: (width, height), or one number for both."""
-    size = (size_px, size_px) if isinstance(size_px, int) else size_px
-    return torch.from_numpy(cv2.getStructuringElement(_SHAPES[shape], size))
+    """`kernel_array` as a tensor on the CPU."""
+    return torch.from_numpy(kernel_array(shape, size_px))
 
 
 def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:

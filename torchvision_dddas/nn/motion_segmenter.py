@@ -15,11 +15,9 @@ hull is the hard one of a region, and counts as far as its region does.
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from kornia.color import rgb_to_grayscale
@@ -336,10 +334,10 @@ class MotionSegmenter(nn.Module):
             check_softness(self.settings)
             margin = evidence - limit
         erode, dilate, close = (self._value(f"morphology.{name}_px", values) for name in ("erode", "dilate", "close"))
-        eroded = F.blend_sizes(erode, lambda side: F.erosion(margin, _ellipse(side)))
+        eroded = F.blend_sizes(erode, lambda side: F.erosion(margin, F.kernel_array("ellipse", side)))
 
         def dilated(side: int) -> Tensor:
-            return eroded if side == 1 else F.dilation(eroded, _ellipse(side))
+            return eroded if side == 1 else F.dilation(eroded, F.kernel_array("ellipse", side))
 
         wide = F.blend_sizes(dilate, dilated)
         return F.blend_sizes(close_px or close, lambda side: close_masks(wide, side))
@@ -465,15 +463,9 @@ def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: 
     return matrix / matrix[:, 2:, 2:]
 
 
-@cache
-def _ellipse(side: int) -> np.ndarray:
-    """The kernel as an array: a trace knows its values."""
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-
-
 def close_masks(mask: Tensor, side: int) -> Tensor:
     """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all."""
-    kernel = _ellipse(side)
+    kernel = F.kernel_array("ellipse", side)
     if mask.dtype != torch.uint8 or not F.may_branch(mask):
         return F.closing(mask, kernel)
     spans = []
