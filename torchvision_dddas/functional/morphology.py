@@ -29,7 +29,7 @@ from torch.nn import functional
 
 Extremum = Callable[[Tensor, Tensor], Tensor]
 Kernel = Shaped[Tensor, "h w"] | Shaped[np.ndarray, "h w"]
-"""Where it is not 0, pixels are looked at. In a trace, which knows no values of tensors, an array of NumPy."""
+"""The pixels that count are those where a kernel is not 0. A trace knows no values of tensors: it needs an array."""
 Run = tuple[int, int, int]
 """Of a kernel's row the columns [first, last) that are set."""
 
