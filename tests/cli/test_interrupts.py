@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -18,6 +19,7 @@ import pytest
 
 from tests.cli.conftest import bad, record
 from tests.evaluation.studies import world
+from torchvision_dddas.io.interrupts import Stopped, raising_signals, uninterrupted
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -141,6 +143,48 @@ def test_sigterm_and_sighup_end_each_command_with_whole_outputs(clip, tmp_path, 
     if line != "evaluate":
         assert record(out)["frames"]["written"] == 3
         assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks the system which signals are handled")
+def test_a_second_signal_after_python_has_ended_changes_no_exit_code(clip, tmp_path):
+    # The library of C runs this once Python is gone, and waits for the end of the input.
+    late = "import ctypes\nlibrary = ctypes.CDLL(None)\nlibrary.__cxa_atexit(library.getchar, None, None)\n"
+    (tmp_path / "det.txt").write_text(TABLE)
+    words = ["track", clip, "--detections", tmp_path / "det.txt", "--out", tmp_path / "out", "--quiet"]
+    call = [sys.executable, "-c", late + PROGRAM, *map(str, words)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(call, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "now\n"
+        process.send_signal(signal.SIGTERM)
+        until = time.monotonic() + 60
+        while _handles(process.pid, signal.SIGHUP) and time.monotonic() < until:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGHUP)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+
+
+def _handles(process, number):
+    (caught,) = (line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line[:7] == "SigCgt:")
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
+def test_a_signal_that_is_ignored_takes_no_other_with_it():
+    def both():
+        with uninterrupted():
+            os.kill(os.getpid(), signal.SIGHUP)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    before = [signal.signal(signal.SIGHUP, signal.SIG_IGN), signal.getsignal(signal.SIGTERM)]
+    try:
+        with raising_signals(lambda *_: None):
+            with pytest.raises(Stopped) as stop:
+                both()
+            assert stop.value.number == signal.SIGTERM
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before[0])
+        signal.signal(signal.SIGTERM, before[1])
 
 
 def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(clip, tmp_path):

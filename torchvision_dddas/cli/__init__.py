@@ -1,5 +1,6 @@
 """The command line, `dddas`: one file a command. Heavy imports wait until a command needs them."""
 
+import atexit
 import io
 import os
 import signal
@@ -34,7 +35,7 @@ from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 from torchvision_dddas.cli.tune import tune
-from torchvision_dddas.io.interrupts import KEPT, StopSignals, raising_signals
+from torchvision_dddas.io.interrupts import KEPT, StopSignals, ignore_signals, raising_signals
 from torchvision_dddas.runtime import VERSION
 
 app = typer.Typer(
@@ -78,6 +79,7 @@ def main() -> None:
 
     signals = raising_signals(end)
     signals.__enter__()  # never left: a second signal may come while Python ends
+    atexit.register(ignore_signals)  # Python takes the handlers away before it has ended
     sys.exit(close_output(output, _run(signals)))
 
 

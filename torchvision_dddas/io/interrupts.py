@@ -21,6 +21,17 @@ TOGETHER_S = 2.0
 _DEAF_S = 1.0  # after which the main thread counts as stuck in a library, where no signal reaches it
 
 
+def _heeded() -> list[int]:
+    """The signals that the process does not ignore, as under nohup."""
+    return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+
+
+def ignore_signals() -> None:
+    """Ignore signals from now on: for the end of the process, where Python would let them kill it."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
 class Stopped(KeyboardInterrupt):
     """A signal asks the run to end. number: of the signal. Its notes say what is kept; without any, nothing is."""
 
@@ -59,8 +70,7 @@ class StopSignals:
         self._ours, self._theirs = socket.socketpair()
         self._theirs.setblocking(False)
         self._wakeup = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
-        heeded = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-        self._before = {number: signal.signal(number, self._notice) for number in heeded}
+        self._before = {number: signal.signal(number, self._notice) for number in _heeded()}
         self._thread = threading.Thread(target=self._listen, name="stopping", daemon=True)
         self._thread.start()
         return self
@@ -141,7 +151,7 @@ def uninterrupted() -> Iterator[None]:
         _heard.set()
         held.append(number)
 
-    before = {number: signal.signal(number, hold) for number in SIGNALS}
+    before = {number: signal.signal(number, hold) for number in _heeded()}
     try:
         yield
     finally:
