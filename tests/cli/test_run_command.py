@@ -239,11 +239,21 @@ def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_r
         out = tmp_path / name
         words = alone(flown, "--config", "fast", "--save", "report", telemetry=name)
         result = dddas(*words, "--out", out)
-        assert result.exit_code == 0, result.output
-        assert "note: 0 located, because the telemetry" in result.stdout and cause in result.stdout
+        assert result.exit_code == 3, result.output
+        (said,) = result.stderr.splitlines()[-1:]
+        assert said.startswith("dddas: 0 located, because the telemetry") and cause in said
+        assert said.endswith(f"; all else is in {out}") and "0 located" not in result.stdout
+        assert record(out)["state"] == "complete" and len(rows(out / "tracks.csv")) > 20
         assert any("0 located, because" in note and cause in note for note in record(out)["notes"])
         page = (out / "report.html").read_text()
         assert "0 located, because the telemetry" in page
+
+
+def test_nothing_to_locate_is_no_failure(dddas, flown, engine, tmp_path):
+    engine(found=False)
+    result = dddas(*alone(flown, "--save", "none"), "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: 0 located, because no target was found" in result.stdout
 
 
 def test_the_telemetry_of_detect_is_any_log(dddas):

@@ -11,8 +11,14 @@ from typing import Any
 
 from torchvision_dddas.errors import InputError, without_secrets
 
-FAULT, BAD_INPUT, OUTPUT_FAILED = 1, 2, 74
-"""Exit codes: a fault of the program; bad input; standard output that cannot be written (EX_IOERR of sysexits.h)."""
+FAULT, BAD_INPUT, NOTHING_LOCATED, OUTPUT_FAILED = 1, 2, 3, 74
+"""Exit codes: a fault of the program; bad input; targets and no place of any, though all else is done; standard output
+that cannot be written (EX_IOERR of sysexits.h).
+"""
+
+
+class Ended(int):
+    """The exit code of a command that a signal ended, and that said so."""
 
 
 def say(text: object) -> None:
@@ -27,10 +33,10 @@ def say_fault() -> None:
         print(without_secrets(traceback.format_exc()), file=sys.stderr, flush=True)
 
 
-def say_stopped(number: int, kept: str) -> int:
+def say_stopped(number: int, kept: str) -> Ended:
     """Say which signal ended the command and what is kept; the exit code, as a shell has it."""
     say(f"{'interrupted' if number == SIGINT else f'ended by {Signals(number).name}'}; {kept or 'nothing was kept'}")
-    return 128 + number
+    return Ended(128 + number)
 
 
 def describe_kept(error: BaseException) -> str:
@@ -82,9 +88,9 @@ def open_output() -> StandardOutput:
 
 
 def close_output(output: StandardOutput, code: int) -> int:
-    """Write what is left; the exit code, which says so if standard output failed and nothing else did."""
+    """Write what is left; the exit code, which says so if standard output failed and nothing worse happened."""
     sys.stdout.flush()
-    if output.failure is None or code:
+    if output.failure is None or code not in (0, NOTHING_LOCATED):
         return code
     say(f"standard output cannot be written: {output.failure.strerror}; what was printed is lost, files are whole")
-    return OUTPUT_FAILED
+    return code or OUTPUT_FAILED

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchvision_dddas.cli.exits import NOTHING_LOCATED, say
 from torchvision_dddas.cli.options import (
     Backend,
     Config,
@@ -116,7 +117,7 @@ def aerial(
         record_results(output, record, locator.locate_table(read), "locate", count, quiet)
     files = [name for name in AerialRecorder.files if (out / name).exists()]
     first = f"{record.frames} frames, {record.targets} targets"
-    print_lines(closing_lines([first, *position_lines(record)], record, out, files), quiet)
+    print_located(closing_lines([first, *position_lines(record)], record, out, files), record, out, quiet)
 
 
 @locate.command()
@@ -144,7 +145,7 @@ def ground(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.detection_tables import read_detections
-    from torchvision_dddas.io.output import GroundRecorder
+    from torchvision_dddas.io.output import NONE_LOCATED, GroundRecorder
 
     settings, poses = load_config(config, set_ or []), poses or []
     if len(camera) != len(tables):
@@ -174,13 +175,26 @@ def ground(
         record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
             record.notes.append("the tables have no rows: nobody to locate")
+        elif not record.counts["people"]:
+            record.notes.append(f"{NONE_LOCATED}no sighting has a distance (see sightings.csv)")
     by = record.counts["sightings"]
     counts = f"{by['both']} by height and feet, {by['height']} by height, {by['feet']} by feet alone"
     lines = [f"{record.frames} frames, {record.targets} sightings ({counts}), {record.counts['people']} positions"]
-    if by["bearing"]:
+    if by["bearing"] and record.counts["people"]:
         lines.append(f"note: {by['bearing']} sightings have a bearing but no distance (see sightings.csv)")
     files = [*(name for name in GroundRecorder.files if name != "run.json" and (out / name).exists()), "run.json"]
-    print_lines(closing_lines(lines, record, out, files), quiet)
+    print_located(closing_lines(lines, record, out, files), record, out, quiet)
+
+
+def print_located(lines: Sequence[str], record: "RunRecord", folder: Path, quiet: bool) -> None:
+    """Print closing lines. Where there were targets and none was located, end with NOTHING_LOCATED and say why."""
+    from torchvision_dddas.io.output import NONE_LOCATED
+
+    cause = next((note for note in record.notes if record.targets and note.startswith(NONE_LOCATED)), "")
+    print_lines([line for line in lines if not cause or line != f"note: {cause}"], quiet)
+    if cause:
+        say(f"{cause}; all else is in {folder}")
+        raise typer.Exit(NOTHING_LOCATED)
 
 
 def position_lines(record: "RunRecord") -> list[str]:

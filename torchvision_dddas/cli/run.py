@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines
+from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines, print_located
 from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
@@ -156,7 +156,11 @@ def run(
         pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
         record.notes += clip_notes(source, interval, ready.settings)
-    print_lines(_summary(record, out, site is not None, "overlay" in names), quiet)
+    lines = _summary(record, out, site is not None, "overlay" in names)
+    if given is None:
+        print_lines(lines, quiet)
+    else:
+        print_located(lines, record, out, quiet)
 
 
 def _refuse(options: Mapping[str, object], why: str) -> None:
@@ -188,7 +192,7 @@ def _fly(
     lines = [first, *score.lines(), *others]
     if "truth" in names:
         lines.append(f"{out / 'truth'}: what is true; dddas evaluate {out / 'truth' / 'gt.txt'} {out}")
-    print_lines(lines, quiet)
+    print_located(lines, record, out, quiet)
 
 
 def _summary(record: "RunRecord", folder: Path, is_located: bool, has_overlay: bool) -> list[str]:

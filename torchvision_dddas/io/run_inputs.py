@@ -29,7 +29,7 @@ from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
-from torchvision_dddas.io.output import Site
+from torchvision_dddas.io.output import NONE_LOCATED, Site
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.pipeline import with_focal_length
 from torchvision_dddas.types import Colours, Source, Telemetry
@@ -105,7 +105,7 @@ def prepare_run(
     else:
         if flight is None and telemetry is not None:
             flight = _read_telemetry(telemetry, settings, clip)
-        notes += [*(flight.notes if flight is not None else ()), f"0 located, because {reason}"]
+        notes += [*(flight.notes if flight is not None else ()), f"{NONE_LOCATED}{reason}"]
     return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
 
 

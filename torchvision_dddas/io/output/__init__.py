@@ -12,6 +12,7 @@ from torchvision_dddas.io.output.recorders import (
     TrackRecorder,
 )
 from torchvision_dddas.io.output.run_record import (
+    NONE_LOCATED,
     RESULTS,
     RUN_JSON,
     Event,
@@ -27,6 +28,7 @@ from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM
 
 __all__ = [
     "CONFIRMATION_NAMES",
+    "NONE_LOCATED",
     "NOTICED",
     "PROBLEM",
     "RESULTS",

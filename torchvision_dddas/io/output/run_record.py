@@ -24,6 +24,8 @@ from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.types import Adjustment, Source
 
 RUN_JSON = "run.json"
+NONE_LOCATED = "0 located, because "
+"""How the note begins that says why a run has no position."""
 NO_POSE = "the camera's pose is unknown"
 """The cause of a frame that is not located and says nothing of why."""
 _STEP = math.log(1.01)
@@ -91,7 +93,7 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
         reason = max(causes, key=lambda cause: causes[cause])
     else:
         reason = "no target was found"
-    return f"0 located, because {reason}"
+    return f"{NONE_LOCATED}{reason}"
 
 
 class RunRecord:
