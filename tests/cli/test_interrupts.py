@@ -164,6 +164,27 @@ def test_a_second_signal_after_python_has_ended_changes_no_exit_code(clip, tmp_p
     assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
 
 
+@pytest.mark.parametrize("lost", ["raise", "raise ImportError('initialization failed') from None"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_command_begins_is_one_line(number, lost):
+    early = textwrap.dedent(f"""
+        import os
+        from torchvision_dddas import cli
+
+        def begin():
+            try:
+                os.kill(os.getpid(), {number:d})
+            except KeyboardInterrupt:  # as while a library is loaded, which makes another error of it
+                {lost}
+
+        cli.app.registered_callback.callback = begin
+        cli.main()
+    """)
+    result = subprocess.run([sys.executable, "-c", early, "settings"], cwd=ROOT, capture_output=True, text=True)
+    name = "interrupted" if number == signal.SIGINT else "ended by SIGTERM"
+    assert (result.returncode, result.stderr) == (128 + number, f"dddas: {name}; nothing was kept\n")
+
+
 def _handles(process, number):
     (caught,) = (line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line[:7] == "SigCgt:")
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
@@ -251,6 +272,18 @@ def test_a_full_or_closed_standard_output_is_one_line_and_costs_no_result(clip, 
     result = run_main("settings", stdout=closed.stdin)
     assert result.returncode == 74 and result.stderr.count("\n") == 1
     assert "Broken pipe" in result.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_output_does_not_hide_that_nothing_was_located(tmp_path):
+    (tmp_path / "t.csv").write_text("frame,x_px,y_px,width_px,height_px,cut\n1,600,700,150,260,1\n")
+    (tmp_path / "c.toml").write_text("focal_px = 1000\nwidth_px = 1280\nheight_px = 960\nheight_m = 1.2\n")
+    words = ("locate", "ground", tmp_path / "t.csv", "--camera", tmp_path / "c.toml", "--out", tmp_path / "out")
+    with open("/dev/full", "w") as full:  # noqa: PTH123
+        result = run_main(*words, stdout=full)
+    located, printed = result.stderr.splitlines()
+    assert result.returncode == 3
+    assert located.startswith("dddas: 0 located, because") and "output cannot be written" in printed
 
 
 @pytest.mark.slow

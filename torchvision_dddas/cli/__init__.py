@@ -19,6 +19,7 @@ from torchvision_dddas.cli.evaluate import evaluate
 from torchvision_dddas.cli.exits import (
     BAD_INPUT,
     FAULT,
+    Ended,
     close_output,
     describe_kept,
     open_output,
@@ -85,12 +86,17 @@ def main() -> None:
 
 def _run(signals: StopSignals) -> int:
     try:
-        return int(app(standalone_mode=False) or 0)
+        code = app(standalone_mode=False) or 0
+        # Before the command begins, Typer takes any signal for Ctrl-C and says nothing.
+        is_said = code != 128 + signal.SIGINT or isinstance(code, Ended)
+        return int(code) if is_said else say_stopped(signals.noticed or signal.SIGINT, "")
     except (KeyboardInterrupt, typer.Abort) as error:  # outside a command, while Python still loads
-        return say_stopped(signals.signal or signal.SIGINT, describe_kept(error))
+        return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else FAULT
     except Exception as error:
+        if signals.noticed is not None and isinstance(error, (ImportError, SystemError)):
+            return say_stopped(signals.noticed, describe_kept(error))  # it cut short the loading of a library
         # A word of the command line that will not do; Typer keeps the class of these errors to itself.
         if not hasattr(error, "format_message"):
             say_fault()

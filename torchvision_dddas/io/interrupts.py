@@ -41,8 +41,9 @@ class Stopped(KeyboardInterrupt):
 
 
 class StopSignals:
-    """A context in which SIGNALS are requests to stop. signal: the first that came, None before.
+    """A context in which SIGNALS are requests to stop.
 
+    signal: the first that came, None before; noticed: the first that the main thread was told of.
     The signals wake a thread of this class: the main thread may be deep in a library, hold any lock, or hang.
     Signals that the process ignores, as under nohup, stay ignored.
     """
@@ -60,6 +61,7 @@ class StopSignals:
         """
         self._ask, self._at_once, self._notice, self._together_s = ask, at_once, notice, together_s
         self.signal: int | None = None
+        self.noticed: int | None = None
         self._first_s = 0.0
         self._before: dict[int, Any] = {}
 
@@ -125,6 +127,7 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
 
     def notice(number: int, frame: FrameType | None) -> None:
         _heard.set()
+        signals.noticed = signals.noticed or number
         if taken.acquire(blocking=False):
             raise Stopped(number)
         if is_rescued.is_set():  # this thread was stuck, and the other one is about to end the process
@@ -136,7 +139,8 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
             kept = [rescue() for rescue in reversed(_rescues)]
             end(number, any(kept))
 
-    return StopSignals(ask, notice=notice)
+    signals = StopSignals(ask, notice=notice)
+    return signals
 
 
 @contextmanager
