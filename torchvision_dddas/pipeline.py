@@ -10,7 +10,14 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection import Engine, MotionDetector, Retune, detect_motion, load_engine
+from torchvision_dddas.detection import (
+    Engine,
+    MotionDetector,
+    Retune,
+    detect_motion,
+    load_engine,
+    with_logged_focal,
+)
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, check_colours, group_crowds
 from torchvision_dddas.geo.aerial_targets import tracked_targets
@@ -240,10 +247,15 @@ class Pipeline:
 
 
 def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """Set gates.focal_px from the camera, given telemetry and an unchanged default. Returns settings and notes."""
-    focal = locator.camera.focal_px[0]
-    if locator.site.telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
-        return settings, []
+    """Set gates.focal_px from telemetry, else from the camera, given telemetry and an unchanged default.
+
+    Returns settings and notes.
+    """
+    telemetry, camera = locator.site.telemetry, locator.camera
+    settings, notes = with_logged_focal(settings, telemetry, camera.size_px[0])
+    if notes or telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
+        return settings, notes
+    focal = camera.focal_px[0]
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
     return with_parameters(settings, {"gates.focal_px": focal}), [note]
 

@@ -249,6 +249,27 @@ def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_r
         assert "0 located, because the telemetry" in page
 
 
+def test_detect_and_run_take_the_logs_field_of_view_before_the_cameras(dddas, flown, engine, tmp_path):
+    (tmp_path / "log.csv").write_text(FLIGHT.telemetry_csv(hfov_deg=60.0))
+    (tmp_path / "placeless.csv").write_text("time_s,altitude_m,hfov_deg\n0,45,60\n3,45,60\n")
+    clip, out = (flown / "clip", "--rate", RATE_HZ), ("--save", "none", "--out", tmp_path / "out")
+    focal = []
+    for command, log, *more in (
+        ("detect", "log.csv"),
+        ("run", "log.csv"),
+        ("run", "log.csv", "--camera", flown / "camera.toml"),
+        ("run", "placeless.csv"),
+    ):
+        result = dddas(command, *clip, *out, "--telemetry", tmp_path / log, *more)
+        assert result.exit_code == 3 * (log == "placeless.csv"), result.output
+        assert "note: gates.focal_px is 554 px by the log's field of view" in result.stdout
+        focal.append(record(tmp_path / "out")["settings"]["gates"]["focal_px"])
+    assert focal == pytest.approx([320 / np.tan(np.radians(30))] * 4)
+    result = dddas("detect", *clip, *out, "--telemetry", tmp_path / "log.csv", "--set", "gates.focal_px=900")
+    assert record(tmp_path / "out")["settings"]["gates"]["focal_px"] == 900
+    assert "gates.focal_px is" not in result.stdout
+
+
 def test_nothing_to_locate_is_no_failure(dddas, flown, engine, tmp_path):
     engine(found=False)
     result = dddas(*alone(flown, "--save", "none"), "--out", tmp_path / "out")

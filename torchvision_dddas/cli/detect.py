@@ -67,7 +67,7 @@ def detect_clip(
 ) -> list[str]:
     """Detect in one clip and write under a folder; returns the closing lines. Raises InputError for bad input."""
     from torchvision_dddas import open_video
-    from torchvision_dddas.detection import detect_motion, load_engine
+    from torchvision_dddas.detection import detect_motion, load_engine, with_logged_focal
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import DetectionRecorder, clip_facts
     from torchvision_dddas.io.run_inputs import clip_notes
@@ -80,6 +80,7 @@ def detect_clip(
         flight = None
         if telemetry is not None:
             flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone)
+        settings, more = with_logged_focal(settings, flight, source.size[0])
         engine = load_engine(backend, settings)
         facts = {
             "input": clip,
@@ -89,7 +90,7 @@ def detect_clip(
             "settings": settings.model_dump(),
         }
         record = output.begin(facts, source.rate_hz)
-        record.notes += flight.notes if flight is not None else ()
+        record.notes += [*(flight.notes if flight is not None else ()), *more]
         scenes = detect_motion(source, settings, engine, flight)
         record_results(output, record, scenes, source.name, source.count, quiet, source)
         record.notes += clip_notes(source, 1, settings)

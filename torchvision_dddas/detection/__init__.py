@@ -17,6 +17,7 @@ from torchvision_dddas.detection.interval import (
     interval_from_telemetry,
     look_cost,
     pixels_per_metre,
+    with_logged_focal,
 )
 from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
 
@@ -45,6 +46,7 @@ __all__ = [
     "match_exposure",
     "pixels_per_metre",
     "track_both_ways",
+    "with_logged_focal",
 ]
 
 

@@ -23,6 +23,7 @@ from torchvision_dddas.detection.interval import (
     look_cost,
     settings_at,
     settling_delay,
+    with_logged_focal,
 )
 from torchvision_dddas.detection.motion_history import MotionHistory
 from torchvision_dddas.detection.observation import Observation, Target, build_detections, draw_targets, observe
@@ -206,6 +207,8 @@ class MotionDetector:
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """As `update`, one scene at a time."""
         start = time.perf_counter()
+        if not self._total:
+            self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1])[0])
         self._skipped += frame.skipped
         view = self.engine.prepare(frame.image)
         is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS

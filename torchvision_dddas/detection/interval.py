@@ -1,5 +1,6 @@
 """What flight and scene decide about detection: the interval, the frames of a window, and the sizes of targets."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
 from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair, pair_about
-from torchvision_dddas.types import Adjustment, Flight
+from torchvision_dddas.types import Adjustment, Flight, Telemetry
 
 # A smaller relative change of distance does not move the gates.
 _DISTANCE_STEP = 0.2
@@ -167,6 +168,19 @@ class DistanceSettings:
 def pixels_per_metre(distance_m: float, focal_px: float) -> float:
     """Scale of what is at a distance. One below 1 m counts as 1 m, so that it stays finite on landing."""
     return focal_px / max(distance_m, 1.0)
+
+
+def with_logged_focal(settings: Settings, telemetry: Telemetry | None, width_px: int) -> tuple[Settings, list[str]]:
+    """Set gates.focal_px by the telemetry's field of view, given an unchanged default. Returns settings and notes.
+
+    width_px: of the pictures.
+    """
+    known = np.zeros(0) if telemetry is None else telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)]
+    if not len(known) or settings.gates.focal_px != Settings().gates.focal_px:
+        return settings, []
+    focal = width_px / 2 / math.tan(float(np.median(known)) / 2)
+    note = f"gates.focal_px is {focal:.0f} px by the log's field of view, so that sizes in metres hold"
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
 def describe_distance(flight: Flight) -> str:

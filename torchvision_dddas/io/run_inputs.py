@@ -8,7 +8,7 @@ from typing import Any
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection import Engine, load_engine
+from torchvision_dddas.detection import Engine, load_engine, with_logged_focal
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
     AerialLocator,
@@ -105,7 +105,8 @@ def prepare_run(
     else:
         if flight is None and telemetry is not None:
             flight = _read_telemetry(telemetry, settings, clip)
-        notes += [*(flight.notes if flight is not None else ()), f"{NONE_LOCATED}{reason}"]
+        settings, more = with_logged_focal(settings, flight, source.size[0])
+        notes += [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
     return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
 
 
