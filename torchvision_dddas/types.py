@@ -398,6 +398,7 @@ class DetectionTable:
     cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
     own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
     label: (N,) str, the class, empty if unknown; None if not given.
+    bridge: (N,) bool, whether nothing was seen there: a box between two detections. None if not given.
     """
 
     path: str
@@ -411,6 +412,7 @@ class DetectionTable:
     feet_px: np.ndarray | None = None
     ours: bool = False
     label: np.ndarray | None = None
+    bridge: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)

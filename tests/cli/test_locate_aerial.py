@@ -262,6 +262,19 @@ def test_what_the_log_lacks_comes_from_the_cameras_file(aerial, located, tmp_pat
     assert any(note.startswith(cause) for note in record(tmp_path / "out")["notes"])
 
 
+def test_a_box_that_bridges_a_gap_has_no_place_as_in_a_run(located, tmp_path):
+    flight = Overflight(geographic=False, pitch_deg=60)
+    lines = ["frame,identity,x_px,y_px,width_px,height_px,score,kind,row,speed_px_per_frame"]
+    for cells in (line.split(",") for line in flight.tracks_txt().splitlines()):
+        kind = "bridge" if (cells[0], cells[1]) in (("4", "2"), ("5", "2")) else "detection"
+        lines.append(",".join([*cells[:6], "1", kind, "" if kind == "bridge" else "1", ""]))
+    found, said = located(flight, table="\n".join(lines) + "\n", **ALONE)
+    assert "10 frames, 38 targets\n38 positions; of the frames 10 by telemetry\n" in said
+    assert "note: boxes that bridge gaps between detections: 2; not seen, they have no place\n" in said
+    assert {row["frame"] for row in found if row["target"] == "2"} == {*"1236789", "10"}
+    assert (record(tmp_path / "out")["positions"], record(tmp_path / "out")["bridges"]) == (38, 2)
+
+
 def test_boxes_above_the_horizon_have_no_row_and_are_counted(located, tmp_path):
     flight = Overflight(geographic=False, pitch_deg=15)
     table = flight.tracks_txt() + "".join(f"{frame},9,600,2,20,20,1,-1,-1,-1\n" for frame in flight.numbers())

@@ -78,6 +78,22 @@ def test_heights_above_the_sea_are_counted_from_the_take_off_of_the_cameras_file
     assert fill_gaps(above_sea, started, PARAMETERS)[0].altitude_m[0] == 50.0
     # The ground's heights, where they are known, are better.
     assert np.isnan(fill_gaps(above_sea, started, PARAMETERS, has_ground=True)[0].altitude_m[0])
+
+
+@pytest.mark.parametrize(
+    ("heights", "unused"),
+    [
+        ({"above_sea_m": 1350.0}, "height_m, takeoff_above_sea_m not used, because the height above ground is known"),
+        ({"altitude_m": np.nan, "above_sea_m": 1350.0}, "height_m not used, because the height above ground is known"),
+        ({"altitude_m": np.nan}, "takeoff_above_sea_m not used, because the log says no height above the sea"),
+    ],
+)
+def test_why_a_height_of_the_cameras_file_is_not_used_is_said(heights, unused):
+    keys = frozenset({"height_m", "takeoff_above_sea_m"})
+    _, notes = fill_gaps(
+        log(**heights), replace(CAMERA, height_m=40.0, takeoff_above_sea_m=1300.0, given=keys), PARAMETERS
+    )
+    assert [note for note in notes if unused in note] and not [note for note in notes if "the log says it" in note]
     high = replace(CAMERA, height_m=60.0, height_sigma_m=2.0, given=frozenset({"height_m", "height_sigma_m"}))
     filled, _ = fill_gaps(log(altitude_m=np.nan), high, PARAMETERS)
     assert (filled.altitude_m[0], filled.altitude_sigma_m[0]) == (60.0, 2.0)

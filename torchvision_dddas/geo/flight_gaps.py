@@ -37,14 +37,24 @@ def fill_gaps(
         if used:
             words = "it is taken" if len(used) == 1 else "they are taken"
             notes.append(f"the log does not say {', '.join(used)}: {words} from camera {camera.name}")
-        if unused := [key for key in known_keys(camera) if key not in used]:
-            notes.append(f"camera {camera.name}: {', '.join(unused)} not used, because the log says it")
+        reasons: dict[str, list[str]] = {}
+        for key in (key for key in known_keys(camera) if key not in used):
+            reasons.setdefault(_why_unused(key, telemetry), []).append(key)
+        notes += [f"camera {camera.name}: {', '.join(keys)} not used, because {why}" for why, keys in reasons.items()]
         if any(camera.place):
             notes.append(f"the place of camera {camera.name} is not used: it is that of the vehicle")
     if _lacks(telemetry, "heading_rad") and not has_landmarks:
         telemetry, more = _take_heading(telemetry, parameters)
         notes += more
     return telemetry, notes
+
+
+def _why_unused(key: str, telemetry: Telemetry) -> str:
+    if key not in ("height_m", "takeoff_above_sea_m"):
+        return "the log says it"
+    if key == "takeoff_above_sea_m" and _lacks(telemetry, "above_sea_m"):
+        return "the log says no height above the sea"
+    return "the height above ground is known without it"
 
 
 def known_keys(camera: Camera) -> list[str]:

@@ -339,8 +339,8 @@ class _LocationCounts:
         record, counts = self._record, self._record.counts
         if unplaced := counts["unplaced"]:
             record.notes.append(
-                f"{unplaced} boxes of located frames have no place: they lie above the horizon or too near it, or off "
-                "the known ground"
+                f"{unplaced} boxes of located frames have no place: they lie above the horizon or off the known "
+                "ground, or how far away they are is uncertain by a fifth, as near the horizon or from a low vehicle"
             )
         if counts["positions"] == 0:
             causes = Counter[str]()

@@ -88,7 +88,10 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
     causes: of frames that were not located, with their number. unplaced: targets without a place in the others.
     """
     if unplaced:
-        reason = "all targets lie above the horizon or too near it, or off the known ground"
+        reason = (
+            "all targets lie above the horizon or off the known ground, or how far away they are is uncertain by a "
+            "fifth, as near the horizon or from a low vehicle"
+        )
     elif causes:
         reason = max(causes, key=lambda cause: causes[cause])
     else:
