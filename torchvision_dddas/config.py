@@ -646,10 +646,12 @@ class Parameter:
 
 def all_parameters() -> list[Parameter]:
     """Every parameter in the order of the groups, for `dddas settings` and the README."""
-    return [
-        Parameter(name, field.default, _unit(field), range_of(field), field.description or "")
-        for name, field in _parameter_fields()
-    ]
+    return [describe_parameter(name, field) for name, field in _parameter_fields()]
+
+
+def describe_parameter(name: str, field: FieldInfo) -> Parameter:
+    """The row of one parameter."""
+    return Parameter(name, field.default, _unit(field), range_of(field), field.description or "")
 
 
 def changes(settings: Settings) -> dict[str, object]:

@@ -56,6 +56,17 @@ def test_settings_of_a_group_lists_its_parameters_alone(dddas):
     assert "wanted one of registration, interval," in bad(dddas("settings", "zzz"))
 
 
+def test_settings_of_scenarios_lists_what_changes_one(dddas, tmp_path):
+    lines = dddas("settings", "scenario").stdout.splitlines()
+    names = {name for line in lines for name in re.findall(r"^│ (\w+(?:\.1)?\.\w+)", line)}
+    assert {"uav.altitude_m", "clip.seconds", "crowd.1.people", "fault.1.what", "gps.rate_hz"} <= names
+    assert "None" not in "".join(lines) and not any("shipped" in line.lower() for line in lines)
+    for name in names:  # each is known to --set, which refuses text for a number and a name that there is not
+        kind, key = name.rsplit(".", 1)
+        wrong = bad(dddas("simulate", "demo", "--set", f"{kind}.{key}=[[[1]]]", "--out", tmp_path / "out"))
+        assert "unknown parameter" not in wrong, name
+
+
 @pytest.mark.parametrize("err", [False, True])
 def test_names_do_not_steer_the_terminal(capsys, err):
     name = "a\x1b[2Jb\x07\x9b\u202ec\udc80"

@@ -60,7 +60,9 @@ def run(
     rate: Rate = None,
     scene: Annotated[
         list[str] | None,
-        typer.Option("--scene", metavar="PARAMETER=VALUE", help="Change a parameter of a scenario (sim:NAME)."),
+        typer.Option(
+            "--scene", metavar="PARAMETER=VALUE", help="Change a parameter of sim:NAME; see dddas settings scenario."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Random seed of the scenario, in place of its own.")] = None,
     live: Annotated[

@@ -8,27 +8,38 @@ from torchvision_dddas.cli.options import report_errors
 from torchvision_dddas.cli.progress import open_console
 from torchvision_dddas.errors import InputError
 
+_SCENARIO = "scenario"
+
 
 @report_errors
 def settings(
     group: Annotated[
-        str | None, typer.Argument(metavar="GROUP", help="Only this group, such as track. [default: all]")
+        str | None,
+        typer.Argument(
+            metavar="GROUP", help="Only this group, such as track; scenario: what --scene changes. [default: all]"
+        ),
     ] = None,
 ) -> None:
-    """List the parameters that --set and a configuration can change: default, unit, range and meaning."""
+    """List the parameters that --set and a configuration can change: default, unit, range and meaning.
+
+    `dddas settings scenario` lists those of a simulated world, for `dddas run sim:NAME --scene` and `dddas simulate`.
+    """
     from rich.table import Table
 
     from torchvision_dddas.config import Settings, all_parameters, config_names, nearest
 
-    groups = list(Settings.model_fields)
+    groups = [*Settings.model_fields, _SCENARIO]
     if group is not None and group not in groups:
         raise InputError(
             f"no group of parameters is named '{group}'; {nearest(group, groups, 'wanted one of ' + ', '.join(groups))}"
         )
     table = Table("parameter", "default", "unit", "range", "meaning")
-    for parameter in all_parameters():
-        if group is not None and not parameter.name.startswith(f"{group}."):
-            continue
+    rows = [row for row in all_parameters() if group is None or row.name.startswith(f"{group}.")]
+    if group == _SCENARIO:
+        from torchvision_dddas.simulation import scenario_parameters
+
+        rows = scenario_parameters()
+    for parameter in rows:
         table.add_row(parameter.name, str(parameter.default), parameter.unit, parameter.range, parameter.meaning)
     # A file or a pipe gets one line per parameter, so that it can be searched.
     console = open_console(width=240)

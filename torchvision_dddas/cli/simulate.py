@@ -26,7 +26,9 @@ def simulate(
     set_: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="PARAMETER=VALUE", help="Change the scenario, as uav.altitude_m=100; may be repeated."
+            "--set",
+            metavar="PARAMETER=VALUE",
+            help="Change the scenario, as uav.altitude_m=100, see dddas settings scenario; may be repeated.",
         ),
     ] = None,
     frames: Annotated[int | None, typer.Option(metavar="N", help="Frames to make. [default: the whole run]")] = None,

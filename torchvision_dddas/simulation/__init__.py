@@ -7,6 +7,7 @@ from torchvision_dddas.simulation.scenario import (
     Scenario,
     load_scenario,
     scenario_names,
+    scenario_parameters,
     scenario_settings,
     scenario_toml,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "open_simulator",
     "record_scenario",
     "scenario_names",
+    "scenario_parameters",
     "scenario_settings",
     "scenario_toml",
 ]

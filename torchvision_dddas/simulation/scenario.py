@@ -7,6 +7,7 @@ and along north, UGVs that are fast at first and slow near the crowd, a UAV 50 t
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -15,9 +16,11 @@ from pydantic.fields import FieldInfo
 
 from torchvision_dddas.config import (
     Group,
+    Parameter,
     Settings,
     config_folder,
     describe_error,
+    describe_parameter,
     format_toml,
     is_file,
     nearest,
@@ -35,6 +38,7 @@ _OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")  # fau
 _FILES = ("elevation", "photo")  # parameters of the world that name files
 
 Place = tuple[float, float]
+_PLACES: dict[Any, str] = {Place: "two numbers", tuple[Place, ...]: "a list of pairs of numbers"}
 
 
 class WorldParameters(Group):
@@ -208,6 +212,18 @@ class Scenario(Group):
 def scenario_names() -> list[str]:
     """The shipped scenarios, by name."""
     return sorted(path.stem for path in (config_folder() / "scenarios").glob("*.toml"))
+
+
+def scenario_parameters() -> list[Parameter]:
+    """Every parameter of a scenario by the name that changes it: `uav.altitude_m`, `crowd.1.people`."""
+    rows = []
+    for key, field in Scenario.model_fields.items():
+        if group := _group(field):
+            inside = f"{key}.1" if get_origin(field.annotation) is tuple else key
+            for name, inner in group.model_fields.items():
+                row, words = describe_parameter(f"{inside}.{name}", inner), _PLACES.get(inner.annotation)
+                rows.append(replace(row, range=words) if words else row)
+    return rows
 
 
 def scenario_settings(scenario: Scenario) -> dict[str, object]:
@@ -400,11 +416,7 @@ def _explain(loc: tuple[int | str, ...], kind: str, message: str, value: object)
 
 def _nearest_parameter(name: str) -> str:
     """Names that look like it, or the tables that there are."""
-    known = ["about", "seed"]
-    for key, field in Scenario.model_fields.items():
-        if group := _group(field):
-            inside = f"{key}.1" if get_origin(field.annotation) is tuple else key
-            known += [f"{inside}.{parameter_name}" for parameter_name in group.model_fields]
+    known = ["about", "seed", *(row.name for row in scenario_parameters())]
     tables = ", ".join(key for key in Scenario.model_fields if key not in ("about", "seed"))
     return nearest(name, known, f"its tables are {tables}")
 
