@@ -198,8 +198,9 @@ def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -
     lines += [f"note: {line}" for line in notes[:MOST_NOTES]]
     if len(notes) > MOST_NOTES:
         lines.append(f"note: {len(notes) - MOST_NOTES} more in run.json")
-    kept = sum(1 for case in results.cases if not case.cause)
-    lines.append(f"{kept} of {len(results.cases)} cases scored, {results.facts['computed']} stages computed")
+    scored, facts = sum(1 for case in results.cases if not case.cause), results.facts
+    kept = f"{facts['computed']} stages computed, {facts['kept']} cases kept from before"
+    lines.append(f"{scored} of {len(results.cases)} cases scored: {kept}")
     print_lines([*lines, f"{folder}: {', '.join(name for name in FILES if (folder / name).is_file())}"])
 
 

@@ -84,6 +84,7 @@ def test_a_repeated_study_starts_no_worker_and_gives_the_same_bytes(study, tmp_p
         with Workers(2) as two:
             again = run_study(study, tmp_path, two, cache=tmp_path / "cache")
     assert again.facts["computed"] == 0 < first.facts["computed"]
+    assert (first.facts["kept"], again.facts["kept"]) == (0, len(again.cases))
     for path in (tmp_path / "cache").glob("??/*.npz"):
         path.write_bytes(path.read_bytes()[:-3])
     damaged = run_study(study, tmp_path, cache=tmp_path / "cache")

@@ -237,7 +237,7 @@ def run_study(
     outcomes = run_jobs(planned.jobs, workers or Workers(1), store, collect_note)
     cases: list[Case] = []
     left_out = list(planned.left_out)
-    faults, computed = [], 0
+    faults, computed, kept = [], 0, 0
     for clip, done in ((job.clip, done) for job in planned.jobs for done in outcomes[job.number]):
         name, cause = clip.name, done.cause
         computed += len(done.computed)
@@ -247,12 +247,13 @@ def run_study(
         if not cause and (found is None or scored is None):
             cause = "its entry in the cache is gone or damaged; run the study again"
         cases.append(Case(clip, done.task, found, scored, cause))
+        kept += not cause and not done.computed
         if cause:
             left_out.append(f"{name}, {done.task}: {cause}")
         if done.trace:
             faults.append({"clip": name, "task": done.task, "trace": done.trace})
     notes = list(dict.fromkeys([*notes, *store.notes]))
-    facts = {**planned.facts, "computed": computed, "notes": notes, "faults": faults}
+    facts = {**planned.facts, "computed": computed, "kept": kept, "notes": notes, "faults": faults}
     return Results(spec, planned.settings, tuple(cases), tuple(left_out), facts)
 
 
