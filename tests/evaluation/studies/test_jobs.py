@@ -11,6 +11,7 @@ import time
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -213,6 +214,65 @@ def test_a_worker_that_is_stopped_costs_its_clip_and_not_the_study(tmp_path, mon
     lost = {case.clip.name: case.cause for case in results.cases if case.cause}
     assert list(lost.values()) == ["its worker gave no sign for 15 s"]
     assert len({case.clip.name for case in results.cases}) == 3
+
+
+def hang(job, keys, store, code):
+    """In place of `jobs._do_remotely`: a job that takes long and heeds nothing."""
+    (store.folder / "begun").touch()
+    time.sleep(60)
+
+
+@pytest.mark.slow
+def test_busy_workers_do_not_hold_up_an_interrupt(by_name, tmp_path, monkeypatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(jobs, "_do_remotely", hang)
+    cache, asked_s = Cache(tmp_path / "cache"), list[float]()
+
+    def ask() -> None:
+        while not (cache.folder / "begun").exists():
+            time.sleep(0.05)
+        asked_s.append(time.monotonic())
+        os.kill(os.getpid(), signal.SIGINT)
+
+    Thread(target=ask, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt), Workers(2) as team:
+        run_jobs([by_name["tracks"], by_name["table"]], team, cache)
+    assert time.monotonic() - asked_s[0] < 3.5  # Dask by itself waits 4 s for them
+
+
+# The first worker that begins sends the signal to its starter.
+AT_START = textwrap.dedent("""
+    import os, signal
+    from distributed import Nanny
+
+    whole = Nanny.instantiate
+
+    async def instantiate(nanny):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return await whole(nanny)
+
+    Nanny.instantiate = instantiate
+""")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at_start", [True, False])
+def test_a_signal_to_a_study_with_workers_is_one_line(tmp_path, at_start) -> None:
+    pytest.importorskip("distributed")
+    words = ["evaluate", "--dataset", world.three(tmp_path / "clips"), "--out", tmp_path / "out", "--jobs", "2"]
+    program = (AT_START if at_start else "") + "from torchvision_dddas.cli import main; main()"
+    call = [sys.executable, "-c", program, *map(str, words), "--cache", str(tmp_path / "cache")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(call, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as run:
+        assert run.stderr is not None
+        if not at_start:
+            assert any("1 of 3" in line for line in run.stderr)
+            os.killpg(run.pid, signal.SIGHUP)  # as a terminal does that is closed
+        error = run.communicate(timeout=60)[1]
+    lines = [line for line in error.splitlines() if " clips" not in line.split(" kept")[0] and " of 3: " not in line]
+    name = "SIGTERM" if at_start else "SIGHUP"
+    assert len(lines) == 1 and lines[0].startswith(f"dddas: ended by {name}; "), error
+    assert run.returncode == 128 + getattr(signal, name)
 
 
 @pytest.mark.slow

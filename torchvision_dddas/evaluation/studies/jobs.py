@@ -4,10 +4,13 @@ One job at a time needs no Dask. Workers of a cluster read the clips' files wher
 must be shared. Their results come back, and this machine keeps them.
 """
 
+import atexit
 import logging
+import multiprocessing
 import os
 import queue
 import signal
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,6 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, islice
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +241,9 @@ class Workers:
             self._client = self._stack.enter_context(_connect(self._scheduler))
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and self._scheduler is None:
+            _kill_local(self._client)
         self._stack.close()
 
     def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
@@ -391,6 +397,7 @@ def _start_local(jobs: int, stack: ExitStack) -> Any:
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    _start_tracker()
     limits = {"allowed-failures": MAX_DEATHS - 1, "worker-ttl": None}  # silent workers are ended here
     with dask.config.set({f"distributed.scheduler.{name}": limit for name, limit in limits.items()}):
         cluster = LocalCluster(
@@ -405,6 +412,35 @@ def _start_local(jobs: int, stack: ExitStack) -> Any:
         )
     stack.enter_context(cluster)
     return stack.enter_context(Client(cluster, set_as_default=False))
+
+
+def _kill_local(client: Any) -> None:
+    """End the workers of this machine at once: what is finished is in the cache, and Dask would wait for the rest.
+
+    client: None if a signal came while they started; what Dask says of that is no concern of the user's.
+    """
+    if "distributed" not in sys.modules:
+        return
+    from distributed.deploy.spec import close_clusters
+
+    for name in ("asyncio", "tornado"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    atexit.unregister(close_clusters)
+    for nanny in client.cluster.workers.values() if client is not None else ():
+        nanny.close_gracefully()  # else it starts another worker
+    for child in multiprocessing.active_children():
+        if child.name.startswith("Dask Worker"):
+            child.kill()
+
+
+def _start_tracker() -> None:
+    """Start the process that cleans up behind workers: it heeds no SIGHUP, as it heeds no Ctrl-C and no SIGTERM."""
+    if hasattr(signal, "pthread_sigmask") and hasattr(signal, "SIGHUP"):
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+        try:
+            resource_tracker.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _connect(scheduler: str) -> Any:
