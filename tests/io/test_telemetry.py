@@ -207,6 +207,14 @@ def test_a_table_in_utc_tells_the_clock(fly, first, second):
     assert flown.start_utc_s == pytest.approx(1_619_863_200 + 3) and flown.time_s.tolist() == [-3, -2]
 
 
+def test_a_flight_log_that_says_when_the_film_begins_tells_how_to_count_from_there(fly):
+    rows = [f"{100 * k},48.1,{11.5 + k * 1e-5:.6f},130,{int(k >= 60)}" for k in range(120)]
+    text = "\n".join(["time(millisecond),latitude,longitude,height_above_takeoff(feet),isVideo", *rows]) + "\n"
+    assert [note for note in fly(text).notes if "began to film 6.0 s after" in note and "clock_offset_s=-6.0" in note]
+    moved = fly(text, clock_offset_s=-6.0)
+    assert moved.at(0.0).place[0] == pytest.approx(11.5006) and not [n for n in moved.notes if "film" in n]
+
+
 def test_a_table_that_counts_frames_takes_the_times_of_its_clip(fly, tmp_path: Path):
     clip = tmp_path / "pictures"
     clip.mkdir()

@@ -241,8 +241,9 @@ def _read_program_table(
     if {names[i] for i in used} & {"altitude", "alt"}:
         log.note("the file does not say where the altitude is zero; above the sea is assumed")
     optics = [names.index(key) if key in names else None for key in ("focallen", "fnum", "dzoomratio")]
-    wanted = {clock, *used, *(i for i in optics if i is not None)}
-    first = begin = math.nan
+    films = names.index("isvideo") if "isvideo" in names else clock  # whether the camera records at the time
+    wanted = {clock, films, *used, *(i for i in optics if i is not None)}
+    first = begin = filmed = math.nan
     is_zoned = False
     for number, row in zip(text.line, text.rows, strict=True):
         cells = {i: row[i] if i < len(row) else "" for i in wanted}
@@ -257,6 +258,8 @@ def _read_program_table(
             raise log.refuse(f"'{cells[clock]}' is no time; wanted a date with a time, or seconds", number)
         first = (moment if is_timed else 0.0) if math.isnan(first) else first
         log.moments.append((moment - first, 0.0, number))
+        if films != clock and math.isnan(filmed) and _to_float(cells[films]) == 1:
+            filmed = moment - first
         for i in used:
             value = _to_float(cells[i])
             if math.isfinite(value) and (found := convert(names[i], value, units[i])):
@@ -267,6 +270,11 @@ def _read_program_table(
             log.note("the field of view is that of a focal length for a picture 36 mm wide")
     if not log.moments:
         raise InputError(f"telemetry {log.path} has a header but no rows")
+    if filmed > 0 and not clock_offset_s:
+        log.note(
+            f"the log says that the camera began to film {filmed:.1f} s after its first row, and times count from that "
+            f"row: aerial.clock_offset_s={-filmed:.1f} counts them from where the film begins"
+        )
     if not is_zoned and zone is not None and parse_date(text.rows[0][clock]) is not None:
         first, is_zoned = to_utc(first, zone), True
     return build_record(log, clock_offset_s, first if is_zoned else math.nan)
