@@ -274,6 +274,17 @@ def test_a_full_or_closed_standard_output_is_one_line_and_costs_no_result(clip, 
     assert "Broken pipe" in result.stderr
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="closes streams by a shell")
+@pytest.mark.parametrize(("closed", "code"), [("2>&-", 0), ("<&- 2>&-", 0), ("<&- >&- 2>&-", 74)])
+def test_closed_streams_cost_no_result(clip, tmp_path, closed, code):
+    (tmp_path / "det.txt").write_text(TABLE)
+    words = ["track", clip, "--detections", tmp_path / "det.txt", "--out", tmp_path / "out"]
+    line = shlex.join([sys.executable, "-c", MAIN, *map(str, words)])
+    result = subprocess.run(["sh", "-c", f"{line} {closed}"], cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (result.returncode, record(tmp_path / "out")["state"]) == (code, "complete")
+    assert ("tracks.csv" in result.stdout) == (code == 0)
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_standard_output_does_not_hide_that_nothing_was_located(tmp_path):
     (tmp_path / "t.csv").write_text("frame,x_px,y_px,width_px,height_px,cut\n1,600,700,150,260,1\n")

@@ -71,9 +71,9 @@ def _options(
 
 def main() -> None:
     """Entry point. Exit codes: see docs/commands.md."""
+    output = open_output()
     if isinstance(sys.stderr, io.TextIOWrapper):
         sys.stderr.reconfigure(errors="replace")
-    output = open_output()
 
     def end(number: int, kept: bool) -> None:
         os._exit(say_stopped(number, KEPT if kept else ""))

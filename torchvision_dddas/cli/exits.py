@@ -73,7 +73,12 @@ class StandardOutput(io.FileIO):
 
 
 def open_output() -> StandardOutput:
-    """Put a StandardOutput in the place of sys.stdout. A terminal that cannot show × or ≥ shows a question mark."""
+    """Put a StandardOutput in the place of sys.stdout. A terminal that cannot show × or ≥ shows a question mark.
+
+    A closed standard input or error leads to nowhere: no other file may be opened with its number.
+    """
+    if sys.stdin is None:
+        sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (open until the process ends)
     before = sys.stdout
     if before is None:  # closed: nothing else may be opened with its number, and all that is written fails
         raw = StandardOutput(os.open(os.devnull, os.O_RDONLY), "w")
@@ -84,6 +89,8 @@ def open_output() -> StandardOutput:
         encoding, is_terminal = before.encoding, before.isatty()
     buffer = io.BufferedWriter(raw)
     sys.stdout = io.TextIOWrapper(buffer, encoding, "replace", line_buffering=is_terminal)
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: PTH123, SIM115
     return raw
 
 
