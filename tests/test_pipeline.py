@@ -94,6 +94,14 @@ def test_what_cannot_be_used_is_one_clear_line(make, message):
         make()
 
 
+def test_telemetry_without_places_locates_nothing_and_says_so(frames):
+    pipeline = Pipeline(telemetry=replace(DOWN, place=np.full((2, 2), np.nan)))
+    assert pipeline.notes == [
+        "nothing is located: the telemetry holds no place of the vehicle, and there are no landmarks"
+    ]
+    assert all(result.locations is None for result in pipeline(frames))
+
+
 def test_tracks_are_located_by_telemetry_alone():
     tracks = Tracks(1, np.array([3]), np.array([[315.0, 235.0, 10, 10]]), np.ones(1), np.zeros(1, np.int64))
     found = AerialLocator(CAMERA, DOWN).locate(tracks)

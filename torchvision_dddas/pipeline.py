@@ -19,7 +19,14 @@ from torchvision_dddas.detection import (
     with_logged_focal,
 )
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, WatchedScene, check_colours, group_crowds
+from torchvision_dddas.geo import (
+    AerialLocator,
+    LandmarkWatch,
+    WatchedScene,
+    check_colours,
+    describe_no_place,
+    group_crowds,
+)
 from torchvision_dddas.geo.aerial_targets import tracked_targets
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
@@ -63,6 +70,7 @@ class Pipeline:
 
     Call it with a source, or give it single frames with `update` and take the last results with `flush`. A frame's
     result is settled some frames later. Targets are located where landmarks are given, or telemetry with places.
+    notes: what the user should know of what was given.
     """
 
     def __init__(
@@ -113,6 +121,8 @@ class Pipeline:
         self._locates = landmarks is not None or has_places
         if not self._locates and (colours or camera or elevation):
             raise InputError("camera, colours and elevation are of no use without landmarks, or telemetry with places")
+        if telemetry is not None and not self._locates:
+            self.notes.append(f"nothing is located: {describe_no_place(telemetry)}")
         self._watch: LandmarkWatch | None = None
         self._mission: Mission | None = None
         self._seen: Callable[[Scene], object] | None = None

@@ -104,7 +104,8 @@ def describe_no_place(telemetry: Telemetry | None) -> str:
     """Why nothing can be located without landmarks, in words."""
     if telemetry is None:
         return "locating needs landmarks, or telemetry that says where the vehicle is; got neither"
-    return f"the telemetry {telemetry.origin} holds no place of the vehicle, and there are no landmarks"
+    named = f"the telemetry {telemetry.origin}".rstrip()
+    return f"{named} holds no place of the vehicle, and there are no landmarks"
 
 
 def has_places(telemetry: Telemetry | None) -> bool:
