@@ -78,7 +78,11 @@ def study(tmp_path):
 
 def test_a_repeated_study_starts_no_worker_and_gives_the_same_bytes(study, tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
+    left = tmp_path / "cache/ab/.abc.0123456789abcdef.part.npz"  # by a worker that was killed
+    left.parent.mkdir(parents=True)
+    left.touch()
     first = run_study(study, tmp_path, cache=tmp_path / "cache")
+    assert not left.exists()
     with monkeypatch.context() as alone:
         alone.setattr(jobs, "_start_local", lambda *given: pytest.fail("a worker was started"))
         with Workers(2) as two:

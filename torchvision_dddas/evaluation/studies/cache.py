@@ -28,7 +28,7 @@ from torchvision_dddas.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.evaluation.metrics.tracking import Clear, Hota, Identity, TargetTrack, TrackCounts, Windows
 from torchvision_dddas.evaluation.studies.records import Found, Scored, ScoredCase, ScoredStudy
-from torchvision_dddas.io.atomic_files import cannot_write, remove, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, remove, remove_left_behind, write_whole
 from torchvision_dddas.runtime import VERSION
 
 SCORES = "scores.bin"
@@ -175,6 +175,11 @@ class Cache:
             write_whole(path, content)
         except OSError as error:
             raise InputError(str(cannot_write(path, error)).replace("another --out", "another --cache")) from None
+
+    def tidy(self) -> None:
+        """Remove the hidden files of entries that killed processes left under way."""
+        for folder in self.folder.glob("??"):
+            remove_left_behind(folder)
 
     def prune(self, days: float) -> tuple[int, int]:
         """Remove entries that were not used for so many days; returns their number and bytes."""

@@ -226,6 +226,7 @@ def run_study(
     """
     planned = plan_study(spec, base, clips)
     store = Cache(cache or cache_folder())
+    store.tidy()
     notes = list(planned.notes)
 
     def collect_note(event: Event) -> None:
