@@ -238,6 +238,15 @@ def test_targets_outside_the_gates_of_the_altitude_are_left_out(noise):
     assert count(min_size_m=20.0) == 0
 
 
+@pytest.mark.parametrize("altitude_m", [0.0, -20.0, np.nan])
+def test_an_altitude_that_is_none_above_ground_counts_for_nothing(altitude_m, film):
+    settings = load_config("fast")
+    wanted = list(detect_motion(Film(film.images), settings, "onboard"))
+    found = list(detect_motion(Film(film.images), settings, "onboard", flight([0, 1.6], altitude_m)))
+    assert [s.detections.box_px.tolist() for s in found] == [s.detections.box_px.tolist() for s in wanted]
+    assert not [a for s in found for a in s.adjustments if a.parameter.startswith("gates.")]
+
+
 @pytest.mark.parametrize(("hfov_deg", "set_px"), [(60.0, 1000.0), (60.0, 900.0), (np.nan, 1000.0)])
 def test_the_gates_take_the_focal_length_that_the_log_says_unless_one_is_set(hfov_deg, set_px, noise):
     images, log = pan(noise, 6, car=5.0), flight([0, 0.6], altitude_m=100.0)

@@ -285,8 +285,9 @@ class MotionDetector:
         """Apply the feedback rules of the detection interval and of the distance to the ground."""
         parameters, number = self.settings.interval, slot.frame.number
         flight = self.telemetry.at(slot.frame.time_s) if self.telemetry is not None else None
-        # A log may say one of altitude and speed without the other, or fall silent for a while.
-        high = flight if flight is not None and np.isfinite(flight.altitude_m) else None
+        # A log may say one of altitude and speed without the other, or fall silent for a while. A height of 0 or less,
+        # as on the ground or below a take-off on a hill, tells nothing of the distance to what is seen.
+        high = flight if flight is not None and flight.altitude_m > 0 else None
         self._distance, moved = follow_distance(number, self._distance, high, self.rate_hz, self.settings)
         slot.adjustments += moved
         slot.distance = self._distance
