@@ -98,3 +98,19 @@ def test_without_optuna_the_line_says_how_to_get_it(run, tmp_path, monkeypatch) 
     monkeypatch.setattr("torchvision_dddas.evaluation.studies.sweep.find_spec", lambda name: None)
     words = ("--optuna", 2, "--range", "difference.threshold=5:40", "--out", tmp_path / "out")
     assert "torchvision-dddas[tune]" in bad(run(*words))
+
+
+def test_an_interrupt_before_the_first_trial_says_that_finished_stages_are_kept(study, run, tmp_path, monkeypatch):
+    from torchvision_dddas.evaluation.studies.sweep import StudyMeasure
+
+    whole = StudyMeasure.prepare
+
+    def stopped(*words, **more):
+        whole(*words, **more)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(StudyMeasure, "prepare", stopped)
+    result = run("--grid", "difference.threshold=11", "--out", tmp_path / "out")
+    assert result.exit_code == 130
+    kept = f"finished stages are kept in {study.parent / 'cache'}; the same command goes on from there"
+    assert result.stderr.splitlines()[-1] == f"dddas: interrupted; {kept}"

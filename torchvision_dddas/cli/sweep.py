@@ -82,6 +82,7 @@ def sweep(
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.evaluation.studies import sweep as sweeps
+    from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
     from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
     from torchvision_dddas.evaluation.studies.summary import parse_goal
     from torchvision_dddas.io.atomic_files import claimed
@@ -107,7 +108,15 @@ def sweep(
             printed = time.monotonic()
             print_now(f"{done} of {total} clips of the next points")
 
-    kept = noting(lambda: f"{len(record.trials)} trials are kept in {out}", lambda: record.trials)
+    place, begun_s = cache or cache_folder(), time.time()
+
+    def describe_kept() -> str:
+        trials = f"{len(record.trials)} trials are kept in {out}" if record.trials else ""
+        has_more = Cache(place).has_newer(begun_s)
+        stages = f"finished stages are kept in {place}; the same command goes on from there" if has_more else ""
+        return ", ".join(filter(None, [trials, stages]))
+
+    kept = noting(describe_kept, describe_kept)
     with claimed(out), kept, Workers(jobs, scheduler, worker_silent or SILENT_S) as workers:
         study = sweeps.StudyMeasure(spec, dataset.parent, goal, workers, cache, on_progress)
         on_tuned, prepare = partial(study.measure, clips=tuned), partial(study.prepare, clips=tuned)
