@@ -262,6 +262,17 @@ def test_what_the_log_lacks_comes_from_the_cameras_file(aerial, located, tmp_pat
     assert any(note.startswith(cause) for note in record(tmp_path / "out")["notes"])
 
 
+def test_a_camera_that_looks_straight_down_or_by_its_file_into_the_sky(aerial, located):
+    flight = Overflight(geographic=False)
+    lines = [line.split(",") for line in flight.telemetry_csv().splitlines()]
+    bare = "\n".join(",".join(line[:5]) for line in lines) + "\n"
+    file = f"{flight.camera_toml()}heading_deg = {np.degrees(flight.heading_rad)}\nroll_deg = 0\npitch_deg = "
+    found, _ = located(flight, telemetry=bare, camera=f"{file}90\n", **ALONE)
+    assert flight.pitch_deg == 90 and flight.errors(found).max() < 0.01
+    line = bad(aerial(flight, telemetry=bare, camera=f"{file}-60\n", **ALONE))
+    assert "by the camera file's pitch of -60 degrees the camera looks into the sky" in line and "turn the sign" in line
+
+
 def test_a_box_that_bridges_a_gap_has_no_place_as_in_a_run(located, tmp_path):
     flight = Overflight(geographic=False, pitch_deg=60)
     lines = ["frame,identity,x_px,y_px,width_px,height_px,score,kind,row,speed_px_per_frame"]

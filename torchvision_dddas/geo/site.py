@@ -114,12 +114,16 @@ def has_places(telemetry: Telemetry | None) -> bool:
 
 
 def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tuple[Site, list[str]]:
-    """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes."""
+    """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes.
+
+    Raises InputError where the camera's file has it look into the sky.
+    """
     if site.telemetry is None:
         keys = [] if camera is None else known_keys(camera)
         return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
     has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
     telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, has_ground, has_landmarks)
+    _check_pitch(telemetry, "camera file")
     return replace(site, telemetry=telemetry), notes
 
 
@@ -146,10 +150,14 @@ def _check_telemetry(telemetry: Telemetry) -> None:
             f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
             "wanted metres above ground: correct it, or leave --telemetry out"
         )
+    _check_pitch(telemetry, "telemetry")
+
+
+def _check_pitch(telemetry: Telemetry, whose: str) -> None:
     pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
     if len(pitch) and np.median(pitch) < -_HIGHEST_DEG:
         raise InputError(
-            f"by the telemetry's pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
+            f"by the {whose}'s pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
             "below the horizon, 90 for straight down: turn the sign of pitch_deg"
         )
 

@@ -46,8 +46,8 @@ _FIELDS = (
 )
 
 
-def read_camera_keys(path: str | Path) -> dict[str, Any]:
-    """The keys of a camera's file, complete or not, each checked.
+def read_camera_keys(path: str | Path, is_aerial: bool = False) -> dict[str, Any]:
+    """The keys of a camera's file, complete or not, each checked. is_aerial: it may look straight down.
 
     Raises InputError with the file and the key: unreadable, no TOML, a key that no camera has, a value out of range.
     """
@@ -57,7 +57,8 @@ def read_camera_keys(path: str | Path) -> dict[str, Any]:
             near = get_close_matches(key, KEYS, 1)
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}"
             raise InputError(f"camera {path} has the key {key}, which no camera has; {hint}")
-    for key, (low, high) in LIMITS.items():
+    limits = LIMITS | {"pitch_deg": (-90, 90)} if is_aerial else LIMITS
+    for key, (low, high) in limits.items():
         value = content.get(key, low)
         if not (_is_number(value) and low <= value <= high) or (key in _SIZE and value != int(value)):
             kind = "whole number" if key in _SIZE else "number"
@@ -102,7 +103,7 @@ def read_camera(path: str | Path) -> Camera:
 
 
 def _build_camera(path: str | Path, size_px: tuple[int, int] | None = None, is_aerial: bool = False) -> Camera:
-    content = read_camera_keys(path)
+    content = read_camera_keys(path, is_aerial)
     if size_px is not None and not set(_SIZE) & content.keys():
         content |= dict(zip(_SIZE, size_px, strict=True))
     numbers = {key: float(content[key]) for key in LIMITS if key in content}
