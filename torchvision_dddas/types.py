@@ -251,7 +251,7 @@ class Telemetry:
         if self.at(0.0) is None and self.at(last_s) is None and not 0 <= from_s <= last_s:
             raise InputError(
                 f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to {last_s:.1f} s; "
-                "they do not overlap: count time_s from the clip's first frame"
+                "they do not overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
             )
 
 

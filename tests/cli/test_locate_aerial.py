@@ -273,6 +273,15 @@ def test_a_camera_that_looks_straight_down_or_by_its_file_into_the_sky(aerial, l
     assert "by the camera file's pitch of -60 degrees the camera looks into the sky" in line and "turn the sign" in line
 
 
+def test_a_take_off_above_the_whole_flight_is_refused(aerial):
+    flight = Overflight(geographic=False)
+    telemetry = flight.telemetry_csv().replace("altitude_m", "above_sea_m", 1)
+    line = bad(
+        aerial(flight, telemetry=telemetry, camera=flight.camera_toml() + "takeoff_above_sea_m = 900\n", **ALONE)
+    )
+    assert "the altitude by the camera's takeoff_above_sea_m is -" in line and "below ground throughout" in line
+
+
 def test_a_box_that_bridges_a_gap_has_no_place_as_in_a_run(located, tmp_path):
     flight = Overflight(geographic=False, pitch_deg=60)
     lines = ["frame,identity,x_px,y_px,width_px,height_px,score,kind,row,speed_px_per_frame"]

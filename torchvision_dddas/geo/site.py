@@ -116,13 +116,14 @@ def has_places(telemetry: Telemetry | None) -> bool:
 def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tuple[Site, list[str]]:
     """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes.
 
-    Raises InputError where the camera's file has it look into the sky.
+    Raises InputError where by the camera's file it looks into the sky or flies below the ground.
     """
     if site.telemetry is None:
         keys = [] if camera is None else known_keys(camera)
         return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
     has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
     telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, has_ground, has_landmarks)
+    _check_altitude(telemetry, "the altitude by the camera's takeoff_above_sea_m", "correct that height")
     _check_pitch(telemetry, "camera file")
     return replace(site, telemetry=telemetry), notes
 
@@ -144,13 +145,17 @@ def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
 
 
 def _check_telemetry(telemetry: Telemetry) -> None:
+    _check_altitude(telemetry, "the telemetry's altitude", "correct it, or leave --telemetry out")
+    _check_pitch(telemetry, "telemetry")
+
+
+def _check_altitude(telemetry: Telemetry, what: str, advice: str) -> None:
     altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
     if len(altitude) and (altitude <= 0).all():
         raise InputError(
-            f"the telemetry's altitude is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; "
-            "wanted metres above ground: correct it, or leave --telemetry out"
+            f"{what} is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; wanted metres above "
+            f"ground: {advice}"
         )
-    _check_pitch(telemetry, "telemetry")
 
 
 def _check_pitch(telemetry: Telemetry, whose: str) -> None:
