@@ -594,7 +594,8 @@ class LiveParameters(Group):
     maximum_every: int = parameter(8, "process at least one of this many frames under load", "frames", 1, 60)
     stall_s: float = parameter(5.0, "a stream without frames for this long counts as lost", "s", 0.1, 600)
     retry_s: float = parameter(0.5, "first delay before a lost stream is opened again; then it doubles", "s", 0.01, 600)
-    retry_most_s: float = parameter(30.0, "longest delay before a lost stream is opened again", "s", 0.01, 3600)
+    retry_most_s: float = parameter(5.0, "longest delay before a lost stream is opened again", "s", 0.01, 3600)
+    lost_s: float = parameter(40.0, "a camera lost for so long ends the run (exit code 70); 0: never", "s", 0, 86_400)
     watchdog_s: float = parameter(30.0, "a step that takes longer counts as hung; 0: no watchdog", "s", 0, 3600)
     status_s: float = parameter(2.0, "time between two writes of the status and the results", "s", 0.1, 600)
 

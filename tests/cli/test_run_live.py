@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 from contextlib import suppress
 from dataclasses import replace
@@ -22,7 +23,7 @@ from tests.cli.conftest import bad
 from tests.live.streams import FakeStream
 from tests.synthetic_clip import render
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-from torchvision_dddas.errors import without_secrets
+from torchvision_dddas.errors import InputError, without_secrets
 from torchvision_dddas.io.run_inputs import prepare_run
 from torchvision_dddas.io.streams.stream import Stream
 
@@ -185,6 +186,48 @@ def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path,
     assert len(shown) == 9 and [name for name, text in shown.items() if "hush" in text] == []
     for name in ("run.json", "", "health.json", "stderr"):
         assert "rtsp://127.0.0.1:554/live?channel=1" in shown[name].replace("&amp;", "&")
+
+
+def test_the_page_is_there_while_a_camera_is_waited_for_and_says_so(dddas, tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    seen: list[tuple[int, dict[str, Any]]] = []
+
+    def asked() -> tuple[int, dict[str, Any]]:
+        try:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/health.json", timeout=60) as page:
+                return page.status, json.load(page)
+        except urllib.error.HTTPError as error:
+            return error.code, json.load(error)
+
+    def end_when_it_runs() -> None:
+        for _ in range(1200):
+            if (now := asked())[1]["state"] == "running":
+                seen.append(now)
+                break
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    images = itertools.cycle(render(0, 8, (240, 180)).images)
+    script = (step for image in images for step in (lambda: time.sleep(0.05), image))
+
+    def opened(*_: object) -> FakeStream:
+        seen.append(asked())
+        if len(seen) < 3:
+            raise InputError("no route to it")
+        threading.Thread(target=end_when_it_runs, daemon=True).start()
+        return FakeStream(script)
+
+    monkeypatch.setattr("torchvision_dddas.live.capture.open_or_refuse", opened)
+    words = ("--wait", "--set", "live.retry_s=0.01", "--serve", port, "--out", tmp_path)
+    done = dddas("run", "rtsp://127.0.0.1:554/live", *FAST, *words)
+    assert done.exit_code == 0, done.output
+    assert [(status, page["state"], page["ok"]) for status, page in seen[:3]] == [
+        (503, "waiting for the camera", False)
+    ] * 3
+    assert seen[0][1]["trouble"] == "waiting for the camera"
+    assert seen[3][1]["state"] == "running" and "waiting" not in seen[3][1]["trouble"]
+    assert done.stderr.index("status page: ") < done.stderr.index("is not there yet: no route to it")
 
 
 @pytest.mark.parametrize("where", ["json:tcp://me:hush@127.0.0.1:9", "cot:udp://me:hu/sh@127.0.0.1:9"])

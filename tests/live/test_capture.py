@@ -165,6 +165,11 @@ def test_a_stream_that_stays_at_another_size_goes_on_with_it(camera, size) -> No
     assert any("for 5.0 s: begun anew" in what for what in some.reported)
 
 
+def test_sizes_that_change_again_and_again_leave_no_stream_blind(camera) -> None:
+    some = camera([1, *[1.0, grey(7, 64, 64), 1.0, grey(7, 32, 32)] * 4])
+    assert [f.image.shape[0] for f in some.take(2)] == [48, 32]
+
+
 def test_a_picture_that_comes_only_when_the_driver_gave_up_is_not_used(camera) -> None:
     some = camera([1, 5.0, 66, 5.0, 67], [2])
     assert levels(some.take(2)) == [1, 2]
@@ -214,6 +219,38 @@ def test_a_driver_that_hangs_again_and_again_ends_the_run_within_a_minute(camera
         thread.join()
     for gate in stuck:
         gate.open.set()
+
+
+@pytest.mark.parametrize("lost_s", [LiveParameters().lost_s, 0.0])
+def test_a_camera_whose_openings_fail_at_once_ends_the_run_unless_it_is_looked_for_for_ever(camera, lost_s) -> None:
+    last = Gate()
+    some = camera([1], None, None, [last, 66], [2], lost_s=lost_s)
+    frames = some.take(1)
+    waking = after(last.reached, lambda: some.clock.pass_s(60))
+    if lost_s:
+        with pytest.raises(DeadCamera, match=r"camera:0 is lost for 40 s \(live.lost_s\): cannot open it"):
+            some.take(1)
+    else:
+        assert levels(frames + some.take(1)) == [1, 2]
+    waking.join()
+    last.open.set()
+
+
+def test_a_camera_that_stays_lost_ends_the_run_before_systemd_does() -> None:
+    default, watchdog_sec = LiveParameters(), 30.0
+    notified_last_s = default.watchdog_s - watchdog_sec / 4
+    assert default.lost_s + 1.25 * default.stall_s < notified_last_s + watchdog_sec < 60
+    assert default.retry_most_s < default.lost_s / 5
+
+
+def test_results_that_stop_are_told_to_the_supervisor_unless_the_camera_is_looked_for_for_ever(camera) -> None:
+    for lost_s in (40.0, 0.0):
+        lost = Gate()
+        some = camera([1], [lost, 2], lost_s=lost_s)
+        some.take(1)
+        assert lost.reached.wait(PATIENCE_S)
+        assert some.source.seeking == (lost_s == 0)
+        lost.open.set()
 
 
 def test_times_of_day_follow_the_machines_clock_when_it_is_set(camera) -> None:

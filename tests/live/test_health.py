@@ -173,7 +173,7 @@ def test_json_is_strict_and_all_pages_show_the_same_trouble(health):
         raise AssertionError(name)
 
     def answer(patience_s):
-        status, kind, text = health_pages(health, run, [run], run, "x", "1", patience_s)["/health.json"]()
+        status, kind, text = health_pages(health, run, [run], lambda: run.state, "x", "1", patience_s)["/health.json"]()
         assert kind == "application/json"
         return status, json.loads(text, parse_constant=refuse)
 
@@ -187,7 +187,7 @@ def test_json_is_strict_and_all_pages_show_the_same_trouble(health):
     assert (status, found["ok"], found["trouble"]) == (503, False, "no result for 0:00")
     run.hung = "the work on frame 3 has taken 40 s"
     assert answer(60.0)[1]["trouble"] == run.hung
-    pages = health_pages(health, run, [run], run, "x", "1", 60.0)
+    pages = health_pages(health, run, [run], lambda: run.state, "x", "1", 60.0)
     assert "dddas_healthy 0" in pages["/metrics"]()[2] and run.hung in pages["/"]()[2]
 
 
@@ -195,7 +195,7 @@ def test_health_is_not_well_while_a_trouble_lasts_or_most_results_are_late():
     health, run = Health(), Run()
 
     def answer():
-        status, _, text = health_pages(health, run, [run], run, "x", "1", 60.0)["/health.json"]()
+        status, _, text = health_pages(health, run, [run], lambda: run.state, "x", "1", 60.0)["/health.json"]()
         return status, json.loads(text)["trouble"]
 
     health.trouble("stream", "camera:0 sends no pictures")
@@ -212,6 +212,16 @@ def test_health_is_not_well_while_a_trouble_lasts_or_most_results_are_late():
     for _ in range(25):
         health.timed(False)
     assert answer() == (200, "")
+
+
+def test_time_without_a_result_counts_from_when_the_camera_is_there(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    health = Health()
+    now[0] = 700.0
+    health.begin()
+    now[0] = 701.0
+    assert health.idle_s == 1.0 and health.snapshot().since_s == 601.0
 
 
 def test_figures_of_the_page_are_labelled_and_written_out():

@@ -62,6 +62,10 @@ class Health:
         with self._lock:
             self._gauges[name] = value
 
+    def begin(self) -> None:
+        """Count the time without a result from now on: a camera that was waited for is there."""
+        self._result = time.monotonic()
+
     def took(self, name: str, seconds: float) -> None:
         """Add a duration."""
         with self._lock:

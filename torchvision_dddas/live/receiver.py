@@ -29,7 +29,7 @@ _WAITING_S = 1.0  # between two calls of `waiting`
 
 
 class DeadCamera(Exception):
-    """The driver hung again and again; only a new process can open the camera. The message is for the user."""
+    """The camera stays lost, or its driver hung again and again. The message is for the user."""
 
 
 class _GivenUp(Exception):
@@ -65,9 +65,10 @@ class Receiver:
         self._call: tuple[float, float] | None = None  # since when it is in the driver, and for how long it may be
         self._pause_s = parameters.retry_s
         self._lost_s: float | None = None
+        self._why = ""  # it was lost, or could not be opened again
         self._tries = 0
         self._start_s = float("nan")
-        self._odd: tuple[tuple[int, ...], float] | None = None  # shape of pictures of another size, since when
+        self._odd_s: float | None = None  # since when pictures have another size
         self._off = False  # the rate was reported to differ from the announced one
         self.threads: list[threading.Thread] = []
         self._at_work: threading.Thread | None = None  # the current thread; None if all hang
@@ -85,8 +86,9 @@ class Receiver:
 
     @property
     def seeking(self) -> bool:
-        """Whether the stream is lost and is being opened again by a driver that answers."""
-        return self._lost_s is not None and sum(thread.is_alive() for thread in self.threads) <= 1
+        """Whether the stream is lost, is being opened again by a driver that answers, and may be for ever."""
+        is_endless = self._parameters.lost_s == 0
+        return is_endless and self._lost_s is not None and sum(thread.is_alive() for thread in self.threads) <= 1
 
     def begin(self) -> None:
         """Nothing to do: it reads already, so that the first frame taken is a fresh one."""
@@ -94,25 +96,38 @@ class Receiver:
     def check(self) -> float:
         """Replace a thread that hangs; called by the run while it waits. Returns the time of the next check.
 
-        Raises DeadCamera if too many hang.
+        Raises DeadCamera if too many hang, or if no picture has come for live.lost_s since the stream was lost.
         """
         with self._queue.changed:
-            now_s = self._clock.now()
-            if self._call is not None:
-                since_s, allowed_s = self._call
-                if now_s < since_s + allowed_s:
-                    return since_s + allowed_s
-                self._turn += 1
-                self._call = self._at_work = None
-                self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
-                self._pause_s = self._parameters.retry_s  # the hung call was pause enough
-            elif self._at_work is not None and self._at_work.is_alive():
-                return now_s + self._parameters.stall_s
-            self.threads = [thread for thread in self.threads if thread.is_alive()]
-            if len(self.threads) >= _MOST_HUNG:
-                raise DeadCamera(f"{self.name} is dead: its driver hung {_MOST_HUNG} times and cannot be ended")
-            self._spawn()
+            until_s = self._lost_until_s()
+            if self._clock.now() >= until_s:
+                raise DeadCamera(f"{self.name} is lost for {self._parameters.lost_s:g} s (live.lost_s): {self._why}")
+            return min(self._check_driver(), until_s)
+
+    def _lost_until_s(self) -> float:
+        """When a stream that was there has been lost for too long."""
+        if self._lost_s is None or not self._ready or not self._parameters.lost_s:
+            return float("inf")
+        return self._lost_s + self._parameters.lost_s
+
+    def _check_driver(self) -> float:
+        """As check, for the driver alone; the caller holds the queue."""
+        now_s = self._clock.now()
+        if self._call is not None:
+            since_s, allowed_s = self._call
+            if now_s < since_s + allowed_s:
+                return since_s + allowed_s
+            self._turn += 1
+            self._call = self._at_work = None
+            self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
+            self._pause_s = self._parameters.retry_s  # the hung call was pause enough
+        elif self._at_work is not None and self._at_work.is_alive():
             return now_s + self._parameters.stall_s
+        self.threads = [thread for thread in self.threads if thread.is_alive()]
+        if len(self.threads) >= _MOST_HUNG:
+            raise DeadCamera(f"{self.name} is dead: its driver hung {_MOST_HUNG} times and cannot be ended")
+        self._spawn()
+        return now_s + self._parameters.stall_s
 
     def _spawn(self) -> None:
         thread = threading.Thread(target=self._work, args=(self._turn,), name="receiving", daemon=True)
@@ -281,21 +296,23 @@ class Receiver:
         """Whether the picture has the stream's size, which changes where another one lasts."""
         width, height = self.size
         if image.shape[:2] == (height, width):
-            self._odd = None
+            self._odd_s = None
             return True
         self._health.count("wrong_size")
         what = f"pictures are {image.shape[1]}x{image.shape[0]} in place of {width}x{height}"
-        if self._odd is None or self._odd[0] != image.shape:
-            self._odd = (image.shape, taken_s)
+        if self._odd_s is None:
+            self._odd_s = taken_s
             self._log.report(f"{what}: they are left out", topic="size")
-        if taken_s - self._odd[1] < self._parameters.stall_s:  # single ones are left out
+        if taken_s - self._odd_s < self._parameters.stall_s:  # single ones are left out
             return False
-        self._log.report(f"{what} for {taken_s - self._odd[1]:.1f} s: begun anew with them")
-        self.size, self._odd = (image.shape[1], image.shape[0]), None
+        # The size may have changed again since: the newest one counts.
+        self._log.report(f"{what} for {taken_s - self._odd_s:.1f} s: begun anew with them")
+        self.size, self._odd_s = (image.shape[1], image.shape[0]), None
         return True
 
     def _lost(self, why: str) -> None:
         self._log.restart()
+        self._why = why
         if self._lost_s is None:
             self._lost_s, self._tries = self._clock.now(), 0
             self._health.gauge("connected", 0)

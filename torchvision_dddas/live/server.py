@@ -15,7 +15,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output import finite
 from torchvision_dddas.io.report import render_page
 from torchvision_dddas.io.streams import Stream
-from torchvision_dddas.live.health import Health, Snapshot, StatusWriter, snapshot_facts
+from torchvision_dddas.live.health import Health, Snapshot, snapshot_facts
 from torchvision_dddas.live.watchdog import Watchdog
 
 LOOPBACK = "127.0.0.1"
@@ -67,12 +67,12 @@ def health_pages(
     health: Health,
     watchdog: Watchdog,
     streams: Sequence[Stream],
-    run: StatusWriter,
+    state_now: Callable[[], str],
     name: str,
     version: str,
     patience_s: float,
 ) -> dict[str, Page]:
-    """The pages of a run. patience_s: a longer time without a result is reported as trouble."""
+    """The pages of a run. state_now: its state. patience_s: a longer time without a result is reported as trouble."""
 
     def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
@@ -81,7 +81,7 @@ def health_pages(
 
     def page() -> tuple[int, str, str]:
         now, trouble = state()
-        return 200, "text/html", html_page(now, name, run.state, trouble)
+        return 200, "text/html", html_page(now, name, state_now(), trouble)
 
     def prometheus() -> tuple[int, str, str]:
         text = metrics(*state(), version, {stream.name: stream.lost for stream in streams})
@@ -89,7 +89,7 @@ def health_pages(
 
     def program() -> tuple[int, str, str]:
         now, trouble = state()
-        facts = {"ok": not trouble, "trouble": trouble, "state": run.state, "input": name, "version": version}
+        facts = {"ok": not trouble, "trouble": trouble, "state": state_now(), "input": name, "version": version}
         text = json.dumps(finite(facts | snapshot_facts(now)), indent=2) + "\n"
         return (503 if trouble else 200), "application/json", text
 

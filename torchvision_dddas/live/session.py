@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Frame, FrameResult
 
+_WAITING = "waiting for the camera"
 _CLEAR = "\r\x1b[K"
 _COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
 
@@ -76,8 +78,14 @@ def run_live(
     with ExitStack() as stack:
         # What may be wrong at the start is found before the session has a folder.
         watchdog = Watchdog(health, live.watchdog_s, supervisor)
+        name, pages = without_secrets(clip), dict[str, Page]()
+        server = None if address is None else stack.enter_context(HealthServer(address, pages))
+        health.trouble("waiting", _WAITING)
+        pages |= health_pages(health, watchdog, (), lambda: _WAITING, name, VERSION, inf)
         if wait:  # the service is up, and has no camera yet
-            supervisor.say("READY=1", "STATUS=waiting for the camera")
+            supervisor.say("READY=1", f"STATUS={_WAITING}")
+            if server is not None and not quiet:
+                _print_page(server)
         told: list[Event] = []
 
         def waiting() -> None:
@@ -93,6 +101,8 @@ def run_live(
             _print(str(error))
             return HUNG
         stack.callback(source.close)
+        health.trouble("waiting")
+        health.begin()
         if source.recorded is not None:
             check_length(source.recorded)
         ready = prepare_run(given, telemetry, settings, source, backend, clip)
@@ -112,13 +122,10 @@ def run_live(
             about = About(time.time(), site.origin_deg is not None, site.landmarks.names)
         opened = stack.enter_context(ExitStack())
         streams = _open(opened, emit, about, health, live, "--emit")
-        pages = dict[str, Page]()
-        server = None if address is None else HealthServer(address, pages)
-
         folder = make_session_folder(out)
         streams = _open(opened, [f"json:{folder / RESULTS}"], about, health, live, "--out") + streams
         facts: dict[str, Any] = {
-            "input": without_secrets(clip),
+            "input": name,
             "telemetry": telemetry,
             "clip": {"name": source.name, "size": source.size, "rate_hz": source.rate_hz},
             "interval_frames": interval,
@@ -140,7 +147,7 @@ def run_live(
             raise cannot_write(folder / "run.json", error) from None
         watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
-        pages |= health_pages(health, watchdog, streams, status, without_secrets(clip), VERSION, patience_s)
+        pages |= health_pages(health, watchdog, streams, lambda: status.state, name, VERSION, patience_s)
 
         feed = Feed(source, health, watchdog, ready.flight)
 
@@ -152,11 +159,11 @@ def run_live(
         signals = stack.enter_context(StopSignals(stop))
         stack.enter_context(status)
         stack.enter_context(watchdog)
-        if server is not None:
-            stack.enter_context(server)
         supervisor.say("READY=1", "STATUS=running")
         if not quiet:
-            _print_start(source, folder, server, ready.notes)
+            _print_start(source, folder, ready.notes)
+            if server is not None and not wait:
+                _print_page(server)
         failure, tally = "", _Located()
         try:
             for result in results(begin, feed, health):
@@ -292,13 +299,15 @@ def _print(text: str) -> None:
     sys.stderr.flush()
 
 
-def _print_start(source: LiveSource, folder: Path, server: HealthServer | None, notes: Sequence[str]) -> None:
+def _print_start(source: LiveSource, folder: Path, notes: Sequence[str]) -> None:
     width, height = source.size
     _print(f"{source.name}, {width}x{height} at {source.rate_hz:g} Hz; into {folder}")
-    if server is not None:
-        _print("status page: http://{}:{}/".format(*server.address))
     for note in notes:
         _print(f"note: {note}")
+
+
+def _print_page(server: HealthServer) -> None:
+    _print("status page: http://{}:{}/".format(*server.address))
 
 
 def _print_event(event: Event) -> None:
