@@ -15,7 +15,7 @@ from tests.io.flights import packet, sentence
 from torchvision_dddas.cli import app
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import Result, load_result
-from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.io import detection_tables
 from torchvision_dddas.io.images import read_image, size_in_header
 from torchvision_dddas.io.sources import ImageSource
@@ -130,6 +130,13 @@ def test_a_log_full_of_beginnings_of_messages_is_read(tmp_path, magic, period):
     )
     assert len(found.time_s) >= 3 and found.place[0, 0] == pytest.approx(10)
     assert any("are no MAVLink messages" in note for note in found.notes)
+
+
+def test_the_bad_lines_of_a_seqinfo_are_not_listed_one_by_one(tmp_path):
+    path = tmp_path / "seqinfo.ini"
+    path.write_text("[Sequence]\nseqLength=5\n" + "a\n" * 250_000)
+    with pytest.raises(InputError, match="500023 characters; wanted at most 16384"):
+        read_seqinfo(path)
 
 
 def test_the_boxes_of_many_frames_are_found_by_frame(tmp_path):

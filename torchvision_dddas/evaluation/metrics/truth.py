@@ -329,6 +329,7 @@ def to_number(cell: str) -> float:
         return math.nan
 
 
+_LONGEST_INI = 16_384
 MOST_FRAMES = 10_000_000
 """No clip is longer."""
 
@@ -344,10 +345,13 @@ class SeqInfo(NamedTuple):
 def read_seqinfo(path: Path) -> SeqInfo:
     """Read the file. Raises InputError: no such format, no usable seqLength or imDir under [Sequence]."""
     ini = configparser.ConfigParser(interpolation=None)
+    text = read_text(path)
+    if len(text) > _LONGEST_INI:  # bad lines take time as their number squared
+        raise InputError(f"{path} has {len(text)} characters; wanted at most {_LONGEST_INI}, none has more")
     try:
-        ini.read(path, encoding="utf-8")
+        ini.read_string(text)
         length = ini.getint("Sequence", "seqLength")
-    except (configparser.Error, UnicodeDecodeError, ValueError) as error:
+    except (configparser.Error, ValueError) as error:
         raise InputError(f"{path} does not hold seqLength under [Sequence]: {error}") from error
     if not 0 <= length <= MOST_FRAMES:
         raise InputError(f"{path}: seqLength is {length}; wanted 0 to {MOST_FRAMES}")
