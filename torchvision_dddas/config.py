@@ -770,13 +770,30 @@ def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
     """What a TOML file holds. what: what the file is, for messages. Raises InputError with file and line."""
     name = f"{what} {path}".strip()
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        text = Path(path).read_text(encoding="utf-8-sig")
+        # The parser takes time as the square of a key's length.
+        if any(line.count(".") > _MOST_DOTS and _has_long_key(line) for line in text.splitlines()):
+            raise ValueError(f"a key has more than {_MOST_DOTS} dots")
+        return tomllib.loads(text)
     except OSError as error:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except RecursionError:
         raise InputError(f"{name} is not valid TOML: its brackets are nested too deeply") from None
     except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
         raise InputError(f"{name} is not valid TOML: {str(error).split(';')[0]}") from None
+
+
+_MOST_DOTS = 100
+
+
+def _has_long_key(line: str) -> bool:
+    """Whether a line has a key of endless parts, a.b.c, and not only many numbers with a point."""
+    run = 0
+    for part in line.split("."):
+        run = run + 1 if (word := part.strip()) and not set(word) & set(" ,=\t") else 0
+        if run > _MOST_DOTS:
+            return True
+    return False
 
 
 def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str:

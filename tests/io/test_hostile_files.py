@@ -3,6 +3,7 @@
 import io
 import signal
 import struct
+import tracemalloc
 import zipfile
 import zlib
 
@@ -13,12 +14,14 @@ from typer.testing import CliRunner
 
 from tests.io.flights import packet, sentence
 from torchvision_dddas.cli import app
+from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import Result, load_result
 from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.io import detection_tables
 from torchvision_dddas.io.images import read_image, size_in_header
 from torchvision_dddas.io.sources import ImageSource
+from torchvision_dddas.io.tables import read_csv
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import KEY, local_sets
 from torchvision_dddas.people.classifiers import read_classifier
@@ -130,6 +133,26 @@ def test_a_log_full_of_beginnings_of_messages_is_read(tmp_path, magic, period):
     )
     assert len(found.time_s) >= 3 and found.place[0, 0] == pytest.approx(10)
     assert any("are no MAVLink messages" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("key", ["a." * 200_000 + "a = 1", "[" + "a . " * 100_000 + "a]", "x = {" + "'a'." * 100_000])
+def test_a_key_of_endless_parts_is_refused(tmp_path, key):
+    path = tmp_path / "a.toml"
+    path.write_text(key + "\n")
+    with pytest.raises(InputError, match="not valid TOML: a key has more than 100 dots"):
+        read_toml(path)
+    path.write_text("about = '" + "." * 300 + "'\nway = [" + "1.5, " * 300 + "2.5]\n")
+    assert len(read_toml(path)["way"]) == 301
+
+
+def test_blank_lines_of_a_table_take_no_memory(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n" + "\n" * 100_000 + "1,2\n" + " , \n" * 100_000)
+    tracemalloc.start()
+    text = read_csv(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert text == (["a", "b"], [100_002], [["1", "2"]]) and most < 2_000_000
 
 
 def test_the_bad_lines_of_a_seqinfo_are_not_listed_one_by_one(tmp_path):

@@ -183,17 +183,20 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
     Raises InputError: unreadable, no CSV text.
     """
     name = f"{what} {path}".strip()
+    lines, rows = list[int](), list[list[str]]()
     try:
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, skipinitialspace=True)
-            lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+            header = [cell.strip() for cell in next(reader, [])] if has_header else []
+            for row in reader:
+                if row and any(cells := [cell.strip() for cell in row]):
+                    lines.append(reader.line_num)
+                    rows.append(cells)
     except OSError as error:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{name} is no CSV text: {error}") from None
-    header = lines.pop(0)[1] if lines and has_header else []
-    lines = [(number, row) for number, row in lines if any(row)]
-    return CsvText(header, [number for number, _ in lines], [row for _, row in lines])
+    return CsvText(header, lines, rows)
 
 
 class CsvTable:

@@ -53,10 +53,12 @@ def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None, z
     Raises InputError with file and line: as read_table, no rows, half a place, a time before the one above it.
     """
     text = read_csv(path, "telemetry")
-    names = {_plain(name)[0] for name in text.header}
+    plain = {name: _plain(name) for name in set(text.header)}
+    names = {name for name, _ in plain.values()}
     if "time_s" in text.header or not (names & (_TIMES | {"frame"}) and names & set(QUANTITY)):
         return _read_own(path, text, clock_offset_s)
-    return _read_program_table(Log(path, "flight log table"), text, clock_offset_s, clip, zone)
+    columns = [plain[name] for name in text.header]
+    return _read_program_table(Log(path, "flight log table"), text, columns, clock_offset_s, clip, zone)
 
 
 def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
@@ -217,13 +219,18 @@ def _plain(name: str) -> tuple[str, str]:
 
 
 def _read_program_table(
-    log: Log, text: CsvText, clock_offset_s: float, clip: Path | None, zone: tzinfo | None
+    log: Log,
+    text: CsvText,
+    columns: list[tuple[str, str]],
+    clock_offset_s: float,
+    clip: Path | None,
+    zone: tzinfo | None,
 ) -> Telemetry:
-    """Rows at dates, times of day, numbers of seconds, or frames of a clip.
+    """Rows at dates, times of day, numbers of seconds, or frames of a clip. columns: as `_plain` gives them.
 
     Raises InputError with the line for a time that is none, and where frames are counted and no clip is given.
     """
-    names, units = zip(*map(_plain, text.header), strict=True)
+    names, units = zip(*columns, strict=True)
     is_timed = not _TIMES.isdisjoint(names)
     clock = next(i for i, name in enumerate(names) if name in (_TIMES if is_timed else ("frame",)))
     rate_hz = math.nan
