@@ -1,5 +1,7 @@
 """What a message, a table or a page shows of an address has no password, and any encoding can hold it."""
 
+import time
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -52,6 +54,32 @@ def test_what_was_hidden_once_keeps_the_words_that_follow():
 )
 def test_what_is_no_secret_stays(text, shown):
     assert without_secrets(text) == shown
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "rtsp://10.0.0.1/user=admin_password=hush_channel=1_stream=0.sdp",
+        "http://10.0.0.1/video.cgi?loginuse=admin&loginpas=hush",
+        "http://10.0.0.1/a?u=admin&p=hush",
+        "https://10.0.0.1/a?sas=hush",
+        "rtsp//me:hush@10.0.0.1/live",
+        "rtsp;//me:hush@10.0.0.1/live",
+    ],
+)
+def test_no_secret_is_shown_of_the_addresses_that_cameras_have(address):
+    shown = str(InputError(f"{address} does not exist"))
+    assert "hush" not in shown and "10.0.0.1" in shown
+
+
+def test_a_text_is_searched_for_secrets_in_time_in_proportion_to_its_length():
+    texts = ("@" + "a" * 99, "a" * 99 + "://=", "@" + "a." * 50, "?" + "pass" * 25, "p_" * 50, "a_" * 50 + "://a@b=")
+    more = ("a://" * 25, "//a:" * 25, "pass_" * 20, "=a:/" * 25, "\u00e9" * 99)
+    for text in (*texts, *more):
+        whole, begin_s = text[:-1] * 600, time.process_time()
+        for shape in (whole, f"@{whole}", f"{whole}@", f"://=?{whole}", f"{text}{whole} ://a@="):
+            without_secrets(shape)
+        assert time.process_time() - begin_s < 5  # of 300 KB; most took minutes
 
 
 @given(st.text(st.characters(codec="utf-16", categories=None) | st.sampled_from("\udcff\udc80\ud800")))

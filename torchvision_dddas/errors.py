@@ -9,12 +9,16 @@ LONGEST = 1000
 _END = 300  # of these, those that are kept of its end, which says what to do
 
 
+# Each of these needs time in proportion to a text's length: names are bounded, and a search for an @ finds one.
 # Between a scheme and the last @ stands who logs in, if there is a colon or no path in between: a password may hold /.
-_LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=]))[a-z][\w+.-]*:/+|[a-z][\w+.-]*://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
-# user:password@host, as it is written where the scheme is forgotten.
-_BARE_LOGIN = re.compile(r"(?:^|(?<=[\s'\"(]))[^\s/:@'\"(]+:(?!/)[^\s]*@")
+_LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=]))[a-z][\w+.-]{0,30}:/+|[a-z][\w+.-]{0,30}://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
+# user:password@host in a word, as it is written where the scheme is forgotten or mistyped.
+_WORD = re.compile(r"\S+")
+_BARE_LOGIN = re.compile(r"(?:^|(?<=['\"(])|(?<=//))[^/:@'\"(]+:(?!/).*@")
+# Cameras also have user=NAME_password=WORD in their path.
 _SECRET_KEY = re.compile(
-    r"(?<=[?&;/])([^\s=?&;/]*(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]*=)(?!\*\*\*(?:[^\w]|$))[^&]+",
+    r"((?:(?<=[?&;/])(?:[^\s=?&;/]{0,60}(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]{0,60}"
+    r"|[^\s=?&;/]{0,60}pas|p|pw|pin|otp|sas|jwt|code)|(?<=_)(?:password|passwd|pass|pwd))=)(?!\*\*\*(?:[^\w]|$))[^&]+",
     re.I,
 )
 _HIDDEN = r"\1***"
@@ -32,9 +36,16 @@ def without_secrets(text: str) -> str:
 
 
 def _without_secrets(line: str) -> str:
-    line = _BARE_LOGIN.sub("", _LOGIN.sub(r"\1", line))
+    before, at, after = line.rpartition("@")
+    line = _LOGIN.sub(r"\1", before + at) + after
+    line = _WORD.sub(_without_login, line)
     head, scheme, address = line.partition("://")
     return head + scheme + _SECRET_KEY.sub(_HIDDEN, address)
+
+
+def _without_login(word: re.Match[str]) -> str:
+    before, at, after = word[0].rpartition("@")
+    return _BARE_LOGIN.sub("", before + at) + after
 
 
 def readable(text: str) -> str:
