@@ -21,6 +21,7 @@ from torchvision_dddas.io.tables import (
     Column,
     CsvTable,
     Schema,
+    check_crowding,
     read_csv,
     read_table,
 )
@@ -70,6 +71,7 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
         frame = 1 + (table["time_s"] + clock_offset_s) * (rate_hz or 1.0)
         # A picture's time is written with three digits or so: what is seen is seen in a whole frame.
         frame = np.round(np.where(is_seen, np.round(frame), frame), 6)
+    check_crowding(frame, f"landmarks {path}", "landmarks")
     index: dict[str, int] = {}
     landmark = np.array([index.setdefault(name, len(index)) for name in table.columns["landmark"]], np.int64)
     table.refuse(landmark == index.get("", -1), "landmark is empty; wanted its name or number")
@@ -188,6 +190,7 @@ def read_positions(path: str | Path) -> Positions:
     some rows have.
     """
     table = read_table(path, POSITIONS, POSITION_COLUMNS)
+    check_crowding(table["frame"], f"positions {path}", "places")
     east, both, north = (table[column.name] for column in COVARIANCE)
     # Unknown variances pass each comparison; a share above 1 allows for rounding.
     is_wrong = (east < 0) | (north < 0) | (both**2 > east * north * 1.01 + 1e-8)

@@ -300,13 +300,13 @@ def parse_numbers(cells: Sequence[str]) -> np.ndarray:
     return np.array([_parse_number(cell) if cell else math.nan for cell in cells], float)
 
 
-def check_crowding(frame: np.ndarray, name: str) -> None:
+def check_crowding(frame: np.ndarray, name: str, rows: str = "boxes") -> None:
     """Raises InputError where one of the frames (N,) has more than MOST_BOXES rows. name: of the table."""
     numbers, counts = np.unique(frame, return_counts=True)
     if len(counts) and counts.max() > MOST_BOXES:
         crowded = numbers[counts.argmax()]
         raise InputError(
-            f"{name} has {counts.max()} boxes in frame {crowded:g}; wanted at most {MOST_BOXES} in a frame"
+            f"{name} has {counts.max()} {rows} in frame {crowded:g}; wanted at most {MOST_BOXES} in a frame"
         )
 
 
