@@ -280,3 +280,11 @@ def test_nothing_to_locate_is_no_failure(dddas, flown, engine, tmp_path):
 def test_the_telemetry_of_detect_is_any_log(dddas):
     told = dddas("detect", "--help").output
     assert ".SRT" in told and "--telemetry" in told and "CSV  " not in told.split("--telemetry")[1][:20]
+
+
+@pytest.mark.parametrize("option", ["--camera", "--dem", "--background"])
+def test_a_file_that_is_not_there_is_refused_also_where_nothing_can_be_located(dddas, clip, tmp_path, option):
+    log = tmp_path / "log.csv"
+    log.write_text("time_s,altitude_m\n" + "".join(f"{k},50\n" for k in range(5)))
+    said = bad(dddas("run", clip, "--telemetry", log, option, tmp_path / "nowhere.x", "--out", tmp_path / "out"))
+    assert "nowhere.x" in said and not (tmp_path / "out" / "run.json").exists()

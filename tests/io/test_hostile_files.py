@@ -266,10 +266,10 @@ def test_a_table_of_too_many_boxes_in_a_frame_is_refused(tmp_path):
     for read_it in (detection_tables.read_detections, load_truth, load_result):
         with pytest.raises(InputError, match="has 3001 boxes in frame 1; wanted at most 3000 in a frame"):
             read_it(path)
-    for read_it, kind in ((read_positions, "target"), (read_landmarks, "landmark")):
+    for read_places, kind in ((read_positions, "target"), (read_landmarks, "landmark")):
         rows = "".join(f"7,{k + 1},{k},1\n" for k in range(3001))
         (tmp_path / "a.csv").write_text(f"frame,{kind},east_m,north_m\n{rows}")
         with pytest.raises(InputError, match=r"has 3001 (places|landmarks) in frame 7; wanted at most 3000 in a frame"):
-            read_it(tmp_path / "a.csv")
+            read_places(tmp_path / "a.csv")
     result = CliRunner().invoke(app, ["track", "--detections", str(path), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2 and "3001 boxes" in result.output and "Traceback" not in result.output

@@ -105,9 +105,20 @@ def prepare_run(
     else:
         if flight is None and telemetry is not None:
             flight = _read_telemetry(telemetry, settings, clip)
+        if given is not None:
+            _check_unused(given, source.size)
         settings, more = with_logged_focal(settings, flight, source.size[0])
         notes += [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
     return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
+
+
+def _check_unused(given: AerialInput, size: tuple[int, int]) -> None:
+    """Raises InputError for a file that is wrong also where nothing can be located with it."""
+    if given.camera is not None:
+        read_aerial_camera(given.camera, size)
+    for path in (given.dem, given.background):
+        if path is not None and not path.is_file():
+            raise InputError(f"{path} is no file; wanted a GeoTIFF")
 
 
 def _read_flight(given: AerialInput, settings: Settings, clip: str | None) -> tuple[Telemetry | None, str]:
