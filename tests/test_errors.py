@@ -50,6 +50,7 @@ def test_what_was_hidden_once_keeps_the_words_that_follow():
         ("frames/a@b", "frames/a@b"),
         ("json:/home/me@work/x.jsonl", "json:/home/me@work/x.jsonl"),
         ("keys/key=5/clip.mp4", "keys/key=5/clip.mp4"),
+        ("json:/home/key=5/clip.mp4", "json:/home/key=5/clip.mp4"),
     ],
 )
 def test_what_is_no_secret_stays(text, shown):
@@ -63,6 +64,8 @@ def test_what_is_no_secret_stays(text, shown):
         "http://10.0.0.1/video.cgi?loginuse=admin&loginpas=hush",
         "http://10.0.0.1/a?u=admin&p=hush",
         "https://10.0.0.1/a?sas=hush",
+        "/vsicurl/http:/me:hush@10.0.0.1/a.tif",
+        "http:/10.0.0.1/a.tif?password=hush",
         "rtsp//me:hush@10.0.0.1/live",
         "rtsp;//me:hush@10.0.0.1/live",
     ],

@@ -11,10 +11,12 @@ _END = 300  # of these, those that are kept of its end, which says what to do
 
 # Each of these needs time in proportion to a text's length: names are bounded, and a search for an @ finds one.
 # Between a scheme and the last @ stands who logs in, if there is a colon or no path in between: a password may hold /.
-_LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=]))[a-z][\w+.-]{0,30}:/+|[a-z][\w+.-]{0,30}://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
+_LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=/]))[a-z][\w+.-]{0,30}:/+|[a-z][\w+.-]{0,30}://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
 # user:password@host in a word, as it is written where the scheme is forgotten or mistyped.
 _WORD = re.compile(r"\S+")
 _BARE_LOGIN = re.compile(r"(?:^|(?<=['\"(])|(?<=//))[^/:@'\"(]+:(?!/).*@")
+# A path has one slash of two.
+_SCHEME = re.compile(r"://|(?:https?|rtsps?|rtmps?|srt|tcp|udp|ftps?):/", re.I)
 # Cameras also have user=NAME_password=WORD in their path.
 _SECRET_KEY = re.compile(
     r"((?:(?<=[?&;/])(?:[^\s=?&;/]{0,60}(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]{0,60}"
@@ -30,7 +32,7 @@ def without_secrets(text: str) -> str:
     A password may hold any sign. Where it cannot be known whether an @ ends one, all before it is left out, and of a
     query all from its secret to the next & or the end of the line. What was hidden once keeps the words that follow.
     """
-    if "@" not in text and ("://" not in text or "=" not in text):
+    if "@" not in text and (":/" not in text or "=" not in text):
         return text
     return "\n".join(_without_secrets(line) for line in text.split("\n"))
 
@@ -39,8 +41,8 @@ def _without_secrets(line: str) -> str:
     before, at, after = line.rpartition("@")
     line = _LOGIN.sub(r"\1", before + at) + after
     line = _WORD.sub(_without_login, line)
-    head, scheme, address = line.partition("://")
-    return head + scheme + _SECRET_KEY.sub(_HIDDEN, address)
+    scheme = _SCHEME.search(line)
+    return line if scheme is None else line[: scheme.end()] + _SECRET_KEY.sub(_HIDDEN, line[scheme.end() :])
 
 
 def _without_login(word: re.Match[str]) -> str:
