@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 MEANING = (
     "better, worse: beyond noise, p below 0.05 after Holm's correction. On these clips: by blocks of their frames; "
-    "their number is too small, or they are too unlike, to say so of others. Too little to tell: so few frames or "
-    "clips could not show any change."
+    "their number is too small, or they are too unlike, to say so of others. Within noise: no change is shown, "
+    "nor that there is none. Too little to tell: so few frames or clips could not show any change. The same: equal "
+    "figures."
 )
 
 

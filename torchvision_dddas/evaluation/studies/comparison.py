@@ -21,7 +21,8 @@ LEVEL = 0.05
 MEANING = (
     "Better and worse are beyond noise: p below 0.05 after Holm's correction for all tests of this table. "
     "“On these clips”: significant over blocks of their frames, which holds for these clips alone. "
-    "“Too little to tell”: so few frames or clips could not show any change."
+    "“Within noise”: no change is shown, nor that there is none. "
+    "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures."
 )
 
 WAYS = ("over_clips", "over_frames")
