@@ -133,6 +133,22 @@ def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
     assert session(tmp_path / "out")[1]["state"] == "stopped"
 
 
+@pytest.mark.slow
+def test_sigterm_ends_a_run_that_waits_for_its_camera_as_any_other(tmp_path):
+    main = "from torchvision_dddas.cli import main; main()"
+    words = [sys.executable, "-c", main, "run", "tcp://127.0.0.1:9", "--live", "--wait", "--out", str(tmp_path / "out")]
+    ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    ready.bind(str(tmp_path / "notify"))
+    ready.settimeout(120)
+    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
+    with ready, subprocess.Popen(words, env=environ, stderr=subprocess.PIPE) as run:
+        assert ready.recv(100) == b"READY=1\nSTATUS=waiting for the camera"
+        time.sleep(0.5)
+        run.send_signal(signal.SIGTERM)
+        run.communicate(timeout=120)
+    assert run.returncode == 0 and not (tmp_path / "out").exists()
+
+
 def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -14,7 +14,7 @@ from torchvision_dddas.config import LiveParameters, Settings, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
-from torchvision_dddas.io.interrupts import StopSignals
+from torchvision_dddas.io.interrupts import Stopped, StopSignals
 from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
 from torchvision_dddas.io.sources import stream_target
@@ -100,6 +100,10 @@ def run_live(
         except DeadCamera as error:
             _print(str(error))
             return HUNG
+        except Stopped as stopped:
+            if stopped.number == signal.SIGTERM:  # how a supervisor ends a run, also one that has no camera yet
+                return 0
+            raise
         stack.callback(source.close)
         health.trouble("waiting")
         health.begin()
