@@ -297,8 +297,9 @@ class _Onwards(io.BufferedReader):
     _short = 0
 
     def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        self._short = max((size or 0) - len(data), 0)
+        data = io.BufferedReader.read(self, size)
+        short = (size or 0) - len(data)
+        self._short = short if short > 0 else 0
         return data
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
