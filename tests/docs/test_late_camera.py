@@ -81,7 +81,9 @@ def test_a_board_waits_for_its_camera_and_is_well_once_pictures_come(tmp_path: P
             killer.start()
             try:
                 assert run.stderr is not None
+                assert "status page: " in run.stderr.readline()
                 assert "is not there yet" in run.stderr.readline()
+                assert ask(address)["trouble"].startswith("waiting for the camera")
                 assert [supervisor.recv(4096).decode().splitlines()[0] for _ in range(3)] == [
                     "READY=1",
                     "WATCHDOG=1",
