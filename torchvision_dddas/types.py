@@ -1040,6 +1040,11 @@ class FrameResult:
         """The targets of the frame with their identities."""
         return self.tracked.tracks
 
+    @property
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """The changes of parameters at the frame, with their causes."""
+        return self.tracked.adjustments if self.locations is None else self.locations.adjustments
+
 
 @dataclass(frozen=True)
 class Order:

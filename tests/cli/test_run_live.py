@@ -69,6 +69,11 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
     looked = sum(use["looked"] for use in uses)
     counts = record["counts"]
     assert (counts["appearance_decisions"], counts["appearance_looked_at"]) == (len(uses), looked)
+    changes = [change for line in results for change in line["adjustments"]]
+    assert changes and record["adjustments"] == changes
+    assert sum(record["adjustments_made"].values()) == len(changes)
+    events = (folder / "events.log").read_text()
+    assert all(f"{change['frame']} adjusted: {change['knob']} " in events for change in changes)
     assert "results of 14 pictures, 0 dropped" in done.stderr
 
 

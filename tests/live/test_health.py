@@ -16,6 +16,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output import SessionLog, make_session_folder
 from torchvision_dddas.live.health import Health, StatusWriter
 from torchvision_dddas.live.server import HealthServer, health_pages, html_page, metrics, parse_address
+from torchvision_dddas.types import Adjustment
 
 
 def test_percentiles_are_of_the_latest_times():
@@ -71,6 +72,23 @@ def test_a_full_disk_is_reported_once_and_gets_everything_later():
     assert sum("No space left on device" in words for words in shown) == 1
     assert [words for words in disk.lines if "No space" not in words] == ["one", "two", "three", "four"]
     assert disk.states == [("running", 0)]
+
+
+def test_changes_of_parameters_are_in_the_log_and_the_state_once_and_not_among_the_events():
+    health, disk, shown = Health(), Disk(), []
+    changes = [Adjustment(k, "interval.frames", k, k + 1, "altitude 90 m") for k in range(200)]
+    status = StatusWriter(health, disk, [], 1000.0, lambda event: shown.append(event.text))
+    health.event("run", "begun")
+    health.adjusted(changes[:2])
+    health.adjusted([Adjustment(5, "sampling.every", 1, 2, "too slow")], ["sampling.every"])
+    status.events()
+    status.events()
+    assert disk.lines == ["begun", *(f"interval.frames {k} -> {k + 1}: altitude 90 m" for k in range(2))]
+    assert shown == ["begun"] and len(health.snapshot().events) == 1
+    health.adjusted(changes[2:])
+    facts = health.adjustments()
+    assert facts["adjustments_made"] == {"interval.frames": 200, "sampling.every": 1}
+    assert [row["frame"] for row in facts["adjustments"] if row["knob"] == "interval.frames"] == list(range(100))
 
 
 def test_each_session_has_its_own_folder(tmp_path):

@@ -9,6 +9,8 @@ from torchvision_dddas.types import Adjustment
 
 # Of so many frames one is processed: no parameter, but named like one in the record.
 SAMPLING = "sampling.every"
+# What load shedding changes.
+SHED = ("registration.keypoints", "people.look_share", SAMPLING)
 # Between two processed frames a target moves by this share of its size at most.
 _MOVED_SHARE = 0.5
 # How fast people walk, and how wide one shows with a shadow: who comes into the picture is at least that.

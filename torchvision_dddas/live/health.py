@@ -4,7 +4,7 @@ import os
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,11 +14,13 @@ from typing import Any, Self
 import numpy as np
 
 from torchvision_dddas.errors import readable, without_secrets
-from torchvision_dddas.io.output import Event, SessionLog
+from torchvision_dddas.io.output import AdjustmentList, Event, SessionLog
 from torchvision_dddas.io.streams import Stream
+from torchvision_dddas.types import Adjustment
 
 _DURATIONS = 4096  # kept of each kind: percentiles are of the latest
 _EVENTS = 64
+_ADJUSTMENTS = 100  # of a parameter that are listed: run.json is written every few seconds
 _LATE = 25  # results are late if most of so many were
 
 
@@ -51,6 +53,7 @@ class Health:
         self._events: deque[Event] = deque(maxlen=_EVENTS)
         self._troubles: dict[str, str] = {}
         self._late: deque[bool] = deque(maxlen=_LATE)
+        self._adjustments, self._unwritten = AdjustmentList(_ADJUSTMENTS), list[Event]()
 
     def count(self, name: str, by: int = 1) -> None:
         """Add to a count."""
@@ -91,6 +94,25 @@ class Health:
                 self._troubles[name] = words
             else:
                 self._troubles.pop(name, None)
+
+    def adjusted(self, adjustments: Sequence[Adjustment], told: Collection[str] = ()) -> None:
+        """Add changes of parameters, for run.json and events.log alone. told: parameters whose changes are events."""
+        with self._lock:
+            for a in self._adjustments.add(adjustments):
+                if a.parameter not in told:
+                    words = f"{a.parameter} {a.old:g} -> {a.new:g}: {a.cause}"
+                    self._unwritten.append(Event(time.time(), a.frame, "adjusted", words))
+
+    def take_adjusted(self) -> list[Event]:
+        """The changes of parameters since the last call, as events."""
+        with self._lock:
+            taken, self._unwritten = self._unwritten, []
+        return taken
+
+    def adjustments(self) -> dict[str, Any]:
+        """What run.json says of changed parameters: the first of each, and how many there were."""
+        with self._lock:
+            return {"adjustments": list(self._adjustments.rows), "adjustments_made": dict(self._adjustments.made)}
 
     @property
     def idle_s(self) -> float:
@@ -175,6 +197,7 @@ class StatusWriter:
         self._known, new = self._health.events_since(self._known)
         for event in new:
             self._say(event)
+        new = tuple(sorted([*new, *self._health.take_adjusted()], key=lambda event: event.utc_s))
         self._waiting = [*self._waiting, *new][-_MOST_WAITING:]
         if not self._waiting:
             return
@@ -192,7 +215,7 @@ class StatusWriter:
         now = self._health.snapshot()
         self._show(now)
         try:
-            self._log.write_state(self.state, snapshot_facts(now))
+            self._log.write_state(self.state, {**snapshot_facts(now), **self._health.adjustments()})
             self._trouble = ""
         except OSError as error:
             self._refused(error)

@@ -183,6 +183,7 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
     if people is not None:
         health.gauge("people", len(people.tracks))
     health.count("unreliable", int(bool(located.tracked.cause)))
+    health.adjusted(located.adjustments, control.SHED)
     if (use := located.tracks.appearance) is not None:
         health.count("appearance_decisions")
         health.count("appearance_looked_at", int(use.looked))

@@ -194,8 +194,7 @@ class RunStory:
 
     def write(self, result: FrameResult) -> None:
         """Add a frame."""
-        tracked, located = result.tracked, result.locations
-        adjustments = tracked.adjustments if located is None else located.adjustments
+        tracked, adjustments = result.tracked, result.adjustments
         self.timeline.add_result(result)
         for moved in adjustments:
             self.log.add_adjustment(moved)

@@ -29,7 +29,6 @@ NONE_LOCATED = "0 located, because "
 NO_POSE = "the camera's pose is unknown"
 """The cause of a frame that is not located and says nothing of why."""
 _STEP = math.log(1.01)
-_MOST_CHANGES = 1000  # of a parameter that run.json lists; the others are counted
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -99,6 +98,29 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
     return f"{NONE_LOCATED}{reason}"
 
 
+class AdjustmentList:
+    """The first adjustments of each parameter, as run.json lists them, and how many there were.
+
+    rows: a dictionary each. made: by parameter.
+    """
+
+    def __init__(self, most: int = 1000) -> None:
+        """most: of a parameter that are listed; the others are counted."""
+        self.rows: list[dict[str, Any]] = []
+        self.made: Counter[str] = Counter()
+        self._most = most
+
+    def add(self, adjustments: Sequence[Adjustment]) -> list[Adjustment]:
+        """Count adjustments; returns those that are listed."""
+        listed = []
+        for a in adjustments:
+            self.made[a.parameter] += 1
+            if self.made[a.parameter] <= self._most:
+                self.rows.append({"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause})
+                listed.append(a)
+        return listed
+
+
 class RunRecord:
     """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
 
@@ -112,8 +134,7 @@ class RunRecord:
         self._begun = time.perf_counter()
         self._stages: dict[str, Durations] = {}
         self.frames = self.targets = self.unreliable_frames = 0
-        self.adjustments: list[dict[str, Any]] = []  # the first _MOST_CHANGES of each parameter
-        self._changes: Counter[str] = Counter()
+        self.adjustments = AdjustmentList()
         self.unreliable = Spans(is_exact=True)
         self.problems: list[str] = []
         self.notes: list[str] = []
@@ -140,11 +161,7 @@ class RunRecord:
         self.targets += targets
         for stage, spent in seconds.items():
             self._stages.setdefault(stage, Durations()).add(spent)
-        for a in adjustments:
-            self._changes[a.parameter] += 1
-            if self._changes[a.parameter] <= _MOST_CHANGES:
-                row = {"frame": a.frame, "knob": a.parameter, "old": a.old, "new": a.new, "cause": a.cause}
-                self.adjustments.append(row)
+        self.adjustments.add(adjustments)
         if cause is not None:
             self.unreliable_frames += 1
             self.unreliable.add(number, self.last_frame, cause)
@@ -174,8 +191,8 @@ class RunRecord:
             "notes": self.notes,
             "problems": self.problems,
             "unreliable": self.unreliable.rows,
-            "adjustments": self.adjustments,
-            "adjustments_made": dict(self._changes),
+            "adjustments": self.adjustments.rows,
+            "adjustments_made": dict(self.adjustments.made),
             "seconds": {"wall": round(time.perf_counter() - self._begun, 3), "stages": stages},
         }
         write_run_record(self._path, state, record)

@@ -97,7 +97,7 @@ def location_tables(record: RunRecord) -> list[Table]:
         return [(format_span(span["first"], span["last"]), *(span[key] for key in keys)) for span in spans]
 
     counts = record.counts
-    adjustments = [tuple(m[key] for key in ("frame", "knob", "old", "new", "cause")) for m in record.adjustments]
+    adjustments = [tuple(m[key] for key in ("frame", "knob", "old", "new", "cause")) for m in record.adjustments.rows]
     landmarks = [
         (name, k["seen"], k["used"], *([format_span(*s) for s in k[state]] for state in ("reassigned", "excluded")))
         for name, k in counts["landmarks"].items()
