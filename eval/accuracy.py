@@ -31,6 +31,7 @@ from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
 from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.types import Scene
 
 Found = tuple[np.ndarray, np.ndarray]
 """(H, W) mask and (N, 4) boxes of a frame."""
@@ -77,8 +78,14 @@ def is_drawn_later(settings: Settings) -> bool:
 
 
 def run_moved(place: Path, config: str, backend: str) -> Iterator[Found | None]:
-    """Mask and boxes of the reference one interval earlier, moved to every frame; None where there is no such."""
+    """Mask and boxes of every frame where the source draws them; None where there are none."""
     scenes = list(detect_motion(open_source(place / "frames"), load_config(config), backend))
+    moved = move_later(scenes)
+    yield from (moved.get(at) for at in range(len(scenes)))
+
+
+def move_later(scenes: Sequence[Scene]) -> dict[int, Found]:
+    """By index of a frame the mask and boxes of the reference one interval earlier, moved to it, where there is one."""
     moved: dict[int, Found] = {}
     for at, scene in enumerate(scenes):
         middle, last = at + scene.interval_frames, at + 2 * scene.interval_frames
@@ -89,7 +96,7 @@ def run_moved(place: Path, config: str, backend: str) -> Iterator[Found | None]:
         size = scene.mask.shape[1], scene.mask.shape[0]
         mask = cv2.warpPerspective(scene.mask.astype(np.uint8), later_from_earlier, size, flags=cv2.INTER_NEAREST)
         moved[middle] = mask > 0, cv2.connectedComponentsWithStats(mask)[2][1:, :4].astype(float)
-    yield from (moved.get(at) for at in range(len(scenes)))
+    return moved
 
 
 def run_plain(place: Path) -> Iterator[Found]:

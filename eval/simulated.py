@@ -4,7 +4,6 @@ python eval/simulated.py altitude     errors of crowds from video to metres by a
                                       (appendix A, Fig. 7)
 python eval/simulated.py landmarks    four landmarks or six, by the centres of their colours or of motion (Fig. 8, 9)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
-python eval/simulated.py interval     what the detection interval buys (appendix B, eq. 2)
 python eval/simulated.py whole        whole scenarios in the closed loop
 
 Figures are mean ± standard error (range) over seeds. --cache FILE keeps finished cases.
@@ -27,15 +26,12 @@ from simulated_clips import CONFIG, GROUND_WAYS, Case, Way, locate_clip, locate_
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.control import StartedSource, build_mission, fit_settings
-from torchvision_dddas.detection import MotionDetector, load_engine
-from torchvision_dddas.evaluation.metrics import boxes as box_metrics
-from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.control import StartedSource, build_mission
+from torchvision_dddas.detection import load_engine
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.simulation import SimulatorSource, load_scenario, scenario_settings
-from torchvision_dddas.types import Command, Frame, Scene, Truth
+from torchvision_dddas.types import Command, Frame
 
 # -- altitude and landmarks ------------------------------------------------------------------------------------------
 
@@ -283,96 +279,7 @@ def fly(source: SimulatorSource, changed: Case) -> Case:
     return {"score": scorer.score().by_name(), "cpu": float(cpu), "aerial": float(aerial)}
 
 
-# -- the detection interval ------------------------------------------------------------------------------------------
-
-ALTITUDES_M, SPEEDS_M_S = (50.0, 100.0, 200.0), (2.0, 5.0, 10.0)
-INTERVALS = (1, 2, 3, 5, 8)
-LOOKED: dict[str, Case] = {
-    "closed loop": {"steering.follow": False, "steering.look": False},
-    **{str(every): {"steering.on": False, "interval.rule": False, "every": every} for every in INTERVALS},
-}
-COMPARED: dict[str, Case] = {
-    "by the rule": {"interval.rule": True},
-    **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
-}
-MEASURED = {"source": ("F of pixels", "f"), "patrol": ("F1 of boxes", "box_f1")}
-"""What is measured of a configuration: boxes of crowds, or the people in them where boxes are not a crowd's."""
-
-
-def measure_interval(options: bench.Options) -> tuple[str, Any]:
-    """Accuracy against processor time by detection interval: its rules beside fixed ones, by altitude and speed.
-
-    First table: one of so many frames is looked at; to how many metres every crowd is known at every moment (10 m where
-    nothing is known), and processor time a second of clip. The closed loop chooses the frames; vehicles fly as planned,
-    with exact instruments, so that the error is that of detection and of the time between looks. Other tables: every
-    frame is looked at, and the interval says how far apart the frames are that are compared; ms of processor a frame.
-    """
-    flights = [(altitude, speed) for altitude in ALTITUDES_M for speed in SPEEDS_M_S]
-    studies = {"looked": [[way] for way in LOOKED], **{config: [list(COMPARED)] for config in options.configs}}
-    cases = [
-        {"study": study, "ways": ways, "altitude_m": a, "speed_m_s": s, "seed": seed, "seconds": options.seconds}
-        for study, parts in studies.items()
-        for a, s in flights
-        for seed in range(options.seeds)
-        for ways in parts
-    ]
-    results = bench.run_cases(cases, fly_interval, options.jobs, options.cache)
-    tables = []
-    for study in studies:
-        ways, digits, what = LOOKED, 2, "known to within m / s a s"
-        if study != "looked":
-            ways, digits, what = COMPARED, 0, f"`{study}`: {MEASURED[study][0]} / ms"
-        rows = []
-        for of in (*flights, None):
-            here = [
-                result
-                for case, result in zip(cases, results, strict=True)
-                if case["study"] == study and of in (None, (case["altitude_m"], case["speed_m_s"]))
-            ]
-            cells = []
-            for way in ways:
-                a, b = (Spread(result[way][k] for result in here if way in result) for k in (0, 1))
-                cells.append(f"{a.text(spread=False)} / {b.text(digits, spread=False)}")
-            rows.append(["all" if of is None else "{:g} m, {:g} m/s".format(*of), *cells])
-        tables.append(bench.format_table([what, *ways], rows))
-    return "\n\n".join([*tables, f"Flights of {options.seconds:g} s, {options.seeds} a row."]), results
-
-
-def fly_interval(case: Case) -> Case:
-    """[accuracy, time] in some ways to choose the interval, on one flight to and fro over two crowds."""
-    uav = {"altitude_m": case["altitude_m"], "speed_m_s": case["speed_m_s"]}
-    uav |= {"start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
-    uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
-    source = SimulatorSource(
-        walking(
-            case["seed"], case["seconds"], uav=uav, team={"ugvs": 0},
-            clip={"seconds": case["seconds"], "located_by": "telemetry"},
-        )
-    )  # fmt: skip
-    if case["study"] == "looked":
-        (way,) = case["ways"]
-        run = fly(source, LOOKED[way])
-        return {way: [run["score"]["knowledge_m"], run["cpu"]]}
-    cv2.setNumThreads(1)
-    frames, truths, found = list(source), source.truths(), {}
-    for way in case["ways"]:
-        settings = with_parameters(fit_settings(load_config(case["study"]), source), COMPARED[way])
-        detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
-        start = bench.now()[1]
-        scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
-        spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
-        found[way] = [score_scenes(scenes, truths)[MEASURED[case["study"]][1]], spent_ms]
-    return found
-
-
-def score_scenes(scenes: list[Scene], truths: list[Truth]) -> dict[str, float]:
-    """Measures of masks, and the F1 of boxes at an IoU of 0.5."""
-    pixels, boxes = pixel_metrics.Pixels(), box_metrics.Boxes()
-    for scene, truth in zip(scenes, truths, strict=True):
-        pixels = add_counts(pixels, pixel_metrics.count(scene.mask, truth.mask))
-        true = box_metrics.boxes_of(truth.mask)
-        boxes = add_counts(boxes, box_metrics.match(scene.detections.box_px, true))
-    return {**pixel_metrics.measures(pixels), "box_f1": box_metrics.measures(boxes)["f1"]}
+# -- whole scenarios -------------------------------------------------------------------------------------------------
 
 
 def measure_whole(options: bench.Options) -> tuple[str, Any]:
@@ -415,7 +322,6 @@ if __name__ == "__main__":
         "altitude": (measure_altitude, common | altitudes),
         "landmarks": (measure_landmarks, common | landmarks),
         "loop": (measure_loop, common | loop),
-        "interval": (measure_interval, common | {"--seeds": 1, "--seconds": 5.0, "--configs": list(MEASURED)}),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
     }
     bench.main(__doc__, studies)

@@ -1,0 +1,196 @@
+"""What the detection interval buys (appendix B, eq. 2), on rendered flights with known truth; no data needed.
+
+python eval/intervals.py fixed     its rules beside fixed intervals: accuracy against time, by altitude and speed
+python eval/intervals.py search    the constants that choose the frames looked at, with flights left out
+"""
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import bench
+import cv2
+import numpy as np
+from accuracy import is_drawn_later, move_later
+from bench import Spread
+from simulated import fly
+from simulated_clips import Case, walking
+
+from torchvision_dddas.config import load_config, with_parameters
+from torchvision_dddas.control import fit_settings
+from torchvision_dddas.detection import MotionDetector
+from torchvision_dddas.evaluation.metrics import boxes as box_metrics
+from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.simulation import SimulatorSource
+from torchvision_dddas.types import Scene, Truth
+
+FLIGHTS = tuple(product((50.0, 100.0, 200.0), (2.0, 5.0, 10.0)))
+"""Altitude in m and speed in m/s of each flight."""
+INTERVALS = (1, 2, 3, 5, 8)
+LOOP: Case = {"steering.follow": False, "steering.look": False}
+"""The closed loop chooses the frames; the vehicles fly as planned."""
+LOOKED: dict[str, Case] = {
+    "closed loop": LOOP,
+    **{str(every): {"steering.on": False, "interval.rule": False, "every": every} for every in INTERVALS},
+}
+COMPARED: dict[str, Case] = {
+    "by the rule": {"interval.rule": True},
+    **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
+}
+MEASURED = {"default": ("F of pixels", "f"), "patrol": ("F1 of boxes", "box_f1")}
+"""What is measured of a configuration, else F of pixels: in `patrol` a target is a crowd, which boxes show better."""
+
+
+def measure_fixed(options: bench.Options) -> tuple[str, Any]:
+    """Accuracy against processor time by detection interval: its rules beside fixed ones, by altitude and speed.
+
+    First table: one of so many frames is looked at; to how many metres every crowd is known at every moment (10 m where
+    nothing is known), and processor time a second of clip. The closed loop chooses the frames; vehicles fly as planned,
+    with exact instruments, so that the error is that of detection and of the time between looks. Other tables: every
+    frame is looked at, and the interval says how far apart the frames are that are compared; ms of processor a frame.
+    Masks that show the movers of a later frame are measured there.
+    """
+    studies = {"looked": [[way] for way in LOOKED], **{config: [list(COMPARED)] for config in options.configs}}
+    cases = [
+        {"study": study, "ways": ways, "altitude_m": a, "speed_m_s": s, "seed": seed, "seconds": options.seconds}
+        for study, parts in studies.items()
+        for a, s in FLIGHTS
+        for seed in range(options.seeds)
+        for ways in parts
+    ]
+    results = bench.run_cases(cases, fly_case, options.jobs, options.cache)
+    tables = []
+    for study in studies:
+        ways, digits, what = LOOKED, 2, "known to within m / s a s"
+        if study != "looked":
+            later = " at t + Δt" if is_drawn_later(_config(study)) else ""
+            ways, digits, what = COMPARED, 0, f"`{study}`: {_measured(study)[0]}{later} / ms"
+        rows = []
+        for of in (*FLIGHTS, None):
+            here = [
+                result
+                for case, result in zip(cases, results, strict=True)
+                if case["study"] == study and of in (None, (case["altitude_m"], case["speed_m_s"]))
+            ]
+            cells = []
+            for way in ways:
+                a, b = (Spread(result[way][k] for result in here if way in result) for k in (0, 1))
+                cells.append(f"{a.text(spread=False)} / {b.text(digits, spread=False)}")
+            rows.append(["all" if of is None else _name(of), *cells])
+        tables.append(bench.format_table([what, *ways], rows))
+    return "\n\n".join([*tables, f"Flights of {options.seconds:g} s, {options.seeds} a row."]), results
+
+
+def fly_case(case: Case) -> Case:
+    """[accuracy, time] in some ways to choose the interval, on one flight to and fro over two crowds."""
+    source = flight(case["altitude_m"], case["speed_m_s"], case["seed"], case["seconds"])
+    if case["study"] == "looked":
+        (way,) = case["ways"]
+        run = fly(source, LOOKED[way])
+        return {way: [run["score"]["knowledge_m"], run["cpu"]]}
+    cv2.setNumThreads(1)
+    frames, truths, found = list(source), source.truths(), {}
+    for way in case["ways"]:
+        settings = with_parameters(fit_settings(_config(case["study"]), source), COMPARED[way])
+        detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
+        start = bench.now()[1]
+        scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
+        spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
+        found[way] = [score_scenes(scenes, truths, is_drawn_later(settings))[_measured(case["study"])[1]], spent_ms]
+    return found
+
+
+def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float) -> SimulatorSource:
+    """To and fro over two crowds, with exact instruments and without ground vehicles."""
+    uav = {"altitude_m": altitude_m, "speed_m_s": speed_m_s, "start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
+    uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
+    clip = {"seconds": seconds, "located_by": "telemetry"}
+    return SimulatorSource(walking(seed, seconds, uav=uav, team={"ugvs": 0}, clip=clip))
+
+
+def score_scenes(scenes: Sequence[Scene], truths: Sequence[Truth], is_later: bool) -> dict[str, float]:
+    """Measures of masks, and the F1 of boxes at an IoU of 0.5. is_later: masks show the movers of a later frame."""
+    found = dict(enumerate((scene.mask, scene.detections.box_px) for scene in scenes))
+    pixels, boxes = pixel_metrics.Pixels(), box_metrics.Boxes()
+    for at, (mask, box_px) in (move_later(scenes) if is_later else found).items():
+        pixels = add_counts(pixels, pixel_metrics.count(mask, truths[at].mask))
+        boxes = add_counts(boxes, box_metrics.match(box_px, box_metrics.boxes_of(truths[at].mask)))
+    return {**pixel_metrics.measures(pixels), "box_f1": box_metrics.measures(boxes)["f1"]}
+
+
+def _config(name: str) -> Any:
+    return load_config(None if name == "default" else name)
+
+
+def _measured(config: str) -> tuple[str, str]:
+    return MEASURED.get(config, MEASURED["default"])
+
+
+def _name(of: tuple[float, float]) -> str:
+    return "{:g} m, {:g} m/s".format(*of)
+
+
+# -- the constants that choose the frames ----------------------------------------------------------------------------
+
+GRID: dict[str, Sequence[float]] = {
+    "steering.least_move_px": (1.5, 2.0, 3.0, 4.0, 6.0),
+    "steering.maximum_every": (5, 8),
+    "steering.sampling_share": (0.5, 1.0),
+}
+SAME_M = 0.02
+"""Settings whose errors differ by less are as good; the quickest of them is taken."""
+SEARCH_SEED = 100
+"""The flights of the search are others than those of `fixed`."""
+
+
+def measure_search(options: bench.Options) -> tuple[str, Any]:
+    """The error of the known places of crowds by the constants that choose the frames which are looked at.
+
+    Left out: the constants for a flight are the best on all the others. Where several are as good, the quickest.
+    """
+    points = list(product(*GRID.values()))
+    cases = [
+        {"point": point, "altitude_m": a, "speed_m_s": s, "seed": SEARCH_SEED + seed, "seconds": options.seconds}
+        for a, s in FLIGHTS
+        for seed in range(options.seeds)
+        for point in points
+    ]
+    results = bench.run_cases(cases, fly_point, options.jobs, options.cache)
+    shape = (len(FLIGHTS), options.seeds, len(points), 2)
+    figures = np.array(results, float).reshape(shape).mean(axis=1)  # (flight, point, error and time)
+
+    def best(error_time: np.ndarray) -> int:
+        as_good = error_time[:, 0] < error_time[:, 0].min() + SAME_M
+        return int(np.where(as_good, error_time[:, 1], np.inf).argmin())
+
+    head = [name.partition(".")[2] for name in GRID]
+    mean = figures.mean(axis=0)
+    rows = [[*(f"{v:g}" for v in points[k]), *(f"{v:.2f}" for v in mean[k])] for k in np.argsort(mean[:, 0])]
+    text = bench.format_table([*head, "known to within m", "s a s"], rows)
+    left, out = [], []
+    for k, of in enumerate(FLIGHTS):
+        at = best(np.delete(figures, k, axis=0).mean(axis=0))
+        out.append(figures[k, at])
+        left.append([_name(of), *(f"{v:g}" for v in points[at]), *(f"{v:.2f}" for v in out[-1])])
+    left.append(["all", *("" for _ in GRID), *(f"{v:.2f}" for v in np.mean(out, axis=0))])
+    text += "\n\n" + bench.format_table(["left out", *head, "known to within m", "s a s"], left)
+    chosen = ", ".join(f"{n} {v:g}" for n, v in zip(head, points[best(mean)], strict=True))
+    end = f"Chosen on all: {chosen}. Flights of {options.seconds:g} s, {options.seeds} a point."
+    return f"{text}\n\n{end}", figures.tolist()
+
+
+def fly_point(case: Case) -> list[float]:
+    """Error and time of one flight."""
+    source = flight(case["altitude_m"], case["speed_m_s"], case["seed"], case["seconds"])
+    run = fly(source, {**LOOP, **dict(zip(GRID, case["point"], strict=True))})
+    return [run["score"]["knowledge_m"], run["cpu"]]
+
+
+if __name__ == "__main__":
+    common = {"--seconds": 5.0, "--jobs": 1, "--cache": None}
+    studies = {
+        "fixed": (measure_fixed, {"--seeds": 3, "--configs": ["patrol", "default", "fast", "source"], **common}),
+        "search": (measure_search, {"--seeds": 2, **common}),
+    }
+    bench.main(__doc__, studies)
