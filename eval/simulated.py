@@ -4,11 +4,13 @@ python eval/simulated.py altitude     errors of crowds from video to metres by a
                                       (appendix A, Fig. 7)
 python eval/simulated.py landmarks    four landmarks or six, by the centres of their colours or of motion (Fig. 8, 9)
 python eval/simulated.py loop         what feedback buys: closed loop beside open loops
+python eval/simulated.py ground       centre and course of crowds by the people seen from the ground (appendix A, III-B)
 python eval/simulated.py whole        whole scenarios in the closed loop
 
 Figures are mean ± standard error (range) over seeds. --cache FILE keeps finished cases.
 """
 
+import csv
 import math
 import tempfile
 from collections import Counter
@@ -307,6 +309,67 @@ def fly_whole(case: Case) -> Case:
     return score.by_name()
 
 
+# -- crowds by the ground vehicles -----------------------------------------------------------------------------------
+
+FOLLOWS = {"closed loop": True, "the UAV does not follow": False}
+"""Where the UAV flies as planned it loses crowds, and what the ground vehicles see steers them."""
+
+
+def measure_ground(options: bench.Options) -> tuple[str, Any]:
+    """Errors of crowds.csv: centre and predicted course of a crowd by the people whom ground vehicles see.
+
+    A row of crowds.csv is compared with the true crowd whose centre is nearest. steers: rows of a crowd that the air
+    has lost, by which the vehicles are steered. Appendix A, III-B.
+    """
+    cases = [
+        {"scenario": name, "seed": seed, "follow": follow}
+        for follow in FOLLOWS.values()
+        for name in options.scenarios
+        for seed in range(options.seeds)
+    ]
+    results = bench.run_cases(cases, fly_ground, options.jobs, options.cache)
+    rows = []
+    for setting, follow in FOLLOWS.items():
+        of = [row for c, rows_of in zip(cases, results, strict=True) if c["follow"] == follow for row in rows_of]
+        for what, steers in (("all", (0.0, 1.0)), ("steers", (1.0,))):
+            table = np.array([row for row in of if row[2] in steers], float).reshape(-1, 3)
+            centre, course = table[:, 0], table[np.isfinite(table[:, 1]), 1]
+            cells = [f"{np.percentile(x, q):.2f}" if len(x) else "–" for x in (centre, course) for q in (50, 95)]
+            known = f"{100 * len(course) / len(table):.0f}" if len(table) else "–"
+            rows.append([setting, what, str(len(table)), *cells[:2], known, *cells[2:]])
+    head = ["setting", "rows", "count", "centre: median error m", "95 %"]
+    text = bench.format_table([*head, "course known, %", "course: median error m/s", "95 %"], rows, words=2)
+    return f"{text}\n\n{', '.join(options.scenarios)}; {options.seeds} seeds.", results
+
+
+def fly_ground(case: Case) -> list[list[float]]:
+    """Of each row of crowds.csv the errors of centre and course, and whether it steers."""
+    from torchvision_dddas.evaluation.simulated_run import run_scenario
+
+    with tempfile.TemporaryDirectory() as out:
+        words = [f"steering.follow={str(case['follow']).lower()}"]
+        run_scenario(Path(out), case["scenario"], overrides=words, seed=case["seed"], save=("truth",))
+        found, true = _rows(Path(out) / "crowds.csv"), _rows(Path(out) / "truth" / "positions.csv")
+    errors = []
+    for row in found:
+        crowds = [t for t in true if t["frame"] == row["frame"] and t["kind"] == "person"]
+        lonlat = np.array([[float(t["longitude_deg"]), float(t["latitude_deg"])] for t in crowds])
+        away = np.linalg.norm(
+            geometry.east_north(lonlat, (float(row["longitude_deg"]), float(row["latitude_deg"]))), axis=1
+        )
+        nearest = crowds[int(away.argmin())]
+        course = [float(row[f"velocity_{of}_m_s"] or "nan") - float(nearest[f"{of}_m_s"]) for of in ("east", "north")]
+        errors.append([float(away.min()), float(np.hypot(*course)), float(row["steers"])])
+    return errors
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
 def about(options: bench.Options) -> str:
     """The last line of a text."""
     return f"{options.seeds} seeds, {options.seconds:g} s each: mean ± standard error (range over seeds)."
@@ -322,6 +385,7 @@ if __name__ == "__main__":
         "altitude": (measure_altitude, common | altitudes),
         "landmarks": (measure_landmarks, common | landmarks),
         "loop": (measure_loop, common | loop),
+        "ground": (measure_ground, {"--scenarios": ["leaving", "splitting", "crossing"], **common, "--seeds": 3}),
         "whole": (measure_whole, {"--scenarios": scenarios, "--seed": 11, "--jobs": 1, "--cache": None}),
     }
     bench.main(__doc__, studies)
