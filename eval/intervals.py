@@ -134,7 +134,7 @@ def _name(of: tuple[float, float]) -> str:
 # -- the constants that choose the frames ----------------------------------------------------------------------------
 
 GRID: dict[str, Sequence[float]] = {
-    "steering.least_move_px": (1.5, 2.0, 3.0, 4.0, 6.0),
+    "steering.least_move_px": (1.5, 3.0, 4.0, 6.0),
     "steering.maximum_every": (5, 8),
     "steering.sampling_share": (0.5, 1.0),
 }
