@@ -94,3 +94,22 @@ def test_a_run_without_truth_removes_that_of_the_earlier_run(dddas, tmp_path):
         result = dddas("run", f"sim:{path}", "--out", tmp_path / "out", "--save", save, "--quiet")
         assert (result.exit_code, result.output) == (0, "")
         assert (tmp_path / "out" / "truth" / "gt.txt").exists() == there
+
+
+@pytest.mark.slow
+def test_what_ground_vehicles_see_steers_them_once_the_air_has_lost_a_crowd(tmp_path, dddas):
+    away = ["uav.way_m=[[-110.0, 0.0]]", "uav.speed_m_s=4.0", "clip.seconds=11.0"]
+    words = [word for change in away for word in ("--scene", change)]
+    run = ("run", "sim:leaving", *words, "--set", "steering.follow=false", "--save", "truth", "--out", tmp_path)
+    result = dddas(*run, "--quiet")
+    assert result.exit_code == 0, result.output
+    log = (tmp_path / "log.txt").read_text()
+    assert "team.by_ground 0 -> 1: target 1 is not located from the air" in log
+    true = {row["frame"]: row for row in rows(tmp_path / "truth" / "positions.csv") if row["kind"] == "person"}
+    steers = [row for row in rows(tmp_path / "crowds.csv") if row["steers"] == "1"]
+    assert steers
+    for row in steers:
+        crowd, seen = (
+            np.array([float(of["longitude_deg"]), float(of["latitude_deg"])]) for of in (true[row["frame"]], row)
+        )
+        assert np.linalg.norm(geometry.east_north(crowd[None], (seen[0], seen[1]))) < 4.0
