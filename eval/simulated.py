@@ -191,6 +191,8 @@ def _part(of: list[Case], part: slice, column: int) -> Spread:
 OPEN: Case = {"steering.on": False, "interval.rule": False, "track.appearance": "never"}
 LOOPS: dict[str, Case] = {
     "closed": {},
+    "closed, looks nearer": {"steering.least_move_px": 1.5, "steering.maximum_every": 5},
+    "closed, looks further apart": {"steering.least_move_px": 4.0},
     "closed, every frame": {"steering.sampling": False},
     "closed, vehicles as planned": {"steering.look": False, "steering.follow": False},
     **{f"open, every {every}": {**OPEN, "every": every} for every in (1, 2, 3, 5)},

@@ -292,11 +292,11 @@ def sampled_by(targets, velocity=0.0, speed_m_s=0.5, misses=(), step=None, look_
 
 
 def test_frames_are_left_out_by_height_and_speed_but_while_a_target_is_lost_or_the_registration_weak():
-    """50 m at 5 Hz and 1.25 m/s: 50 / 20 x 5 / 1.25 x 5 / 10 = 5 frames, and half of it by the share."""
+    """50 m at 5 Hz and 1.3 m/s: 50 / 20 x 5 / 1.3 x 5 / 10 = 4.8 frames, half of it by the share; 12.5 at 0.5 m/s."""
     assert sampled_by([[0, 0]], speed_m_s=1.3)[0][-1] == 2
     every, made = sampled_by([[0, 0]], (0.5, 0.0), misses=range(50, 56))
-    assert every[45] == 5 and every[60] == 1 and every[-1] == 5
-    assert (made[0].new, made[0].cause) == (5.0, "altitude 50.0 m, speed 0.5 m/s")
+    assert every[45] == 6 and every[60] == 1 and every[-1] == 6
+    assert (made[0].new, made[0].cause) == (6.0, "altitude 50.0 m, speed 0.5 m/s")
     assert [change.cause for change in made if change.new == 1] == ["target 1 was lost"]
     assert set(sampled_by([], step=Registration(np.eye(3), 200, 40, 0.3, 0.2))[0]) == {1}
 
