@@ -174,10 +174,10 @@ def _locate_clip(scenario: Scenario, config: str, ways: Mapping[str, Way]) -> Ca
     scorers, errors = {name: one.scorer() for name, one in locators.items()}, {name: [] for name in locators}
     by_second: dict[str, dict[int, tuple[CrowdScorer, list[float]]]] = {name: {} for name in locators}
     truths, settings, started = {}, usual(source, config), StartedSource(source)
-    # As many frames are left out as the closed loop leaves out before anything is found.
-    scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
-    least = every_least(scale, source.rate_hz, settings.steering)
-    source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
+    if settings.steering.sampling:  # as many frames are left out as the closed loop leaves out before it found anything
+        scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
+        least = every_least(scale, source.rate_hz, settings.steering)
+        source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
     for scene in detect_motion(started, settings, "onboard"):
         truths |= {truth.frame: truth for truth in source.truths()}
         truth = truths.pop(scene.frame.number, None)

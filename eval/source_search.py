@@ -33,7 +33,7 @@ from torchvision_dddas.io.sources import open_source
 
 GRID: dict[str, tuple[int, ...]] = {
     "interval.frames": (1, 2, 3),
-    "difference.threshold": (10, 14, 20, 28, 40),
+    "difference.threshold": (10, 14, 20),
     "difference.blur_px": (3, 5),
     "morphology.erode_px": (2, 3),
     "morphology.dilate_px": (9, 13, 17, 21, 25),

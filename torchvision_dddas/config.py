@@ -293,7 +293,7 @@ class TrackParameters(Group):
 
 
 class PaperParameters(Group):
-    """The source's association as printed (appendix C, III); each reading that it leaves open is a named option."""
+    """The source's association (appendix C, III); each reading of its text is an option, by default one that links."""
 
     window: int = parameter(3, "number of frames associated at once: K of the source", "frames", 2, 3)
     rule: Literal["dispersion", "fixed"] = parameter(

@@ -135,6 +135,13 @@ def test_closing_in_metres_is_bounded_by_the_pixels():
     assert settings_at(200.0, 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
 
 
+def test_where_no_speed_is_computed_its_gate_is_not_set():
+    fast = load_config("fast")
+    _, records = follow_distance(1, DistanceSettings(fast), Flight(100.0), 10, fast)
+    assert {"gates.max_size_px"} <= (changed := {record.parameter for record in records})
+    assert "gates.max_speed_px" not in changed
+
+
 def test_settings_change_only_when_the_distance_changes_by_a_fifth_or_is_lost():
     current, first = follow_distance(1, DistanceSettings(BASE), Flight(100.0), 10, BASE)
     assert {record.parameter for record in first} >= {"gates.min_area_px", "gates.max_size_px", "gates.max_speed_px"}

@@ -99,7 +99,7 @@ def test_identities_after_frames_in_disorder_a_miss_and_a_target_that_leaves(fra
         (at((20, 40), (100, 100), (400, 300)), None, {}, 1.0, "dispersion of locations 1.000, above 0.65"),
         (at((400, 300), (404, 300)), (1, 200), {}, 0.0, "locations 0.000, of appearances 1.000: only the latter above"),
         (at((400, 300), (404, 300)), (9, 9), {}, 0.5, "locations 0.000, of appearances 0.000: neither above 0.65"),
-        (at((400, 300), (404, 300)), None, {}, 1.0, "dispersion of locations 0.000, and a frame has no picture"),
+        (at((400, 300), (404, 300)), None, {}, 1.0, "locations 0.000, not above 0.65, but a frame has no picture"),
         (at((400, 300), (404, 300)), (9, 9), {"rule": "fixed", "weight": 0.7}, 0.7, "paper.rule is fixed"),
     ],
 )

@@ -208,7 +208,9 @@ def settings_at(distance_m: float, rate_hz: float, base: Settings) -> DistanceSe
         "small.on": small.on and square <= small.max_box_px,
         "morphology.close_px": close_px,
     }
-    bounds = Gates(gates.min_size_m * scale, gates.max_size_m * scale, gates.max_speed_m_s * scale / rate_hz)
+    has_speed = base.history.on or base.persistence.on or base.refine.on or base.small.on
+    max_speed = gates.max_speed_m_s * scale / rate_hz if has_speed else float("inf")
+    bounds = Gates(gates.min_size_m * scale, gates.max_size_m * scale, max_speed)
     return DistanceSettings(with_parameters(base, chosen), distance_m, bounds)
 
 

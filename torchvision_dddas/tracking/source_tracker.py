@@ -344,9 +344,10 @@ def explain_weight(
         cause = f"{found}, of appearances {appearance:.3f}: {'only the latter' if weight == 0 else 'neither'}"
         cause += f" above {lowest:g}"
     else:
-        cause = found
+        cause = f"{found}, not above {lowest:g}"
     if not has_pictures and weight == 1:
-        cause += ", and a frame has no picture"
+        is_wanted = parameters.rule != "fixed" and location <= lowest
+        cause += f", {'but' if is_wanted else 'and'} a frame has no picture"
     shown = float("nan") if appearance is None else appearance
     return AppearanceUse(weight < 1, cause, weight, location, shown)
 
