@@ -172,6 +172,7 @@ class Telemetry:
     heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
+    Raises InputError for columns of other lengths and times that decrease.
     """
 
     time_s: np.ndarray
@@ -194,11 +195,17 @@ class Telemetry:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        # A column that was not given is one of unknown values.
+        time_s = np.asarray(self.time_s, float)
+        object.__setattr__(self, "time_s", time_s)
+        if (np.diff(time_s) < 0).any():
+            raise InputError("time_s of telemetry must not decrease; sort its rows by time")
         for name in COLUMNS_OF_TELEMETRY:
-            given = getattr(self, name)
-            if len(given) == 0 < len(self.time_s):
-                object.__setattr__(self, name, np.full((len(self.time_s), *given.shape[1:]), np.nan))
+            given, wanted = np.asarray(getattr(self, name), float), (len(time_s), 2)[: 1 + (name == "place")]
+            if len(given) == 0 < len(time_s):  # a column that was not given is one of unknown values
+                given = np.full(wanted, np.nan)
+            if given.shape != wanted:
+                raise InputError(f"{name} of telemetry must have the shape {wanted}, a row a time, got {given.shape}")
+            object.__setattr__(self, name, given)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -492,6 +499,11 @@ class Adjustment:
     old: float
     new: float
     cause: str
+
+    def describe(self) -> str:
+        """The change in words, "none" for a bound that is not set."""
+        old, new = (f"{value:.5g}" if math.isfinite(value) else "none" for value in (self.old, self.new))
+        return f"{self.parameter} {old} -> {new}"
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,8 @@ def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dd
 def test_a_run_without_truth_removes_that_of_the_earlier_run(dddas, tmp_path):
     path = scenario(tmp_path / "tiny.toml", clip={"seconds": 0.5})
     for save, there in (("truth", True), ("none", False)):
-        result = dddas("run", f"sim:{path}", "--out", tmp_path / "out", "--save", save, "--quiet")
+        words = ("--save", save, "--set", "steering.sampling=false", "--quiet")
+        result = dddas("run", f"sim:{path}", "--out", tmp_path / "out", *words)
         assert (result.exit_code, result.output) == (0, "")
         assert (tmp_path / "out" / "truth" / "gt.txt").exists() == there
 

@@ -405,7 +405,7 @@ class Georeferencer:
 def describe_unknown_pose(flight: Flight | None, prior: Prior | None) -> str:
     """Why telemetry alone does not tell the pose, in words; empty where it does. A guessed pitch does not count."""
     if flight is None or prior is None:
-        return "the telemetry says nothing at this time"
+        return "the telemetry says nothing of this time; give all of it, or set aerial.clock_offset_s"
     lacking = list(dict.fromkeys(_POSE_PARTS[~prior.known].tolist()))
     if not np.isfinite(flight.pitch_rad):
         lacking.append("pitch")

@@ -190,7 +190,10 @@ def describe_unknown_heights(site: Site) -> list[str]:
                 notes.append("the elevation has no height " + what.format(missing, len(places)))
     elif telemetry is not None:
         if not np.isfinite(telemetry.altitude_m).any() and np.isfinite(telemetry.above_sea_m).any():
-            notes.append("the telemetry says heights above sea alone: give --dem, the ground's, or they are of no use")
+            notes.append(
+                "the telemetry says heights above sea alone: --dem, or takeoff_above_sea_m or height_m in the "
+                "camera's file, gives those above ground"
+            )
         low = telemetry.altitude_m <= 0
         if low.any():
             notes.append(

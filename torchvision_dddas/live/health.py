@@ -100,7 +100,7 @@ class Health:
         with self._lock:
             for a in self._adjustments.add(adjustments):
                 if a.parameter not in told:
-                    words = f"{a.parameter} {a.old:g} -> {a.new:g}: {a.cause}"
+                    words = f"{a.describe()}: {a.cause}"
                     self._unwritten.append(Event(time.time(), a.frame, "adjusted", words))
 
     def take_adjusted(self) -> list[Event]:

@@ -50,6 +50,7 @@ class Feed:
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
         self._log, self._silent = telemetry, False
+        self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
         self._first = True
         self._held: Frame | None = None  # the first of another size, for the pipeline that begins anew
 
@@ -84,10 +85,10 @@ class Feed:
             self.newest = frame
             if self._log is not None:
                 flight = self._log.at(frame.time_s)
-                silent = flight is None or not isfinite(flight.altitude_m)
+                silent = flight is None or (self._has_altitude and not isfinite(flight.altitude_m))
                 if silent != self._silent:
                     self._silent = silent
-                    words = "silent: the altitude is not known any more" if silent else "there again"
+                    words = "silent" if silent else "there again"
                     self._health.event("telemetry", f"telemetry is {words}", frame.number)
                     self._health.trouble("telemetry", "telemetry is silent" if silent else "")
             self._watchdog.begin(frame.number)

@@ -76,8 +76,7 @@ class RunLog:
 
     def add_adjustment(self, moved: Adjustment) -> None:
         """Add the adjustment of a parameter."""
-        old, new = (f"{value:.5g}" if math.isfinite(value) else "none" for value in (moved.old, moved.new))
-        change = f"{moved.parameter} {old} -> {new}"
+        change = moved.describe()
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
     def add_orders(self, result: FrameResult, explained: Iterable[str]) -> None:

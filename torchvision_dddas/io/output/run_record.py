@@ -92,7 +92,8 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
             "fifth, as near the horizon or from a low vehicle"
         )
     elif causes:
-        reason = max(causes, key=lambda cause: causes[cause])
+        first = sorted(causes, key=lambda cause: -causes[cause])[:3]
+        reason = first[0] if len(causes) == 1 else "; ".join(f"{cause} ({causes[cause]} frames)" for cause in first)
     else:
         reason = "no target was found"
     return f"{NONE_LOCATED}{reason}"

@@ -97,7 +97,10 @@ def location_tables(record: RunRecord) -> list[Table]:
         return [(format_span(span["first"], span["last"]), *(span[key] for key in keys)) for span in spans]
 
     counts = record.counts
-    adjustments = [tuple(m[key] for key in ("frame", "knob", "old", "new", "cause")) for m in record.adjustments.rows]
+    adjustments = [
+        (m["frame"], m["knob"], *(m[k] if math.isfinite(m[k]) else "none" for k in ("old", "new")), m["cause"])
+        for m in record.adjustments.rows
+    ]
     landmarks = [
         (name, k["seen"], k["used"], *([format_span(*s) for s in k[state]] for state in ("reassigned", "excluded")))
         for name, k in counts["landmarks"].items()
