@@ -2,12 +2,13 @@
 
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import Detections, Positions, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Positions, Telemetry, Tracks
 
 CORNERS = np.array([[10.0, 20, 40, 80], [0, 0, 5, 5]])
 
@@ -86,6 +87,24 @@ def test_the_confidence_of_a_link_is_unknown_unless_given_and_stays_with_its_row
     assert len(Tracks(3).link) == 0 and np.isnan(unknown.link).all()
     joined = Tracks.concat([known[1:], unknown[:1], known[np.array([2, 1])]])
     np.testing.assert_array_equal(joined.link, [0.25, 0.75, np.nan, 0.75, 0.25])
+
+
+def test_telemetry_takes_lists_and_refuses_columns_of_other_lengths_and_times_that_decrease():
+    lists: Any = [0.0, 1.0], [40.0, 42.0], [1.0, 1.0]
+    flight = Telemetry(*lists).at(0.5)
+    assert flight is not None and flight.altitude_m == 41.0
+    cases: Any = (
+        ({"altitude_m": np.ones(3)}, r"altitude_m of telemetry must have the shape \(2,\), a row a time, got \(3,\)"),
+        ({"place": np.ones((2, 3))}, r"place of telemetry must have the shape \(2, 2\)"),
+        ({"time_s": np.array([1.0, 0.0])}, "time_s of telemetry must not decrease"),
+    )
+    for given, message in cases:
+        with pytest.raises(InputError, match=message):
+            Telemetry(**{"time_s": np.arange(2.0), "altitude_m": np.ones(2), "speed_m_s": np.ones(2), **given})
+
+
+def test_an_adjustment_calls_a_bound_that_is_not_set_none():
+    assert Adjustment(3, "gates.max_size_px", float("inf"), 75.0, "").describe() == "gates.max_size_px none -> 75"
 
 
 def test_a_table_becomes_a_pandas_frame_of_its_columns(monkeypatch):

@@ -27,6 +27,7 @@ _HOME = {
     "Settings": ("config", "Settings"),
     "Telemetry": ("types", "Telemetry"),
     "load_settings": ("config", "load_config"),
+    "read_telemetry": ("io.telemetry", "read_telemetry"),
     "PersonDetector": ("people", "PersonDetector"),
     "Tracker": ("tracking", "Tracker"),
 }

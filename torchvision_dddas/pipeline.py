@@ -106,7 +106,8 @@ class Pipeline:
             ("elevation", elevation, Elevation),
         ):
             if value is not None and not isinstance(value, kind):
-                raise InputError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}")
+                read = "; td.read_telemetry(path) makes one of a log" if kind is Telemetry else ""
+                raise InputError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}{read}")
         self.settings, self.telemetry, self.interval, self.rate_hz = (
             settings or Settings(),
             telemetry,
@@ -267,6 +268,8 @@ def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Setti
         return settings, notes
     focal = camera.focal_px[0]
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    if not locator.focal_known:
+        note = f"gates.focal_px is {focal:.0f} px by a guess: sizes in metres may be off by as much as the lens is"
     return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 

@@ -272,6 +272,8 @@ def _wrap(value: float, full: float) -> float:
 
 
 COLUMNS_OF_TELEMETRY = (
+    "altitude_m",
+    "speed_m_s",
     "place",
     "above_sea_m",
     "heading_rad",

@@ -24,6 +24,7 @@ from torchvision_dddas.io.output import (
     PipelineRecorder,
     Site,
     TrackRecorder,
+    describe_nothing_located,
     parse_save,
 )
 from torchvision_dddas.io.output.run_record import Durations, finite
@@ -159,6 +160,13 @@ def test_the_record_lists_the_first_thousand_changes_of_a_parameter_and_counts_t
     frames = [row["frame"] for row in kept["adjustments"] if row["knob"] == "appearance.looked"]
     assert frames == list(range(1, 1001))
     assert [row["frame"] for row in kept["adjustments"] if row["knob"] == "interval.frames"] == [1, 2500]
+
+
+def test_nothing_located_names_the_causes_with_their_frames_the_most_frequent_first():
+    assert describe_nothing_located({"no heading": 12}, 0) == "0 located, because no heading"
+    causes = {"no heading": 12, "the log has ended": 48, "blank": 2, "shaken": 1}
+    words = "0 located, because the log has ended (48 frames); no heading (12 frames); blank (2 frames)"
+    assert describe_nothing_located(causes, 0) == words
 
 
 def test_decisions_on_appearance_are_a_table_and_a_summary_and_without_any_there_is_neither(tmp_path):

@@ -154,6 +154,12 @@ def test_telemetry_that_falls_silent_and_comes_back_is_reported_once_each():
     assert ["silent" in event.text for event in events] == [True, False, True]
 
 
+def test_telemetry_without_heights_above_ground_is_not_called_silent_while_it_speaks():
+    health, time_s = Health(), np.arange(12) / 10
+    list(feed_of(10, health, Telemetry(time_s, np.full(12, np.nan), np.full(12, 5.0), above_sea_m=np.full(12, 400.0))))
+    assert health.snapshot().events == () and health.snapshot().troubles == ()
+
+
 def test_latency_is_of_the_newest_picture_and_late_results_are_counted():
     health, feed = Health(), feed_of(1, taken_s=time.monotonic() - 1.0)
     (frame,) = feed
