@@ -193,7 +193,10 @@ def _fly(
     first, *others = _summary(record, out, True, "overlay" in names)
     lines = [first, *score.lines(), *others]
     if "truth" in names:
-        lines.append(f"{out / 'truth'}: what is true; dddas evaluate {out / 'truth' / 'gt.txt'} {out}")
+        command = f"dddas evaluate {out / 'truth' / 'gt.txt'} {out}"
+        lines.append(
+            f"{out / 'truth'}: what is true; boxes in the picture, not places as above, are scored by {command}"
+        )
     print_located(lines, record, out, quiet)
 
 
