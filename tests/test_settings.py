@@ -18,6 +18,7 @@ from torchvision_dddas.config import (
     changes,
     config_names,
     format_toml,
+    is_set,
     load_config,
     parameter,
     range_of,
@@ -217,3 +218,12 @@ def test_settings_survive_a_round_trip_through_plain_data() -> None:
 def test_pauses_before_a_stream_is_opened_again_cannot_shrink():
     with pytest.raises(InputError, match=r"retry_most_s = 1 is below retry_s = 4"):
         load_config(None, ["live.retry_s=4", "live.retry_most_s=1"])
+
+
+def test_a_value_that_is_set_counts_as_set_also_where_it_is_the_default(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text("[gates]\nfocal_px = 1000\n")
+    name = "gates.focal_px"
+    assert not is_set(load_config("fast", ["gates.min_area_px=80"]), name)
+    for settings in (load_config(tmp_path / "own.toml"), load_config(None, [f"{name}=1000"])):
+        assert is_set(settings, name) and settings == Settings()
+        assert is_set(with_parameters(settings, {"track.doubt": 3.0}), name)

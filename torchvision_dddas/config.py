@@ -125,7 +125,7 @@ class IntervalParameters(Group):
     )
     cost: float = parameter(
         1.0,
-        "time of a look, in frames at the reference rate (O in eq. 2); 0: measured; 1 is measured too by `run --live`",
+        "time of a look, in frames at the reference rate (O in eq. 2); 0: measured, as by `run --live` if not set",
         "frames",
         0,
         10,
@@ -661,6 +661,12 @@ def changes(settings: Settings) -> dict[str, object]:
     return {name: now[name] for name, field in _parameter_fields() if now[name] != field.default}
 
 
+def is_set(settings: Settings, name: str) -> bool:
+    """Whether somebody has set a parameter, `group.parameter`: its value counts then, also where it is the default."""
+    group, key = name.split(".")
+    return key in getattr(settings, group).model_fields_set
+
+
 def _parameter_fields() -> Iterator[tuple[str, FieldInfo]]:
     for group, holder in Settings.model_fields.items():
         for name, field in type(holder.default).model_fields.items():
@@ -721,12 +727,12 @@ def with_parameters(settings: Settings, values: Mapping[str, object], origin: st
     """
     before = f"{origin}: " if origin else ""
     fields = dict(_parameter_fields())
-    content = settings.model_dump()
+    content = settings.model_dump(exclude_unset=True)
     for name, value in values.items():
         if name not in fields:
             raise InputError(f"{before}unknown parameter '{name}'; {nearest(name, list(fields))}")
         group, key = name.split(".")
-        content[group][key] = tuple(value) if isinstance(value, list) else value
+        content.setdefault(group, {})[key] = tuple(value) if isinstance(value, list) else value
     try:
         return Settings.model_validate(content)
     except ValidationError as error:

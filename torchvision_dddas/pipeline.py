@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, load_config, with_parameters
+from torchvision_dddas.config import Settings, is_set, load_config, with_parameters
 from torchvision_dddas.detection import (
     Engine,
     MotionDetector,
@@ -258,13 +258,13 @@ class Pipeline:
 
 
 def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """Set gates.focal_px from telemetry, else from the camera, given telemetry and an unchanged default.
+    """Set gates.focal_px from telemetry, else from the camera, given telemetry, unless it is set.
 
     Returns settings and notes.
     """
     telemetry, camera = locator.site.telemetry, locator.camera
     settings, notes = with_logged_focal(settings, telemetry, camera.size_px[0])
-    if notes or telemetry is None or settings.gates.focal_px != Settings().gates.focal_px:
+    if notes or telemetry is None or is_set(settings, "gates.focal_px"):
         return settings, notes
     focal = camera.focal_px[0]
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"

@@ -265,9 +265,16 @@ def test_detect_and_run_take_the_logs_field_of_view_before_the_cameras(dddas, fl
         assert "note: gates.focal_px is 554 px by the log's field of view" in result.stdout
         focal.append(record(tmp_path / "out")["settings"]["gates"]["focal_px"])
     assert focal == pytest.approx([320 / np.tan(np.radians(30))] * 4)
-    result = dddas("detect", *clip, *out, "--telemetry", tmp_path / "log.csv", "--set", "gates.focal_px=900")
-    assert record(tmp_path / "out")["settings"]["gates"]["focal_px"] == 900
-    assert "gates.focal_px is" not in result.stdout
+    (tmp_path / "own.toml").write_text("[gates]\nfocal_px = 1000\n")
+    for command, words, wanted in (
+        ("detect", ("--set", "gates.focal_px=900"), 900),
+        ("detect", ("--set", "gates.focal_px=1000"), 1000),
+        ("run", ("--config", tmp_path / "own.toml"), 1000),
+    ):
+        result = dddas(command, *clip, *out, "--telemetry", tmp_path / "log.csv", *words)
+        assert result.exit_code == 0, result.output
+        assert record(tmp_path / "out")["settings"]["gates"]["focal_px"] == wanted
+        assert "gates.focal_px is" not in result.stdout
 
 
 def test_nothing_to_locate_is_no_failure(dddas, flown, engine, tmp_path):

@@ -78,7 +78,13 @@ def test_each_frame_is_a_line_of_each_stream_and_the_record_is_whole(dddas, fram
 
 
 @pytest.mark.parametrize(
-    ("words", "cost"), [((), 1.0), (("live.pace=50",), 0.0), (("live.pace=50", "interval.cost=2"), 2.0)]
+    ("words", "cost"),
+    [
+        ((), 1.0),
+        (("live.pace=50",), 0.0),
+        (("live.pace=50", "interval.cost=2"), 2.0),
+        (("live.pace=50", "interval.cost=1"), 1.0),
+    ],
 )
 def test_the_cost_of_a_look_is_measured_where_frames_do_not_wait_unless_it_is_set(words, cost, dddas, frames, tmp_path):
     changed = [word for change in words for word in ("--set", change)]

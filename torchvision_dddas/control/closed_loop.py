@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.config import Settings, is_set, with_parameters
 from torchvision_dddas.control.footprint import CameraMount, ground_in_middle, inside, update_mount
 from torchvision_dddas.control.ground_confirmation import GroundConfirmation
 from torchvision_dddas.control.prediction import MISSED, Prediction, TargetPredictor
@@ -144,11 +144,11 @@ def build_mission(source: Instrument, settings: Settings, backend: str, by_landm
 
 
 def fit_settings(settings: Settings, source: Instrument) -> Settings:
-    """The settings with the source's own focal length and height of markers, unless other values are set."""
+    """The settings with the source's own focal length and height of markers, unless they are set."""
     own: dict[str, object] = {}
-    if settings.gates.focal_px == Settings().gates.focal_px:
+    if not is_set(settings, "gates.focal_px"):
         own["gates.focal_px"] = float(source.camera.focal_px[0])
-    if settings.landmarks.height_m == Settings().landmarks.height_m:
+    if not is_set(settings, "landmarks.height_m"):
         own["landmarks.height_m"] = source.plate_m
     return with_parameters(settings, own)
 

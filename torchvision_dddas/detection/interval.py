@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.config import IntervalParameters, Settings, with_parameters
+from torchvision_dddas.config import IntervalParameters, Settings, is_set, with_parameters
 from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.types import Adjustment, Flight, Telemetry
 
@@ -171,12 +171,12 @@ def pixels_per_metre(distance_m: float, focal_px: float) -> float:
 
 
 def with_logged_focal(settings: Settings, telemetry: Telemetry | None, width_px: int) -> tuple[Settings, list[str]]:
-    """Set gates.focal_px by the telemetry's field of view, given an unchanged default. Returns settings and notes.
+    """Set gates.focal_px by the telemetry's field of view, unless it is set. Returns settings and notes.
 
     width_px: of the pictures.
     """
     known = np.zeros(0) if telemetry is None else telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)]
-    if not len(known) or settings.gates.focal_px != Settings().gates.focal_px:
+    if not len(known) or is_set(settings, "gates.focal_px"):
         return settings, []
     focal = width_px / 2 / math.tan(float(np.median(known)) / 2)
     note = f"gates.focal_px is {focal:.0f} px by the log's field of view, so that sizes in metres hold"

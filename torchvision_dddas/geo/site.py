@@ -7,7 +7,7 @@ from typing import TypeVar
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, is_set
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.flight_gaps import fill_gaps, known_keys
 from torchvision_dddas.geo.projection import ground_height
@@ -228,7 +228,7 @@ def resolve_camera(
         if parameters.mode == "paper" and (camera.k1 or camera.k2):
             notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
         # A value set by hand overrides the file.
-        if parameters.focal_sigma != Settings().aerial.focal_sigma or not math.isfinite(camera.focal_px[0]):
+        if is_set(settings, "aerial.focal_sigma") or not math.isfinite(camera.focal_px[0]):
             camera = replace(camera, focal_sigma=parameters.focal_sigma)
         if math.isfinite(camera.focal_px[0]):
             if any(abs(math.log(_focal_px(camera.size_px, hfov) / camera.focal_px[0])) > _OTHER for hfov in wide[:1]):

@@ -10,7 +10,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.config import LiveParameters, Settings, with_parameters
+from torchvision_dddas.config import LiveParameters, Settings, is_set, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
@@ -194,8 +194,8 @@ def run_live(
 
 
 def with_measured_cost(settings: Settings) -> Settings:
-    """The settings with O of the interval rule measured, unless another value than the default is set."""
-    if settings.interval.cost != Settings().interval.cost:
+    """The settings with O of the interval rule measured, unless it is set."""
+    if is_set(settings, "interval.cost"):
         return settings
     return with_parameters(settings, {"interval.cost": 0.0})
 

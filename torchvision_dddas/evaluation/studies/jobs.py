@@ -24,7 +24,7 @@ from typing import Any
 
 import cv2
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Group, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, code_digest, digest, files_digest
@@ -128,7 +128,7 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
                 raise InputError(before.cause)
             found = digest(
                 ("found", task, code_digest(STAGES[task], job.backend), job.backend),
-                {group: getattr(settings, group).model_dump() for group in PARAMETER_GROUPS[task]},
+                {group: _content(getattr(settings, group)) for group in PARAMETER_GROUPS[task]},
                 files_digest(files, memory),
                 clip.rate_hz,
                 truth,
@@ -145,6 +145,11 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
         except InputError as error:
             keys[task] = Done(task, cause=str(error))
     return keys
+
+
+def _content(group: Group) -> tuple[dict[str, Any], list[str]]:
+    """The values of a group of settings, and which of them are set: a value that is set wins over a log's."""
+    return group.model_dump(), sorted(group.model_fields_set)
 
 
 def code_identity(backend: str) -> str:
