@@ -407,7 +407,8 @@ class DetectionTable:
     cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
     own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
     label: (N,) str, the class, empty if unknown; None if not given.
-    bridge: (N,) bool, whether nothing was seen there: a box between two detections. None if not given.
+    kind: (N,) str, what a row is; of `dddas track` detection, bridge (nothing was seen there: a box between two
+    detections) or untracked (a detection without identity). None if not given.
     """
 
     path: str
@@ -421,10 +422,14 @@ class DetectionTable:
     feet_px: np.ndarray | None = None
     ours: bool = False
     label: np.ndarray | None = None
-    bridge: np.ndarray | None = None
+    kind: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def of_kind(self, *kinds: str) -> np.ndarray:
+        """(N,) bool, whether a row is of one of these kinds."""
+        return np.zeros(len(self), bool) if self.kind is None else np.isin(self.kind, kinds)
 
     @property
     def first(self) -> int:

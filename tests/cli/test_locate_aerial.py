@@ -282,15 +282,17 @@ def test_a_take_off_above_the_whole_flight_is_refused(aerial):
     assert "the altitude by the camera's takeoff_above_sea_m is -" in line and "below ground throughout" in line
 
 
-def test_a_box_that_bridges_a_gap_has_no_place_as_in_a_run(located, tmp_path):
+def test_bridges_and_untracked_detections_have_no_place_as_in_a_run(located, tmp_path):
     flight = Overflight(geographic=False, pitch_deg=60)
     lines = ["frame,identity,x_px,y_px,width_px,height_px,score,kind,row,speed_px_per_frame"]
     for cells in (line.split(",") for line in flight.tracks_txt().splitlines()):
         kind = "bridge" if (cells[0], cells[1]) in (("4", "2"), ("5", "2")) else "detection"
         lines.append(",".join([*cells[:6], "1", kind, "" if kind == "bridge" else "1", ""]))
+    lines.append("6,-1,100,100,20,20,0.1,untracked,9,")
     found, said = located(flight, table="\n".join(lines) + "\n", **ALONE)
     assert "10 frames, 38 targets\n38 positions; of the frames 10 by telemetry\n" in said
     assert "note: boxes that bridge gaps between detections: 2; not seen, they have no place\n" in said
+    assert "note: detections without identity: 1; not followed, they have no place\n" in said
     assert {row["frame"] for row in found if row["target"] == "2"} == {*"1236789", "10"}
     assert (record(tmp_path / "out")["positions"], record(tmp_path / "out")["bridges"]) == (38, 2)
 

@@ -103,7 +103,8 @@ def aerial(
         facts = {"input": table, **given.facts, "rows": len(read), **locator_facts(locator)}
         record = output.begin({**facts, "settings": settings.model_dump()}, map_site(locator, background))
         record.notes += notes
-        record.counts["bridges"] = 0 if read.bridge is None else int(read.bridge.sum())
+        for name, kind in (("bridges", "bridge"), ("untracked", "untracked")):
+            record.counts[name] = int(read.of_kind(kind).sum())
         if not len(read):
             record.notes.append("the table has no rows: nothing to locate")
         elif read.identity is None or (read.identity < 1).all():
@@ -207,6 +208,8 @@ def position_lines(record: "RunRecord") -> list[str]:
         lines.append(f"note: {gaps} frames could not be located and have no positions; run.json gives the causes")
     if bridges := counts.get("bridges", 0):
         lines.append(f"note: boxes that bridge gaps between detections: {bridges}; not seen, they have no place")
+    if untracked := counts.get("untracked", 0):
+        lines.append(f"note: detections without identity: {untracked}; not followed, they have no place")
     for what, words in (("weak", "located with a warning"), ("repairs", "repaired")):
         if spans := counts.get(what):
             lines.append(f"note: {words}, {_describe_longest(spans)}")

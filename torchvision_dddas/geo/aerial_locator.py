@@ -144,13 +144,14 @@ class AerialLocator:
     def locate_table(self, table: DetectionTable) -> Iterator[AerialLocations]:
         """Where the targets of a table stand, in each of its frames and in those between that show landmarks.
 
-        Boxes that bridge gaps were not seen and have no place, as in `seen_targets`.
+        Boxes that bridge gaps and detections that no track follows have no place, as in `seen_targets`.
         """
         lasting = table.identity > 0 if table.identity is not None else np.zeros(len(table), bool)
         score = np.clip(table.score, 0, 1) if table.probable else np.ones(len(table))
+        has_place = ~table.of_kind("bridge", "untracked")
         for frame in frames_to_locate(table, self.site.landmarks):
             rows = np.arange(len(table))[table.rows(frame)]
-            rows = rows if table.bridge is None else rows[~table.bridge[rows]]
+            rows = rows[has_place[rows]]
             feet = None if table.feet_px is None else table.feet_px[rows]
             targets = Targets(table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours)
             yield self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)

@@ -41,6 +41,8 @@ class Targets:
 def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | None = None) -> Targets:
     """The targets of a frame that were seen: a box that bridges a gap has an identity, but no place.
 
+    A detection without identity is no target and has no place either.
+
     middle_px: (M, 2) of the frame's detections.
     """
     seen = tracks.row >= 0

@@ -79,8 +79,7 @@ def read_detections(path: str | Path) -> DetectionTable:
         )
     identity = parse_numbers(table.columns.get("identity", [""] * len(table)))
     is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
-    kind = table.columns.get("kind", ())
-    kinds = set(kind)
+    kinds = set(table.columns.get("kind", ()))
     label = next((table.columns[name] for name in CLASS if name in table), None)
     order = np.argsort(table["frame"], kind="stable")
     return DetectionTable(
@@ -95,7 +94,7 @@ def read_detections(path: str | Path) -> DetectionTable:
         feet_px=table.stack(*FEET)[order] if set(FEET) <= table.columns.keys() else None,
         ours=kinds == {"moving"} or {"identity", "kind", "row", "speed_px_per_frame"} <= set(table.header),
         label=None if label is None else np.array(label, object)[order],
-        bridge=np.array([name == "bridge" for name in kind])[order] if kind else None,
+        kind=np.array(table["kind"])[order] if kinds else None,
     )
 
 
