@@ -281,3 +281,6 @@ def test_a_session_locates_by_telemetry_alone_or_says_why_not(dddas, frames, tmp
         cause = "0 located, because the telemetry does not say the camera's pitch"
         assert not placed and any(note.startswith(cause) for note in record["notes"])
         assert cause in done.stderr
+        first, last = (event for event in record["events"] if event["kind"] == "locate")
+        assert first["frame"] == 1 and first["text"].startswith(cause.replace("0 located, because", "not located:"))
+        assert last["text"].startswith(cause)

@@ -15,7 +15,14 @@ from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
 from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.interrupts import Stopped, StopSignals
-from torchvision_dddas.io.output import RESULTS, Event, SessionLog, describe_nothing_located, make_session_folder
+from torchvision_dddas.io.output import (
+    RESULTS,
+    Event,
+    SessionLog,
+    describe_nothing_located,
+    make_session_folder,
+    without_numbers,
+)
 from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
 from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
@@ -171,7 +178,8 @@ def run_live(
         failure, tally = "", _Located()
         try:
             for result in results(begin, feed, health):
-                tally.add(result[0])
+                if cause := tally.add(result[0]):
+                    health.event("locate", f"not located: {cause}", result[0].number)
                 about.start_utc_s = source.start_utc_s
                 send_result(result, streams, health)
                 record_result(result, feed, health, live.deadline_ms)
@@ -205,17 +213,22 @@ class _Located:
 
     def __init__(self) -> None:
         self.located = self._unplaced = 0
-        self._causes = Counter[str]()
+        self._causes, self._told = Counter[str](), set[str]()
 
-    def add(self, result: FrameResult) -> None:
-        """Count a frame."""
+    def add(self, result: FrameResult) -> str:
+        """Count a frame. Returns why it was not located where that is new, apart from its numbers; else ""."""
         if (found := result.locations) is None:
-            return
+            return ""
         self.located += len(found.positions)
         if found.fix.by:
             self._unplaced += len(found.box_px) - len(found.positions)
-        else:
-            self._causes[found.fix.cause] += 1
+            return ""
+        cause = found.fix.cause
+        self._causes[cause] += 1
+        if (kind := without_numbers(cause)) in self._told:
+            return ""
+        self._told.add(kind)
+        return cause
 
     def describe(self) -> str:
         """Why nothing was located, in words."""

@@ -23,6 +23,7 @@ from torchvision_dddas.io.output.run_record import (
     describe_nothing_located,
     finite,
     make_session_folder,
+    without_numbers,
 )
 from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
 from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM
@@ -53,4 +54,5 @@ __all__ = [
     "finite",
     "make_session_folder",
     "parse_save",
+    "without_numbers",
 ]
