@@ -249,6 +249,20 @@ def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_r
         assert "0 located, because the telemetry" in page
 
 
+def test_a_table_without_heights_takes_that_of_the_cameras_file(dddas, flown, tmp_path):
+    lines = [line.split(",") for line in FLIGHT.telemetry_csv().splitlines()]
+    column = lines[0].index("altitude_m")
+    (flown / "low.csv").write_text("\n".join(",".join(line[:column] + line[column + 1 :]) for line in lines) + "\n")
+    (tmp_path / "camera.toml").write_text(FLIGHT.camera_toml() + f"height_m = {FLIGHT.height_m}\n")
+    words = alone(flown, "--config", "fast", "--save", "none", "--out", tmp_path / "out", telemetry="low.csv")
+    result = dddas(*words, "--camera", tmp_path / "camera.toml")
+    assert result.exit_code == 0, result.output
+    assert record(tmp_path / "out")["positions"] > 20
+    assert "note: the log does not say height_m: it is taken from camera camera" in result.stdout
+    result = dddas(*words)
+    assert result.exit_code == 3 and "height_m or takeoff_above_sea_m in the camera's file" in result.stderr
+
+
 def test_detect_and_run_take_the_logs_field_of_view_before_the_cameras(dddas, flown, engine, tmp_path):
     (tmp_path / "log.csv").write_text(FLIGHT.telemetry_csv(hfov_deg=60.0))
     (tmp_path / "placeless.csv").write_text("time_s,altitude_m,hfov_deg\n0,45,60\n3,45,60\n")

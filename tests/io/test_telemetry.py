@@ -33,7 +33,12 @@ def known_at(flown, time_s):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["lacks time_s, altitude_m, speed_m_s", "none"]),
+        ("", ["looks like no log", "names none of time_s, altitude_m", "a CSV needs time_s and altitude_m"]),
+        (
+            "# Surveillance, from the air\n",
+            ["looks like no log", "a CSV, DJI .SRT,", "altitude_m, or a place"],
+        ),
+        ("altitude_m,speed_m_s\n5,1\n", ["lacks time_s;", "its columns are altitude_m, speed_m_s"]),
         ("time_s,height,speed_m_s\n0,1,2\n", ["lacks altitude_m", "time_s, height, speed_m_s"]),
         (HEADER, ["no rows"]),
         (HEADER + "0,20,5\n1,high,5\n", ["line 3", "altitude_m is 'high'"]),

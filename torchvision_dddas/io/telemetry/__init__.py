@@ -11,6 +11,7 @@ from pathlib import Path
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.autopilots import MAGIC, looks_like_tlog, read_tlog, read_ulog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
+from torchvision_dddas.io.telemetry.record import KINDS
 from torchvision_dddas.io.telemetry.tables import parse_time_zone, read_telemetry_table
 from torchvision_dddas.io.telemetry.text_logs import read_nmea, read_subtitles
 from torchvision_dddas.types import Telemetry
@@ -22,7 +23,6 @@ _OTHERS = {
     b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
     b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
 }
-KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
 
 def read_telemetry(

@@ -10,6 +10,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.types import Telemetry
 
+KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
+
 OWN = "table"
 """The kind of own tables, which may lack a place."""
 

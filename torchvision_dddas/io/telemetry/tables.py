@@ -12,11 +12,8 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.io.tables import Column, CsvText, Schema, read_csv, read_table
-from torchvision_dddas.io.telemetry.record import OWN, Log, build_record
+from torchvision_dddas.io.telemetry.record import KINDS, OWN, Log, build_record
 from torchvision_dddas.types import Telemetry
-
-COLUMNS = ("time_s", "altitude_m", "speed_m_s")
-"""The usual columns; the speed may be left out, and the altitude where above_sea_m is there."""
 
 PAIRS = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
 _ANY = (-math.inf, math.inf, "")
@@ -63,8 +60,14 @@ def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None, z
 
 def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
     known = [name for name in SCHEMA.names if name in text.header]
-    height = "above_sea_m" if "above_sea_m" in known else "altitude_m"
-    table = read_table(path, SCHEMA, ("time_s", height) if known else COLUMNS, is_ragged=True, text=text)
+    if not known:
+        raise InputError(
+            f"telemetry {path} looks like no log: its first line names none of {', '.join(SCHEMA.names)}; wanted "
+            f"{KINDS}, of which a CSV needs time_s and altitude_m, or a place"
+        )
+    is_placed = any(set(pair) & set(known) for pair in PAIRS)
+    heights = () if is_placed or "above_sea_m" in known else ("altitude_m",)  # the camera's file may say the height
+    table = read_table(path, SCHEMA, ("time_s", *heights), is_ragged=True, text=text)
     pairs = [pair for pair in PAIRS if set(pair) & set(known)]
     for pair in pairs:
         if missing := set(pair) - set(known):
