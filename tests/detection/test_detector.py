@@ -182,6 +182,15 @@ def test_the_interval_adapts_to_the_telemetry_and_the_change_is_recorded(film):
     assert [a.frame for s in scenes for a in s.adjustments if a.parameter == "gates.max_size_px"] == [1, 9]
 
 
+def test_an_interval_that_changes_for_dropped_frames_says_how_many_were_dropped(film):
+    changed = {"interval.frames": 6, "interval.minimum_frames": 1, "interval.maximum_frames": 6}
+    detector = MotionDetector(with_parameters(load_config(), changed), "onboard", telemetry=flight([0, 2], 100.0))
+    frames = [replace(frame, skipped=2 * (k > 0)) for k, frame in enumerate(frames_of(film.images))]
+    scenes = [scene for frame in frames for scene in detector.update(frame)] + list(detector.flush())
+    (cause, *_) = [a.cause for s in scenes for a in s.adjustments if a.parameter == "interval.frames" and a.frame > 1]
+    assert "altitude 100.0 m" in cause and cause.endswith(", 2 frames before it dropped or left out")
+
+
 @pytest.mark.parametrize("config", [None, "fast", "half", "source", "two_frames"])
 def test_the_interval_decides_what_is_found(config, film):
     found = []

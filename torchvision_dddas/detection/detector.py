@@ -305,7 +305,8 @@ class MotionDetector:
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
         if wanted is not None:
             wanted /= slot.frame.skipped + 1
-            cause += f", one of {slot.frame.skipped + 1} frames looked at" if slot.frame.skipped else ""
+            if left := slot.frame.skipped:
+                cause += f", {left} frame{'s' * (left > 1)} before it dropped or left out"
             used = self._distance.settings
             self.interval, moved = adjust_interval(number, self.interval, wanted, cause + measured, used)
             slot.adjustments += moved
