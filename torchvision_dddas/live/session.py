@@ -193,7 +193,7 @@ def run_live(
         supervisor.say("STOPPING=1")
         opened.close()
     if not quiet:
-        _print(_summarize(health, folder))
+        _print(_summarize(health, folder, live.deadline_ms))
     elif failure:  # --quiet silences events, not errors
         _print(failure)
     if failure:
@@ -335,21 +335,21 @@ def _print_snapshot(now: Snapshot) -> None:
     """The state in one line, in place of the one before; nothing where stderr is no terminal."""
     if not sys.stderr.isatty():
         return
-    late = f", {1000 * now.seconds['latency'][0]:.0f} ms late" if "latency" in now.seconds else ""
+    latency = f", latency {1000 * now.seconds['latency'][0]:.0f} ms" if "latency" in now.seconds else ""
     counts, gauges = now.counts, now.gauges
     line = (
-        f"{gauges.get('rate_hz', 0.0):.1f} results/s{late}, {gauges.get('targets', 0):g} targets, "
+        f"{gauges.get('rate_hz', 0.0):.1f} results/s{latency}, {gauges.get('targets', 0):g} targets, "
         f"{counts.get('dropped', 0)} of {counts.get('captured', 0)} pictures dropped"
     )
     sys.stderr.write(f"{_CLEAR}{line}")
     sys.stderr.flush()
 
 
-def _summarize(health: Health, folder: Path) -> str:
+def _summarize(health: Health, folder: Path, deadline_ms: float) -> str:
     now = health.snapshot()
     counts = {name: now.counts.get(name, 0) for name in ("results", "captured", "dropped", "late")}
-    late = f", {1000 * now.seconds['latency'][2]:.0f} ms at 99 %" if "latency" in now.seconds else ""
+    within = f", 99 % within {1000 * now.seconds['latency'][2]:.0f} ms" if "latency" in now.seconds else ""
     return (
         f"{counts['results']} results of {counts['captured']} pictures, {counts['dropped']} dropped, "
-        f"{counts['late']} late{late}; {folder}"
+        f"{counts['late']} late (over {deadline_ms:g} ms){within}; {folder}"
     )
