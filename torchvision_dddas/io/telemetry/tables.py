@@ -116,6 +116,9 @@ _DATE = re.compile(
     r"(\d{4})[./-](\d{1,2})[./-](\d{1,2})[ T]+(\d{1,2}):(\d{1,2}):(\d{1,2})"
     r"(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*(Z|[+-]\d{2}:?\d{2})?"
 )
+UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
+"""The note on a log whose dates say no zone."""
+
 _CLOCK = re.compile(r"(\d+):(\d+):(\d+(?:\.\d+)?)")
 # Half the width of the picture whose focal length is given for one 36 mm wide.
 _HALF_WIDTH_MM = 18.0
@@ -285,8 +288,11 @@ def _read_program_table(
             f"the log says that the camera began to film {filmed:.1f} s after its first row, and times count from that "
             f"row: aerial.clock_offset_s={-filmed:.1f} counts them from where the film begins"
         )
-    if not is_zoned and zone is not None and parse_date(text.rows[0][clock]) is not None:
-        first, is_zoned = to_utc(first, zone), True
+    if not is_zoned and parse_date(text.rows[0][clock]) is not None:
+        if zone is None:
+            log.note(UNKNOWN_ZONE)
+        else:
+            first, is_zoned = to_utc(first, zone), True
     return build_record(log, clock_offset_s, first if is_zoned else math.nan)
 
 

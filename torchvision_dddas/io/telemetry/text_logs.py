@@ -11,7 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.record import Log, build_record
-from torchvision_dddas.io.telemetry.tables import convert, hfov_of_focal, parse_date, quantity_of, to_utc
+from torchvision_dddas.io.telemetry.tables import UNKNOWN_ZONE, convert, hfov_of_focal, parse_date, quantity_of, to_utc
 from torchvision_dddas.types import Telemetry
 
 Numbers = list[tuple[float, str]]
@@ -65,7 +65,7 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | 
     if not is_zoned and zone is not None and math.isfinite(first_s):
         first_s, is_zoned = to_utc(first_s, zone), True
     elif not is_zoned and math.isfinite(first_s):
-        log.note("the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it")
+        log.note(UNKNOWN_ZONE)
     return build_record(log, clock_offset_s, first_s - log.moments[0][0] if is_zoned and log.moments else math.nan)
 
 
