@@ -99,7 +99,7 @@ def test_a_clip_in_which_nothing_is_found_has_empty_tables(dddas, engine, scorer
 def test_detect_saves_everything_by_default_and_sums_up(dddas, engine, clip, tmp_path):
     result = dddas("detect", clip, "--out", tmp_path / "out", "--backend", "onboard")
     assert result.stdout.splitlines() == [
-        "5 frames, 5 targets, 1 frames with unreliable registration",
+        "5 frames, 5 detections, 1 frames with unreliable registration",
         f"{tmp_path / 'out'}: detections.csv, detections.txt, masks/, overlay.mp4, run.json",
     ]
     assert names(tmp_path / "out/masks") == [f"{k:06d}.png" for k in range(1, 6)]

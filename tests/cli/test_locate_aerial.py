@@ -290,7 +290,7 @@ def test_bridges_and_untracked_detections_have_no_place_as_in_a_run(located, tmp
         lines.append(",".join([*cells[:6], "1", kind, "" if kind == "bridge" else "1", ""]))
     lines.append("6,-1,100,100,20,20,0.1,untracked,9,")
     found, said = located(flight, table="\n".join(lines) + "\n", **ALONE)
-    assert "10 frames, 38 targets\n38 positions; of the frames 10 by telemetry\n" in said
+    assert "10 frames, 38 detections\n38 positions; of the frames 10 by telemetry\n" in said
     assert "note: boxes that bridge gaps between detections: 2; not seen, they have no place\n" in said
     assert "note: detections without identity: 1; not followed, they have no place\n" in said
     assert {row["frame"] for row in found if row["target"] == "2"} == {*"1236789", "10"}

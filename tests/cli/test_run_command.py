@@ -227,6 +227,9 @@ def test_a_clip_and_a_log_alone_give_places_maps_and_a_picture_without_a_bar_of_
     assert {"tracks.geojson", "map.png", "report.html"} <= set(names(tmp_path))
     assert "0 of 0" not in result.stdout and "located with a warning" not in result.stdout
     kept = record(tmp_path)
+    identities = len({row["identity"] for row in rows(tmp_path / "tracks.csv") if row["kind"] != "untracked"})
+    assert f"24 frames, {kept['targets']} detections of {identities} identities\n" in result.stdout
+    assert "identities located" in (tmp_path / "report.html").read_text()
     assert kept["positions"] == len(found) > 20 and kept["by"]["telemetry"] == FLIGHT.frames
     assert kept["telemetry"].endswith("telemetry.csv") and kept["landmarks_file"] is None
 

@@ -97,4 +97,4 @@ def detect_clip(
     saved = {"masks": "masks/", "overlay": "overlay.mp4"}
     files = ["detections.csv", "detections.txt", *(saved[name] for name in save), "run.json"]
     doubtful = f"{record.unreliable_frames} frames with unreliable registration"
-    return closing_lines(f"{record.frames} frames, {record.targets} targets, {doubtful}", record, folder, files)
+    return closing_lines(f"{record.frames} frames, {record.targets} detections, {doubtful}", record, folder, files)

@@ -118,7 +118,7 @@ def aerial(
         count = len(frames_to_locate(read, locator.site.landmarks))
         record_results(output, record, locator.locate_table(read), "locate", count, quiet)
     files = [name for name in AerialRecorder.files if (out / name).exists()]
-    first = f"{record.frames} frames, {record.targets} targets"
+    first = f"{record.frames} frames, {record.targets} detections"
     print_located(closing_lines([first, *position_lines(record)], record, out, files), record, out, quiet)
 
 

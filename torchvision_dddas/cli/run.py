@@ -205,5 +205,8 @@ def _summary(record: "RunRecord", folder: Path, is_located: bool, has_overlay: b
 
     known = PipelineRecorder.files if is_located else PipelineRecorder.found_files
     files = [n for n in known if (folder / n).exists() and (n != "overlay.mp4" or has_overlay)]
-    found = f"{record.frames} frames, {record.targets} targets, {record.counts.get('identities', 0)} identities"
+    # Where targets are located, detections without identity are counted in a note.
+    apart = " of" if is_located else ","
+    identities = record.counts.get("identities", 0)
+    found = f"{record.frames} frames, {record.targets} detections{apart} {identities} identities"
     return closing_lines([found, *(position_lines(record) if is_located else [])], record, folder, files)

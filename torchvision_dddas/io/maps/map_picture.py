@@ -119,7 +119,7 @@ def map_picture(
     _draw_legend(picture, frame, camera, len(landmarks) > 0, signs)
     places = frame.pixels(tracks.east_north_m) / FINE
     outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
-    count = f"{len(tracks.of)} targets, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")
+    count = f"{len(tracks.of)} identities, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")
     _write(picture, count, (LEFT, TOP + frame.height + BOTTOM - 12), 0.5)
     return cv2.resize(picture, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA)
 

@@ -119,7 +119,7 @@ class AerialMaps:
     def _report(self, targets: GroundTracks, picture: bytes, complete: bool) -> str:
         record = self.record
         by = {name: count for name, count in record.counts["by"].items() if name != "nothing"}
-        counts = {"frames": record.frames, "located": sum(by.values()), "targets": len(targets.of)}
+        counts = {"frames": record.frames, "located": sum(by.values()), "identities located": len(targets.of)}
         counts["positions"] = record.counts["positions"]
         counts |= {f"frames by {name}": count for name, count in by.items() if count}
         figures = [(name, f"{count}") for name, count in counts.items()]
