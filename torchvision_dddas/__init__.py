@@ -5,10 +5,11 @@ neither torch nor OpenCV.
 """
 
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from torchvision_dddas.types import Source
 
 # Public name -> the module that holds it, and its name there.
@@ -35,7 +36,7 @@ _HOME = {
 __all__ = ["open_source", "open_video", *_HOME]
 
 
-def open_video(spec: str | Path, **options: Any) -> "Source":
+def open_video(spec: "str | Path", **options: Any) -> "Source":
     """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`, or `sim:` and a scenario.
 
     options: rate_hz, full_scale, single, as `io.sources.open_source` has them. A simulated clip can be steered.

@@ -185,6 +185,40 @@ def test_a_signal_before_the_command_begins_is_one_line(number, lost):
     assert (result.returncode, result.stderr) == (128 + number, f"dddas: {name}; nothing was kept\n")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_while_the_commands_are_loaded_is_one_line(number):
+    early = textwrap.dedent(f"""
+        import os, sys
+        from torchvision_dddas.cli import main
+
+        class Loading:
+            def find_spec(self, name, *_):
+                if name == "typer":
+                    os.kill(os.getpid(), {number:d})
+
+        sys.meta_path.insert(0, Loading())
+        main()
+    """)
+    result = subprocess.run([sys.executable, "-c", early, "settings"], cwd=ROOT, capture_output=True, text=True)
+    name = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    assert (result.returncode, result.stderr) == (128 + number, f"dddas: {name}; nothing was kept\n")
+
+
+def test_a_signal_after_the_command_has_ended_is_one_line():
+    late = textwrap.dedent("""
+        import os, signal
+        from torchvision_dddas.cli import commands, main
+
+        def close(output, code):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        commands.close_output = close
+        main()
+    """)
+    result = subprocess.run([sys.executable, "-c", late, "settings"], cwd=ROOT, capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+
+
 def _handles(process, number):
     (caught,) = (line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line[:7] == "SigCgt:")
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)

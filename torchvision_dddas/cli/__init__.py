@@ -1,108 +1,37 @@
-"""The command line, `dddas`: one file a command. Heavy imports wait until a command needs them."""
+"""The command line, `dddas`: one file a command. This file imports nothing slow, so that signals are heeded early."""
 
-import atexit
-import io
 import os
 import signal
-import sys
-from typing import Annotated
+from contextlib import suppress
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from torchvision_dddas.cli.calibrate import calibrate
-from torchvision_dddas.cli.colours import colours
-from torchvision_dddas.cli.compare import compare
-from torchvision_dddas.cli.confirm import confirm
-from torchvision_dddas.cli.demo import demo
-from torchvision_dddas.cli.detect import detect
-from torchvision_dddas.cli.evaluate import evaluate
-from torchvision_dddas.cli.exits import (
-    BAD_INPUT,
-    FAULT,
-    Ended,
-    close_output,
-    describe_kept,
-    open_output,
-    say,
-    say_fault,
-    say_stopped,
-)
-from torchvision_dddas.cli.export import export
-from torchvision_dddas.cli.locate import locate
-from torchvision_dddas.cli.people import people
-from torchvision_dddas.cli.run import run
-from torchvision_dddas.cli.settings import settings
-from torchvision_dddas.cli.simulate import simulate
-from torchvision_dddas.cli.sweep import sweep
-from torchvision_dddas.cli.track import track
-from torchvision_dddas.cli.tune import tune
-from torchvision_dddas.io.interrupts import KEPT, StopSignals, ignore_signals, raising_signals
-from torchvision_dddas.runtime import VERSION
-
-app = typer.Typer(
-    name="dddas",
-    help="Moving targets from a moving camera, steered by what the data show.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-for command in (
-    *(run, detect, people, track, confirm, calibrate, colours),
-    *(evaluate, compare, sweep, tune, simulate, export, demo, settings),
-):
-    app.command()(command)
-app.add_typer(locate, name="locate")
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"dddas {VERSION}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    pass
+if TYPE_CHECKING:
+    from torchvision_dddas.cli.commands import app as app
 
 
 def main() -> None:
     """Entry point. Exit codes: see docs/commands.md."""
-    output = open_output()
-    if isinstance(sys.stderr, io.TextIOWrapper):
-        sys.stderr.reconfigure(errors="replace")
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _end)  # until the commands are loaded, which set their own
+    from torchvision_dddas.cli.commands import run_command_line
 
-    def end(number: int, kept: bool) -> None:
-        os._exit(say_stopped(number, KEPT if kept else ""))
-
-    signals = raising_signals(end)
-    signals.__enter__()  # never left: a second signal may come while Python ends
-    atexit.register(ignore_signals)  # Python takes the handlers away before it has ended
-    sys.exit(close_output(output, _run(signals)))
+    run_command_line()
 
 
-def _run(signals: StopSignals) -> int:
-    try:
-        code = app(standalone_mode=False) or 0
-        # Before the command begins, Typer takes any signal for Ctrl-C and says nothing.
-        is_said = code != 128 + signal.SIGINT or isinstance(code, Ended)
-        return int(code) if is_said else say_stopped(signals.noticed or signal.SIGINT, "")
-    except (KeyboardInterrupt, typer.Abort) as error:  # outside a command, while Python still loads
-        return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
-    except SystemExit as error:
-        return error.code if isinstance(error.code, int) else FAULT
-    except Exception as error:
-        if signals.noticed is not None and isinstance(error, (ImportError, SystemError)):
-            return say_stopped(signals.noticed, describe_kept(error))  # it cut short the loading of a library
-        # A word of the command line that will not do; Typer keeps the class of these errors to itself.
-        if not hasattr(error, "format_message"):
-            say_fault()
-            return FAULT
-        if len(sys.argv) < 2 or not error.format_message():  # a group of commands, none of which was named
-            error.show()  # type: ignore[attr-defined]
-        else:
-            say(f"{' '.join(error.format_message().split()).rstrip('.')}; see dddas --help")
-        return BAD_INPUT
+def _end(number: int, frame: FrameType | None) -> None:
+    """As `say_stopped`, which is not loaded yet."""
+    how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+    with suppress(OSError):
+        os.write(2, f"dddas: {how}; nothing was kept\n".encode())
+    os._exit(128 + number)
+
+
+def __getattr__(name: str) -> Any:
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from torchvision_dddas.cli.commands import app
+
+    return app
