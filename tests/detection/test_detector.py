@@ -256,15 +256,15 @@ def test_an_altitude_that_is_none_above_ground_counts_for_nothing(altitude_m, fi
     assert not [a for s in found for a in s.adjustments if a.parameter.startswith("gates.")]
 
 
-@pytest.mark.parametrize(("hfov_deg", "set_px"), [(60.0, 1000.0), (60.0, 900.0), (np.nan, 1000.0)])
+@pytest.mark.parametrize(("hfov_deg", "set_px"), [(60.0, None), (60.0, 900.0), (60.0, 1000.0), (np.nan, None)])
 def test_the_gates_take_the_focal_length_that_the_log_says_unless_one_is_set(hfov_deg, set_px, noise):
     images, log = pan(noise, 6, car=5.0), flight([0, 0.6], altitude_m=100.0)
     log = replace(log, hfov_rad=np.full(2, np.radians(hfov_deg)))
-    settings = with_parameters(load_config("fast"), {"gates.focal_px": set_px})
+    settings = with_parameters(load_config("fast"), {} if set_px is None else {"gates.focal_px": set_px})
     scenes = list(detect_motion(Film(images), settings, "onboard", log))
     most_px = next(a.new for s in scenes for a in s.adjustments if a.parameter == "gates.max_size_px")
-    by_log = set_px == 1000.0 and np.isfinite(hfov_deg)
-    focal_px = SIZE[0] / 2 / np.tan(np.radians(30.0)) if by_log else set_px
+    by_log = set_px is None and np.isfinite(hfov_deg)
+    focal_px = SIZE[0] / 2 / np.tan(np.radians(30.0)) if by_log else set_px or 1000.0
     assert most_px == pytest.approx(25.0 / 100.0 * focal_px)
 
 
