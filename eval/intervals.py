@@ -2,6 +2,7 @@
 
 python eval/intervals.py fixed     its rules beside fixed intervals: accuracy against time, by altitude and speed
 python eval/intervals.py search    the constants that choose the frames looked at, with flights left out
+python eval/intervals.py small     how far a walker moves between frames that show small targets, with flights left out
 """
 
 from collections.abc import Sequence
@@ -89,23 +90,28 @@ def fly_case(case: Case) -> Case:
         (way,) = case["ways"]
         run = fly(source, LOOKED[way])
         return {way: [run["score"]["knowledge_m"], run["cpu"]]}
+    return detect_in_ways(source, case["study"], {way: COMPARED[way] for way in case["ways"]})
+
+
+def detect_in_ways(source: SimulatorSource, config: str, ways: dict[str, Case]) -> Case:
+    """[accuracy, ms a frame] of a configuration with the settings of each way, every frame looked at."""
     cv2.setNumThreads(1)
     frames, truths, found = list(source), source.truths(), {}
-    for way in case["ways"]:
-        settings = with_parameters(fit_settings(_config(case["study"]), source), COMPARED[way])
+    for way, changed in ways.items():
+        settings = with_parameters(fit_settings(_config(config), source), changed)
         detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
         start = bench.now()[1]
         scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
         spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
-        found[way] = [score_scenes(scenes, truths, is_drawn_later(settings))[_measured(case["study"])[1]], spent_ms]
+        found[way] = [score_scenes(scenes, truths, is_drawn_later(settings))[_measured(config)[1]], spent_ms]
     return found
 
 
-def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float) -> SimulatorSource:
+def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float, rate_hz: float = 10.0) -> SimulatorSource:
     """To and fro over two crowds, with exact instruments and without ground vehicles."""
     uav = {"altitude_m": altitude_m, "speed_m_s": speed_m_s, "start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
     uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
-    clip = {"seconds": seconds, "located_by": "telemetry"}
+    clip = {"seconds": seconds, "located_by": "telemetry", "rate_hz": rate_hz}
     return SimulatorSource(walking(seed, seconds, uav=uav, team={"ugvs": 0}, clip=clip))
 
 
@@ -187,10 +193,56 @@ def fly_point(case: Case) -> list[float]:
     return [run["score"]["knowledge_m"], run["cpu"]]
 
 
+# -- how far apart the frames are that show small targets ------------------------------------------------------------
+
+MOVES_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 3.0)
+"""Of `small.gap_move_px`; 0: always `small.gap_frames`."""
+RATES_HZ = (10.0, 25.0)
+"""Pictures a second: the same distance takes more frames at more of them."""
+
+
+def measure_small(options: bench.Options) -> tuple[str, Any]:
+    """Accuracy by `small.gap_move_px`, the way of a walker between the frames that show small targets.
+
+    Every frame is looked at. Figures are the mean of F of pixels in the default and F1 of boxes in `patrol`. Left out:
+    the value for the flights of an altitude and rate is the best on all the others.
+    """
+    scenes = list(product(RATES_HZ, sorted({a for a, _ in FLIGHTS})))
+    cases = [
+        {"rate_hz": rate, "altitude_m": a, "speed_m_s": s, "seed": SEARCH_SEED + seed, "seconds": options.seconds}
+        for rate, a in scenes
+        for s in sorted({s for _, s in FLIGHTS})
+        for seed in range(options.seeds)
+    ]
+    results = bench.run_cases(cases, fly_small, options.jobs, options.cache)
+    figures = np.array(results, float).reshape(len(scenes), -1, len(MOVES_PX), len(MEASURED)).mean(axis=1)
+    rows, out = [], []
+    for (rate, a), found, k in zip(scenes, figures, range(len(scenes)), strict=True):
+        chosen = int(np.delete(figures, k, axis=0).mean(axis=(0, 2)).argmax())
+        out.append(found[chosen])
+        cells = [" / ".join(f"{v:.2f}" for v in found[m]) for m in (*range(len(MOVES_PX)), chosen)]
+        rows.append([f"{rate:g} Hz, {a:g} m", *cells, f"{MOVES_PX[chosen]:g}"])
+    mean = figures.mean(axis=0)
+    cells = [" / ".join(f"{v:.2f}" for v in of) for of in (*mean, np.mean(out, axis=0))]
+    rows.append(["all", *cells, f"{MOVES_PX[int(mean.mean(axis=1).argmax())]:g}"])
+    head = ["default / `patrol`", *(f"{move:g} px" for move in MOVES_PX), "left out", "chosen, px"]
+    end = f"Flights of {options.seconds:g} s, {len(cases) // len(scenes)} a row."
+    return f"{bench.format_table(head, rows)}\n\n{end}", figures.tolist()
+
+
+def fly_small(case: Case) -> list[list[float]]:
+    """Of each way of a walker, the accuracy in the default and in `patrol` on one flight."""
+    arguments = [case[name] for name in ("altitude_m", "speed_m_s", "seed", "seconds", "rate_hz")]
+    ways = {f"{move}": {"small.gap_move_px": move} for move in MOVES_PX}
+    found = [detect_in_ways(flight(*arguments), config, ways) for config in MEASURED]
+    return [[of[way][0] for of in found] for way in ways]
+
+
 if __name__ == "__main__":
     common = {"--seconds": 5.0, "--jobs": 1, "--cache": None}
     studies = {
         "fixed": (measure_fixed, {"--seeds": 3, "--configs": ["patrol", "default", "fast", "source"], **common}),
         "search": (measure_search, {"--seeds": 2, **common}),
+        "small": (measure_small, {"--seeds": 2, **common, "--seconds": 3.8}),
     }
     bench.main(__doc__, studies)

@@ -208,7 +208,9 @@ def test_looks_that_take_long_lengthen_the_interval_if_their_cost_is_measured(co
     readings = chain.from_iterable((second, second + 0.2 / 6) for second in range(1000))
     clock = SimpleNamespace(perf_counter=lambda: next(readings))
     monkeypatch.setattr("torchvision_dddas.detection.detector.time", clock)
-    settings = with_parameters(load_config(), {"interval.cost": cost, "interval.maximum_frames": 20})
+    # The search for small targets compares frames as far apart as the interval allows: its change has an effect.
+    changed = {"interval.cost": cost, "interval.maximum_frames": 20, "small.gap_frames": 10, "small.gap_move_px": 0.0}
+    settings = with_parameters(load_config(), changed)
     telemetry = flight(np.arange(64) / 10, 100.0)
     scenes = list(detect_motion(Film(film.images * 4), settings, "onboard", telemetry))
     assert scenes[-1].interval_frames == interval

@@ -122,6 +122,26 @@ def test_the_expected_size_sets_the_smallest_area_and_switches_the_small_path(al
 
 
 @pytest.mark.parametrize(
+    ("altitude", "rate", "move_px", "gap"),
+    [(100, 10, 1.4, 1), (200, 10, 1.4, 2), (200, 25, 1.4, 5), (200, 25, 0.7, 2), (400, 25, 1.4, 6), (200, 25, 0.0, 6)],
+)
+def test_a_walker_moves_as_far_between_the_frames_that_show_small_targets_at_any_distance_and_rate(
+    altitude, rate, move_px, gap
+):
+    """1.4 m/s at 1000 px focal length are 1400 / altitude px a second; the gap has gap_frames, here 6, at most."""
+    base = with_parameters(BASE, {"small.gap_move_px": move_px})
+    assert settings_at(altitude, rate, base).settings.small.gap_frames == gap
+
+
+def test_the_gap_of_small_targets_is_reported_only_where_they_are_searched():
+    changed = [
+        {record.parameter for record in follow_distance(1, DistanceSettings(BASE), Flight(high), 10, BASE)[1]}
+        for high in (10.0, 200.0)
+    ]
+    assert ["small.gap_frames" in names for names in changed] == [False, True]
+
+
+@pytest.mark.parametrize(
     ("altitude", "rate", "gates"), [(50, 10, (10, 200, 60)), (50, 30, (10, 200, 20)), (100, 10, (5, 100, 30))]
 )
 def test_gates_are_metric_bounds_times_focal_over_altitude(altitude, rate, gates):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchvision_dddas.config import Settings, SteeringParameters
+from torchvision_dddas.detection import WALKER_M_S
 from torchvision_dddas.types import Adjustment
 
 # Of so many frames one is processed: no parameter, but named like one in the record.
@@ -13,8 +14,8 @@ SAMPLING = "sampling.every"
 SHED = ("registration.keypoints", "people.look_share", SAMPLING)
 # Between two processed frames a target moves by this share of its size at most.
 _MOVED_SHARE = 0.5
-# How fast people walk, and how wide one shows with a shadow: who comes into the picture is at least that.
-_WALKER_M_S, _WALKER_M = 1.4, 1.0
+# How wide a person shows with a shadow: who comes into the picture is at least that.
+_WALKER_M = 1.0
 # Frames that take so many times what they may are made as cheap as can be at once.
 _FAR_OVER = 2.0
 # More is processed again where it is expected to take this share of what it may at most: else it would flutter.
@@ -40,7 +41,7 @@ def every_wanted(
     wanted = parameters.sampling_share * interval
     known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
     if not known.any():
-        most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / _WALKER_M_S)), 1.0)
+        most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / WALKER_M_S)), 1.0)
         return (most, "; nothing is found yet") if most < min(wanted, parameters.maximum_every) else (wanted, "")
     speed_m_s, size_m = speed_m_s[known], size_m[known]
     frames = _MOVED_SHARE * size_m * rate_hz / np.maximum(speed_m_s, 1e-3)
@@ -53,7 +54,7 @@ def every_wanted(
 
 def every_least(pixels_per_metre: float, rate_hz: float, parameters: SteeringParameters) -> float:
     """Of how many frames one is processed at the least: between two of them a walker must move far enough to show."""
-    return parameters.least_move_px * rate_hz / (_WALKER_M_S * pixels_per_metre)
+    return parameters.least_move_px * rate_hz / (WALKER_M_S * pixels_per_metre)
 
 
 def sampled(

@@ -12,6 +12,7 @@ from torchvision_dddas.detection.engine import (
     match_exposure,
 )
 from torchvision_dddas.detection.interval import (
+    WALKER_M_S,
     describe_distance,
     interval_from_flow,
     interval_from_telemetry,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LAST_TOLERANCE",
+    "WALKER_M_S",
     "Engine",
     "Foreground",
     "MotionDetector",

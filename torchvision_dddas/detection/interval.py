@@ -10,6 +10,9 @@ from torchvision_dddas.config import IntervalParameters, Settings, is_set, with_
 from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.types import Adjustment, Flight, Telemetry
 
+WALKER_M_S = 1.4
+"""Speed of a person who walks."""
+
 # A smaller relative change of distance does not move the gates.
 _DISTANCE_STEP = 0.2
 # More frames than any window spans.
@@ -148,7 +151,8 @@ class Gates:
 class DistanceSettings:
     """Settings and size gates for the current distance to the ground. distance_m, gates: None without telemetry.
 
-    settings: those of the user with `gates.min_area_px`, `small.on` and `morphology.close_px` chosen for the distance.
+    settings: those of the user with `gates.min_area_px`, `small.on`, `small.gap_frames` and `morphology.close_px`
+    chosen for the distance.
     """
 
     settings: Settings
@@ -160,6 +164,7 @@ class DistanceSettings:
         return {
             "gates.min_area_px": self.settings.gates.min_area_px,
             "small.on": float(self.settings.small.on),
+            "small.gap_frames": self.settings.small.gap_frames,
             "morphology.close_px": self.settings.morphology.close_px,
             **{f"gates.{name}": bound for name, bound in vars(self.gates or Gates()).items()},
         }
@@ -195,17 +200,21 @@ def settings_at(distance_m: float, rate_hz: float, base: Settings) -> DistanceSe
 
     A target measures e = expected_size_m x focal / distance pixels in the picture's middle. Obliquely the far side of
     the picture is smaller, so the bounds are meant to be wide. The smallest area is expected_share x e^2,
-    between that of the small path and the user's. The small path is on while e^2 is at most its largest box. Gaps of
-    close_m, if it is set, are closed up to close_px, which would join ever more from a greater height.
+    between that of the small path and the user's. The small path is on while e^2 is at most its largest box, and
+    compares frames between which a walker moves by gap_move_px (ours). Gaps of close_m, if it is set, are closed up to
+    close_px, which would join ever more from a greater height.
     """
-    gates, small, close_px = base.gates, base.small, base.morphology.close_px
+    gates, small, gap, close_px = base.gates, base.small, base.small.gap_frames, base.morphology.close_px
     scale = pixels_per_metre(distance_m, gates.focal_px)
     square = (gates.expected_size_m * scale) ** 2
     if base.morphology.close_m:
         close_px = int(np.clip(round(base.morphology.close_m * scale), 1, close_px))
+    if small.gap_move_px:
+        gap = int(np.clip(round(small.gap_move_px * rate_hz / (WALKER_M_S * scale)), 1, gap))
     chosen = {
         "gates.min_area_px": int(min(gates.min_area_px, max(small.min_area_px, round(gates.expected_share * square)))),
         "small.on": small.on and square <= small.max_box_px,
+        "small.gap_frames": gap,
         "morphology.close_px": close_px,
     }
     has_speed = base.history.on or base.persistence.on or base.refine.on or base.small.on
@@ -234,4 +243,6 @@ def follow_distance(
         cause += "" if before_m is None else f", was {before_m:.1f} m"
     old = current.values()
     changed = {name: value for name, value in new.values().items() if value != old[name]}
+    if not new.settings.small.on:
+        changed.pop("small.gap_frames", None)  # it has no effect
     return new, tuple(Adjustment(frame, name, old[name], value, cause) for name, value in changed.items())
