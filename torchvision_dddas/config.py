@@ -205,7 +205,7 @@ class SmallParameters(Group):
     from_interval: int = parameter(3, "shortest interval at which they are detected", "frames", 1, 60)
     gap_frames: int = parameter(6, "distance to the neighbours on both sides, at most the interval", "frames", 1, 30)
     gap_move_px: float = parameter(
-        1.4, "with telemetry: a walker moves by this over the gap, of at most gap_frames; 0: gap_frames", "px", 0, 30
+        1.4, "with telemetry: a walker moves by this over the gap, unless gap_frames is set; 0: gap_frames", "px", 0, 30
     )
     threshold: float = parameter(6.0, "smallest difference of a candidate", "grey levels", 1, 255)
     noise_ratio: float = parameter(

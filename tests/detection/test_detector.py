@@ -209,7 +209,7 @@ def test_looks_that_take_long_lengthen_the_interval_if_their_cost_is_measured(co
     clock = SimpleNamespace(perf_counter=lambda: next(readings))
     monkeypatch.setattr("torchvision_dddas.detection.detector.time", clock)
     # The search for small targets compares frames as far apart as the interval allows: its change has an effect.
-    changed = {"interval.cost": cost, "interval.maximum_frames": 20, "small.gap_frames": 10, "small.gap_move_px": 0.0}
+    changed = {"interval.cost": cost, "interval.maximum_frames": 20, "small.gap_frames": 10}
     settings = with_parameters(load_config(), changed)
     telemetry = flight(np.arange(64) / 10, 100.0)
     scenes = list(detect_motion(Film(film.images * 4), settings, "onboard", telemetry))

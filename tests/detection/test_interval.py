@@ -123,14 +123,19 @@ def test_the_expected_size_sets_the_smallest_area_and_switches_the_small_path(al
 
 @pytest.mark.parametrize(
     ("altitude", "rate", "move_px", "gap"),
-    [(100, 10, 1.4, 1), (200, 10, 1.4, 2), (200, 25, 1.4, 5), (200, 25, 0.7, 2), (400, 25, 1.4, 6), (200, 25, 0.0, 6)],
+    [(100, 10, 1.4, 1), (200, 10, 1.4, 2), (200, 25, 1.4, 5), (200, 25, 0.7, 2), (400, 25, 1.4, 8), (200, 25, 0.0, 6)],
 )
 def test_a_walker_moves_as_far_between_the_frames_that_show_small_targets_at_any_distance_and_rate(
     altitude, rate, move_px, gap
 ):
-    """1.4 m/s at 1000 px focal length are 1400 / altitude px a second; the gap has gap_frames, here 6, at most."""
+    """1.4 m/s at 1000 px focal length are 1400 / altitude px a second; the gap is at most the longest interval."""
     base = with_parameters(BASE, {"small.gap_move_px": move_px})
     assert settings_at(altitude, rate, base).settings.small.gap_frames == gap
+
+
+def test_a_gap_that_is_set_holds_at_any_distance():
+    base = with_parameters(BASE, {"small.gap_frames": 6})
+    assert settings_at(50.0, 10, base).settings.small.gap_frames == 6
 
 
 def test_the_gap_of_small_targets_is_reported_only_where_they_are_searched():

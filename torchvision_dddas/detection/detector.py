@@ -23,6 +23,7 @@ from torchvision_dddas.detection.interval import (
     look_cost,
     settings_at,
     settling_delay,
+    small_gap_follows_distance,
     with_logged_focal,
 )
 from torchvision_dddas.detection.motion_history import MotionHistory
@@ -148,7 +149,7 @@ class MotionDetector:
         self.rate_hz, self.telemetry = rate_hz, telemetry
         self.interval = self.settings.interval.frames
         self._slots: deque[_Slot] = deque()
-        self._memory = _memory_frames(self.settings)
+        self._memory = _memory_frames(self.settings, telemetry is not None)
         self._first = 0  # index of _slots[0]; indices count the frames that were read
         # Slots below these indices are registered, observed, have their targets, are in the history, were returned.
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
@@ -185,7 +186,7 @@ class MotionDetector:
         if settings is self.settings:
             return
         self.settings = self.engine.parameters = settings
-        self._memory = max(self._memory, _memory_frames(settings))
+        self._memory = max(self._memory, _memory_frames(settings, self.telemetry is not None))
         distance_m = self._distance.distance_m
         if distance_m is None:
             self._distance = DistanceSettings(settings)
@@ -275,7 +276,7 @@ class MotionDetector:
                 if slot.step is None and not self._ended:
                     break
                 self._steer(index, slot)
-            if not self._ended and self._registered < index + look_ahead(slot.interval, self.settings):
+            if not self._ended and self._registered < index + look_ahead(slot.interval, slot.distance.settings):
                 break
             ready.append(index)
         # Whole batches only while the clip runs: a batching engine takes as long for four windows as for eight.
@@ -284,7 +285,10 @@ class MotionDetector:
     def _steer(self, index: int, slot: _Slot) -> None:
         """Apply the feedback rules of the detection interval and of the distance to the ground."""
         parameters, number = self.settings.interval, slot.frame.number
-        flight = self.telemetry.at(slot.frame.time_s) if self.telemetry is not None else None
+        flight = None
+        if self.telemetry is not None:
+            flight = self.telemetry.at(slot.frame.time_s)
+            self._memory = max(self._memory, _memory_frames(self.settings, True))
         # A log may say one of altitude and speed without the other, or fall silent for a while. A height of 0 or less,
         # as on the ground or below a take-off on a hill, tells nothing of the distance to what is seen.
         high = flight if flight is not None and flight.altitude_m > 0 else None
@@ -399,7 +403,7 @@ class MotionDetector:
         """The scenes that no later frame can change, and let go of what no window needs again."""
         while self._emitted < self._drawn:
             slot = self._at(self._emitted)
-            delay = settling_delay(slot.interval, self.settings)
+            delay = settling_delay(slot.interval, slot.distance.settings)
             if not self._all_observed and self._emitted + delay >= self._observed:
                 break
             yield from self._fill_gap(slot.frame.number - slot.frame.skipped)
@@ -467,13 +471,16 @@ class MotionDetector:
         return found
 
 
-def _memory_frames(settings: Settings) -> int:
+def _memory_frames(settings: Settings, has_telemetry: bool) -> int:
     """How many frames before the observed one a window may use again."""
     parameters, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
     if parameters.kind in ("between_later", "to_next"):
         return max(longest, _JUDGED_FRAMES)
     # A wide or small window that looks one way only looks twice as far.
-    small = settings.small.gap_frames if settings.small.on else 0
+    small = 0
+    if settings.small.on:
+        is_any = has_telemetry and small_gap_follows_distance(settings)
+        small = longest // 2 if is_any else settings.small.gap_frames
     widest = 2 * max(parameters.wide_frames, small)
     near = near_gaps(parameters.near_frames, parameters.wide_frames, longest // 2)
     return max(min(widest, longest), parameters.wide_frames, *near, _JUDGED_FRAMES)

@@ -105,6 +105,11 @@ def _small_gap(interval: int, settings: Settings) -> int:
     return min(interval, small.gap_frames) if small.on and interval >= small.from_interval else 0
 
 
+def small_gap_follows_distance(settings: Settings) -> bool:
+    """Whether `small.gap_move_px` sets the gap once the distance to the ground is known."""
+    return settings.small.gap_move_px > 0 and not is_set(settings, "small.gap_frames")
+
+
 def choose_pairs(
     at: int, interval: int, first: int, last: int, settings: Settings
 ) -> tuple[list[Pair], Pair | None, Pair | None]:
@@ -209,8 +214,9 @@ def settings_at(distance_m: float, rate_hz: float, base: Settings) -> DistanceSe
     square = (gates.expected_size_m * scale) ** 2
     if base.morphology.close_m:
         close_px = int(np.clip(round(base.morphology.close_m * scale), 1, close_px))
-    if small.gap_move_px:
-        gap = int(np.clip(round(small.gap_move_px * rate_hz / (WALKER_M_S * scale)), 1, gap))
+    if small_gap_follows_distance(base):
+        most = max(base.interval.maximum_frames, base.interval.frames)
+        gap = int(np.clip(round(small.gap_move_px * rate_hz / (WALKER_M_S * scale)), 1, most))
     chosen = {
         "gates.min_area_px": int(min(gates.min_area_px, max(small.min_area_px, round(gates.expected_share * square)))),
         "small.on": small.on and square <= small.max_box_px,
