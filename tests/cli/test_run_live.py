@@ -201,7 +201,7 @@ def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path,
     rest = (step for image in itertools.cycle(images) for step in (lambda: time.sleep(0.05), image))
     script = itertools.chain(images, [False], rest)
     for module in ("capture", "refusal"):
-        monkeypatch.setattr(f"torchvision_dddas.live.{module}.OpenedStream", lambda *_: FakeStream(script))
+        monkeypatch.setattr(f"torchvision_dddas.live.{module}.open_stream", lambda *_: FakeStream(script))
     threading.Thread(target=fetch_and_end, daemon=True).start()
     source = "rtsp://me:hush1/a@b:hush2@127.0.0.1:554/live?channel=1&password=hush3 hush4"
     emit = ("--emit", f"mot:{tmp_path}/rows.txt", "--emit", "json:-")

@@ -112,6 +112,12 @@ def test_a_camera_that_sends_more_than_it_announced_is_thinned_and_reported(came
     assert any("sends 50.0 pictures a second, not 25" in what for what in some.reported)
 
 
+def test_pictures_that_were_gathered_while_a_stream_was_opened_say_nothing_of_its_rate(camera) -> None:
+    some = camera([*[0.01, 1] * 50, *[APART_S, 1] * 150])
+    assert next(frame for frame in some.frames if frame.number >= 120)
+    assert not any("pictures a second" in what for what in some.reported)
+
+
 def test_a_slow_reader_gets_the_newest_pictures_and_how_many_were_dropped(camera) -> None:
     done = Gate()
     some = camera([1, done, *[APART_S, 2] * 9], queue_frames=2)

@@ -89,6 +89,17 @@ def test_a_kill_keeps_what_was_sent_and_a_restart_gets_the_port_and_a_new_folder
     assert len((again / "results.jsonl").read_text().splitlines()) == FRAMES
 
 
+def test_ctrl_c_ends_a_live_run_with_its_summary_and_says_no_more(clip, tmp_path):
+    with running(clip, tmp_path, "--set", "live.pace=0.5", "--emit", "json:-") as run:
+        assert run.stdout is not None
+        run.stdout.readline()
+        run.send_signal(signal.SIGINT)
+        _, err = run.communicate()
+    (folder,) = tmp_path.iterdir()
+    assert run.returncode == 130 and json.loads((folder / "run.json").read_text())["state"] == "stopped"
+    assert err.splitlines()[-1].endswith(f"; {folder}") and "nothing was kept" not in err
+
+
 def test_a_disk_that_fills_up_ends_nothing_and_leaves_whole_lines(clip, tmp_path):
     with running(clip, tmp_path, "--set", "live.pace=0.5", "--emit", "json:-") as run:
         assert run.stdout is not None

@@ -1,6 +1,7 @@
 """The loop of a live run goes on after errors, and sheds load."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,13 @@ def test_latency_is_of_the_newest_picture_and_late_results_are_counted():
     assert now.gauges["targets"] == now.gauges["people"] == 1
     record_result(result_of(frame), feed, health, 1e9)
     assert health.snapshot().counts["late"] == 1
+
+
+def test_the_row_of_a_picture_that_never_came_is_not_late():
+    health, feed = Health(), feed_of(1, taken_s=time.monotonic() - 5.0)
+    (frame,) = feed
+    record_result(result_of(replace(frame, taken_s=float("nan"))), feed, health, 80.0)
+    assert "late" not in health.snapshot().counts or health.snapshot().counts["late"] == 0
 
 
 class Sink:

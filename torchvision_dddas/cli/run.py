@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchvision_dddas.cli.exits import Ended
 from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines, print_located
 from torchvision_dddas.cli.options import (
     CLIP,
@@ -127,7 +128,7 @@ def run(
         code = run_live(
             out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet, wait
         )
-        raise typer.Exit(code)
+        raise typer.Exit(Ended(code))  # its last line says where the results are
     from torchvision_dddas import open_video
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save

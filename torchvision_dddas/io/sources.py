@@ -5,7 +5,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Protocol
 from urllib.parse import urlsplit
 
 # FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
@@ -193,7 +192,7 @@ class VideoSource(_Clip):
         self._live = _is_live(target)
         capture = self._open()
         try:
-            own_hz = _announced_hz(capture)
+            own_hz = announced_hz(capture)
             count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
             is_counted = Path(urlsplit(str(target)).path if self._live else str(target)).suffix.lower() in _EXACT_COUNT
             decoded, first = capture.read()
@@ -341,60 +340,14 @@ def _is_live(target: str | int) -> bool:
     return isinstance(target, int) or "://" in target
 
 
-def _announced_hz(capture: cv2.VideoCapture) -> float | None:
-    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+def announced_hz(capture: cv2.VideoCapture) -> float | None:
+    """The rate that a video or stream announces; None where nothing credible is."""
+    return credible_hz(float(capture.get(cv2.CAP_PROP_FPS)))
+
+
+def credible_hz(rate_hz: float) -> float | None:
+    """An announced rate that can be true, else None."""
     return rate_hz if 0 < rate_hz <= 1000 else None
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# Live streams, picture by picture: the camera or the sender may fall silent at any time.
-
-# Pictures in a row that may fail to be decoded at the start: a stream is joined in the middle.
-_MOST_UNDECODED = 100
-
-
-class Stream(Protocol):
-    """What a live run needs of an open camera or stream; the calls may take as long as they like."""
-
-    rate_hz: float | None  # as announced; None where nothing credible is
-
-    def grab(self) -> bool:
-        """Wait for the next picture; False: none came."""
-        ...
-
-    def retrieve(self) -> np.ndarray | None:
-        """The picture grabbed last, uint8 (H, W) or (H, W, 3) BGR; None where it cannot be decoded."""
-        ...
-
-    def release(self) -> None:
-        """Let go of the camera or the connection."""
-        ...
-
-
-class OpenedStream:
-    """A Stream through OpenCV. limits_s: an opening, or a read, that takes longer fails, where the driver heeds it.
-
-    Raises InputError: cannot be opened, is no video.
-    """
-
-    def __init__(self, target: str | int, name: str, limits_s: tuple[float, float]) -> None:
-        self._capture = open_capture(target, name, limits_s)
-        # The reader reports failures from now on; OpenCV would write a line for each.
-        cv2.utils.logging.setLogLevel(0)
-        self.rate_hz = _announced_hz(self._capture)
-
-    def grab(self) -> bool:
-        """Wait for the next picture; False: none came."""
-        return bool(self._capture.grab())
-
-    def retrieve(self) -> np.ndarray | None:
-        """The picture grabbed last; None where it cannot be decoded."""
-        decoded, image = self._capture.retrieve()
-        return image if decoded else None
-
-    def release(self) -> None:
-        """Let go of the camera or the connection."""
-        self._capture.release()
 
 
 def stream_target(spec: str) -> str | int | None:
@@ -405,13 +358,3 @@ def stream_target(spec: str) -> str | int | None:
             raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
         return int(index)
     return spec if "://" in spec else None
-
-
-def first_picture(stream: Stream, name: str) -> np.ndarray:
-    """The first picture that can be decoded. Raises InputError where there is none."""
-    for _ in range(_MOST_UNDECODED):
-        if not stream.grab():
-            raise InputError(f"no picture comes from {name}; is it sending, in a codec that FFmpeg knows?")
-        if (image := stream.retrieve()) is not None:
-            return image
-    raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection too poor")

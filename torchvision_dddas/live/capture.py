@@ -9,7 +9,8 @@ import numpy as np
 from torchvision_dddas import open_video
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import without_secrets
-from torchvision_dddas.io.sources import ImageSource, OpenedStream, Stream, VideoSource, stream_target
+from torchvision_dddas.io.live_streams import Stream, open_stream
+from torchvision_dddas.io.sources import ImageSource, VideoSource, stream_target
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.receiver import OPENING, Receiver
@@ -75,7 +76,7 @@ class LiveSource:
 
     def _open(self, target: str | int, limits_s: tuple[float, float]) -> Stream:
         # A lost stream is not asked why: it was there, and may count its clients.
-        return (OpenedStream if self._queue.begun else open_or_refuse)(target, self.name, limits_s)
+        return (open_stream if self._queue.begun else open_or_refuse)(target, self.name, limits_s)
 
     @property
     def size(self) -> tuple[int, int]:

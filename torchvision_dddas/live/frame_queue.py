@@ -14,8 +14,8 @@ from torchvision_dddas.types import Frame, Problem
 _QUIET_S = 10.0
 # A larger jump of the time of day against the monotonic clock means that the clock was set.
 _CLOCK_SET_S = 0.5
-# The rate is measured over this time.
-_COUNTED_S = 2.0
+# The rate is measured over this time, which begins so long after a stream was joined.
+_COUNTED_S, _GATHERED_S = 2.0, 2.0
 _PROBLEMS = 64
 
 
@@ -120,7 +120,7 @@ class CaptureLog:
         self._health, self._clock = health, clock
         self._reported_s: dict[str, float] = {}
         self._ahead_s = float("nan")  # time of day minus monotonic time
-        self._count, self._since_s = 0, float("nan")
+        self._count, self._joined_s, self._since_s = 0, float("nan"), float("nan")
 
     def report(self, what: str, number: int | None = None, topic: str = "") -> None:
         """Record an event and a problem. topic: of events that may happen often; one of a topic every 10 s is kept."""
@@ -146,16 +146,21 @@ class CaptureLog:
             self.report(
                 f"the machine's clock was set {which} by {abs(jump_s):.1f} s; times of day follow", topic="clock"
             )
+        if np.isnan(self._joined_s):
+            self._joined_s = taken_s
+        # What the driver has gathered while it opened the stream comes at once, and says nothing of the rate.
+        if taken_s - self._joined_s < _GATHERED_S:
+            return
         if np.isnan(self._since_s):
-            self.restart(taken_s)
+            self._count, self._since_s = 0, taken_s
             return
         self._count += 1
         if (spent_s := taken_s - self._since_s) >= _COUNTED_S:
             self.sent_hz = self._count / spent_s
             self._health.gauge("sent_hz", self.sent_hz)
             note(self.sent_hz)
-            self.restart(taken_s)
+            self._count, self._since_s = 0, taken_s
 
-    def restart(self, since_s: float = float("nan")) -> None:
-        """Measure the rate again from a time, or from the next picture."""
-        self._count, self._since_s = 0, since_s
+    def restart(self) -> None:
+        """Measure the rate again, of a stream that is joined with the next picture."""
+        self._joined_s = self._since_s = float("nan")

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.sources import Stream, first_picture
+from torchvision_dddas.io.live_streams import Stream, first_picture
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.refusal import Refused

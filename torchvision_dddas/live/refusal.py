@@ -8,7 +8,7 @@ import ssl
 from urllib.parse import unquote, urlsplit
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.sources import OpenedStream
+from torchvision_dddas.io.live_streams import Stream, open_stream
 
 _PORTS = {"rtsp": 554, "http": 80, "https": 443}
 _MOST_BYTES = 65536
@@ -23,10 +23,10 @@ class Refused(InputError):
     """The camera is there and refuses the address; waiting does not help."""
 
 
-def open_or_refuse(target: str | int, name: str, limits_s: tuple[float, float]) -> OpenedStream:
+def open_or_refuse(target: str | int, name: str, limits_s: tuple[float, float]) -> Stream:
     """An opened stream. Raises Refused if the server answers 401, 403 or 404, else InputError."""
     try:
-        return OpenedStream(target, name, limits_s)
+        return open_stream(target, name, limits_s)
     except InputError:
         status = answered_status(target, limits_s[1]) if isinstance(target, str) else None
         if status in _MEANING:

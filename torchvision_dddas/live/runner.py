@@ -174,12 +174,12 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
     """Record the latency of a result that was sent, and what it holds, in the health."""
     located, people = result
     now_s, frame = time.monotonic(), located.tracked.frame
-    if feed.newest is not None and isfinite(feed.newest.taken_s):
-        latency_s = now_s - feed.newest.taken_s
-        health.took("latency", latency_s)
-        health.timed(1000 * latency_s > deadline_ms)
-    if frame is not None and isfinite(frame.taken_s):
+    if frame is not None and isfinite(frame.taken_s):  # rows of pictures that never came are not late
         health.took("age", now_s - frame.taken_s)
+        if feed.newest is not None and isfinite(feed.newest.taken_s):
+            latency_s = now_s - feed.newest.taken_s
+            health.took("latency", latency_s)
+            health.timed(1000 * latency_s > deadline_ms)
     health.gauge("targets", len(located.tracked.tracks))
     if people is not None:
         health.gauge("people", len(people.tracks))
