@@ -19,7 +19,8 @@ import pytest
 
 from tests.cli.conftest import bad, record
 from tests.evaluation.studies import world
-from torchvision_dddas.io.interrupts import Stopped, raising_signals, uninterrupted
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.interrupts import Stopped, is_stop, raising_signals, uninterrupted
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -114,6 +115,33 @@ def test_signals_leave_whole_outputs_also_several_at_once(clip, tmp_path, number
     assert error.endswith("; results up to here are kept\n") and error.count("\n") == 1
     assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
     assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("lost", ["SystemError('an exception set') from error", "ImportError('no luck') from None"])
+def test_a_signal_that_a_library_turns_into_another_exception_leaves_whole_outputs(clip, tmp_path, lost):
+    turning = "def turn():\n    try:\n        time.sleep(60)\n    except KeyboardInterrupt as error:\n"
+    turning += f"        raise {lost}\n"
+    program = PROGRAM.replace("time.sleep(60)", "turn()").replace("@contextmanager", f"{turning}@contextmanager")
+    with tracking(clip, tmp_path, "--quiet", program=program) as process:
+        process.send_signal(signal.SIGHUP)
+        _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (129, "dddas: ended by SIGHUP; results up to here are kept\n")
+    assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
+    assert (tmp_path / "out" / "tracks.txt").exists()
+
+
+def test_a_signal_is_found_behind_the_exception_of_a_library_and_not_behind_bad_input():
+    def behind(error):
+        try:
+            try:
+                raise Stopped(signal.SIGTERM)
+            except KeyboardInterrupt:
+                raise error  # noqa: B904 (libraries say no more)
+        except Exception as raised:
+            return is_stop(raised)
+
+    assert is_stop(Stopped(signal.SIGTERM)) and behind(RuntimeError()) and behind(OSError())
+    assert not behind(InputError("cannot write")) and not is_stop(RuntimeError()) and not is_stop(None)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 from torchvision_dddas.cli.tune import tune
-from torchvision_dddas.io.interrupts import KEPT, StopSignals, ignore_signals, raising_signals
+from torchvision_dddas.io.interrupts import KEPT, StopSignals, ignore_signals, is_stop, raising_signals
 from torchvision_dddas.runtime import VERSION
 
 app = typer.Typer(
@@ -99,8 +99,8 @@ def _run(signals: StopSignals) -> int:
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else FAULT
     except Exception as error:
-        if signals.noticed is not None and isinstance(error, (ImportError, SystemError)):
-            return say_stopped(signals.noticed, describe_kept(error))  # it cut short the loading of a library
+        if is_stop(error):
+            return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
         # A word of the command line that will not do; Typer keeps the class of these errors to itself.
         if not hasattr(error, "format_message"):
             say_fault()

@@ -10,6 +10,7 @@ from signal import SIGINT, Signals
 from typing import Any
 
 from torchvision_dddas.errors import InputError, without_secrets
+from torchvision_dddas.io.interrupts import is_stop
 
 FAULT, BAD_INPUT, NOTHING_LOCATED, OUTPUT_FAILED = 1, 2, 3, 74
 """Exit codes: a fault of the program; bad input; targets and no place of any, though all else is done; standard output
@@ -49,8 +50,8 @@ def noting(words: Callable[[], str], has: Callable[[], Any] = lambda: True) -> I
     """Note on a signal that ends the block what is kept of it, if there is anything."""
     try:
         yield
-    except KeyboardInterrupt as error:
-        if has():
+    except BaseException as error:
+        if is_stop(error) and has():
             error.add_note(words())
         raise
 

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+from torchvision_dddas.errors import InputError
+
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 KEPT = "results up to here are kept"
@@ -38,6 +40,21 @@ class Stopped(KeyboardInterrupt):
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
         self.number = number
+
+
+def is_stop(error: BaseException | None) -> bool:
+    """Whether a signal raised an exception, also where a library turned it into another.
+
+    Libraries raise ImportError or SystemError in its place, and not all say of which exception. An InputError tells of
+    something else, also if it came while a signal was dealt with.
+    """
+    if isinstance(error, (ImportError, SystemError)) and _heard.is_set():
+        return True
+    while error is not None and not isinstance(error, InputError):
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 class StopSignals:

@@ -15,6 +15,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies.records import Spec
 from torchvision_dddas.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.io.atomic_files import claimed, save_file
+from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.tuning import time_cost
 from torchvision_dddas.tuning.checkpoint import set_aside
@@ -111,7 +112,7 @@ class Tuner:
                 if self._state:  # otherwise the record of an earlier run in this folder is still there
                     with suppress(InputError):
                         self._write_json(RUN, {**self._state, "state": "interrupted"})
-                if isinstance(error, KeyboardInterrupt) and (self._folder / CHECKPOINT).is_file():
+                if is_stop(error) and (self._folder / CHECKPOINT).is_file():
                     error.add_note(f"the descent is kept in {self._folder / CHECKPOINT}; --resume goes on from there")
                 raise
 

@@ -39,6 +39,7 @@ from torchvision_dddas.evaluation.studies.records import TASKS, Case, Results, S
 from torchvision_dddas.evaluation.studies.stages import allowed_tasks
 from torchvision_dddas.evaluation.studies.summary import summarize, summarize_costs
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
+from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.io.output.run_record import finite, versions
 
 FILES = ("metrics.json", "metrics.csv", "metrics.parquet", "frames.parquet", SCORES, "report.html", "run.json")
@@ -314,7 +315,7 @@ def write_study(
             if has_begun:
                 with suppress(OSError):
                     _write_json(folder / "run.json", {"state": "interrupted", "study": spec.name, "cache": place})
-            if isinstance(error, KeyboardInterrupt) and (finished or Cache(place).has_newer(begun_s)):
+            if is_stop(error) and (finished or Cache(place).has_newer(begun_s)):
                 clips = "1 finished clip is" if finished == 1 else f"{finished} finished clips are"
                 kept = clips if finished else "finished stages are"
                 error.add_note(f"{kept} kept in {place}; the same command goes on from there")

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
 from torchvision_dddas.errors import InputError, LostInputError
 from torchvision_dddas.io.atomic_files import ClaimedFolder, cannot_write
 from torchvision_dddas.io.images import MASK_NAME
-from torchvision_dddas.io.interrupts import KEPT, rescued_by, uninterrupted
+from torchvision_dddas.io.interrupts import KEPT, is_stop, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RunRecord, read_run_record
 
 # A disk or an encoder that takes longer to write or close counts as stuck.
@@ -168,7 +168,7 @@ class RunRecorder(Generic[Item]):
         record = self._record
         if record is not None and isinstance(error, InputError):
             record.problems.append(str(error))
-        is_cut = isinstance(error, (KeyboardInterrupt, LostInputError))
+        is_cut = is_stop(error) or isinstance(error, LostInputError)
         if record is None or not (error is None or (is_cut and record.frames > 0)):
             self.discard()
             return
