@@ -108,6 +108,7 @@ def test_a_linear_svm_of_cv2_ml_scores_people_above_the_rest_as_opencv_does(tmp_
 BROKEN_ZIP = b"PK\x03\x04" + b"\0" * 40
 KERNEL = "%YAML:1.0\n---\nsvm:\n   svmType: C_SVC\n   kernel:\n      type: RBF\n   support_vectors:\n      - [ 1. ]\n"
 SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n         sv_count: 1\n"
+HOG = "%YAML:1.0\n---\nhog: !!opencv-object-detector-hog\n"
 
 
 @pytest.mark.parametrize(
@@ -140,6 +141,7 @@ SVM = KERNEL.replace("RBF", "LINEAR") + "   decision_functions:\n      -\n      
         ("w.yml", SVM + "         alpha: [ 1., 2. ]\n         rho: 0.5\n", ["broken", "do not fit"]),
         ("w.yml", SVM + "         alpha: [ 1. ]\n         rho: 0.5\n         index: [ 7 ]\n", ["does not hold"]),
         ("w.yml", SVM.partition("   decision")[0] + "   decision_functions: 3\n", ["broken", "do not fit"]),
+        ("w.yml", HOG + "   winSize: [ 1, 2, 3 ]\n   SVMDetector: [ 1. ]\n", ["broken", "do not fit"]),
         ("w.txt", "1_0 2 3 4 5 6", ["line 1", "'1_0' is not a number"]),
         ("w.xml", "<html></html>", ["OpenCV"]),
     ],

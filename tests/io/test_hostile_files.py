@@ -3,6 +3,8 @@
 import io
 import signal
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zipfile
 import zlib
@@ -244,6 +246,49 @@ def test_the_limit_of_pixels_can_be_set(tmp_path, monkeypatch):
 def test_the_size_in_a_header_is_the_pictures(suffix):
     ok, data = cv2.imencode(suffix, np.full((48, 64, 3), 90, np.uint8))
     assert ok and size_in_header(bytes(data)) == (64, 48)
+
+
+SVM = "   svmType: C_SVC\n   kernel: {{ type: LINEAR }}\n   support_vectors: {}\n   decision_functions: {}\n"
+HOG = "%YAML:1.0\n---\nhog: !!opencv-object-detector-hog\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.yml", HOG + "   x: " + "a: " * 100_000),
+        ("a.yml", HOG + "   x: " + "-" * 100_000),
+        ("a.yml", HOG + "   x: " + "{a: " * 100_000),
+        ("a.xml", "<opencv_storage>" + "<a>" * 100_000),
+        ("a.json", '{"a":' * 100_000),
+        ("a.json", '{"a":' + "[" * 100_000),
+    ],
+)
+def test_a_classifier_whose_parts_lie_deep_in_each_other_is_refused_before_opencv_reads_it(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_text(content)
+    # OpenCV ends the process on such a file.
+    code = (
+        "import sys; from torchvision_dddas.people.classifiers import read_classifier; read_classifier(sys.argv[1], 6)"
+    )
+    result = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 1
+    assert "keys, lists and items; wanted at most 10,000" in result.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("part", "words"),
+    [
+        ("   SVMDetector: [ {} ]\n", "has 300001 numbers; a descriptor of these settings has 3780"),
+        ("   winSize: [ {} ]\n   SVMDetector: [ 1. ]\n", "its parts do not fit"),
+        (SVM.format("[ {} ]", "[ { alpha: [ 1 ], rho: 1 } ]"), "has 300,001 support vectors"),
+        (SVM.format("[ [ 1 ] ]", "[ { alpha: [ {} ], rho: 1 } ]"), "its parts do not fit"),
+    ],
+)
+def test_a_classifier_of_too_many_numbers_is_refused_by_their_count(tmp_path, part, words):
+    path = tmp_path / "a.yml"
+    path.write_text(HOG + part.replace("{}", "1," * 300_000 + "1"))
+    with pytest.raises(InputError, match=words):
+        read_classifier(path, 3780)
 
 
 @pytest.mark.parametrize("kind", [".npy", ".npz"])

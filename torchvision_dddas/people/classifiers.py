@@ -1,8 +1,9 @@
 """Linear SVMs from files: the shipped coefficients, or a user's own as text, NumPy's or OpenCV's."""
 
 import math
+import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
@@ -41,6 +42,8 @@ _HOG_KEYS = {
 }
 """Of a HOGDescriptor that OpenCV saved."""
 _MOST_NUMBERS = 1_000_000  # of an array; descriptors have thousands
+_MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # begins a part of what OpenCV saves: a key, a list, an item, a tag
+_MOST_MARKS = 10_000  # OpenCV crashes on parts that lie deeper in each other than twice that
 _DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
 
 
@@ -62,7 +65,7 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
         raise InputError(f"no classifier is named '{name}', nor is it a file; give {', '.join(SHIPPED)}, or a file")
     reader = _READERS.get(path.suffix.lower(), _read_text)
     try:
-        numbers, stated = reader(path)
+        numbers, stated = reader(path, features)
     except OSError as error:
         raise InputError(f"classifier {path} cannot be read: {error.strerror or error}") from None
     for name, parameter in _PARAMETERS.items():
@@ -109,7 +112,7 @@ def _format(value: object, like: object) -> str:
     return " x ".join(f"{number:g}" for number in np.ravel(np.asarray(value, float)))
 
 
-def _read_text(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_text(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -126,7 +129,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, Layout]:
     return np.array(numbers, np.float64), {}
 
 
-def _read_numpy(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_numpy(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     try:
         _check_array_sizes(path)
         with path.open("rb") as file:  # NumPy leaves one that it opened itself open where an archive is broken
@@ -174,9 +177,14 @@ def _check_array_sizes(path: Path) -> None:
                 raise InputError(f"classifier {path} announces {sides} numbers; wanted at most {_MOST_NUMBERS:,}")
 
 
-def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
+def _read_opencv(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     try:
         text = path.read_text(encoding="utf-8")
+        if (count := sum(1 for _ in _MARK.finditer(text))) > _MOST_MARKS:
+            raise InputError(
+                f"classifier {path} has {count:,} keys, lists and items; wanted at most {_MOST_MARKS:,}, as of a "
+                "HOGDescriptor with its SVMDetector, or of a linear SVM of cv2.ml"
+            )
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         top = storage.getFirstTopLevelNode()
         # An SVM's node is the top one; a HOGDescriptor saved by hand may lie anywhere at the top.
@@ -185,12 +193,15 @@ def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
         raise InputError(f"classifier {path} is not a file that OpenCV saved (YAML, XML or JSON)") from None
     try:
         if "SVMDetector" in inside:
-            values = {name: _numbers(top.getNode(key)).tolist() for name, key in _HOG_KEYS.items() if key in inside}
+            values = {name: _numbers(top.getNode(key), 2).tolist() for name, key in _HOG_KEYS.items() if key in inside}
             # Cells, blocks and strides are squares in a layout.
             stated = {name: v if name == "window" or len(set(v)) > 1 else v[0] for name, v in values.items()}
-            return _numbers(top.getNode("SVMDetector")), stated
+            detector = top.getNode("SVMDetector")
+            if detector.size() > features + 1:  # whose length alone is told
+                return np.full(detector.size(), np.nan), stated
+            return _numbers(detector, features + 1), stated
         if "support_vectors" in inside:
-            return _read_support_vectors(top, path), {}
+            return _read_support_vectors(top, path, features), {}
     except InputError:
         raise
     except (ValueError, IndexError, cv2.error, SystemError):
@@ -200,7 +211,7 @@ def _read_opencv(path: Path) -> tuple[np.ndarray, Layout]:
     )
 
 
-def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
+def _read_support_vectors(node: "cv2.FileNode", path: Path, features: int) -> np.ndarray:
     """Weights and bias of a saved cv2.ml.SVM.
 
     Its decision is alpha . K - rho. A classifier takes a positive one for its first label, the lower number; people are
@@ -217,22 +228,29 @@ def _read_support_vectors(node: "cv2.FileNode", path: Path) -> np.ndarray:
         )
     if functions.size() != 1:
         raise InputError(f"classifier {path} has {functions.size()} decision functions; wanted one, of two classes")
-    rows = np.array([_numbers(vectors.at(i)) for i in range(vectors.size())])
+    if vectors.size() > _MOST_MARKS:
+        raise InputError(f"classifier {path} has {vectors.size():,} support vectors; wanted at most {_MOST_MARKS:,}")
+    rows = np.array([_numbers(vectors.at(i), features + 1) for i in range(vectors.size())])
     function = functions.at(0)
     if lacking := [name for name in ("alpha", "rho") if function.getNode(name).empty()]:
         raise InputError(f"classifier {path} lacks {lacking[0]}, a part of its decision function; save it again")
-    alpha, index = _numbers(function.getNode("alpha")), function.getNode("index")
-    place = np.arange(len(rows)) if index.empty() else _numbers(index)
+    alpha, index = _numbers(function.getNode("alpha"), len(rows)), function.getNode("index")
+    place = np.arange(len(rows)) if index.empty() else _numbers(index, len(rows))
     if not ((place >= 0) & (place < len(rows))).all():
         raise InputError(f"classifier {path} names support vectors that it does not hold; save it again")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused with its place
         return sign * np.append(alpha @ rows[place.astype(int)], -function.getNode("rho").real())
 
 
-def _numbers(node: "cv2.FileNode") -> np.ndarray:
-    """A number, or a sequence of them."""
-    return np.array([node.at(i).real() for i in range(node.size())] if node.isSeq() else [node.real()])
+def _numbers(node: "cv2.FileNode", most: int) -> np.ndarray:
+    """A number, or a sequence of them. Raises ValueError for more than `most`: OpenCV finds each from the first on."""
+    if not node.isSeq():
+        return np.array([node.real()])
+    if node.size() > most:
+        raise ValueError(f"{node.size()} numbers")
+    return np.array([node.at(i).real() for i in range(node.size())])
 
 
-_READERS = dict.fromkeys((".npy", ".npz"), _read_numpy)
+_Reader = Callable[[Path, int], tuple[np.ndarray, Layout]]
+_READERS: dict[str, _Reader] = dict.fromkeys((".npy", ".npz"), _read_numpy)
 _READERS |= dict.fromkeys((".yml", ".yaml", ".xml", ".json"), _read_opencv)
