@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.io.flights import packet, sentence
+from tests.io.flights import packet, sentence, ulog
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
@@ -136,6 +136,17 @@ def test_a_log_full_of_beginnings_of_messages_is_read(tmp_path, magic, period):
     )
     assert len(found.time_s) >= 3 and found.place[0, 0] == pytest.approx(10)
     assert any("are no MAVLink messages" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("rubbish", [b"\xff", b"a.", b"0"])
+def test_a_px4_log_is_read_on_behind_megabytes_of_rubbish(tmp_path, rubbish):
+    pytest.importorskip("pyulog")
+    fields, rows = ("double lat", "double lon", "float alt"), [(i * 100_000, 63.4, 10.4, 60 + i) for i in range(40)]
+    content = ulog({"vehicle_global_position": (fields, rows)})
+    half = len(content) - 20 * 33  # messages of 3 + 2 + 28 bytes
+    flown = read(tmp_path / "a.ulg", content[:half] + rubbish * (5_000_000 // len(rubbish)) + content[half:])
+    np.testing.assert_array_equal(flown.above_sea_m, np.arange(60, 100))
+    assert any("the log is damaged" in note for note in flown.notes)
 
 
 @pytest.mark.parametrize("key", ["a." * 200_000 + "a = 1", "[" + "a . " * 100_000 + "a]", "x = {" + "'a'." * 100_000])

@@ -288,22 +288,35 @@ def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
     return build_record(log, clock_offset_s, clock_s, from_first=True)
 
 
-class _Onwards(io.BufferedReader):
-    """A file that seeks back by no more than was read.
+# The beginning of a message: its length, up to about 10,000, and a kind that pyulog knows.
+_HEADER = re.compile(rb"(?:[^\0][\0-\x27]|\0[\1-\x27])[ABCDFILMOPQRS]", re.DOTALL)
 
-    pyulog 1.3 seeks back by the announced length of a damaged message; at the end of the file it would loop forever.
+
+class _Onwards(io.BytesIO):
+    """The bytes of a log, of which those between damage and the next beginning of a message are left out.
+
+    pyulog 1.3 seeks back from a damaged message to the byte behind its first, which takes seconds a megabyte; and at the
+    end of the file by its announced length, though it read less, which would loop forever.
     """
 
-    _short = 0
+    def __init__(self, content: bytes) -> None:
+        super().__init__(content)
+        self._content, self._asked, self._short = content, 0, 0
 
     def read(self, size: int | None = -1, /) -> bytes:
-        data = io.BufferedReader.read(self, size)
-        short = (size or 0) - len(data)
-        self._short = short if short > 0 else 0
+        data = super().read(size)
+        self._asked = size or 0
+        self._short = max(self._asked - len(data), 0)
         return data
 
-    def seek(self, offset: int, whence: int = 0, /) -> int:
-        return super().seek(offset + self._short if whence == io.SEEK_CUR and offset < 0 else offset, whence)
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        if whence != io.SEEK_CUR or offset >= 0:
+            return super().seek(offset, whence)
+        place = self.tell() + offset + self._short
+        if offset == -2 - self._asked:  # behind the first byte of a message, the last that was read
+            following = _HEADER.search(self._content, place)
+            place = len(self._content) if following is None else following.start()
+        return super().seek(place)
 
 
 def _px4_topics(log: Log) -> dict[str, Topic]:
@@ -313,15 +326,16 @@ def _px4_topics(log: Log) -> dict[str, Topic]:
         raise InputError(
             f"telemetry {log.path} is a PX4 log, which needs pyulog: pip install 'torchvision-dddas[telemetry]'"
         ) from None
+    content = log.path.read_bytes()
     try:
         # It prints what it finds damaged.
-        with contextlib.redirect_stdout(io.StringIO()), _Onwards(io.FileIO(log.path)) as file:
-            read = ULog(file, list(_TOPICS))
+        with contextlib.redirect_stdout(io.StringIO()):
+            read = ULog(_Onwards(content), list(_TOPICS))
     except Exception as error:
         raise log.refuse(f"the PX4 log is damaged from its beginning and cannot be read ({error})") from None
     if read.file_corruption:
         log.note("the log is damaged: what could not be read is left out")
-    elif (byte := _cut(log.path.read_bytes())) is not None:
+    elif (byte := _cut(content)) is not None:
         log.note(f"byte {byte}: the file ends within a message; it was cut off")
     if read.dropouts:
         lost_s = sum(part.duration for part in read.dropouts) / 1000
