@@ -72,7 +72,7 @@ def decode_image(data: bytes, flags: int, name: object = "a picture") -> np.ndar
 def most_pixels() -> int:
     """The most pixels that a picture may have: MOST_PIXELS, or what the environment says. Raises InputError."""
     given = os.environ.get(MOST_PIXELS_VARIABLE, "")
-    if given and not (given.isascii() and given.isdigit() and int(given)):
+    if given and not (given.isascii() and given.isdigit() and len(given) < 20 and int(given)):
         raise InputError(f"{MOST_PIXELS_VARIABLE} is '{given}'; wanted a whole number of pixels")
     return int(given or MOST_PIXELS)
 

@@ -119,7 +119,7 @@ _DATE = re.compile(
 UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
 """The note on a log whose dates say no zone."""
 
-_CLOCK = re.compile(r"(\d+):(\d+):(\d+(?:\.\d+)?)")
+_CLOCK = re.compile(r"(\d{1,9}):(\d{1,9}):(\d+(?:\.\d+)?)")
 # Half the width of the picture whose focal length is given for one 36 mm wide.
 _HALF_WIDTH_MM = 18.0
 
