@@ -374,7 +374,8 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 def about(options: bench.Options) -> str:
     """The last line of a text."""
-    return f"{options.seeds} seeds, {options.seconds:g} s each: mean ± standard error (range over seeds)."
+    length = f"{options.seconds:g} s each" if options.seconds else "each as long as the scenario says"
+    return f"{options.seeds} seeds, {length}: mean ± standard error (range over seeds)."
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Every measured table in the documents is what docs/results says: none is typed by hand."""
 
+import argparse
 import importlib
 import itertools
 import json
@@ -83,6 +84,12 @@ def test_a_study_prints_its_text_and_keeps_it_with_its_figures(figures, tmp_path
     assert kept["figures"] == [3] and kept["blocks"][1]["rows"] == [["a", "1.5"], ["b", "–"]]
     assert bench.result_text(kept) == f"Of two:\n\n{table}"
     assert {"processor", "cores", "python", "numpy", "opencv-python-headless"} <= set(kept["machine"])
+
+
+@pytest.mark.parametrize(("seconds", "words"), [(0.0, "each as long as the scenario says"), (19.0, "19 s each")])
+def test_a_study_of_simulations_says_how_long_they_are(figures, seconds, words) -> None:
+    simulated = importlib.import_module("simulated")
+    assert simulated.about(argparse.Namespace(seeds=2, seconds=seconds)).startswith(f"2 seeds, {words}: mean")
 
 
 def test_the_check_of_the_texts_says_nothing_where_all_is_well() -> None:
