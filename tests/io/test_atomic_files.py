@@ -115,3 +115,14 @@ def test_every_file_has_a_name_in_utf8_with_the_same_ending(tmp_path, name):
     found = utf8_name(path)
     assert found.encode().endswith(b".mp4")
     assert Path(found).read_bytes() == b"content"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_an_error_of_an_open_file_names_it(tmp_path):
+    part = PartFile(tmp_path / "a.csv")
+    full = os.open("/dev/full", os.O_WRONLY)
+    with pytest.raises(OSError, match="No space left") as error, part.naming():
+        os.write(full, b"1")
+    os.close(full)
+    assert error.value.filename == str(part.path)
+    part.discard()

@@ -15,7 +15,6 @@ import pytest
 from tests.io.conftest import make_scene
 from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas.errors import InputError, LostInputError
-from torchvision_dddas.io.atomic_files import PartFile
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import (
     AerialRecorder,
@@ -43,7 +42,7 @@ from torchvision_dddas.types import (
 
 PICTURE = np.zeros((60, 80, 3), np.uint8)
 SITE = Site(NAMES, ORIGIN, START, 10.0)
-FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+FULL = errno.ENOSPC, os.strerror(errno.ENOSPC)
 BOTH = ("masks", "overlay")
 ALL_OF_TWO = ["detections.csv", "detections.txt", "masks/000001.png", "masks/000002.png", "overlay.mp4", "run.json"]
 
@@ -223,30 +222,32 @@ def test_ctrl_c_while_a_frame_is_written_waits_for_the_whole_frame(tmp_path, mon
 
 
 @pytest.mark.parametrize("victim", ["mask", "table", "closing"])
-def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(tmp_path, monkeypatch, victim):
-    write, replace = PartFile.write, Path.replace
+def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing_half_written(tmp_path, monkeypatch, victim):
+    write, replace = os.write, Path.replace
 
     def refuse(*_):
-        raise FULL
+        raise OSError(*FULL)
 
-    def refuse_mask(self, content):
-        if "000002" in self.path.name:
-            write(self, content[:10])
-            raise FULL
-        write(self, content)
+    def refuse_mask(file, content):
+        is_second = any(os.path.samestat(os.fstat(file), p.stat()) for p in tmp_path.glob("masks/.000002.*"))
+        return refuse(write(file, content[:10])) if is_second else write(file, content)
 
     def refuse_table(self, target):
-        return refuse() if target.name == "detections.csv" else replace(self, target)
+        if target.name == "detections.csv":
+            raise OSError(*FULL, str(self))
+        return replace(self, target)
 
-    place, how = {
-        "mask": ("torchvision_dddas.io.atomic_files.PartFile.write", refuse_mask),
-        "table": ("torchvision_dddas.io.tables.mot_rows", refuse),
-        "closing": ("pathlib.Path.replace", refuse_table),
+    place, how, file = {
+        "mask": ("os.write", refuse_mask, "masks/000002.png"),
+        "table": ("torchvision_dddas.io.tables.mot_rows", refuse, ""),
+        "closing": ("pathlib.Path.replace", refuse_table, "detections.csv"),
     }[victim]
     monkeypatch.setattr(place, how)
     with pytest.raises(InputError, match="No space left on device") as error:
         fill(tmp_path, [make_scene(1), make_scene(2)])
     assert "\n" not in str(error.value)
+    assert f"cannot write {tmp_path / file}: " in str(error.value)
+    assert "What was not whole, such as tables under way, is removed" in str(error.value)
     assert not any(".part" in name for name in visible(tmp_path))
     assert not {"detections.csv", "overlay.mp4"} & set(visible(tmp_path)) or victim == "closing"
     # The film is encoded beside the rest: the next mask may be there, and whole, before its error is known.

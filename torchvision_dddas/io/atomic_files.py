@@ -52,12 +52,22 @@ class PartFile:
     def write(self, content: bytes) -> None:
         """Add bytes. Raises OSError."""
         rest = memoryview(content)
-        while rest:
-            rest = rest[os.write(self._file, rest) :]
+        with self.naming():
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
 
     def open_text(self) -> TextIO:
         """A text file that writes here; closed before `keep`."""
         return open(self._file, "w", encoding="utf-8", newline="", closefd=False)
+
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """Name the file in an OSError of the block that names none, as those of open files."""
+        try:
+            yield
+        except OSError as error:
+            error.filename = error.filename or str(self.path)
+            raise
 
     def keep(self) -> None:
         """Put the file in its place. Raises OSError."""
@@ -273,6 +283,6 @@ def cannot_write(path: Path, error: OSError) -> InputError:
     part = _PART.fullmatch(path.name)
     place = path if part is None else path.with_name(f"{part[1]}{part[2] or ''}")
     return InputError(
-        f"cannot write {place}: {error.strerror or error}. Nothing half-written was kept; "
-        "free some space or choose another --out"
+        f"cannot write {place}: {error.strerror or error}. What was not whole, such as tables under way, "
+        "is removed; free some space or choose another --out"
     )

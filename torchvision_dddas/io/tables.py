@@ -135,13 +135,15 @@ class TextFiles:
 
     def write(self, *texts: str) -> None:
         """Add to each file, in the order of the paths."""
-        for file, text in zip(self._open(), texts, strict=True):
-            file.write(text)
+        for file, part, text in zip(self._open(), self._parts, texts, strict=True):
+            with part.naming():
+                file.write(text)
 
     def close(self) -> None:
         """Put the files in their places, also those to which nothing was added. Raises OSError if they cannot be."""
-        for file in self._open():
-            file.close()
+        for file, part in zip(self._open(), self._parts, strict=True):
+            with part.naming():
+                file.close()
         for part in self._parts:
             part.keep()
 
