@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchvision_dddas.errors import InputError, readable, without_secrets
+from torchvision_dddas.errors import InputError, printable, readable, without_secrets
 from torchvision_dddas.io.output.run_record import finite
 
 SIGNS = st.characters(min_codepoint=32, max_codepoint=126)
@@ -93,5 +93,6 @@ def test_every_text_is_readable_in_utf8(text):
 
 
 def test_bytes_of_a_name_that_are_no_utf8_are_shown_by_their_numbers():
-    assert readable("cl\udcffip.mp4") == r"cl\xffip.mp4"
+    for show in (readable, printable, lambda text: str(InputError(text))):
+        assert show("cl\udcffip.mp4") == r"cl\xffip.mp4"
     assert readable("\udcc3\udcbc") == "ü"  # a name in UTF-8 where the locale is another

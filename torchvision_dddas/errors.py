@@ -82,11 +82,12 @@ def _line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """The text with its line feeds and spaces, and what steers a terminal or is half a character by its number."""
+    """The text with its line feeds and spaces; what steers a terminal, or is no UTF-8, by its number."""
     if text.isprintable():
         return text
+    text = readable(text)
     return "".join(letter if letter == "\n" or category(letter) == "Zs" else _shown(letter) for letter in text)
 
 
 def _shown(letter: str) -> str:
-    return letter if letter.isprintable() else letter.encode("unicode_escape", "surrogatepass").decode("ascii")
+    return letter if letter.isprintable() else letter.encode("unicode_escape").decode("ascii")

@@ -295,8 +295,8 @@ _HEADER = re.compile(rb"(?:[^\0][\0-\x27]|\0[\1-\x27])[ABCDFILMOPQRS]", re.DOTAL
 class _Onwards(io.BytesIO):
     """The bytes of a log, of which those between damage and the next beginning of a message are left out.
 
-    pyulog 1.3 seeks back from a damaged message to the byte behind its first, which takes seconds a megabyte; and at the
-    end of the file by its announced length, though it read less, which would loop forever.
+    pyulog 1.3 seeks back from a damaged message to the byte behind its first, which takes seconds a megabyte; and at
+    the end of the file by its announced length, though it read less, which would loop forever.
     """
 
     def __init__(self, content: bytes) -> None:
