@@ -47,6 +47,8 @@ def test_what_was_hidden_once_keeps_the_words_that_follow():
         ("me:pass@host/live does not exist", "host/live does not exist"),
         ("rtsp://host/live@2x/clip", "rtsp://host/live@2x/clip"),
         ("http://host:80/a?stream=2", "http://host:80/a?stream=2"),
+        ("rtsp://host/a?k=x is lost; try x=3", "rtsp://host/a?k=*** is lost; try x=3"),
+        ("cannot open 'udp://host:5?ttl=4&k=x'; wait", "cannot open 'udp://host:5?ttl=4&k=***'; wait"),
         ("frames/a@b", "frames/a@b"),
         ("json:/home/me@work/x.jsonl", "json:/home/me@work/x.jsonl"),
         ("keys/key=5/clip.mp4", "keys/key=5/clip.mp4"),
@@ -64,6 +66,9 @@ def test_what_is_no_secret_stays(text, shown):
         "http://10.0.0.1/video.cgi?loginuse=admin&loginpas=hush",
         "http://10.0.0.1/a?u=admin&p=hush",
         "https://10.0.0.1/a?sas=hush",
+        "rtsp://10.0.0.1:1/?u=me&k=hush",
+        "rtsp://10.0.0.1:1/live?stream=2;login=hush&x",
+        "'https://10.0.0.1/a?x=hush.hush,'",
         "/vsicurl/http:/me:hush@10.0.0.1/a.tif",
         "http:/10.0.0.1/a.tif?password=hush",
         "rtsp//me:hush@10.0.0.1/live",
@@ -77,7 +82,7 @@ def test_no_secret_is_shown_of_the_addresses_that_cameras_have(address):
 
 def test_a_text_is_searched_for_secrets_in_time_in_proportion_to_its_length():
     texts = ("@" + "a" * 99, "a" * 99 + "://=", "@" + "a." * 50, "?" + "pass" * 25, "p_" * 50, "a_" * 50 + "://a@b=")
-    more = ("a://" * 25, "//a:" * 25, "pass_" * 20, "=a:/" * 25, "\u00e9" * 99)
+    more = ("a://" * 25, "//a:" * 25, "pass_" * 20, "=a:/" * 25, "?a=." * 25, "?a=." + "." * 96, "\u00e9" * 99)
     for text in (*texts, *more):
         whole, begin_s = text[:-1] * 600, time.process_time()
         for shape in (whole, f"@{whole}", f"{whole}@", f"://=?{whole}", f"{text}{whole} ://a@="):

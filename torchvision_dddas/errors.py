@@ -23,14 +23,22 @@ _SECRET_KEY = re.compile(
     r"|[^\s=?&;/]{0,60}pas|p|pw|pin|otp|sas|jwt|code)|(?<=_)(?:password|passwd|pass|pwd))=)(?!\*\*\*(?:[^\w]|$))[^&]+",
     re.I,
 )
+# Of a query any other value too, up to a blank, unless its key is known to tell of no secret.
+_OTHER_KEY = re.compile(
+    r"((?<=[?&;])(?!(?:(?:rtsp_)?transport|timeout|stimeout|port|rate|fps|framerate|width|height|size|resolution|channel"
+    r"|camera|stream|subtype|profile|codec|video|audio|format|quality|mode|latency|ttl|hops|bytes|interface|localaddr"
+    r"|pkt_size|fifo_size|buffer_size|overrun_nonfatal)=)[^\s=?&;/]+=)[^&\s]*[^&\s'\".,;:)]",
+    re.I,
+)
 _HIDDEN = r"\1***"
 
 
 def without_secrets(text: str) -> str:
     """A text without the names and passwords of its addresses: `user:password@` is left out, `?password=` says ***.
 
-    A password may hold any sign. Where it cannot be known whether an @ ends one, all before it is left out, and of a
-    query all from its secret to the next & or the end of the line. What was hidden once keeps the words that follow.
+    So does any other value of a query whose key is not known to tell of no secret, as `?stream=2` does. A password may
+    hold any sign. Where it cannot be known whether an @ ends one, all before it is left out, and of a query all from
+    its secret to the next & or the end of the line. What was hidden once keeps the words that follow.
     """
     if "@" not in text and (":/" not in text or "=" not in text):
         return text
@@ -42,7 +50,10 @@ def _without_secrets(line: str) -> str:
     line = _LOGIN.sub(r"\1", before + at) + after
     line = _WORD.sub(_without_login, line)
     scheme = _SCHEME.search(line)
-    return line if scheme is None else line[: scheme.end()] + _SECRET_KEY.sub(_HIDDEN, line[scheme.end() :])
+    if scheme is None:
+        return line
+    rest = _SECRET_KEY.sub(_HIDDEN, line[scheme.end() :])
+    return line[: scheme.end()] + _OTHER_KEY.sub(_HIDDEN, rest)
 
 
 def _without_login(word: re.Match[str]) -> str:
