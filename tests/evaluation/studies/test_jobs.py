@@ -114,6 +114,15 @@ def test_bad_input_and_faults_are_the_causes_of_the_tasks_that_meet_them(folder,
     assert all("a fault of the program, KeyError: 'x'" in d.cause and "in broken" in d.trace for d in done)
 
 
+def test_a_signal_that_a_library_turns_into_another_exception_ends_a_job(folder, monkeypatch) -> None:
+    def stopped(*given, **more):
+        raise RuntimeError("an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(jobs, "find", stopped)
+    with pytest.raises(RuntimeError, match="an exception set"):
+        do(folder, job_of(folder), Cache(folder / "empty"))
+
+
 NODE = """
     import asyncio, sys
     {before}

@@ -40,6 +40,7 @@ from torchvision_dddas.evaluation.studies.stages import (
     labelled_frames,
     upstream_task,
 )
+from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.runtime import VERSION
 
 MAX_DEATHS = 3
@@ -191,6 +192,8 @@ def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None)
         except InputError as error:
             return Done(task, cause=str(error), computed=tuple(computed))
         except Exception as error:
+            if is_stop(error):
+                raise
             cause = str(InputError(f"a fault of the program, {type(error).__name__}: {error}"))
             return Done(task, cause=cause, computed=tuple(computed), trace=traceback.format_exc())
 
