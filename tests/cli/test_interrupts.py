@@ -270,6 +270,39 @@ def test_a_signal_that_is_ignored_takes_no_other_with_it():
         signal.signal(signal.SIGTERM, before[1])
 
 
+def test_a_signal_at_any_step_of_the_handling_of_another_one_does_not_hang():
+    together = textwrap.dedent("""
+        import os, signal, sys
+        from torchvision_dddas.io.interrupts import Stopped, raising_signals, uninterrupted
+
+        def trace(frame, event, argument):
+            global left
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return trace
+
+        def send():
+            sys.settrace(trace)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        def send_held():
+            with uninterrupted():
+                send()
+
+        for act in (send, send_held):
+            for left in range(1, 40):
+                with raising_signals(lambda *_: None):
+                    try:
+                        act()
+                        raise SystemExit("no signal came")
+                    except Stopped:
+                        sys.settrace(None)
+    """)
+    result = subprocess.run([sys.executable, "-c", together], cwd=ROOT, capture_output=True, text=True, timeout=30)
+    assert (result.returncode, result.stderr) == (0, "")
+
+
 def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(clip, tmp_path):
     # A mutex of C that is locked twice waits on after a signal, as a library's loop does.
     deafly = "library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)"

@@ -21,6 +21,7 @@ TOGETHER_S = 2.0
 """Signals that follow the first within this time are one request: a second Ctrl-C, or SIGTERM and SIGHUP at once."""
 
 _DEAF_S = 1.0  # after which the main thread counts as stuck in a library, where no signal reaches it
+_POLL_S = 0.01
 
 
 def _heeded() -> list[int]:
@@ -48,7 +49,7 @@ def is_stop(error: BaseException | None) -> bool:
     Libraries raise ImportError or SystemError in its place, and not all say of which exception. An InputError tells of
     something else, also if it came while a signal was dealt with.
     """
-    if isinstance(error, (ImportError, SystemError)) and _heard.is_set():
+    if isinstance(error, (ImportError, SystemError)) and _heard:
         return True
     while error is not None and not isinstance(error, InputError):
         if isinstance(error, KeyboardInterrupt):
@@ -120,7 +121,9 @@ Rescue = Callable[[], bool]
 """Makes the outputs of an open run whole, from another thread; returns whether there are any."""
 
 _rescues: list[Rescue] = []
-_heard = threading.Event()  # the main thread knows of a signal, and acts on it when it may
+# The signals that the main thread knows of; it acts on them when it may. Not an Event, which takes a lock: a handler
+# that a second signal interrupts would wait for itself.
+_heard: list[int] = []
 
 
 @contextmanager
@@ -143,7 +146,7 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
     _heard.clear()
 
     def notice(number: int, frame: FrameType | None) -> None:
-        _heard.set()
+        _heard.append(number)
         signals.noticed = signals.noticed or number
         if taken.acquire(blocking=False):
             raise Stopped(number)
@@ -151,7 +154,10 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
             time.sleep(_DEAF_S)
 
     def ask(number: int) -> None:
-        if not _heard.wait(_DEAF_S) and taken.acquire(blocking=False):
+        until = time.monotonic() + _DEAF_S
+        while not _heard and time.monotonic() < until:
+            time.sleep(_POLL_S)
+        if not _heard and taken.acquire(blocking=False):
             is_rescued.set()
             kept = [rescue() for rescue in reversed(_rescues)]
             end(number, any(kept))
@@ -169,7 +175,7 @@ def uninterrupted() -> Iterator[None]:
     held: list[int] = []
 
     def hold(number: int, frame: FrameType | None) -> None:
-        _heard.set()
+        _heard.append(number)
         held.append(number)
 
     before = {number: signal.signal(number, hold) for number in _heeded()}
