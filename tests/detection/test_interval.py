@@ -138,12 +138,19 @@ def test_a_gap_that_is_set_holds_at_any_distance():
     assert settings_at(50.0, 10, base).settings.small.gap_frames == 6
 
 
-def test_the_gap_of_small_targets_is_reported_only_where_they_are_searched():
-    changed = [
-        {record.parameter for record in follow_distance(1, DistanceSettings(BASE), Flight(high), 10, BASE)[1]}
-        for high in (10.0, 200.0)
-    ]
-    assert ["small.gap_frames" in names for names in changed] == [False, True]
+@pytest.mark.parametrize(
+    ("altitude", "parameters", "is_reported"),
+    [
+        (10.0, {}, False),
+        (200.0, {}, True),
+        (200.0, {"difference.kind": "between_later"}, False),
+        (200.0, {"interval.rule": False, "interval.frames": 2}, False),
+    ],
+)
+def test_the_gap_of_small_targets_is_reported_only_where_they_can_be_searched(altitude, parameters, is_reported):
+    base = with_parameters(BASE, parameters)
+    _, records = follow_distance(1, DistanceSettings(base), Flight(altitude), 10, base)
+    assert ("small.gap_frames" in {record.parameter for record in records}) == is_reported
 
 
 @pytest.mark.parametrize(

@@ -226,7 +226,7 @@ class MotionDetector:
         check_length(self._total)
         self._ended = True
         yield from self._advance()
-        yield from self._fill_gap(last_number + 1)
+        yield from self._fill_gap(last_number + 1, self.interval)
 
     def _advance(self) -> Iterator[Scene]:
         self._register()
@@ -406,7 +406,7 @@ class MotionDetector:
             delay = settling_delay(slot.interval, slot.distance.settings)
             if not self._all_observed and self._emitted + delay >= self._observed:
                 break
-            yield from self._fill_gap(slot.frame.number - slot.frame.skipped)
+            yield from self._fill_gap(slot.frame.number - slot.frame.skipped, slot.interval)
             self._last_number = slot.frame.number
             yield self._build_scene(slot, self._emitted)
             # Colour is most of the memory: the scene has it, and windows use the view's only.
@@ -419,13 +419,13 @@ class MotionDetector:
                 self._slots.popleft()
                 self._first += 1
 
-    def _fill_gap(self, until: int) -> Iterator[Scene]:
+    def _fill_gap(self, until: int, interval: int) -> Iterator[Scene]:
         """Empty scenes for the frame numbers below `until` that could not be read."""
         for number in range(self._last_number + 1, until):
             image = np.zeros_like(self._last.image)
             missing = Frame(number, (number - 1) / self.rate_hz, image)
             detections, mask, _ = build_detections([], (image.shape[1], image.shape[0]))
-            yield Scene(missing, mask, detections, self.interval, False, "the frame could not be read")
+            yield Scene(missing, mask, detections, interval, False, "the frame could not be read")
         self._last_number = until
 
     def _build_scene(self, slot: _Slot, index: int) -> Scene:

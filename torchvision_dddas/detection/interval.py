@@ -105,6 +105,14 @@ def _small_gap(interval: int, settings: Settings) -> int:
     return min(interval, small.gap_frames) if small.on and interval >= small.from_interval else 0
 
 
+def _can_search_small(settings: Settings) -> bool:
+    """Whether small targets are searched for at any interval that can come."""
+    interval = settings.interval
+    longest = max(interval.frames, interval.maximum_frames) if interval.rule else interval.frames
+    has_both_sides = settings.difference.kind not in ("between_later", "to_next")
+    return settings.small.on and has_both_sides and longest >= settings.small.from_interval
+
+
 def small_gap_follows_distance(settings: Settings) -> bool:
     """Whether `small.gap_move_px` sets the gap once the distance to the ground is known."""
     return settings.small.gap_move_px > 0 and not is_set(settings, "small.gap_frames")
@@ -249,6 +257,6 @@ def follow_distance(
         cause += "" if before_m is None else f", was {before_m:.1f} m"
     old = current.values()
     changed = {name: value for name, value in new.values().items() if value != old[name]}
-    if not new.settings.small.on:
+    if not _can_search_small(new.settings):
         changed.pop("small.gap_frames", None)  # it has no effect
     return new, tuple(Adjustment(frame, name, old[name], value, cause) for name, value in changed.items())
