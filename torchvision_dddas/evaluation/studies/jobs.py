@@ -56,6 +56,7 @@ SILENT_S = 60.0
 """A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip is left out."""
 
 _POLL_S = _REPORT_S = 0.25
+_LATE_S = 0.5  # after a signal, workers that were about to start have started by then
 _LONGEST_STEP_S = 1.0  # counted of the time between two polls: longer, and this process was stopped, too
 _TOPIC = "dddas-frames"
 _ONE_THREAD = {
@@ -436,9 +437,15 @@ def _kill_local(client: Any) -> None:
     atexit.unregister(close_clusters)
     for nanny in client.cluster.workers.values() if client is not None else ():
         nanny.close_gracefully()  # else it starts another worker
-    for child in multiprocessing.active_children():
-        if child.name.startswith("Dask Worker"):
-            child.kill()
+    # Those that were about to start would write a traceback once this process has gone.
+    until_s = time.monotonic() + (_LATE_S if client is None else 0.0)
+    while True:
+        for child in multiprocessing.active_children():
+            if child.name.startswith("Dask Worker"):
+                child.kill()
+        if time.monotonic() >= until_s:
+            return
+        time.sleep(0.01)
 
 
 def _start_tracker() -> None:
