@@ -1,6 +1,7 @@
 """Live streams, picture by picture: the camera or the sender may fall silent at any time."""
 
 import os
+import time
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -76,13 +77,14 @@ class AvStream:
     def __init__(self, target: str, name: str, limits_s: tuple[float, float]) -> None:
         import av
 
+        self._limit_s = limits_s[1]
         self._failures = (av.FFmpegError, OSError)
         try:
-            self._container = av.open(target, options=_read_options(), timeout=limits_s)
+            self._container = av.open(target, options=_read_options(), timeout=limits_s, metadata_errors="replace")
         except (*self._failures, ValueError):
             raise InputError(f"cannot open {name} as a stream; is it there?") from None
         videos = self._container.streams.video
-        if not videos or videos[0].codec_context.name == "ansi":
+        if not videos or videos[0].codec_context is None or videos[0].codec_context.name == "ansi":
             self._container.close()
             raise InputError(f"{name} is no video")
         self._video = videos[0]
@@ -93,8 +95,10 @@ class AvStream:
 
     def grab(self) -> bool:
         """Wait for the next picture; False: none came."""
-        self._frame = None
+        self._frame, until_s = None, time.monotonic() + self._limit_s
         while not self._waiting:
+            if time.monotonic() > until_s:  # packets come, and no picture of them
+                return False
             try:
                 packet = next(self._packets)
             except (StopIteration, *self._failures):
