@@ -340,9 +340,10 @@ def poses_at(
     Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
     """
     n = len(frame)
-    place, heading, pitch = np.tile(camera.place, (n, 1)).astype(float), camera.heading_rad, camera.pitch_rad
+    place = np.tile(camera.place, (n, 1)).astype(float)
+    heading, pitch = np.full(n, float(camera.heading_rad)), np.full(n, float(camera.pitch_rad))
     if table is None:
-        return camera, Poses(place, np.full(n, heading), np.full(n, pitch))
+        return camera, Poses(place, heading, pitch)
     if table.timed and rate_hz is None:
         raise InputError(f"poses {table.path} are by time_s; say with --rate how many frames a second there are")
     at, values = table.at, table.values
@@ -367,7 +368,7 @@ def poses_at(
         heading = np.interp(when, at, np.unwrap(np.radians(values["heading_deg"])))
     if "pitch_deg" in values:
         pitch = np.interp(when, at, np.radians(values["pitch_deg"]))
-    return camera, Poses(place, np.broadcast_to(heading, n).astype(float), np.broadcast_to(pitch, n).astype(float))
+    return camera, Poses(place, heading, pitch)
 
 
 # -- frames about a frame ----------------------------------------------------------------------------------------------

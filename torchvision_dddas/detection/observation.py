@@ -370,10 +370,9 @@ def remove_shadow(
     mean = light.mean(axis=0)
     alike = np.abs(light - mean).max(axis=0) < _COLOURS_ALIKE * mean
     low, high = _LIGHT_LEFT
-    shadow = (bare & alike & (mean > low) & (mean < high)).astype(np.uint8)
-    shadow = cv2.morphologyEx(shadow, cv2.MORPH_OPEN, ellipse(5))
-    body = (mask & (shadow == 0)).astype(np.uint8)
-    body = cv2.morphologyEx(body, cv2.MORPH_OPEN, ellipse(3))
+    is_shadow = bare & alike & (mean > low) & (mean < high)
+    shadow = cv2.morphologyEx(is_shadow.astype(np.uint8), cv2.MORPH_OPEN, ellipse(5))
+    body = cv2.morphologyEx((mask & (shadow == 0)).astype(np.uint8), cv2.MORPH_OPEN, ellipse(3))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(body)
     if count < 2:
         return mask

@@ -80,7 +80,7 @@ class AvStream:
         self._limit_s = limits_s[1]
         self._failures = (av.FFmpegError, OSError)
         try:
-            self._container = av.open(target, options=_read_options(), timeout=limits_s, metadata_errors="replace")
+            self._container = av.open(target, options=_read_options(), timeout=limits_s, **_metadata_options(av))
         except (*self._failures, ValueError):
             raise InputError(f"cannot open {name} as a stream; is it there?") from None
         videos = self._container.streams.video
@@ -120,6 +120,11 @@ class AvStream:
     def release(self) -> None:
         """Let go of the connection."""
         self._container.close()
+
+
+def _metadata_options(av: Any) -> dict[str, Any]:
+    """Make PyAV read metadata that is no UTF-8. Since release 19 it always does, and has no such argument."""
+    return {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 
 
 def _read_options() -> dict[str, str]:

@@ -125,9 +125,9 @@ def stack_padded(
     for field in fields(kind):  # type: ignore[arg-type]
         arrays = [np.asarray(row[field.name]) for row in rows]
         if arrays[0].ndim:
-            shape = np.max([array.shape for array in arrays], axis=0)
+            shape = [max(sizes) for sizes in zip(*(array.shape for array in arrays), strict=True)]
             for place, array in enumerate(arrays):
-                wider = [(0, int(size)) for size in shape - array.shape]
+                wider = [(0, size - own) for size, own in zip(shape, array.shape, strict=True)]
                 if pad == "zero" or array.dtype == bool:
                     arrays[place] = np.pad(array, wider)
                 elif array.size:
