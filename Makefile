@@ -3,7 +3,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v p
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: demo test test-all lint onboard peers figures
+.PHONY: demo test test-all lint onboard peers figures gpu
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
@@ -20,6 +20,11 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# On a machine with an accelerator: the tests that need one, and how fast it is beside OpenCV.
+gpu: $(STAMP)
+	$(BIN)/python -m pytest -m gpu
+	$(BIN)/python eval/speed.py gpu
 
 # The wheel with nothing but its own dependencies, as on a vehicle: does it work without torch?
 onboard: .venv-onboard/.installed

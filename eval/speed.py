@@ -5,6 +5,7 @@ python eval/speed.py memory             peak memory of processes that run one ch
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
 python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
+python eval/speed.py gpu                frames a second and the operations' forms on an accelerator; see `make gpu`
 python eval/speed.py association SEQ    the source's association of a MOTChallenge sequence, onboard and torch
 
 The processor's time is summed over threads; a ratio of two in one turn suffers least from other programs. Without DATA
@@ -368,6 +369,13 @@ def measure_operations(options: bench.Options) -> tuple[str, Any]:
     return f"{about}\n\n{bench.format_table(head, table)}", figures
 
 
+def measure_gpu(options: bench.Options) -> tuple[str, Any]:
+    """See `gpu_speed.measure_gpu`, which needs torch."""
+    from gpu_speed import measure_gpu as measure
+
+    return measure(options)
+
+
 def measure_association(options: bench.Options) -> tuple[str, Any]:
     """The source's association of a sequence's true boxes, onboard and torch in turns, in processor time.
 
@@ -467,6 +475,17 @@ if __name__ == "__main__":
         "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
         "geo": (measure_geo, {"--rounds": 15}),
         "operations": (measure_operations, {"--size": "640x480", "--batch": 8, "--rounds": 9}),
+        "gpu": (
+            measure_gpu,
+            {
+                "--sizes": sizes[1:],
+                "--size": "1280x720",
+                "--batch": 8,
+                "--batches": [1, 8, 32],
+                "--rounds": 5,
+                "--device": "cuda",
+            },
+        ),
         "association": (measure_association, {"data": Path, "--interval": 5, "--rounds": 3}),
         "chain": (run_chain, {"data": Path, "--name": "plain"}),
     }

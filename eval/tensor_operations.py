@@ -10,6 +10,7 @@ import torch
 from clips import Size
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.detection.torch_blobs import label_components
 from torchvision_dddas.tracking import rgb_histograms
 
 Call = Callable[[], object]
@@ -17,30 +18,37 @@ _POINTS, _WRONG, _HYPOTHESES, _TOLERANCE_PX = 300, 0.3, 128, 2.0
 _BOXES, _BOX_PX = 10, (40, 90)
 
 
-def operations(size: Size, batch: int) -> dict[str, dict[str, Call | None]]:
-    """{operation: {"OpenCV", "ours", "Kornia"}}, calls that do the work of a batch; None where Kornia has nothing."""
-    made = _of_pictures(size, batch) | _of_points(batch)
+def operations(size: Size, batch: int, device: str = "cpu") -> dict[str, dict[str, Call | None]]:
+    """{operation: {"OpenCV", "ours", "Kornia"}}, calls that do the work of a batch; None where Kornia has nothing.
+
+    device: where torch computes, for ours and for Kornia's. OpenCV computes on the CPU.
+    """
+    made = _of_pictures(size, batch, device) | _of_points(batch, device)
     return {row: dict(zip(("OpenCV", "ours", "Kornia"), calls, strict=True)) for row, calls in made.items()}
 
 
-def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
+def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, Call, Call | None]]:
     width, height = size
     random = np.random.default_rng(0)
     coloured = random.integers(0, 256, (batch, height, width, 3), np.uint8)
     coloured = np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in coloured])
     grey = np.stack([cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in coloured])
-    bytes_, levels = torch.from_numpy(grey)[:, None], torch.from_numpy(grey)[:, None].float()
-    bgr = torch.from_numpy(coloured).permute(0, 3, 1, 2).float().div(255).contiguous()
+    bytes_ = torch.from_numpy(grey)[:, None].to(device)
+    levels = bytes_.float()
+    bgr = torch.from_numpy(coloured).to(device).permute(0, 3, 1, 2).float().div(255).contiguous()
     rgb = bgr.flip(1)
     is_set = (grey > np.percentile(grey, 90)).astype(np.uint8)
-    masks = torch.from_numpy(is_set)[:, None]
+    masks = torch.from_numpy(is_set)[:, None].to(device)
     around = {side: F.structuring_element("ellipse", side) for side in (3, 15)}
     matrix = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
-    matrices = torch.from_numpy(matrix).float().expand(batch, 3, 3)
+    matrices = torch.from_numpy(matrix).float().expand(batch, 3, 3).to(device)
     smaller = (height * 2 // 3, width * 2 // 3)
     corner = random.integers(0, (width - _BOX_PX[0], height - _BOX_PX[1]), (batch, _BOXES, 2))
     box_px = np.concatenate([corner, np.broadcast_to(_BOX_PX, corner.shape)], axis=2).astype(float)
-    boxes, valid = torch.from_numpy(box_px).float(), torch.ones(batch, _BOXES, dtype=torch.bool)
+    boxes, valid = (
+        torch.from_numpy(box_px).float().to(device),
+        torch.ones(batch, _BOXES, dtype=torch.bool, device=device),
+    )
     box_blur, sobel = kornia.filters.box_blur, kornia.filters.sobel
 
     def each(call: Callable[[np.ndarray], object], pictures: np.ndarray = grey) -> Call:
@@ -58,17 +66,19 @@ def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | N
             for x, y, w, h in some
         ]
         count = kornia.enhance.image_histogram2d
-        return [count(crop, 0.0, 255.0, 256, 1.0, torch.arange(256.0)) for crop in crops]
+        return [count(crop, 0.0, 255.0, 256, 1.0, torch.arange(256.0, device=device)) for crop in crops]
 
     def morphology(side: int, how: int, name: str) -> tuple[Call, Call, Call]:
         kernel = around[side]
+        ones = kernel.float().to(device)
         return (
             each(lambda picture: cv2.morphologyEx(picture, how, kernel.numpy()), is_set),
             lambda: getattr(F, name)(masks, kernel),
-            lambda: getattr(kornia.morphology, name)(masks.float(), kernel.float()),
+            lambda: getattr(kornia.morphology, name)(masks.float(), ones),
         )
 
     components = each(lambda picture: cv2.connectedComponentsWithStats(picture, ltype=cv2.CV_32S), is_set)
+    labelled = components if device == "cpu" else lambda: label_components(masks > 0, masks)
     return {
         "warp": (
             each(lambda picture: cv2.warpPerspective(picture, matrix, size)),
@@ -112,9 +122,9 @@ def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | N
             lambda: F.bgr_to_hsv(bgr),
             lambda: kornia.color.rgb_to_hsv(rgb),
         ),
-        "components (ours: OpenCV's)": (
+        "components (ours: OpenCV's)" if device == "cpu" else "components": (
             components,
-            components,
+            labelled,
             lambda: kornia.contrib.connected_components_union_find(masks.float()),
         ),
         f"histograms of {_BOXES} boxes": (
@@ -125,7 +135,7 @@ def _of_pictures(size: Size, batch: int) -> dict[str, tuple[Call, Call, Call | N
     }
 
 
-def _of_points(batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
+def _of_points(batch: int, device: str) -> dict[str, tuple[Call, Call, Call | None]]:
     generator = torch.Generator().manual_seed(0)
     matrix = torch.tensor([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]]).expand(batch, 3, 3)
     points = 400 * torch.rand(batch, _POINTS, 2, generator=generator)
@@ -135,27 +145,31 @@ def _of_points(batch: int) -> dict[str, tuple[Call, Call, Call | None]]:
     weights = 0.5 + torch.rand(batch, _POINTS, generator=generator)
     there = torch.ones(batch, _POINTS, dtype=torch.bool)
     samples = F.draw_samples(generator, 1, _HYPOTHESES, _POINTS).expand(batch, -1, -1)
+    homography, host = matrix[0].double().numpy(), (points, seen, wrong)
+    matrix, points, seen, wrong, weights, there, samples = (
+        given.to(device) for given in (matrix, points, seen, wrong, weights, there, samples)
+    )
     many = points.repeat(1, 100, 1)
-    homography = matrix[0].double().numpy()
+    many_on_host = many.cpu().numpy()
     kornias = kornia.geometry.RANSAC("homography", inl_th=_TOLERANCE_PX, seed=0)
 
     def each(call: Callable[[Any, Any], object], other: torch.Tensor) -> Call:
-        pairs = [(p.numpy(), q.numpy()) for p, q in zip(points, other, strict=True)]
+        pairs = [(p.numpy(), q.numpy()) for p, q in zip(host[0], other, strict=True)]
         return lambda: [call(p, q) for p, q in pairs]
 
     return {
         f"homography of {_POINTS}, weighted (OpenCV: not)": (
-            each(lambda p, q: cv2.findHomography(p, q, 0), seen),
+            each(lambda p, q: cv2.findHomography(p, q, 0), host[1]),
             lambda: F.find_homography(points, seen, weights),
             lambda: kornia.geometry.find_homography_dlt(points, seen, weights),
         ),
         f"RANSAC of {_POINTS}, {_WRONG:.0%} wrong": (
-            each(lambda p, q: cv2.findHomography(p, q, cv2.RANSAC, _TOLERANCE_PX), wrong),
+            each(lambda p, q: cv2.findHomography(p, q, cv2.RANSAC, _TOLERANCE_PX), host[2]),
             lambda: F.ransac(points, wrong, there, samples, tolerance_px=_TOLERANCE_PX),
             lambda: [kornias(p, q) for p, q in zip(points, wrong, strict=True)],
         ),
         f"{many.shape[1]} points transformed (ours: Kornia's)": (
-            lambda: [cv2.perspectiveTransform(some.numpy()[:, None], homography) for some in many],
+            lambda: [cv2.perspectiveTransform(some[:, None], homography) for some in many_on_host],
             lambda: F.transform_points(matrix, many),
             lambda: kornia.geometry.transform_points(matrix, many),
         ),

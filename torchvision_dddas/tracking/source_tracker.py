@@ -39,7 +39,7 @@ def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     for row, crop in zip(counts, crops(image, box_px), strict=True):
         if crop.size:
             for place, channel in enumerate((2, 1, 0)):
-                row[place] = cv2.calcHist([crop], [channel], None, [256], [0, 256])[:, 0]
+                row[place] = cv2.calcHist([crop], [channel], None, [256], [0, 256]).ravel()
     return counts.reshape(len(box_px), 768)
 
 
