@@ -1,7 +1,7 @@
 """Time and memory, always beside a reference in the same turns: ratios are medians over turns, with quartiles.
 
 python eval/speed.py detection [DATA]   a frame by stage and resolution, beside the plain OpenCV chain; onboard, torch
-python eval/speed.py memory             peak memory of processes that run one chain, and `dddas detect`
+python eval/speed.py memory             peak memory of one chain alone, of `dddas detect` and of `dddas people`
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
 python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
@@ -212,7 +212,7 @@ def _films(data: Path | None, size: Size) -> Iterable[tuple[str, list[np.ndarray
 def measure_memory(options: bench.Options) -> tuple[str, Any]:
     """Peak memory of a process that takes one chain through a video; "nothing" reads the video only.
 
-    `dddas detect` runs on videos of two lengths: its memory does not grow.
+    `dddas detect` and `dddas people` run on videos of two lengths: their memory does not grow.
     """
     width, height = bench.parse_size(options.size)
     found = {}
@@ -224,10 +224,15 @@ def measure_memory(options: bench.Options) -> tuple[str, Any]:
                 name: [sys.executable, __file__, "chain", str(video), "--name", name]
                 for name in ("nothing", "plain", *available_chains(options.chains))
             }
-            detect = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()", "detect", str(video)]
-            detect += ["--backend", "onboard", "--quiet", "--save", "none", "--out"]
-            commands["dddas detect, default"] = [*detect, f"{folder}/default-{frames}"]
-            commands["dddas detect, fast"] = [*detect, f"{folder}/fast-{frames}", "--config", "fast"]
+            dddas = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()"]
+            words = [str(video), "--quiet", "--save", "none", "--out"]
+            for config in ("default", "fast"):
+                place = f"{folder}/{config}-{frames}"
+                commands[f"dddas detect, {config}"] = [
+                    *[*dddas, "detect", *words, place, "--backend", "onboard"],
+                    *(["--config", config] if config == "fast" else []),
+                ]
+            commands["dddas people"] = [*dddas, "people", *words, f"{folder}/people-{frames}"]
             for name, command in commands.items():
                 found.setdefault(name, {})[frames] = bench.measure_memory(command)
                 bench.log(name, frames, found[name][frames])

@@ -189,8 +189,8 @@ def test_each_engine_runs_and_finds_nobody_in_noise(dddas, tmp_path, backend):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak is read from /proc")
-def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(tmp_path):
-    """A film besides takes 35 MB more: PyAV and its encoder."""
+def test_people_needs_little_memory_and_loads_neither_scipy_nor_torch(tmp_path):
+    """It allocates 70 MB. Pages of libraries are not counted: the kernel maps more or fewer of the same library."""
     for name in ("1.png", "2.png"):
         image = np.random.default_rng(0).integers(0, 256, (480, 640, 3), dtype=np.uint8)
         cv2.imwrite(str(tmp_path / name), image)
@@ -204,17 +204,18 @@ def test_people_needs_less_than_150_mb_and_loads_neither_scipy_nor_torch(tmp_pat
         try:
             torchvision_dddas.cli.main()
         except SystemExit as stop:
-            lines = Path("/proc/self/status").read_text().splitlines()
-            peak_mb = next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
-            print(json.dumps([stop.code, peak_mb, [name for name in ("scipy", "torch") if name in sys.modules]]))
+            status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+            peak_mb, files_mb = (int(status[name].split()[0]) / 1024 for name in ("VmHWM", "RssFile"))
+            loaded = [name for name in ("scipy", "torch") if name in sys.modules]
+            print(json.dumps([stop.code, peak_mb - files_mb, loaded]))
     """
     words = f"people {tmp_path} --set people.search=regions --set people.scale_step=1.2 --save none --quiet"
     command = [sys.executable, "-c", textwrap.dedent(program), *words.split(), "--out", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
-    code, peak_mb, loaded = json.loads(done.stdout)
+    code, allocated_mb, loaded = json.loads(done.stdout)
     assert not code and loaded == []
-    assert peak_mb < 150
+    assert allocated_mb < 110
 
 
 # Track.
