@@ -1,16 +1,28 @@
 # A bare machine needs Python 3.11 and a package index; everything else is made here, inside .venv.
-PYTHON ?= $(shell command -v python3.11 || command -v python3.12 || command -v python3.13 || command -v python3)
-BIN := .venv/bin
-STAMP := .venv/.installed
+PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
+	$$name -c '' 2> /dev/null && { echo $$name; break; }; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+EXTRAS := torch,video,telemetry,elevation,export,train,tune,distributed,parquet,dev
 
-.PHONY: demo test test-all lint onboard peers figures gpu
+.PHONY: demo test test-all lint quick oldest onboard peers figures gpu
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
 
 # What a change needs: lint, types and the quick tests.
-test: lint
+test: lint quick
+
+quick: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
+
+# The quick tests with the oldest release of each dependency that pyproject.toml admits.
+oldest:
+	test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check uv
+	VIRTUAL_ENV=.venv-oldest .venv-oldest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EXTRAS)]'
+	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
 # Everything: the slow tests, those in a browser, and the install without torch too.
 test-all: test onboard
@@ -61,6 +73,6 @@ endif
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "torchvision-dddas needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.11" >&2; exit 2; }
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[torch,video,telemetry,elevation,export,train,tune,distributed,parquet,dev]'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRAS)]'
 	@touch $@
