@@ -1,7 +1,6 @@
 """What tuning by gradient is worth, by hard decisions on data that nothing was learned from.
 
 python eval/tuning.py recovery           perturbed parameters of motion, on simulated scenes
-python eval/tuning.py registration       tolerances that are three times too wide or narrow
 python eval/tuning.py default            the shipped parameters of the difference beside those before they were tuned
 python eval/tuning.py identities DATA    the tracker's parameters, each sequence left out in turn
 python eval/tuning.py affinities DATA    the source's association, the same
@@ -12,7 +11,6 @@ Gradient descent beside random search or Optuna at equal time: `dddas tune` and 
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +18,9 @@ import bench
 import clips
 import numpy as np
 import torch
-from robustness import corner_distance
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.detection import detect_motion, load_engine
+from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics import pixels as segmentation
@@ -34,7 +31,6 @@ from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.tuning.descent import Plan, descend
 from torchvision_dddas.tuning.motion import MotionFamily
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.registration import RegistrationFamily
 from torchvision_dddas.tuning.source_association import SourceFamily
 from torchvision_dddas.tuning.tracking import TrackingFamily
 
@@ -42,7 +38,6 @@ MOTION = ("difference.noise_levels", "difference.gradient_share", "difference.th
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
 BASE = {"gates.min_area_px": 60, "morphology.close_px": 9}
 """People are some ten pixels tall at this size."""
-TOLERANCES = ("registration.ransac_px", "registration.forward_backward_px")
 BEFORE = {"difference.threshold": 4.0, "difference.gradient_share": 0.15, "refine.spatial_px": 60.0}
 
 
@@ -76,47 +71,6 @@ def measure_recovery(options: bench.Options) -> tuple[str, Any]:
     text = bench.format_table(["scene", "shipped", "perturbed", "tuned", "least, tuned / shipped"], cells)
     recovered = int((table[:, 2] >= WITHIN * table[:, 0]).sum())
     return f"{text}\n\nRecovered: {recovered} of {options.seeds} seeds.", rows
-
-
-def measure_registration(options: bench.Options) -> tuple[str, Any]:
-    """Tolerances of the registration that start at three times and a third of the shipped values.
-
-    They learn from masks; the true homographies are used for judging only: mean distance over the corners, px.
-    """
-    shipped, cells, found = with_parameters(load_config(), BASE), [], {}
-    for name, factor in (("three times", 3.0), ("a third", 1 / 3)):
-        rows = []
-        for seed in range(options.seeds):
-            with tempfile.TemporaryDirectory() as place:
-                numbers = 2 * seed, 2 * seed + 1
-                pair = [film_clip(Path(place), number, SIZE) for number in numbers]
-                start, family = scaled(shipped, dict.fromkeys(TOLERANCES, factor)), RegistrationFamily()
-                plan = Plan(options.steps, 4, 0.15, seed, most_watched=4)
-                tuned = descend(family, Parameters(start, TOLERANCES), family.examples(pair[:1], start), plan).settings
-                rows.append(
-                    [
-                        [(corner_error(clip, number, s), measure_f(clip, s)) for s in (shipped, start, tuned)]
-                        for clip, number in zip(pair, numbers, strict=True)
-                    ]
-                )
-            bench.log(name, seed, np.round(rows[-1], 3).tolist())
-        found[name] = table = np.array(rows)  # seed, scene, setting, measure
-        for k, scene in enumerate(("learned from", "not learned from")):
-            px, share = np.moveaxis(table[:, k].mean(axis=0), -1, 0)
-            nearer = f"{int((table[:, k, 2, 0] < table[:, k, 0, 0]).sum())} of {len(rows)}"
-            cells.append([name, scene, *(f"{v:.3f}" for v in (*px, *share)), nearer])
-    head = ["begins at", "scene", "corners, px: shipped", "start", "tuned", "F: shipped", "start", "tuned"]
-    return bench.format_table([*head, "nearer than shipped"], cells, words=2), found
-
-
-def corner_error(clip: Clip, seed: int, settings: Settings) -> float:
-    """Mean error of the registrations over the corners, px."""
-    maps = [view.image_from_ground for view in clips.flight(seed, FRAMES, SIZE, clips.RATE_HZ)]
-    true = [later @ np.linalg.inv(earlier) for earlier, later in pairwise(maps)]
-    engine = load_engine("onboard", settings)
-    views = [engine.prepare(frame.image) for frame in open_clip(clip)]
-    ours = [engine.register([pair])[0].later_from_earlier for pair in pairwise(views)]
-    return float(np.mean([corner_distance(a, b, *SIZE) for a, b in zip(ours, true, strict=True)]))
 
 
 def measure_default(options: bench.Options) -> tuple[str, Any]:
@@ -223,7 +177,6 @@ if __name__ == "__main__":
     left_out = {"data": Path, "--interval": 5, "--steps": 24, "--only": []}
     studies = {
         "recovery": (measure_recovery, seeds),
-        "registration": (measure_registration, seeds | {"--seeds": 8}),
         "default": (measure_default, {"--seeds": 20}),
         "identities": (measure_identities, left_out | {"--detections": False}),
         "affinities": (measure_affinities, left_out),

@@ -8,8 +8,9 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
-from torchvision_dddas.detection import View, Window, detect_keypoints, load_engine
+from torchvision_dddas.detection import View, Window, load_engine
 from torchvision_dddas.detection.engine import fit_exposure, match_exposure
+from torchvision_dddas.detection.opencv_engine import detect_keypoints
 from torchvision_dddas.geometry import corner_error
 
 SIZE = (320, 240)

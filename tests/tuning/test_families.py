@@ -42,7 +42,6 @@ IDLE = frozenset(f"track.{name}" for name in IDLE_SCORES.split())
 IDLE_POSITIONS = "aerial.focal_sigma aerial.own_sigma ground.body_height_sigma_m ground.height_sigma ground.feet_sigma"
 CASES = {
     "motion": Case("motion", lambda place, _: filmed_clip(place, 9), list(range(1, 10)), "no masks", MOTION),
-    "registration": Case("registration", lambda place, _: filmed_clip(place, 5), [1, 2, 3, 4], "no masks"),
     "tracking": Case(
         "tracking",
         lambda place, _: walk(),

@@ -20,13 +20,11 @@ from torchvision_dddas.detection.interval import (
     pixels_per_metre,
     with_logged_focal,
 )
-from torchvision_dddas.detection.opencv_engine import LAST_TOLERANCE, detect_keypoints, fit_motion, track_both_ways
 
 if TYPE_CHECKING:
     from torchvision_dddas.detection.torch_engine import TorchEngine
 
 __all__ = [
-    "LAST_TOLERANCE",
     "WALKER_M_S",
     "Engine",
     "Foreground",
@@ -37,17 +35,14 @@ __all__ = [
     "Window",
     "check_length",
     "describe_distance",
-    "detect_keypoints",
     "detect_motion",
     "fill_hull",
-    "fit_motion",
     "interval_from_flow",
     "interval_from_telemetry",
     "load_engine",
     "look_cost",
     "match_exposure",
     "pixels_per_metre",
-    "track_both_ways",
     "with_logged_focal",
 ]
 

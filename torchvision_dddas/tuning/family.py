@@ -24,7 +24,6 @@ Tick = Callable[[], object]
 
 FAMILIES = {
     "motion": "motion.MotionFamily",
-    "registration": "registration.RegistrationFamily",
     "tracking": "tracking.TrackingFamily",
     "paper": "source_association.SourceFamily",
     "people": "people.PeopleFamily",

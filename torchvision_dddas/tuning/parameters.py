@@ -86,8 +86,6 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "blur_px", rounding="odd"),
     **_from_settings("motion", "morphology", "erode_px dilate_px close_px", rounding="whole"),
     **_from_settings("motion", "gates", "min_area_px", rounding="whole"),
-    **_from_settings("registration", "registration", "ransac_px"),
-    **_from_settings("registration", "registration", "forward_backward_px", offset=0.01),
     **_from_settings("tracking", "track", "wander scatter size_scatter tail upright rest_drift"),
     **_from_settings("tracking", "track", "crossing", offset=0.01),
     **_from_settings("tracking", "track", "rest_price appearance_weight", offset=0.1),
