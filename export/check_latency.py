@@ -2,7 +2,7 @@
 
 usage: python export/check_latency.py [CLIP] [--size 640x480] [--config fast] [--rate 25] [--frames 100] [--people]
 
-Run it where `pip install torchvision-dddas` went. CLIP is a video or a folder of pictures; without one the project's
+Run it where the package is installed. CLIP is a video or a folder of pictures; without one the project's
 own scene is rendered at --size. Told are milliseconds a frame, the middle, the 95th and the 99th of a hundred and the
 worst, beside the time that --rate leaves; the time of one set of landmarks through the homography graph; the peak
 memory. Exit code 0 if the 99th of a hundred fits the rate, 1 if not.

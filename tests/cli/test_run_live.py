@@ -1,5 +1,6 @@
 """`dddas run --live`: streams, the session's own folder, and one line for each mistake."""
 
+import errno
 import itertools
 import json
 import os
@@ -14,6 +15,10 @@ import urllib.error
 import urllib.request
 from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -167,6 +172,188 @@ def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):
         said = bad(dddas("run", frames, *FAST, "--serve", port, "--out", tmp_path / "out"))
     assert f"cannot serve at 127.0.0.1:{port}" in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_session_that_cannot_begin_its_log_is_one_line_and_its_record_says_failed(
+    dddas, frames, tmp_path, monkeypatch
+):
+    honest = os.open
+
+    def refuse(path, *how, **more):
+        if str(path).endswith("events.log"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return honest(path, *how, **more)
+
+    monkeypatch.setattr("os.open", refuse)
+    said = bad(dddas("run", frames, *FAST, "--out", tmp_path))
+    assert "events.log cannot be written: No space left on device" in said
+    _, record, results = session(tmp_path)
+    assert record["state"] == "failed" and results == []
+    assert [event["kind"] for event in record["events"]] == ["sink"]
+
+
+@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+def test_a_record_that_cannot_be_replaced_at_the_end_is_an_event_one_line_and_no_success(
+    dddas, frames, tmp_path, monkeypatch, quiet
+):
+    honest = Path.replace
+
+    def refuse(self, target):
+        if target.name == "run.json" and target.exists():
+            raise PermissionError(errno.EACCES, "Permission denied", str(self))
+        return honest(self, target)
+
+    monkeypatch.setattr("pathlib.Path.replace", refuse)
+    done = dddas("run", frames, *FAST, "--out", tmp_path, *quiet)
+    assert done.exit_code == 74
+    folder, record, results = session(tmp_path)
+    assert record["state"] == "running" and len(results) == FRAMES
+    assert " sink: run.json cannot be written: Permission denied; tried again" in (folder / "events.log").read_text()
+    lines = [line for line in done.stderr.splitlines() if str(folder) in line and "Permission denied" in line]
+    assert lines == [
+        f"dddas: {folder}: run.json cannot be written: Permission denied; free some space or choose another --out"
+    ]
+    assert not quiet or len(done.stderr.splitlines()) == 1
+
+
+def nmea(begins_utc_s: float, seconds: int, north_m_s: float = 50.0) -> str:
+    """A log of a vehicle that goes north from 48 N 11.5 E, one fix a second."""
+    lines = []
+    for k in range(seconds + 1):
+        moment = datetime.fromtimestamp(begins_utc_s + k, UTC)
+        clock, date = f"{moment:%H%M%S}.{moment.microsecond // 1000:03d}", f"{moment:%d%m%y}"
+        minutes = k * north_m_s / 1855.0
+        place = f"48{minutes:08.5f},N,01130.00000,E"
+        lines += [f"GPRMC,{clock},A,{place},50.0,0.0,{date},,,A", f"GPGGA,{clock},{place},1,10,1.0,540.0,M,46.0,M,,"]
+    return "".join(f"${line}*{reduce(xor, line.encode()):02X}\n" for line in lines)
+
+
+@pytest.fixture
+def film_camera(monkeypatch):
+    """A camera that shows a film again and again, and ends the run by a signal after so many pictures."""
+
+    def install(pictures: int) -> None:
+        images = itertools.cycle(render(0, FRAMES, (240, 180)).images)
+        end = [lambda: os.kill(os.getpid(), signal.SIGTERM)]
+        rest = (step for image in images for step in (lambda: time.sleep(0.02), image))
+        script = itertools.chain(itertools.islice(rest, 2 * pictures), end, rest)
+        for module in ("capture", "refusal"):
+            monkeypatch.setattr(f"torchvision_dddas.live.{module}.open_stream", lambda *_: FakeStream(script))
+
+    return install
+
+
+CAMERA = "hfov_deg = 60\npitch_deg = 60\nheading_deg = 0\nheight_m = 15\n"
+
+
+@pytest.mark.parametrize("ago_s", [1440, 100])
+def test_the_log_of_another_time_is_refused_beside_a_camera_and_leaves_no_session(
+    dddas, film_camera, file, tmp_path, ago_s
+):
+    pytest.importorskip("pynmea2")
+    film_camera(40)
+    given = ("--telemetry", file("log.nmea", nmea(time.time() - ago_s, 20)), "--camera", file("camera.toml", CAMERA))
+    said = bad(dddas("run", "rtsp://127.0.0.1:9/live", *FAST, *given, "--out", tmp_path / "out"))
+    assert "before the first picture" in said and "its places are not those of now" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_are_those_of_the_log_at_the_time_of_the_picture(dddas, film_camera, file, tmp_path):
+    pytest.importorskip("pynmea2")
+    film_camera(40)
+    begins_utc_s = time.time() - 30
+    given = ("--telemetry", file("log.nmea", nmea(begins_utc_s, 600)), "--camera", file("camera.toml", CAMERA))
+    done = dddas("run", "rtsp://127.0.0.1:9/live", *FAST, *given, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    _, record, results = session(tmp_path / "out")
+    assert any("aligned by the clock" in note for note in record["notes"])
+    placed = [(line, target) for line in results for target in line["targets"] if target.get("lonlat_deg")]
+    assert placed
+    for line, target in placed:
+        flown_m = (datetime.fromisoformat(line["utc"]).timestamp() - begins_utc_s) * 50.0
+        # The targets lie within tens of metres of the vehicle; an alignment by the log's own zero is 1500 m off.
+        assert (target["lonlat_deg"][1] - 48) * 111_200 == pytest.approx(flown_m, abs=60)
+
+
+def test_a_recording_has_the_times_of_day_of_its_own_log(dddas, frames, file, tmp_path):
+    pytest.importorskip("pynmea2")
+    given = ("--telemetry", file("log.nmea", nmea(1.6e9, 20)), "--camera", file("camera.toml", CAMERA), "--rate", "10")
+    done = dddas("run", frames, *FAST, *given, "--out", tmp_path / "out", "--emit", f"cot:{tmp_path}/cot.xml")
+    assert done.exit_code == 0, done.output
+    _, record, results = session(tmp_path / "out")
+    assert [line["utc"][:21] for line in results[:3]] == [f"2020-09-13T12:26:40.{k}" for k in range(3)]
+    assert any("this is a recording" in note for note in record["notes"])
+    events = (tmp_path / "cot.xml").read_text()
+    assert 'time="2020-09-13T12:26:4' in events and not re.search('time="(?!2020-09-13T12:26:4)', events)
+
+
+def test_a_log_without_times_of_day_is_taken_from_the_first_picture_on_and_a_note_says_so(
+    dddas, film_camera, file, tmp_path
+):
+    film_camera(30)
+    page = (Path(__file__).resolve().parents[2] / "docs/onboard.md").read_text(encoding="utf-8")
+    (table,) = re.findall(r"```\n(time_s,.*?)```", page, re.DOTALL)
+    log = file("mast.csv", table)
+    done = dddas("run", "rtsp://127.0.0.1:9/live", *FAST, "--telemetry", log, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    _, record, results = session(tmp_path / "out")
+    assert any("says no time of day: its time 0 counts as the first picture's" in note for note in record["notes"])
+    places = [target["lonlat_deg"] for line in results for target in line["targets"] if target.get("lonlat_deg")]
+    assert places and np.abs(np.subtract(places, [-110.95, 32.23])).max() < 0.002
+
+
+@pytest.mark.parametrize(
+    ("address", "content", "environ", "opened"),
+    [
+        ("rtsp://me@host/live", "s3cret\n", None, "rtsp://me:s3cret@host/live"),
+        (
+            "rtsp://me@host/live",
+            "p@ss/w:rd %é \r\nmore\n",
+            "other",
+            "rtsp://me:p%40ss%2Fw%3Ard%20%25%C3%A9%20@host/live",
+        ),
+        ("rtsp://me@host/live", None, "s3cret", "rtsp://me:s3cret@host/live"),
+        ("rtsp://me:own@host/live", None, "s3cret", "rtsp://me:own@host/live"),
+        ("rtsp://host/live?mail=a@b", None, "s3cret", "rtsp://host/live?mail=a@b"),
+        ("http://me@host:81/a@b", "s3cret", None, "http://me:s3cret@host:81/a@b"),
+    ],
+)
+def test_the_password_of_an_address_may_be_in_a_file_or_in_the_environment(
+    dddas, file, tmp_path, monkeypatch, address, content, environ, opened
+):
+    asked: list[str] = []
+
+    def refuse(target, name, *_):
+        asked.append(target)
+        raise InputError(f"cannot open {name} as a stream; is it there?")
+
+    for module in ("capture", "refusal"):
+        monkeypatch.setattr(f"torchvision_dddas.live.{module}.open_stream", refuse)
+    monkeypatch.setattr("torchvision_dddas.live.refusal.answered_status", lambda *_: None)
+    monkeypatch.delenv("DDDAS_PASSWORD", raising=False)
+    if environ is not None:
+        monkeypatch.setenv("DDDAS_PASSWORD", environ)
+    given = () if content is None else ("--password-file", file("password", content))
+    said = bad(dddas("run", address, *FAST, *given, "--out", tmp_path / "out"))
+    assert asked == [opened] and "cret" not in said and "@" not in said.replace("a@b", "")
+
+
+@pytest.mark.parametrize(
+    ("clip", "content", "words"),
+    [
+        ("rtsp://host/live", "s3cret", "is for an address with a name alone"),
+        ("rtsp://me:own@host/live", "s3cret", "is for an address with a name alone"),
+        ("camera:0", "s3cret", "is for an address with a name alone"),
+        ("rtsp://me@host/live", "\ns3cret", "begins with an empty line"),
+        ("rtsp://me@host/live", None, "cannot be read: No such file"),
+    ],
+)
+def test_a_password_file_of_no_use_is_one_line_without_the_password(dddas, tmp_path, clip, content, words):
+    path = tmp_path / "password"
+    if content is not None:
+        path.write_text(content)
+    said = bad(dddas("run", clip, *FAST, "--password-file", path, "--out", tmp_path / "out"))
+    assert words in said and "s3cret" not in said and "own" not in said
 
 
 def test_a_place_that_cannot_be_written_is_one_line(dddas, frames, tmp_path):

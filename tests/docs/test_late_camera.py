@@ -122,3 +122,18 @@ def ask(address: str) -> dict[str, Any]:
 
 def test_the_service_waits_for_its_camera() -> None:
     assert re.search(r"^ExecStart=.* --live --wait ", (ROOT / "export/dddas.service").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("recipe", ["export/dddas.service", "export/README.md", "export/Containerfile"])
+def test_a_recipe_installs_the_wheel_that_it_has_built(recipe: str) -> None:
+    text = (ROOT / recipe).read_text(encoding="utf-8").replace("\\\n", " ")
+    (built,) = re.findall(r"pip wheel .*--no-deps --wheel-dir (\S+) \.", text)
+    (installed,) = re.findall(r"pip install .*\$\(echo (\S+)\)\[video\]", text)
+    assert installed == f"{built}/*.whl" and "pip install torchvision-dddas" not in text
+
+
+def test_the_service_may_take_the_memory_that_its_largest_measured_run_takes() -> None:
+    unit = (ROOT / "export/dddas.service").read_text(encoding="utf-8")
+    (high,), (most,) = (re.findall(rf"^{name}=(\d+)M$", unit, re.MULTILINE) for name in ("MemoryHigh", "MemoryMax"))
+    measured = [int(size) for size in re.findall(r"\b(\d+) MB\b", unit)]
+    assert len(measured) == 3 and 1.1 * max(measured) < int(high) < int(most)

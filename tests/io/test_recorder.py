@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import signal
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from torchvision_dddas.io.output import (
     describe_nothing_located,
     parse_save,
 )
-from torchvision_dddas.io.output.run_record import Durations, finite
+from torchvision_dddas.io.output.run_record import Durations, finite, write_run_record
 from torchvision_dddas.io.tables import TableFiles
 from torchvision_dddas.types import (
     Adjustment,
@@ -119,6 +120,66 @@ def test_a_recorder_replaces_no_file_of_another_program(tmp_path, make):
             make(tmp_path)
         assert (tmp_path / name).read_text() == "mine"
         (tmp_path / name).unlink()
+
+
+def make_old(folder):
+    """A complete run of each recorder's files, as if an earlier one had left them, and files of the user's."""
+    folder.mkdir()
+    for name in {name for make, *_ in RECORDERS.values() for name in make.files} - {"run.json"}:
+        (folder / name).write_text("old")
+    for number in (1, 2, 3, 40):
+        (folder / "masks").mkdir(exist_ok=True)
+        (folder / "masks" / f"{number:06d}.png").write_text("old")
+    (folder / "notes.txt").write_text("old, and the user's")
+    write_run_record(folder / "run.json", "complete", {})
+
+
+@pytest.mark.parametrize("ended", ["whole", "interrupted", "failed", "without overlay", "killed"])
+@pytest.mark.parametrize("kind", RECORDERS)
+def test_from_its_first_item_on_a_run_has_the_folder_for_itself_however_it_ends(tmp_path, kind, ended, monkeypatch):
+    make, begin, item = RECORDERS[kind]
+    folder, own = tmp_path / "out", set(make.files)
+    make_old(folder)
+    others = {name for name in visible(folder) if name not in own and not ("masks/" in name and make.numbered)}
+
+    def refuse(*_):
+        raise ValueError("the encoder is out of order")
+
+    if ended == "without overlay":
+        monkeypatch.setattr("torchvision_dddas.io.overlay_video._H264.encode", refuse)
+    error = {"interrupted": KeyboardInterrupt(), "failed": InputError("frame 3 is no picture")}.get(ended)
+    recorder = make(folder)
+    with suppress(InputError, KeyboardInterrupt), recorder:
+        begin(recorder)
+        for number in (1, 2):
+            recorder.write(item(number))
+        if ended == "killed":  # nothing of what follows is done
+            now = {name: content for name, content in contents(folder).items() if ".part" not in name}
+        if error is not None:
+            raise error
+    now = now if ended == "killed" else contents(folder)
+    state = json.loads(now["run.json"])["state"]
+    assert state == {"interrupted": "interrupted", "failed": "failed", "killed": "running"}.get(ended, "complete")
+    assert {name for name, content in now.items() if content.startswith(b"old")} == others
+    assert "notes.txt" in others
+
+
+def test_what_is_not_saved_is_not_left_from_the_run_before(tmp_path):
+    fill(tmp_path, [make_scene(n) for n in (1, 2, 3)])
+    fill(tmp_path, [make_scene(n) for n in (1, 3)], save=("masks",))
+    assert visible(tmp_path) == ["detections.csv", "detections.txt", "masks/000001.png", "masks/000003.png", "run.json"]
+    fill(tmp_path, [])
+    assert visible(tmp_path) == ["detections.csv", "detections.txt", "run.json"]
+    assert run_json(tmp_path)["state"] == "complete"
+
+
+def test_a_file_of_the_run_before_that_cannot_be_removed_is_one_line_and_the_run_is_not_complete(tmp_path):
+    fill(tmp_path, [make_scene(1)])
+    (tmp_path / "overlay.mp4").unlink()
+    (tmp_path / "overlay.mp4" / "mine").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"cannot write .*overlay\.mp4: "):
+        fill(tmp_path, [make_scene(1), make_scene(2)], save=())
+    assert run_json(tmp_path)["state"] == "failed"
 
 
 # --------------------------------------------------------------------------------------------------------------------

@@ -183,6 +183,24 @@ def test_lost_messages_are_counted_and_reported_less_and_less_often():
     assert bench.notes[-1].startswith("json:x closed; ")
 
 
+def test_a_stream_is_in_trouble_while_it_cannot_send_and_for_a_while_after_a_message_was_lost():
+    bench = Bench(most_kept=1)
+    bench.write(1)
+    assert bench.stream.trouble() == ""
+    bench.trouble = errno.ENOSPC
+    bench.write(2)
+    assert bench.stream.trouble() == "json:x: No space left on device"
+    bench.trouble = None
+    bench.now_s += 0.5
+    bench.write(3)  # 2 is lost: one message is kept
+    assert bench.stream.trouble() == "json:x: it is read too slowly; messages are lost"
+    bench.now_s += 29
+    bench.write(4)
+    assert bench.stream.trouble()
+    bench.now_s += 2
+    assert bench.stream.trouble() == ""
+
+
 def test_a_frame_that_cannot_be_encoded_is_reported_and_the_next_one_goes_out():
     def encode(result, people, age_s, most_bytes):
         return numbered(result, people, 1 / (result.tracked.number % 2), most_bytes)

@@ -54,7 +54,7 @@ class FakeStream:
     """
 
     def __init__(self, script: Iterable[Any], rate_hz: float | None = 25.0, clock: FakeClock | None = None) -> None:
-        self.rate_hz, self.clock = rate_hz, clock
+        self.rate_hz, self.clock, self.concealed = rate_hz, clock, False
         self.released = threading.Event()
         self._script = iter(script)
         self._image: np.ndarray | None = None

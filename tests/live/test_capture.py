@@ -269,6 +269,42 @@ def test_times_of_day_follow_the_machines_clock_when_it_is_set(camera) -> None:
     assert some.reported == ["the machine's clock was set forward by 3600.0 s; times of day follow"]
 
 
+def test_each_time_that_the_clock_is_set_counts_and_both_directions_are_reported(camera) -> None:
+    def set_by(seconds: float) -> Callable[[], None]:
+        def act() -> None:
+            some.clock.utc_ahead_s += seconds
+
+        return act
+
+    some = camera([1, APART_S, set_by(3600), 2, APART_S, set_by(-3600), 3, APART_S, set_by(0.2), 4])
+    some.take(4)
+    assert some.counts["clock_jumps"] == 2
+    assert some.source.start_utc_s == pytest.approx(1.7e9 + 100)
+    assert [words.partition(";")[0] for words in some.reported] == [
+        "the machine's clock was set forward by 3600.0 s",
+        "the machine's clock was set back by 3600.0 s",
+    ]
+
+
+def test_errors_that_the_decoder_conceals_are_counted_told_once_and_a_trouble_for_a_while(camera) -> None:
+    def conceal(is_so: bool) -> Callable[[], None]:
+        def act() -> None:
+            some.streams[0].concealed = is_so
+
+        return act
+
+    some = camera([1, APART_S, conceal(True), 2, APART_S, 3, conceal(False), APART_S, 4])
+    assert levels(some.take(4)) == [1, 2, 3, 4]
+    assert some.counts["concealed"] == 2
+    assert [words for words in some.reported if "conceals errors" in words] == list(some.health.snapshot().troubles)
+
+
+def test_a_picture_that_cannot_be_decoded_is_a_trouble_for_a_while(camera) -> None:
+    some = camera([1, APART_S, None, APART_S, 2])
+    assert levels(some.take(2)) == [1, 2] and some.counts["undecoded"] == 1
+    assert "could not be decoded" in some.health.snapshot().troubles[0]
+
+
 @pytest.mark.parametrize(("given_hz", "rate_hz"), [(None, 20), (12, 12)])
 def test_the_rate_is_measured_where_none_is_announced_or_given(given_hz, rate_hz) -> None:
     clock = FakeClock()

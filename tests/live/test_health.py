@@ -14,8 +14,18 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.output import SessionLog, make_session_folder
+from torchvision_dddas.live import session
 from torchvision_dddas.live.health import Health, StatusWriter
-from torchvision_dddas.live.server import HealthServer, health_pages, html_page, metrics, parse_address
+from torchvision_dddas.live.server import (
+    _COUNTS,
+    _GAUGES,
+    _SECONDS,
+    HealthServer,
+    health_pages,
+    html_page,
+    metrics,
+    parse_address,
+)
 from torchvision_dddas.types import Adjustment
 
 
@@ -72,6 +82,48 @@ def test_a_full_disk_is_reported_once_and_gets_everything_later():
     assert sum("No space left on device" in words for words in shown) == 1
     assert [words for words in disk.lines if "No space" not in words] == ["one", "two", "three", "four"]
     assert disk.states == [("running", 0)]
+
+
+def test_what_the_disk_refuses_is_a_trouble_until_it_is_written_and_at_the_end_a_refusal():
+    health, disk = Health(), Disk()
+    status = StatusWriter(health, disk, [], 1000.0)
+    for disk.full, troubles in ((True, 1), (False, 0)):
+        health.event("run", "one")
+        status.events()
+        status.status()
+        assert len(health.snapshot().troubles) == troubles == len(status.refused.split(";")) - 1
+    with status:
+        disk.full = True
+    assert "run.json cannot be written: No space left on device" in status.refused
+    assert health.snapshot().events[-1].text.endswith("; tried again")
+
+
+@pytest.mark.parametrize("victim", ["events.log", "run.json"])
+def test_a_file_of_a_session_that_cannot_be_begun_is_one_line_and_the_other_says_so(tmp_path, victim):
+    (tmp_path / victim / "mine").mkdir(parents=True)
+    health, log = Health(), SessionLog(tmp_path, {})
+    with pytest.raises(InputError, match=rf"^{tmp_path}: {victim} cannot be written: .*directory.*--out$"):
+        StatusWriter(health, log, [], 1000.0).begin()
+    log.close()
+    if victim == "events.log":
+        record = json.loads((tmp_path / "run.json").read_text())
+        assert record["state"] == "failed" and "events.log cannot be written" in record["events"][-1]["text"]
+    else:
+        assert " sink: run.json cannot be written: " in (tmp_path / "events.log").read_text()
+
+
+def test_a_trouble_may_end_by_itself_and_others_are_asked_for(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    health, asked = Health(), ["the network is away"]
+    health.trouble("damage", "frame 3 could not be decoded", 10.0)
+    health.ask(lambda: asked[0])
+    assert health.snapshot().troubles == ("frame 3 could not be decoded", "the network is away")
+    asked[0] = ""
+    now[0] = 109.0
+    assert health.snapshot().troubles == ("frame 3 could not be decoded",)
+    now[0] = 111.0
+    assert health.snapshot().troubles == ()
 
 
 def test_changes_of_parameters_are_in_the_log_and_the_state_once_and_not_among_the_events():
@@ -255,6 +307,36 @@ def test_figures_of_the_page_are_labelled_and_written_out():
         ("1 234 MB", "memory"),
     ):
         assert f"{figure} {label}" in words or f"{label} {figure}" in words
+
+
+def test_every_tile_of_the_page_has_a_title_and_a_value():
+    health = Health()
+    for name in (*_COUNTS, *session._COUNTED):
+        health.count(name, 2)
+    for name in _GAUGES:
+        health.gauge(name, 1)
+    for name in _SECONDS:
+        health.took(name, 0.1)
+    found: dict[str, list[str]] = {"dt": [], "dd": []}
+
+    class Reader(HTMLParser):
+        within = ""
+
+        def handle_starttag(self, tag, attrs):
+            self.within = tag
+            if tag in found:
+                found[tag].append("")
+
+        def handle_data(self, data):
+            if self.within in found:
+                found[self.within][-1] += data.strip()
+
+    Reader().feed(html_page(health.snapshot(), "x", "running", ""))
+    assert len(found["dt"]) == len(found["dd"]) == len(set(found["dt"])) > 20
+    assert all(found["dt"]) and all(found["dd"])
+    assert found["dd"][found["dt"].index("camera")] == "sends pictures"
+    health.gauge("connected", 0)
+    assert re.search(r"camera\W.{,30}\Wlost\W", html_page(health.snapshot(), "x", "running", ""), re.DOTALL)
 
 
 PATIENCE_S = 60.0

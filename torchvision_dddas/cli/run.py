@@ -1,9 +1,12 @@
 """`dddas run`: the whole path, from a clip or a simulated scenario to places on the ground."""
 
+import os
+import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote
 
 import typer
 
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
     from torchvision_dddas.io.output import RunRecord
 
 SIMULATED = "sim:"
+PASSWORD = "DDDAS_PASSWORD"  # in the environment
+_LOGIN = re.compile(r"([a-z][a-z0-9+.-]*://[^/?#@:]+)@(.*)", re.I | re.S)
 
 
 @report_errors
@@ -82,6 +87,10 @@ def run(
         typer.Option(metavar="[HOST:]PORT", help="With --live: serve a status page, /metrics and /health.json."),
     ] = None,
     people: Annotated[bool, typer.Option("--people", help="With --live: recognize people too.")] = False,
+    password_file: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help=f"Its first line is the password of rtsp://NAME@HOST/..., else ${PASSWORD}."),
+    ] = None,
     wait: Annotated[
         bool, typer.Option("--wait", help="With --live: wait for a camera or stream that is not there yet.")
     ] = False,
@@ -99,6 +108,7 @@ def run(
     from torchvision_dddas.io.run_inputs import AerialInput
 
     check_interval(interval)
+    clip = _with_password(clip, password_file)
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
         _refuse(others, "is of no use with --live, which draws and steers nothing")
@@ -164,6 +174,24 @@ def run(
         print_lines(lines, quiet)
     else:
         print_located(lines, record, out, quiet)
+
+
+def _with_password(clip: str, path: Path | None) -> str:
+    """An address that has a name alone gets the password in the file, else in the environment. Raises InputError."""
+    login = _LOGIN.fullmatch(clip)
+    if path is None:
+        password = os.environ.get(PASSWORD, "")
+    elif login is None:
+        raise InputError(f"--password-file is for an address with a name alone, rtsp://NAME@HOST/...; got {clip}")
+    else:
+        try:
+            with path.open("rb") as file:
+                password = file.readline(4096).decode().rstrip("\r\n")
+        except (OSError, ValueError) as error:
+            raise InputError(f"--password-file {path} cannot be read: {getattr(error, 'strerror', error)}") from None
+        if not password:
+            raise InputError(f"--password-file {path} begins with an empty line; wanted the password")
+    return f"{login[1]}:{quote(password, safe='')}@{login[2]}" if login is not None and password else clip
 
 
 def _refuse(options: Mapping[str, object], why: str) -> None:

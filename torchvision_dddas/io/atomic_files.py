@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TextIO
+from typing import Protocol, TextIO, TypeVar
 
 from torchvision_dddas.errors import InputError
 
@@ -29,6 +29,24 @@ _PART = re.compile(r"\.(.+)\.[0-9a-f]{16}\.part(\.\w+)?")
 _PATTERN = ".*.part*"
 # Folders in a run's folder that it writes into.
 _INNER = ("", "masks", "frames", "ground/*", "truth", "truth/masks")
+
+
+_Taken = TypeVar("_Taken", contravariant=True)
+
+
+class Part(Protocol[_Taken]):
+    """A part of a run's output: tables, masks, an overlay, maps, the log."""
+
+    def write(self, item: _Taken, /) -> None:
+        """Add an item. Raises OSError if it cannot be kept."""
+
+    def close(self, complete: bool) -> None:
+        """Make the files valid and put them in their places. complete: False if the user cut the run short."""
+        return
+
+    def discard(self) -> None:
+        """Leave nothing behind that looks whole and is not. Never raises."""
+        return
 
 
 class PartFile:

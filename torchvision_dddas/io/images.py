@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.atomic_files import write_whole
+from torchvision_dddas.io.atomic_files import Part, write_whole
 from torchvision_dddas.types import Scene
 
 IMAGE_SUFFIXES = frozenset(
@@ -22,7 +22,8 @@ MOST_PIXELS = 100_000_000
 """A picture with more is refused: a file of kilobytes may say that it has billions."""
 
 MOST_PIXELS_VARIABLE = "DDDAS_MOST_PIXELS"
-MASK_NAME = re.compile(r"\d{6,}\.png")
+NUMBERED = re.compile(r"\d{6,}\.(png|jpg)")
+"""Names of the pictures of a run, one a frame."""
 
 # 8, 16 bits and EXIF rotation are kept, alpha is dropped.
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
@@ -195,12 +196,11 @@ def _images(paths: Sequence[Path]) -> list[Path]:
     return sorted(files, key=lambda file: natural_order(str(file)))
 
 
-class Masks:
+class Masks(Part[Scene]):
     """masks/000001.png and so on, each whole once it is there. 8 bits, or 16 for frames with over 255 targets."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "masks"
-        self._last = 0
 
     def write(self, scene: Scene) -> None:
         """Write the mask of a frame. Raises OSError if the disk refuses."""
@@ -215,13 +215,3 @@ class Masks:
         if not ok:
             raise OSError(f"mask of frame {number} could not be encoded")
         write_whole(self._folder / f"{number:06d}.png", png.tobytes())
-        self._last = number
-
-    def close(self, complete: bool) -> None:
-        """Remove the masks of an earlier, longer clip, so that the folder holds one clip only."""
-        for path in self._folder.glob("*.png"):
-            if MASK_NAME.fullmatch(path.name) and int(path.stem) > self._last:
-                path.unlink()
-
-    def discard(self) -> None:
-        """Nothing to do: each mask is whole already."""

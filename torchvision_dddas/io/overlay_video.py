@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import cv2
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import PartFile, utf8_name, write_whole
+from torchvision_dddas.io.atomic_files import Part, PartFile, utf8_name, write_whole
 
 Item = TypeVar("Item")
 
@@ -62,7 +62,7 @@ class OverlayVideo(Generic[Item]):
             self._part.discard()
 
 
-class OverlayPicture(Generic[Item]):
+class OverlayPicture(Part[Item]):
     """overlay.png: the picture of the last item."""
 
     def __init__(self, folder: Path, draw: Callable[[Item], np.ndarray]) -> None:
@@ -77,9 +77,6 @@ class OverlayPicture(Generic[Item]):
         """Write it, if there is one. Raises OSError if the disk refuses."""
         if self._content:
             write_whole(self._path, self._content)
-
-    def discard(self) -> None:
-        """Nothing is begun before the end."""
 
 
 class ThreadedWriter:

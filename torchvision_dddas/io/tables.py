@@ -103,22 +103,29 @@ Rows = Mapping[str, Any]
 class TableFiles(Generic[Item]):
     """Tables that grow together, item by item, and appear whole at the end.
 
+    is_optional: whether there is no file unless an item has rows; rows are None for items that have none.
     tables: path -> the table's schema, and the function that makes its rows of an item:
 
         TableFiles({folder / "sizes.csv": (SIZES, lambda frame: {"frame": frame.number, "width_px": frame.widths})})
     """
 
-    def __init__(self, tables: Mapping[Path, tuple[Schema, Callable[[Item], Rows]]]) -> None:
-        self._tables = tuple(tables.values())
+    def __init__(
+        self, tables: Mapping[Path, tuple[Schema, Callable[[Item], Rows | None]]], is_optional: bool = False
+    ) -> None:
+        self._tables, self._is_left_out = tuple(tables.values()), is_optional
         self._files = TextFiles({path: schema.header for path, (schema, _) in tables.items()})
 
     def write(self, item: Item) -> None:
         """Add the rows of an item to each table. Raises OSError if the disk refuses."""
-        self._files.write(*(schema.format_rows(rows(item)) for schema, rows in self._tables))
+        given = [(schema, rows(item)) for schema, rows in self._tables]
+        if texts := [schema.format_rows(rows) for schema, rows in given if rows is not None]:
+            self._is_left_out = False
+            self._files.write(*texts)
 
     def close(self, complete: bool = True) -> None:
         """Put the tables in their places, also those without rows. Raises OSError if they cannot be written."""
-        self._files.close()
+        if not self._is_left_out:
+            self._files.close()
 
     def discard(self) -> None:
         """Remove what was begun."""

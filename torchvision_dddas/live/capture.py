@@ -194,5 +194,5 @@ class Player:
 
     def _report(self) -> None:
         for problem in self._recording.problems:
-            self._log.report(problem.what, problem.frame, topic="damage")
+            self._log.damaged(problem.what, problem.frame)
         self._recording.problems.clear()

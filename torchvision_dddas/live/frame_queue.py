@@ -133,6 +133,11 @@ class CaptureLog:
         self.problems.append(Problem(number, what))
         del self.problems[:-_PROBLEMS]
 
+    def damaged(self, what: str, number: int | None = None, topic: str = "damage") -> None:
+        """Report damage to the pictures, a trouble for the next 10 s."""
+        self.report(what, number, topic)
+        self._health.trouble("damage", what, _QUIET_S)
+
     def captured(self, taken_s: float, note: Callable[[float], object] = lambda sent_hz: None) -> None:
         """Count a picture that came at taken_s. note: called with each new measurement of the rate, Hz."""
         self._health.count("captured")
@@ -143,9 +148,9 @@ class CaptureLog:
             self.start_utc_s += jump_s
             self._ahead_s = ahead_s
             which = "forward" if jump_s > 0 else "back"
-            self.report(
-                f"the machine's clock was set {which} by {abs(jump_s):.1f} s; times of day follow", topic="clock"
-            )
+            what = f"the machine's clock was set {which} by {abs(jump_s):.1f} s; times of day follow"
+            self._health.count("clock_jumps")
+            self.report(what, topic=f"clock {which}")
         if np.isnan(self._joined_s):
             self._joined_s = taken_s
         # What the driver has gathered while it opened the stream comes at once, and says nothing of the rate.

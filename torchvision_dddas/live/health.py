@@ -1,5 +1,6 @@
 """The health of a live run: counts, gauges, durations, events; and the thread that writes it to the disk."""
 
+import math
 import os
 import threading
 import time
@@ -13,8 +14,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from torchvision_dddas.errors import readable, without_secrets
-from torchvision_dddas.io.output import AdjustmentList, Event, SessionLog
+from torchvision_dddas.errors import InputError, readable, without_secrets
+from torchvision_dddas.io.output import EVENTS, RUN_JSON, AdjustmentList, Event, SessionLog
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.types import Adjustment
 
@@ -51,7 +52,8 @@ class Health:
         self._gauges: dict[str, float] = {}
         self._seconds: dict[str, deque[float]] = {}
         self._events: deque[Event] = deque(maxlen=_EVENTS)
-        self._troubles: dict[str, str] = {}
+        self._troubles: dict[str, tuple[str, float]] = {}  # words, and until when they hold
+        self._asked: list[Callable[[], str]] = []
         self._late: deque[bool] = deque(maxlen=_LATE)
         self._adjustments, self._unwritten = AdjustmentList(_ADJUSTMENTS), list[Event]()
 
@@ -87,13 +89,17 @@ class Health:
         late = sum(self._late)
         self.trouble("late", f"{late} of the latest {len(self._late)} results are late" if late > _LATE // 2 else "")
 
-    def trouble(self, name: str, words: str = "") -> None:
-        """Say that something is not well until it is called with no words."""
+    def trouble(self, name: str, words: str = "", for_s: float = math.inf) -> None:
+        """Say that something is not well for so long, or until it is called with no words."""
         with self._lock:
             if words:
-                self._troubles[name] = words
+                self._troubles[name] = words, time.monotonic() + for_s
             else:
                 self._troubles.pop(name, None)
+
+    def ask(self, trouble: Callable[[], str]) -> None:
+        """Ask a function for further trouble whenever the health is read; it returns "" while all is well."""
+        self._asked.append(trouble)
 
     def adjusted(self, adjustments: Sequence[Adjustment], told: Collection[str] = ()) -> None:
         """Add changes of parameters, for run.json and events.log alone. told: parameters whose changes are events."""
@@ -140,11 +146,12 @@ class Health:
             now = time.monotonic()
             since_s, idle_s = now - self._start, now - self._result
             counts, gauges, events = dict(self._counts), dict(self._gauges), tuple(self._events)
-            troubles = tuple(self._troubles.values())
+            troubles = [words for words, until_s in self._troubles.values() if now < until_s]
             taken = {name: list(values) for name, values in self._seconds.items()}
         # Sorting thousands of times takes a millisecond, which a frame must not wait for.
         seconds = {name: tuple(np.percentile(values, (50, 95, 99)).tolist()) for name, values in taken.items()}
-        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, troubles)
+        troubles += filter(None, [trouble() for trouble in self._asked])
+        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, tuple(troubles))
 
 
 _EVENTS_S = 0.2
@@ -154,7 +161,7 @@ _MOST_WAITING = 1000  # events kept while the disk refuses them
 class StatusWriter:
     """A context whose thread writes events and state; both are written once more when it is left.
 
-    The run never waits for it. A disk that refuses to write is an event and does not end the run.
+    The run never waits for it. A disk that refuses to write is an event and a trouble, and does not end the run.
     """
 
     def __init__(
@@ -171,14 +178,25 @@ class StatusWriter:
         self._say, self._show = say, show
         self.state = "running"
         self._known, self._waiting = 0, list[Event]()
-        self._trouble = ""
+        self._failing = dict[str, str]()  # by file
         self._measured_s, self._results = time.monotonic(), 0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="status", daemon=True)
 
     def begin(self) -> None:
-        """Write the state for the first time. Raises OSError if the disk refuses."""
-        self._log.write_state(self.state, snapshot_facts(self._health.snapshot()))
+        """Begin both files. Raises InputError if the disk refuses one; then the other says so."""
+        self._is_written(EVENTS, lambda: self._log.append([]))
+        self._write_state()
+        if self.refused:
+            self.state = "failed"
+            self._write_state()
+            self._is_written(EVENTS, lambda: self._log.append(self._health.snapshot().events))
+            raise InputError(f"{self._log.folder}: {self.refused}; free some space or choose another --out")
+
+    @property
+    def refused(self) -> str:
+        """Why the files are not as they should be; empty if the disk took all."""
+        return "; ".join(f"{name} cannot be written: {why}" for name, why in self._failing.items())
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -191,6 +209,7 @@ class StatusWriter:
         self._thread.join()
         self.events()
         self.status()
+        self.events()  # the status may have failed
 
     def events(self) -> None:
         """Write and show the new events."""
@@ -199,26 +218,16 @@ class StatusWriter:
             self._say(event)
         new = tuple(sorted([*new, *self._health.take_adjusted()], key=lambda event: event.utc_s))
         self._waiting = [*self._waiting, *new][-_MOST_WAITING:]
-        if not self._waiting:
-            return
-        try:
-            self._log.append(self._waiting)
+        if self._waiting and self._is_written(EVENTS, lambda: self._log.append(self._waiting)):
             self._waiting = []
-        except OSError as error:
-            self._refused(error)
 
     def status(self) -> None:
         """Write the state, and sync the streams to the disk."""
         for stream in self._streams:
             stream.sync()
         self._measure()
-        now = self._health.snapshot()
-        self._show(now)
-        try:
-            self._log.write_state(self.state, {**snapshot_facts(now), **self._health.adjustments()})
-            self._trouble = ""
-        except OSError as error:
-            self._refused(error)
+        self._show(self._health.snapshot())
+        self._write_state()
 
     def _measure(self) -> None:
         now_s, results = time.monotonic(), self._health.snapshot().counts.get("results", 0)
@@ -229,11 +238,22 @@ class StatusWriter:
             pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
             self._health.gauge("resident_bytes", pages * os.sysconf("SC_PAGE_SIZE"))
 
-    def _refused(self, error: OSError) -> None:
-        trouble = f"the state of the run cannot be written: {error.strerror or error}; tried again"
-        if trouble != self._trouble:  # reported once; else writing the report would fail and make another
-            self._trouble = trouble
-            self._health.event("sink", trouble)
+    def _write_state(self) -> None:
+        facts = {**snapshot_facts(self._health.snapshot()), **self._health.adjustments()}
+        self._is_written(RUN_JSON, lambda: self._log.write_state(self.state, facts))
+
+    def _is_written(self, name: str, write: Callable[[], object]) -> bool:
+        """Write a file. A new refusal is an event; an event for each would fail to be written and make another."""
+        before = set(self._failing.values())
+        try:
+            write()
+            self._failing.pop(name, None)
+        except OSError as error:
+            self._failing[name] = error.strerror or str(error)
+            if self._failing[name] not in before:
+                self._health.event("sink", f"{self.refused}; tried again")
+        self._health.trouble("files", self.refused)
+        return name not in self._failing
 
     def _run(self) -> None:
         due = time.monotonic() + self._status_s

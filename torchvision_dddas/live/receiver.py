@@ -263,6 +263,9 @@ class Receiver:
         self._start_s = taken_s if np.isnan(self._start_s) else self._start_s
         place = (taken_s - self._start_s) * rate_hz
         log.captured(taken_s, self._compare)
+        if getattr(stream, "concealed", False):
+            self._health.count("concealed")
+            log.damaged("the decoder conceals errors in the pictures")
         if log.number - place > max(_AHEAD_S * rate_hz, 2):
             self._health.count("dropped")
             return True
@@ -273,7 +276,7 @@ class Receiver:
         image = stream.retrieve()
         if image is None:
             self._health.count("undecoded")
-            log.report(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
+            log.damaged(f"frame {log.number} could not be decoded and was left out", topic="undecoded")
             return False
         if self._fits(image, taken_s):
             self._found()

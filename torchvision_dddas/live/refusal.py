@@ -13,7 +13,7 @@ from torchvision_dddas.io.live_streams import Stream, open_stream
 _PORTS = {"rtsp": 554, "http": 80, "https": 443}
 _MOST_BYTES = 65536
 _MEANING = {
-    401: "the name or the password is wrong; give both in the address, before the host",
+    401: "the name or the password is wrong; give both in the address, before the host, or see --password-file",
     403: "it is forbidden to this name",
     404: "there is no such stream; check the path",
 }

@@ -5,7 +5,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from math import isfinite
+from math import isfinite, nan
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.frame_queue import Clock
 from torchvision_dddas.live.health import Health
+from torchvision_dddas.live.log_alignment import align_log
 from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
@@ -31,8 +32,9 @@ class RepeatedFailure(Exception):
 class Feed:
     """The source as the pipeline sees it: one stream of frames, also after the pipeline was restarted.
 
-    A step lasts from taking a frame to asking for the next one. newest: the frame taken last. telemetry: a function, as
-    the pipeline expects of a source; None if there is none.
+    A step lasts from taking a frame to asking for the next one. newest: the frame taken last. log: the telemetry.
+    telemetry: a function, as the pipeline expects of a source; None if there is none. clock_offset_s: set it beside a
+    camera, as for `align_log`, so that a log with a clock is aligned by it. aligned: called with the aligned log.
     """
 
     count = None
@@ -46,10 +48,11 @@ class Feed:
         self.problems: list[object] = []
         self.newest: Frame | None = None
         self.ended = False
-        self.telemetry = None if telemetry is None else lambda: telemetry
+        self.log, self.clock_offset_s, self._silent, self._start_utc_s = telemetry, nan, False, nan
+        self.telemetry = None if telemetry is None else lambda: self.log
+        self.aligned: Callable[[Telemetry], object] = lambda log: None
         self._source, self._health, self._watchdog = source, health, watchdog
         self._frames = iter(source)
-        self._log, self._silent = telemetry, False
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
         self._first = True
         self._held: Frame | None = None  # the first of another size, for the pipeline that begins anew
@@ -83,16 +86,26 @@ class Feed:
                 # Earlier frames are not missing: the pipeline that failed has seen them.
                 frame, self._first = replace(frame, skipped=frame.number - 1), False
             self.newest = frame
-            if self._log is not None:
-                flight = self._log.at(frame.time_s)
-                silent = flight is None or (self._has_altitude and not isfinite(flight.altitude_m))
-                if silent != self._silent:
-                    self._silent = silent
-                    words = "silent" if silent else "there again"
-                    self._health.event("telemetry", f"telemetry is {words}", frame.number)
-                    self._health.trouble("telemetry", "telemetry is silent" if silent else "")
+            self._read_log(frame)
             self._watchdog.begin(frame.number)
             yield frame
+
+    def _read_log(self, frame: Frame) -> None:
+        """Align the log with the first picture, again whenever the machine's clock was set; report its gaps."""
+        if self.log is None:
+            return
+        if isfinite(self.log.start_utc_s + self.clock_offset_s) and self._source.start_utc_s != self._start_utc_s:
+            self._start_utc_s = self._source.start_utc_s
+            self.log = align_log(self.log, self._start_utc_s, self.clock_offset_s)
+            self.aligned(self.log)
+        flight = self.log.at(frame.time_s)
+        silent = flight is None or (self._has_altitude and not isfinite(flight.altitude_m))
+        if silent != self._silent:
+            self._silent = silent
+            has_ended = silent and frame.time_s > self.log.time_s[-1]
+            words = f"telemetry is {'silent' if silent else 'there again'}{': its log has ended' if has_ended else ''}"
+            self._health.event("telemetry", words, frame.number)
+            self._health.trouble("telemetry", words if silent else "")
 
     def stop(self) -> None:
         """Take no further frame; results of those taken still come."""

@@ -157,8 +157,10 @@ _COUNTS = {
     "dropped": ("dropped", "Pictures that came too late to be processed."),
     "late": ("late", "Results later than the deadline."),
     "undecoded": ("not decoded", "Pictures that could not be decoded."),
+    "concealed": ("with concealed errors", "Pictures in which the decoder concealed errors."),
     "unreliable": ("without a conclusion", "Frames from which nothing could be concluded."),
     "reconnects": ("reconnected", "Times that the stream was opened again."),
+    "clock_jumps": ("clock set", "Times that the machine's clock was set."),
     "begun_anew": ("begun anew", "Times that the work failed, or the pictures changed size, and it was restarted."),
     "wrong_size": ("of another size", "Pictures of another size than the run's."),
     "looked_at": ("", "Pictures that were looked at."),
@@ -167,7 +169,7 @@ _COUNTS = {
 _GAUGES = {
     "sent_hz": ("pictures a second", "Pictures a second that the source sends."),
     "rate_hz": ("results a second", "Results a second."),
-    "connected": ("", "1 while the camera sends pictures."),
+    "connected": ("camera", "1 while the camera sends pictures."),
     "targets": ("targets now", "Targets in the latest frame."),
     "people": ("people now", "People in the latest frame."),
     "every": ("pictures for each one looked at", "One of so many pictures is looked at."),
@@ -191,7 +193,9 @@ def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int
 
     figures = [("running for", _span(now.since_s)), ("results", count("results"))]
     for key, (title, _) in _GAUGES.items():
-        if key in now.gauges:
+        if key == "connected" and key in now.gauges:
+            figures.append((title, "sends pictures" if now.gauges[key] else "lost"))
+        elif key in now.gauges:
             is_bytes = key == "resident_bytes"
             shown = now.gauges[key] / (1e6 if is_bytes else 1)
             digits = 1 if key in ("sent_hz", "rate_hz") else 0

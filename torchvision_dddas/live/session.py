@@ -6,14 +6,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from math import inf
+from dataclasses import replace
+from functools import partial
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import Any
 
 from torchvision_dddas.config import LiveParameters, Settings, is_set, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
-from torchvision_dddas.io.atomic_files import cannot_write
 from torchvision_dddas.io.interrupts import Stopped, StopSignals
 from torchvision_dddas.io.output import (
     RESULTS,
@@ -28,6 +29,7 @@ from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot, StatusWriter
+from torchvision_dddas.live.log_alignment import describe_landmarks, describe_log
 from torchvision_dddas.live.receiver import DeadCamera
 from torchvision_dddas.live.runner import (
     Feed,
@@ -39,7 +41,7 @@ from torchvision_dddas.live.runner import (
     send_result,
 )
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
-from torchvision_dddas.live.watchdog import HUNG, Supervisor, Watchdog
+from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
 from torchvision_dddas.pipeline import Pipeline
 from torchvision_dddas.runtime import VERSION
@@ -48,7 +50,10 @@ from torchvision_dddas.types import Adjustment, Frame, FrameResult
 
 _WAITING = "waiting for the camera"
 _CLEAR = "\r\x1b[K"
-_COUNTED = ("captured", "dropped", "looked_at", "undecoded", "reconnects", "results", "late", "begun_anew")
+_COUNTED = (
+    *("captured", "dropped", "looked_at", "undecoded", "concealed", "reconnects", "clock_jumps"),
+    *("results", "late", "begun_anew"),
+)
 
 
 def run_live(
@@ -77,8 +82,9 @@ def run_live(
         raise InputError(f"--wait is for a camera or a stream, and {clip} is none; leave it out")
     if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
         backend = "onboard"
-    if settings.live.pace:  # without a pace frames wait, and every run has the same results
-        settings = with_measured_cost(settings)
+    # O of the interval rule is measured, unless it is set; without a pace frames wait, and all runs give the same.
+    if settings.live.pace and not is_set(settings, "interval.cost"):
+        settings = with_parameters(settings, {"interval.cost": 0.0})
     health, supervisor, live = Health(), Supervisor(), settings.live
     for name in _COUNTED:  # a count that is there from the start can be distinguished from a missing one
         health.count(name, 0)
@@ -116,18 +122,18 @@ def run_live(
         health.begin()
         if source.recorded is not None:
             check_length(source.recorded)
-        ready = prepare_run(given, telemetry, settings, source, backend, clip)
-        begin = build_path(
-            ready,
-            source,
-            people,
-            interval,
-            backend,
-            health,
-            lambda: prepare_run(given, telemetry, settings, source, backend, clip),
-        )
-        # What streams need to know; the time follows the source's clock.
+        prepare = partial(prepare_run, given, telemetry, settings, source, backend, clip)
+        ready = prepare()
+        flight, is_recording, offset_s = ready.flight, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
+        if flight is not None:
+            ready.notes.append(describe_log(flight, is_recording, time.time(), offset_s))
+        if site is not None and not is_recording:
+            ready.notes.extend(describe_landmarks(site.landmarks))
+        # Of a recording, times of day are those of its own log, if that has a clock.
+        recorded_utc_s = flight.start_utc_s if is_recording and flight is not None else nan
+        begin = build_path(ready, source, people, interval, backend, health, prepare)
+        # What streams need to know; the time follows the source's clock.
         about = About(time.time())
         if site is not None:
             about = About(time.time(), site.origin_deg is not None, site.landmarks.names)
@@ -149,18 +155,15 @@ def run_live(
         facts["settings"] = ready.settings.model_dump()
         log = SessionLog(folder, facts)
         stack.callback(log.close)
-        status = StatusWriter(health, log, streams, live.status_s)
-        if not quiet:
-            status = StatusWriter(health, log, streams, live.status_s, _print_event, _print_snapshot)
-        try:
-            status.begin()
-        except OSError as error:
-            raise cannot_write(folder / "run.json", error) from None
+        shown = () if quiet else (_print_event, _print_snapshot)
+        status = StatusWriter(health, log, streams, live.status_s, *shown)
+        status.begin()
         watchdog.idle_s = lambda: 0.0 if source.seeking else health.idle_s
         patience_s = max(2 * live.stall_s, 30 / source.rate_hz)
         pages |= health_pages(health, watchdog, streams, lambda: status.state, name, VERSION, patience_s)
 
-        feed = Feed(source, health, watchdog, ready.flight)
+        feed = Feed(source, health, watchdog, flight)
+        feed.clock_offset_s = nan if is_recording else offset_s
 
         def stop(number: int) -> None:
             """Take no further picture; the run ends once those that were taken are settled."""
@@ -172,7 +175,9 @@ def run_live(
         stack.enter_context(watchdog)
         supervisor.say("READY=1", "STATUS=running")
         if not quiet:
-            _print_start(source, folder, ready.notes)
+            _print("{}, {}x{} at {:g} Hz; into {}".format(source.name, *source.size, source.rate_hz, folder))
+            for note in ready.notes:
+                _print(f"note: {note}")
             if server is not None and not wait:
                 _print_page(server)
         failure, tally = "", _Located()
@@ -180,7 +185,7 @@ def run_live(
             for result in results(begin, feed, health):
                 if cause := tally.add(result[0]):
                     health.event("locate", f"not located: {cause}", result[0].number)
-                about.start_utc_s = source.start_utc_s
+                about.start_utc_s = source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
                 send_result(result, streams, health)
                 record_result(result, feed, health, live.deadline_ms)
             status.state = "complete" if signals.signal is None else "stopped"
@@ -196,16 +201,12 @@ def run_live(
         _print(_summarize(health, folder, live.deadline_ms))
     elif failure:  # --quiet silences events, not errors
         _print(failure)
-    if failure:
-        return HUNG
+    lost = f"{RESULTS} lacks {streams[0].lost} lines" if streams[0].lost else ""
+    if refused := "; ".join(filter(None, (status.refused, lost))):
+        _print(f"{folder}: {refused}; free some space or choose another --out")
+    if failure or refused:
+        return HUNG if failure else UNWRITTEN
     return 0 if signals.signal in (None, signal.SIGTERM) else 128 + signals.signal
-
-
-def with_measured_cost(settings: Settings) -> Settings:
-    """The settings with O of the interval rule measured, unless it is set."""
-    if is_set(settings, "interval.cost"):
-        return settings
-    return with_parameters(settings, {"interval.cost": 0.0})
 
 
 class _Located:
@@ -281,11 +282,16 @@ def build_path(
                 person_tracker.retune(settings)
             return settings, adjustments
 
+        running = None if watch is None else watch.restarted()
+        if running is not None and feed.log is not None:
+            locator = running.locator
+            feed.aligned = lambda log: locator.set_site(replace(locator.site, telemetry=log))
+            feed.aligned(feed.log)
         pipeline = Pipeline.from_parts(
             engine,
             shedding.settings,
             None,
-            None if watch is None else watch.restarted(),
+            running,
             interval,
             seen=None if person_tracker is None else person_tracker.update,
             retune=retune,
@@ -304,6 +310,7 @@ def _open(
     streams = open_streams(texts, about, health.event, live.retry_s, live.retry_most_s, option)
     for stream in streams:
         opened.callback(stream.close)
+        health.ask(stream.trouble)
     return streams
 
 
@@ -314,13 +321,6 @@ def _print(text: str) -> None:
     clear = _CLEAR if sys.stderr.isatty() else ""
     sys.stderr.write(f"{clear}dddas: {printable(' '.join(text.split()))}\n")
     sys.stderr.flush()
-
-
-def _print_start(source: LiveSource, folder: Path, notes: Sequence[str]) -> None:
-    width, height = source.size
-    _print(f"{source.name}, {width}x{height} at {source.rate_hz:g} Hz; into {folder}")
-    for note in notes:
-        _print(f"note: {note}")
 
 
 def _print_page(server: HealthServer) -> None:

@@ -14,6 +14,8 @@ from torchvision_dddas.live.health import Health
 
 HUNG = 70
 """Exit code of a run that hung or failed again and again: EX_SOFTWARE of sysexits.h."""
+UNWRITTEN = 74
+"""Exit code of a run that went well, and whose files the disk refused: EX_IOERR."""
 
 _CHECK_S = 1.0
 

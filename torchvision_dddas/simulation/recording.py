@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
-from torchvision_dddas.io.atomic_files import cannot_write, claimed, remove, write_whole
+from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
 from torchvision_dddas.io.output.recorder import PartOf
@@ -140,9 +140,10 @@ class _RecordingOutput(RunRecorder[_Recorded]):
     """Everything that `dddas simulate` writes. Raises InputError as RunRecorder does."""
 
     files: ClassVar[tuple[str, ...]] = (
-        *("frames/000001.jpg", "clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif"),
-        *("scenario.toml", *TruthOutput.files, RUN_JSON),
+        *("clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif", "scenario.toml"),
+        *("ground/*/camera.toml", "ground/*/poses.csv", *TruthOutput.files, RUN_JSON),
     )
+    numbered: ClassVar[tuple[str, ...]] = ("frames", "ground/*", "truth/masks")
     saved: ClassVar[tuple[str, ...]] = RECORDED
 
     def begin(self, simulator: Simulator, count: int) -> RunRecord:
@@ -213,22 +214,16 @@ class _Tables:
         self._files.close()
 
 
-class _Frames:
+class _Frames(Part[_Recorded]):
     """frames/000001.jpg and so on; a dropped frame is an empty file, so that the others keep their numbers."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._last = folder, 0
+        self._folder = folder
 
     def write(self, item: _Recorded) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._last, frame = item.shot.truth.frame, item.shot.frame
-        write_whole(self._folder / f"{self._last:06d}.jpg", b"" if frame is None else _encode_jpeg(frame.image))
-
-    def close(self, complete: bool) -> None:
-        _clear_after(self._folder, self._last)
-
-    def discard(self) -> None:
-        pass
+        number, frame = item.shot.truth.frame, item.shot.frame
+        write_whole(self._folder / f"{number:06d}.jpg", b"" if frame is None else _encode_jpeg(frame.image))
 
 
 class _Ground:
@@ -252,12 +247,8 @@ class _Ground:
             self._poses[name].write(f"{number},{place},{angles},{picture.frame}\n")
 
     def close(self, complete: bool) -> None:
-        for name, count in self._count.items():
-            _clear_after(self._folder / name, count)
-            if name in self._poses:
-                self._poses[name].close()
-            else:
-                remove(self._folder / name / "poses.csv")
+        for poses in self._poses.values():
+            poses.close()
 
     def discard(self) -> None:
         for poses in self._poses.values():
@@ -315,14 +306,6 @@ def _encode_jpeg(image: np.ndarray) -> bytes:
     if not ok:
         raise OSError("a picture could not be encoded")
     return content.tobytes()
-
-
-def _clear_after(folder: Path, last: int) -> None:
-    """Remove the pictures of an earlier, longer run, so that the folder holds one run only."""
-    for path in folder.glob("*.jpg"):
-        if path.stem.isdecimal() and int(path.stem) > last:
-            with suppress(OSError):
-                path.unlink()
 
 
 def _camera_toml(camera: Camera, is_standing: bool = False) -> str:

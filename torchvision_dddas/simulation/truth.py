@@ -10,9 +10,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.images import Masks
-from torchvision_dddas.io.interrupts import uninterrupted
 from torchvision_dddas.io.maps.formats import encode_geojson, geojson
 from torchvision_dddas.io.maps.ground_tracks import Gathered
 from torchvision_dddas.io.output import PipelineRecorder
@@ -86,8 +85,6 @@ class TruthOutput:
         """Put the tables in their places and write the map. Raises OSError if they cannot be written."""
         self._folder.mkdir(parents=True, exist_ok=True)
         self._files.close()
-        if self._masks is not None:
-            self._masks.close(complete)
         targets, landmarks = self._targets.tracks(True), self._landmarks.tracks(True)
         # Landmarks by their row in the team in place of their targets' numbers.
         numbers, row = np.unique(landmarks.target, return_inverse=True)
@@ -98,8 +95,6 @@ class TruthOutput:
     def discard(self) -> None:
         """Remove what was begun."""
         self._files.discard()
-        if self._masks is not None:
-            self._masks.discard()
 
 
 class _Targets(NamedTuple):
@@ -154,44 +149,34 @@ class SimulatedRunRecorder(PipelineRecorder):
 
     files: ClassVar[tuple[str, ...]] = (*PipelineRecorder.files, *TruthOutput.files)
     saved: ClassVar[tuple[str, ...]] = (*PipelineRecorder.saved, "truth")
-    _truth: TruthOutput | None = None
+    _truth: "_TruthUntil | None" = None
 
     def record_truth(self, lonlat: LonLat) -> None:
         """Call after `begin`. lonlat: (N, 2) longitudes and latitudes of (N, 2) metres of the world."""
-        self._truth = TruthOutput(self.folder, lonlat, masks=False) if "truth" in self.save else None
-        self._ahead: deque[Truth] = deque()
+        if "truth" in self.save:
+            self._truth = _TruthUntil(TruthOutput(self.folder, lonlat, masks=False))
+            self._parts.append(self._truth)
 
     def add_truth(self, truth: Truth) -> None:
         """Add the truth of a frame before its result; both are written together, so that both end at one frame."""
         if self._truth is not None:
-            self._ahead.append(truth)
+            self._truth.ahead.append(truth)
+
+
+class _TruthUntil:
+    """A part that writes the truth that is ahead with the result of its frame."""
+
+    def __init__(self, output: TruthOutput) -> None:
+        self.ahead: deque[Truth] = deque()
+        self._output, self.discard = output, output.discard
 
     def write(self, item: FrameResult) -> None:
-        """Write a frame and the truth until then. Raises InputError if the disk refuses."""
-        with uninterrupted():
-            super().write(item)
-            with self._refusals():
-                self._write_truth(item.tracked.number)
+        self._write(item.tracked.number)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place; without `truth` in save, that of an earlier run is removed."""
-        with uninterrupted():
-            with self._refusals():
-                if self._truth is None:
-                    for name in TruthOutput.files:
-                        remove(self.folder / name)
-                else:
-                    self._write_truth(math.inf if complete else 0)
-                    self._truth.close(complete)
-            super().close(complete)
+        self._write(math.inf if complete else 0)
+        self._output.close(complete)
 
-    def discard(self) -> None:
-        """Leave only what is whole."""
-        with uninterrupted():
-            if self._truth is not None:
-                self._truth.discard()
-            super().discard()
-
-    def _write_truth(self, until: float) -> None:
-        while self._truth is not None and self._ahead and self._ahead[0].frame <= until:
-            self._truth.write(self._ahead.popleft())
+    def _write(self, until: float) -> None:
+        while self.ahead and self.ahead[0].frame <= until:
+            self._output.write(self.ahead.popleft())

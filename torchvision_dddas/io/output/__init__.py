@@ -1,7 +1,8 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
+from torchvision_dddas.io.atomic_files import Part
 from torchvision_dddas.io.output.map_files import Site
-from torchvision_dddas.io.output.recorder import Part, RunRecorder, parse_save
+from torchvision_dddas.io.output.recorder import RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
     AerialRecorder,
     ConfirmationRecorder,
@@ -12,6 +13,7 @@ from torchvision_dddas.io.output.recorders import (
     TrackRecorder,
 )
 from torchvision_dddas.io.output.run_record import (
+    EVENTS,
     NONE_LOCATED,
     RESULTS,
     RUN_JSON,
@@ -30,6 +32,7 @@ from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM
 
 __all__ = [
     "CONFIRMATION_NAMES",
+    "EVENTS",
     "NONE_LOCATED",
     "NOTICED",
     "PROBLEM",

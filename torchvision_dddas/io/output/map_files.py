@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import readable
-from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.atomic_files import Part, write_whole
 from torchvision_dddas.io.maps.formats import cot, encode_geojson, geojson, kml
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
 from torchvision_dddas.io.maps.map_picture import CameraPath, map_picture, view_of
@@ -48,7 +48,7 @@ class Site:
         return {"origin_deg": self.origin_deg, "start_utc": begun, "rate_hz": self.rate_hz}
 
 
-class AerialMaps:
+class AerialMaps(Part[AerialLocations]):
     """tracks.geojson, tracks.kml, tracks.cot.xml, map.png and report.html of targets located from the air.
 
     Memory: 104 bytes per place of a target or landmark, three times that while the array grows, and about 800 while
@@ -84,7 +84,7 @@ class AerialMaps:
             self._last = fix
 
     def close(self, complete: bool) -> None:
-        """Write all files, and remove those of an earlier run that this one does not make."""
+        """Write all files."""
         site, save, names = self._site, self._save, tuple(self._site.names)
         has_degrees = site.origin_deg is not None
         targets = self._targets.tracks(has_degrees, site.start_utc_s)
@@ -102,10 +102,7 @@ class AerialMaps:
             makers[MAP] = lambda: picture
         if "report" in save:
             makers[REPORT] = lambda: readable(self._report(targets, picture, complete)).encode()
-        _replace(self._folder, self.files, makers)
-
-    def discard(self) -> None:
-        """Nothing is begun before the end."""
+        _write(self._folder, makers)
 
     def _draw(self, targets: GroundTracks, landmarks: GroundTracks) -> bytes:
         last, site = self._last, self._site
@@ -140,7 +137,7 @@ class AerialMaps:
         return report.html()
 
 
-class GroundMaps:
+class GroundMaps(Part[GroundLocations]):
     """tracks.geojson and tracks.kml of people located from the ground, if their longitudes and latitudes are known."""
 
     files = (GEOJSON, KML)
@@ -158,15 +155,10 @@ class GroundMaps:
         """Write the maps. Raises OSError if they cannot be written."""
         tracks = self._gathered.tracks(geographic=True)
         makers = {GEOJSON: lambda: encode_geojson(geojson(tracks)), KML: lambda: kml(tracks).encode()}
-        _replace(self._folder, self.files, makers if self._has_degrees else {})
-
-    def discard(self) -> None:
-        """Nothing is begun before the end."""
+        _write(self._folder, makers if self._has_degrees else {})
 
 
-def _replace(folder: Path, files: Sequence[str], makers: Mapping[str, Callable[[], bytes]]) -> None:
-    """Write each file that has a maker, one after the other, and remove the others, which an earlier run left."""
+def _write(folder: Path, makers: Mapping[str, Callable[[], bytes]]) -> None:
+    """Write the files one after the other."""
     for name, make in makers.items():
         write_whole(folder / name, make())
-    for name in set(files) - makers.keys():
-        remove(folder / name)

@@ -1,37 +1,23 @@
 """The output folder of a run: claimed before any work, filled item by item, valid whenever it is closed."""
 
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 from torchvision_dddas.errors import InputError, LostInputError
-from torchvision_dddas.io.atomic_files import ClaimedFolder, cannot_write
-from torchvision_dddas.io.images import MASK_NAME
+from torchvision_dddas.io.atomic_files import ClaimedFolder, Part, cannot_write
+from torchvision_dddas.io.images import NUMBERED
 from torchvision_dddas.io.interrupts import KEPT, is_stop, rescued_by, uninterrupted
-from torchvision_dddas.io.output.run_record import RunRecord, read_run_record
+from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, read_run_record
 
 # A disk or an encoder that takes longer to write or close counts as stuck.
 _WRITING_S = 20.0
 
 Item = TypeVar("Item")
 Whole = TypeVar("Whole")
-_Taken = TypeVar("_Taken", contravariant=True)
-
-
-class Part(Protocol[_Taken]):
-    """A part of a run's output: tables, masks, an overlay, maps, the log."""
-
-    def write(self, item: _Taken, /) -> None:
-        """Add an item. Raises OSError if it cannot be kept."""
-
-    def close(self, complete: bool) -> None:
-        """Make the files valid and put them in their places. complete: False if the user cut the run short."""
-
-    def discard(self) -> None:
-        """Leave nothing behind that looks whole and is not. Never raises."""
 
 
 class PartOf(Generic[Whole, Item]):
@@ -80,11 +66,14 @@ class RunRecorder(Generic[Item]):
     """Records a run in a folder: begin, write items, and leave the context.
 
     Leaving it normally, by a signal (see `interrupts`) or by LostInputError keeps what there is; any other exception
-    discards what is not whole. Files begin with the first item, so bad input changes nothing.
-    files: names of the files that a run may leave in the folder. saved: what `--save` may name.
+    discards what is not whole. With the first item run.json says `running`, and the files of an earlier run are
+    removed: from then on all files in the folder are of one run. Bad input before the first item changes nothing.
+    files: names of the files that a run may leave in the folder. numbered: folders of its pictures, 000001.png and so
+    on. Both may be patterns. saved: what `--save` may name.
     """
 
     files: ClassVar[tuple[str, ...]] = ()
+    numbered: ClassVar[tuple[str, ...]] = ()
     saved: ClassVar[tuple[str, ...]] = ()
     pictures: ClassVar[tuple[str, ...]] = ("overlay", "video")
     """Parts without which the results are whole."""
@@ -97,7 +86,7 @@ class RunRecorder(Generic[Item]):
         """
         self.folder = folder
         self.save = self.saved if save is None else tuple(save)
-        self._claim = _claim(folder, self.files)
+        self._claim = _claim(folder, self.files, self.numbered)
         self._open = ExitStack()
         self._lock, self._is_closed = threading.RLock(), False
         self._parts: list[Part[Item]] = []
@@ -125,11 +114,20 @@ class RunRecorder(Generic[Item]):
         """Note an item in the record."""
         raise NotImplementedError
 
+    def _replace_earlier(self) -> None:
+        """Say in run.json that a run is under way, and remove the files of an earlier one, once."""
+        if not self.record.has_begun:
+            self.record.begin()
+            for path in _files_of_runs(self.folder, self.files, self.numbered):
+                if path.name != RUN_JSON:
+                    path.unlink(missing_ok=True)
+
     def write(self, item: Item) -> None:
         """Write an item to every part, or to none if a signal came before. Raises InputError if the disk refuses."""
         with uninterrupted(), self._lock, self._refusals():
             if self._is_closed:  # by `_rescue`: the process ends
                 return
+            self._replace_earlier()
             self._count(item)
             for part in self._parts:
                 part.write(item)
@@ -140,6 +138,7 @@ class RunRecorder(Generic[Item]):
             if self._is_closed:
                 return
             self._is_closed = True
+            self._replace_earlier()
             for part in reversed(self._parts):
                 part.close(complete)
             self.record.close(complete)
@@ -222,11 +221,16 @@ def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
     return tuple(known) if "all" in chosen else tuple(n for n in known if n in chosen)
 
 
-def _claim(folder: Path, files: Sequence[str]) -> ClaimedFolder:
+def _files_of_runs(folder: Path, files: Iterable[str], numbered: Iterable[str]) -> list[Path]:
+    """The files in a folder that runs leave there; arguments as in RunRecorder."""
+    pictures = [path for name in numbered for path in sorted(folder.glob(f"{name}/*")) if NUMBERED.fullmatch(path.name)]
+    return [path for name in files for path in folder.glob(name)] + pictures
+
+
+def _claim(folder: Path, files: Sequence[str], numbered: Sequence[str]) -> ClaimedFolder:
     """Claim a folder. Raises InputError if that fails, or if it holds such files of another program."""
     claim = ClaimedFolder(folder)
-    foreign = [folder / name for name in files if (folder / name).exists()]
-    foreign += [p for p in sorted((folder / "masks").glob("*.png")) if MASK_NAME.fullmatch(p.name)]
+    foreign = _files_of_runs(folder, files, {"masks", *numbered})
     if foreign and read_run_record(folder) is None:
         claim.release()
         raise InputError(

@@ -4,15 +4,16 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
 
-from torchvision_dddas.io.atomic_files import remove
+from torchvision_dddas.io.atomic_files import Part
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import tables
 from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
-from torchvision_dddas.io.output.recorder import Part, PartOf, RunRecorder
+from torchvision_dddas.io.output.recorder import PartOf, RunRecorder
 from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
 from torchvision_dddas.io.output.run_record import (
     NO_POSE,
@@ -41,6 +42,7 @@ class DetectionRecorder(RunRecorder[Scene]):
     """The folder of `dddas detect`: tables, masks, overlay."""
 
     files = ("detections.txt", "detections.csv", "overlay.mp4", RUN_JSON)
+    numbered = ("masks",)
     saved = ("masks", "overlay")
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float) -> RunRecord:
@@ -85,6 +87,7 @@ class PeopleRecorder(RunRecorder[PeopleFrame]):
     """
 
     files = ("detections.txt", "detections.csv", "overlay.png", "overlay.mp4", RUN_JSON)
+    numbered = ("masks",)  # those of `dddas detect`, whose detections.csv is replaced
     saved = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> RunRecord:
@@ -197,6 +200,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
+    numbered: ClassVar[tuple[str, ...]] = ("masks",)  # as of PeopleRecorder
     saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
 
     def begin(
@@ -205,7 +209,6 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         """Start the run. rate_hz, size: of the overlay, (width, height). site: None if nothing is located."""
         folder, save = self.folder, self.save
         names = () if site is None else site.names
-        self._has_landmarks = bool(names)
         pictures = RunPictures(size, names)
         self.story = RunStory(folder, names, pictures if "report" in save else None, site is not None)
         parts: dict[str, Part[FrameResult]] = {}
@@ -221,8 +224,8 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             }
         parts |= {
             "detections": PartOf(detection_tables(folder), _scene),
-            "tracks": PartOf(tables.track_tables(folder), _tracked),
-            "appearance": PartOf(tables.appearance_table(folder), _tracked),
+            "tracks": PartOf(tables.track_tables(folder), attrgetter("tracked")),
+            "appearance": PartOf(tables.appearance_table(folder), attrgetter("tracked")),
             "overlay": OverlayVideo(folder, rate_hz, pictures),
             "story": self.story,
         }
@@ -246,15 +249,10 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place; removes files of an earlier run that this one has not."""
+        """Put everything in its place, with the reason if nothing was located."""
         if self._locations is not None:
             self._locations.note_unplaced()
         super().close(complete)
-        unused = set(PipelineRecorder.files) - set(self.found_files) if self._locations is None else set()
-        if not self._has_landmarks:
-            unused.add("landmarks.csv")
-        for name in unused:
-            remove(self.folder / name)
 
 
 def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
@@ -361,10 +359,6 @@ def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:
 def _locations(result: FrameResult) -> AerialLocations:
     assert result.locations is not None
     return result.locations
-
-
-def _tracked(result: FrameResult) -> TrackedFrame:
-    return result.tracked
 
 
 def _scene(result: FrameResult) -> Scene:

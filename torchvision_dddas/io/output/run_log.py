@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.errors import readable
-from torchvision_dddas.io.atomic_files import remove, write_whole
+from torchvision_dddas.io.atomic_files import Part, write_whole
 from torchvision_dddas.io.maps.map_picture import Signs
 from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, KeyFrames, RunReport, describe_state, format_span
@@ -159,7 +159,7 @@ def format_log(entries: Iterable[Entry], clock: Clock, heading: str) -> str:
     return "\n".join(out) + "\n"
 
 
-class RunStory:
+class RunStory(Part[FrameResult]):
     """A part that writes log.txt, and collects events, timeline, key frames and map signs for report.html.
 
     Of a run that locates nothing it writes report.html too.
@@ -224,11 +224,6 @@ class RunStory:
             report = RunReport(f"Detected and tracked: {record.input_name}", record, complete, self.timeline, figures)
             self.extend(report)
             write_whole(self._folder / REPORT, readable(report.html()).encode())
-        elif not self._is_located:
-            remove(self._folder / REPORT)
-
-    def discard(self) -> None:
-        """Nothing is begun before the end."""
 
     def extend(self, report: RunReport) -> None:
         """Add events, key frames, timelines and the score to a report."""

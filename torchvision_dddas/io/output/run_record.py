@@ -126,6 +126,7 @@ class RunRecord:
     """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
 
     counts: what a command counts beside frames and targets. notes: what the user should know of the run.
+    has_begun: whether run.json is this run's.
     """
 
     def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
@@ -141,6 +142,7 @@ class RunRecord:
         self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
         self.last_frame = 0
+        self.has_begun = False
 
     @property
     def input_name(self) -> str:
@@ -156,8 +158,6 @@ class RunRecord:
         cause: str | None = None,
     ) -> None:
         """Count a frame. cause: why nothing could be concluded from it; None where all is well."""
-        if self.frames == 0:
-            self._save("running")
         self.frames += 1
         self.targets += targets
         for stage, spent in seconds.items():
@@ -168,13 +168,18 @@ class RunRecord:
             self.unreliable.add(number, self.last_frame, cause)
         self.last_frame = number
 
+    def begin(self) -> None:
+        """Write that the run is under way."""
+        self._save("running")
+        self.has_begun = True
+
     def close(self, complete: bool) -> None:
         """Write the whole record."""
         self._save("complete" if complete else "interrupted")
 
     def discard(self) -> None:
         """Write that the run failed, if it had begun."""
-        if self.frames:
+        if self.has_begun:
             with suppress(OSError):  # the file that says `running` stays
                 self._save("failed")
 
@@ -291,10 +296,12 @@ class SessionLog:
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         """facts: what run.json says of the run from its start."""
         self.folder, self.facts = folder, facts
-        self._events = os.open(folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self._events = -1
 
     def append(self, events: Sequence[Event]) -> None:
         """Append events, a line each: UTC time, frame or -, kind, text."""
+        if self._events < 0:
+            self._events = os.open(self.folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         stamps = iso_utc(np.array([event.utc_s for event in events]))
         lines = "".join(
             f"{stamp} {e.frame or '-'} {e.kind}: {' '.join(e.text.split())}\n"
@@ -315,4 +322,5 @@ class SessionLog:
 
     def close(self) -> None:
         """Close events.log."""
-        os.close(self._events)
+        if self._events >= 0:
+            os.close(self._events)

@@ -1,15 +1,14 @@
 """The tables that runs write: their schemas, and their rows for one frame."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Generic
+from typing import Any
 
 import numpy as np
 
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.io.atomic_files import remove
 from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
     BOX,
@@ -26,11 +25,9 @@ from torchvision_dddas.io.tables import (
     SCORE,
     TARGET,
     Column,
-    Item,
     Rows,
     Schema,
     TableFiles,
-    TextFiles,
     compass_deg,
     mot_rows,
 )
@@ -282,30 +279,7 @@ def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequenc
     return TableFiles({folder / "confirmed.csv": (schema, rows)})
 
 
-class OptionalTable(Generic[Item]):
-    """A table of the items that have something for it; no file if none has."""
-
-    def __init__(self, path: Path, schema: Schema, rows: Callable[[Item], Rows | None]) -> None:
-        """rows: of an item; None: it has nothing for the table."""
-        self._path, self._schema, self._rows = path, schema, rows
-        self._file, self._is_written = TextFiles({path: schema.header}), False
-        self.discard = self._file.discard
-
-    def write(self, item: Item) -> None:
-        """Add what an item has. Raises OSError if the disk refuses."""
-        if (rows := self._rows(item)) is not None:
-            self._is_written = True
-            self._file.write(self._schema.format_rows(rows))
-
-    def close(self, complete: bool = True) -> None:
-        """Put the table in its place, or remove that of an earlier run. Raises OSError if it cannot be written."""
-        if self._is_written:
-            self._file.close()
-        else:
-            remove(self._path)
-
-
-def confirmed_positions(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
+def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
     """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
 
     def rows(result: FrameResult) -> Rows | None:
@@ -315,12 +289,11 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> OptionalTable[FrameR
         own = _position_rows(located.positions)
         return {name: np.asarray(values)[confirmed.row] for name, values in own.items()} | _confirmation_rows(confirmed)
 
-    return OptionalTable(
-        folder / "confirmed.csv", Schema("positions", *_position_columns(has_degrees), *CONFIRMATION), rows
-    )
+    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION)
+    return TableFiles({folder / "confirmed.csv": (schema, rows)}, is_optional=True)
 
 
-def crowd_table(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
+def crowd_table(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
     """crowds.csv, of crowds as ground vehicles see them; no file if none was seen."""
     own = (Column("people", "d"), *_VELOCITY, Column("seen_by"), Column("steers", "d"))
     schema = Schema("crowds", FRAME, TARGET, *EAST_NORTH, *(DEGREES if has_degrees else ()), *own)
@@ -342,17 +315,17 @@ def crowd_table(folder: Path, has_degrees: bool) -> OptionalTable[FrameResult]:
             "steers": crowds.steers,
         }
 
-    return OptionalTable(folder / "crowds.csv", schema, rows)
+    return TableFiles({folder / "crowds.csv": (schema, rows)}, is_optional=True)
 
 
-def appearance_table(folder: Path) -> OptionalTable[TrackedFrame]:
+def appearance_table(folder: Path) -> TableFiles[TrackedFrame]:
     """appearance.csv; no file if nothing was decided, as without pictures."""
 
     def rows(tracked: TrackedFrame) -> Rows | None:
         use = tracked.tracks.appearance
         return None if use is None else {"frame": tracked.number, **asdict(use)}
 
-    return OptionalTable(folder / "appearance.csv", APPEARANCE, rows)
+    return TableFiles({folder / "appearance.csv": (APPEARANCE, rows)}, is_optional=True)
 
 
 def _confirmation_rows(confirmed: Confirmation) -> dict[str, Any]:

@@ -57,11 +57,18 @@ class Stream:
         self._failed = self._reported_lost = 0
         self._reason = self._reported_reason = ""
         self._lost_wait_s, self._lost_due_s = 0.0, -math.inf
+        self._lost_s = -math.inf  # when a message was lost last
 
     @property
     def lost(self) -> int:
         """Messages lost for good."""
         return self._outlet.lost + self._failed
+
+    def trouble(self) -> str:
+        """Why messages cannot be sent, or were lost in the last 30 s; empty if all is well. Any thread may ask."""
+        if self._trouble or self._clock() - self._lost_s < _NOTIFY_S:
+            return f"{self.name}: {self._trouble or f'{self._reason}; messages are lost'}"
+        return ""
 
     def write(self, result: FrameResult | None, people: TrackedFrame | None = None) -> None:
         """Send a frame: its targets and people, each None if it has none to send. Never raises."""
@@ -84,6 +91,8 @@ class Stream:
             self._flush()
             if self._outlet.lost > lost:
                 self._reason = self._outlet.reason
+            if defect or self._outlet.lost > lost:
+                self._lost_s = self._clock()
             if not self._trouble and self.lost > self._reported_lost:
                 self._report_lost()
 
