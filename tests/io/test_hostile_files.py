@@ -282,6 +282,7 @@ HOG = "%YAML:1.0\n---\nhog: !!opencv-object-detector-hog\n"
         ("a.json", '{"a":' * 100_000),
         ("a.json", '{"a":' + "[" * 100_000),
     ],
+    ids=["yml names", "yml dashes", "yml braces", "xml", "json objects", "json lists"],
 )
 def test_a_classifier_whose_parts_lie_deep_in_each_other_is_refused_before_opencv_reads_it(tmp_path, name, content):
     path = tmp_path / name
