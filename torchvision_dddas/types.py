@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, overload
 
 import numpy as np
 
@@ -165,7 +165,9 @@ def is_sampled(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
 class Telemetry:
     """The vehicle's own reports, one row per sample, sorted by time; NaN where unknown. Arrays are (N,).
 
-    time_s: since the clip's first frame. altitude_m: above ground. speed_m_s: over ground.
+    time_s: since the clip's first frame. altitude_m: above height_zero: "ground", that below the vehicle, or "takeoff",
+    the point where it took off. above_sea_m: if height_zero is "unknown", the log does not say whether it counts from
+    the sea or from the take-off point. above_ellipsoid_m: above WGS 84. speed_m_s: over ground.
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
     heading_rad, pitch_rad, roll_rad: of the camera, as in Camera; straight down the pitch is pi/2 and the heading that
     of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
@@ -189,6 +191,8 @@ class Telemetry:
     heading_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     tilt_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     altitude_sigma_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    above_ellipsoid_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    height_zero: Literal["ground", "takeoff", "unknown"] = "ground"
     heading_from: str = ""
     start_utc_s: float = float("nan")
     origin: str = ""
@@ -284,6 +288,7 @@ COLUMNS_OF_TELEMETRY = (
     "heading_sigma_rad",
     "tilt_sigma_rad",
     "altitude_sigma_m",
+    "above_ellipsoid_m",
 )
 
 

@@ -22,7 +22,7 @@ from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.io.telemetry import autopilots, nmea, read_telemetry
 from torchvision_dddas.io.telemetry.tables import quantity_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -233,3 +233,11 @@ def test_the_readme_is_short_and_its_picture_small() -> None:
     assert len(PAGES["README.md"].splitlines()) <= 170
     assert len(PAGES["README.md"].encode()) <= 12_000
     assert (ROOT / "docs/demo.jpg").stat().st_size < 300_000
+
+
+def test_the_page_on_telemetry_names_each_message_field_and_sentence_that_is_read():
+    page = PAGES["telemetry.md"]
+    fields = {field for group in autopilots._PLACES for row in group.values() for field in re.findall(r"=(\w+)/", row)}
+    # The page names the fields from which these are computed.
+    computed = {"speed", "height"}
+    assert [name for name in {*autopilots.NAMES, *nmea._FIELDS, *fields} - computed if f"`{name}`" not in page] == []

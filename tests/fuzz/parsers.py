@@ -281,6 +281,8 @@ _BYTES: tuple[tuple[str, str, Callable[[Path], object], Callable[..., Sequence[b
     ("KLV", "flight.klv", _telemetry, seeds.klv, (False,), "", 1),
     ("MAVLink tlog", "flight.tlog", _telemetry, seeds.mavlink, (), "pymavlink", 1),
     ("PX4 ULog", "flight.ulg", _telemetry, seeds.px4, (), "pyulog", 0.7),
+    ("ArduPilot DataFlash", "flight.bin", _telemetry, seeds.ardupilot, (False,), "", 1),
+    ("ArduPilot DataFlash as text", "flight.log", _telemetry, seeds.ardupilot, (True,), "", 1),
     *(
         ("classifier " + e, "a" + e, _classifier, seeds.classifiers, (e,), "", 0.3)
         for e in (".npy", ".npz", ".yml", ".xml", ".json")

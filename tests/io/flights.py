@@ -80,11 +80,11 @@ def transport_stream(
 # -- MAVLink -----------------------------------------------------------------------------------------------------------
 
 
-def tlog(messages: Iterable[tuple[float, str, dict]], system: int = 1, version: int = 2) -> bytes:
+def tlog(messages: Iterable[tuple[float, str, dict]], system: int = 1, version: int = 2, component: int = 1) -> bytes:
     """Each message (seconds since 1970 at which it came, name, fields) behind its time."""
     from pymavlink.dialects.v20 import all as dialect
 
-    sender = dialect.MAVLink(None, srcSystem=system, srcComponent=1)
+    sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
     content = b""
     for time_s, name, fields in messages:
         message = getattr(dialect, f"MAVLink_{name.lower()}_message")(**fields)
@@ -117,17 +117,21 @@ def eastward(count: int = 20, step_s: float = 0.25, delays_s: Sequence[float] = 
 _LETTERS = {"uint64_t": "Q", "float": "f", "double": "d", "int32_t": "i", "uint8_t": "B", "bool": "B", "uint16_t": "H"}
 
 
-def ulog(topics: dict[str, tuple[Sequence[str], Sequence[Sequence[float]]]]) -> bytes:
-    """Topics: (type and name of the fields behind the time stamp, rows with the time in microseconds first)."""
+def ulog(topics: Mapping[str, tuple[Sequence[str], Sequence[Sequence[float]]]]) -> bytes:
+    """Topics: (type and name of the fields behind the time stamp, rows with the time in microseconds first).
+
+    The name of an instance other than the first ends with its number: `sensor_gps 1`.
+    """
     content = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
 
     def message(kind: bytes, body: bytes) -> bytes:
         return struct.pack("<H", len(body)) + kind + body
 
-    for name, (fields, _) in topics.items():
+    for name, fields in {name.split()[0]: fields for name, (fields, _) in topics.items()}.items():
         content += message(b"F", f"{name}:{';'.join(['uint64_t timestamp', *fields])};".encode())
     for number, name in enumerate(topics):
-        content += message(b"A", struct.pack("<BH", 0, number) + name.encode())
+        name, _, instance = name.partition(" ")
+        content += message(b"A", struct.pack("<BH", int(instance or 0), number) + name.encode())
     for number, (fields, rows) in enumerate(topics.values()):
         pattern = "<HQ"
         for field in fields:
@@ -136,6 +140,41 @@ def ulog(topics: dict[str, tuple[Sequence[str], Sequence[Sequence[float]]]]) -> 
         for row in rows:
             content += message(b"D", struct.pack(pattern, number, *row))
     return content
+
+
+# -- ArduPilot's DataFlash ---------------------------------------------------------------------------------------------
+
+_CODES = {"Q": "Q", "B": "B", "I": "I", "H": "H", "f": "f", "d": "d", "L": "i", "c": "h", "C": "H"}
+_PER_UNIT = {"L": 1e7, "c": 100, "C": 100}
+
+
+def dataflash(kinds: Mapping[str, tuple[str, str]], rows: Iterable[tuple]) -> bytes:
+    """A binary log. kinds: letters of the format and the columns by message. rows: message and its values, in order."""
+    content, numbers = b"", {name: 129 + k for k, name in enumerate(kinds)}
+    for name, letters, columns in (
+        ("FMT", "BBnNZ", "Type,Length,Name,Format,Columns"),
+        *((name, *kind) for name, kind in kinds.items()),
+    ):
+        size = 89 if name == "FMT" else 3 + struct.calcsize("<" + "".join(_CODES[letter] for letter in letters))
+        texts = (name.encode(), letters.encode(), columns.encode())
+        content += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", numbers.get(name, 128), size, *texts)
+    for name, *values in rows:
+        letters = kinds[name][0]
+        raw = [round(v * _PER_UNIT[c]) if c in _PER_UNIT else v for c, v in zip(letters, values, strict=True)]
+        pattern = "<" + "".join(_CODES[letter] for letter in letters)
+        content += b"\xa3\x95" + bytes([numbers[name]]) + struct.pack(pattern, *raw)
+    return content
+
+
+def dataflash_text(kinds: Mapping[str, tuple[str, str]], rows: Iterable[tuple], comma: str = ", ") -> str:
+    """The same log as text."""
+    lines = [f"FMT, 128, 89, FMT, BBnNZ, {comma.join(['Type', 'Length', 'Name', 'Format', 'Columns'])}"]
+    lines += [
+        f"FMT, {129 + k}, 50, {name}, {letters}, {columns}"
+        for k, (name, (letters, columns)) in enumerate(kinds.items())
+    ]
+    lines += [", ".join(map(str, row)) for row in rows]
+    return "\n".join(lines).replace(", ", comma)
 
 
 # -- NMEA 0183 ---------------------------------------------------------------------------------------------------------

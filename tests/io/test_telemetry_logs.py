@@ -1,4 +1,4 @@
-"""Logs of autopilots and receivers: MAVLink, PX4, NMEA 0183; and files that are none of these."""
+"""Logs of autopilots: MAVLink and PX4; and files that are none of these."""
 
 import math
 
@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.io.telemetry.autopilots import px4_lonlat
+from torchvision_dddas.io.telemetry.px4 import px4_lonlat
 
 pytest.importorskip("pymavlink")
 pytest.importorskip("pyulog")
-pytest.importorskip("pynmea2")
-from tests.io.flights import CLOCK_S, eastward, sentence, tlog, ulog
+from tests.io.flights import CLOCK_S, eastward, global_position, tlog, ulog
 
 HEARTBEAT = {"type": 2, "autopilot": 3, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3}
 
@@ -125,6 +124,183 @@ def test_a_single_damaged_time_does_not_spoil_a_mavlink_log(fly):
     np.testing.assert_array_equal(flown.altitude_m, whole.altitude_m)
 
 
+# -- One vehicle, one gimbal, one clock --------------------------------------------------------------------------------
+
+STATION = {**HEARTBEAT, "type": 6, "autopilot": 8}
+TRACKER = {**HEARTBEAT, "type": 5}
+ELSEWHERE = [(t + 0.01, name, {**fields, "lat": -360_000_000}) for t, name, fields in eastward(80, 0.05)[::2]]
+
+
+def together(*parts: bytes) -> bytes:
+    """Some logs as one, in order of time."""
+    messages: list[bytes] = []
+    for part in parts:
+        place = 0
+        while place < len(part):
+            end = place + 20 + part[place + 9]
+            messages.append(part[place:end])
+            place = end
+    messages.sort(key=lambda message: message[:8])
+    return b"".join(messages)
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "heartbeat"),
+    [
+        (255, 190, None),
+        (255, 1, None),
+        (252, 0, None),
+        (1, 190, None),
+        (7, 1, STATION),
+        (2, 1, TRACKER),
+        (245, 190, STATION),
+    ],
+)
+def test_a_ground_station_is_never_the_vehicle_though_it_reports_more_often(fly, system, component, heartbeat):
+    calls = [(CLOCK_S, "HEARTBEAT", heartbeat)] if heartbeat else []
+    station = tlog([*calls, *ELSEWHERE], system, component=component)
+    flown = fly(together(tlog(eastward()), station), "flight.tlog")
+    assert flown.place[:, 1].tolist() == [-35.0] * len(flown) and np.nanmax(flown.altitude_m) == 69
+    left_out = f"its component {component}" if system == 1 else f"{system}"
+    assert any(f"system 1 is taken, left out are {left_out} (ground station)" in note for note in flown.notes)
+
+
+def test_a_sender_of_nothing_but_its_place_is_not_taken_for_a_vehicle_that_says_more(fly):
+    flown = fly(
+        together(tlog(eastward()), tlog([row for row in ELSEWHERE if "lat" in row[2]], system=42)), "flight.tlog"
+    )
+    assert flown.place[:, 1].tolist() == [-35.0] * len(flown)
+    assert any("system 1 is taken, left out are 42" in note for note in flown.notes)
+
+
+def test_a_log_of_ground_stations_alone_is_refused(refused):
+    said = refused(read_telemetry, tlog(ELSEWHERE, system=255, component=190), "a.tlog")
+    assert "only ground stations" in said
+
+
+def test_a_vehicle_without_a_fix_has_no_place_though_a_station_has_one(fly):
+    nowhere = [
+        (t, name, {**fields, "lat": 0, "lon": 0} if "lat" in fields else fields) for t, name, fields in eastward()
+    ]
+    flown = fly(together(tlog(nowhere), tlog(ELSEWHERE, 255, component=190)), "flight.tlog")
+    assert np.isnan(flown.place).all() and np.nanmax(flown.altitude_m) == 69
+    assert any("nothing in the log has a fix" in note for note in flown.notes)
+
+
+def test_the_autopilot_is_taken_rather_than_another_part_of_the_vehicle(fly):
+    flown = fly(together(tlog(eastward()), tlog(ELSEWHERE, component=191)), "flight.tlog")
+    assert flown.place[:, 1].tolist() == [-35.0] * len(flown)
+    assert any("left out are its component 191" in note for note in flown.notes)
+
+
+def turns(pitch_up: float, count: int = 20, boot_ms: int = 5000, **more) -> list:
+    others = ("target_system", "target_component", "failure_flags", *(f"angular_velocity_{axis}" for axis in "xyz"))
+    gimbal = {**dict.fromkeys(others, 0), "flags": 32, "q": quaternion(40, pitch_up, 0), **more}
+    stamps = [(CLOCK_S + i * 0.25, {"time_boot_ms": boot_ms + 250 * i}) for i in range(count)]
+    return [(time_s, "GIMBAL_DEVICE_ATTITUDE_STATUS", {**stamp, **gimbal}) for time_s, stamp in stamps]
+
+
+@pytest.mark.parametrize(
+    ("gimbals", "pitch", "words"),
+    [
+        (
+            [tlog(turns(-30), component=154), tlog(turns(-80), component=171)],
+            30,
+            "component 154 is taken, left out are component 171",
+        ),
+        (
+            [tlog(turns(-30, gimbal_device_id=1)), tlog(turns(-80, gimbal_device_id=2))],
+            30,
+            "left out are component 1 device 2",
+        ),
+        (
+            [tlog(turns(-30, q=[0, 0, 0, 0]), component=154), tlog(turns(-80), component=171)],
+            80,
+            "component 171 is taken",
+        ),
+        ([tlog(turns(-30, 3), component=154), tlog(turns(-80), component=171)], 80, "component 171 is taken"),
+        ([tlog(turns(-30), system=9, component=154)], 30, None),
+        # The clock of a gimbal began at another time.
+        ([tlog(turns(-30, boot_ms=9_000_000), component=154)], 30, None),
+    ],
+)
+def test_one_gimbal_is_used_and_named(fly, gimbals, pitch, words):
+    flown = fly(together(tlog(eastward()), *gimbals), "flight.tlog")
+    assert camera_deg(flown.at(1.0))[:2] == pytest.approx([140, pitch], abs=1e-4)
+    assert words is None or any("several gimbals report" in note and words in note for note in flown.notes)
+    assert not any("drift" in note for note in flown.notes)
+
+
+ROLLOVER_S = 1024 * 604_800
+SINCE_1970 = -CLOCK_S + 100
+
+
+def shifted(said: list, by_s: float) -> list:
+    return [(time_s + by_s, *rest) for time_s, *rest in said]
+
+
+def calls(utc_s: float, boot_ms: int = 5000) -> list:
+    stamps = [(i * 1000, round((utc_s + i) * 1e6)) for i in range(5)]
+    return [
+        (CLOCK_S + at / 1e3, "SYSTEM_TIME", {"time_boot_ms": boot_ms + at, "time_unix_usec": utc}) for at, utc in stamps
+    ]
+
+
+@pytest.mark.parametrize(
+    ("said", "start_utc_s", "words"),
+    [
+        (eastward(), CLOCK_S, None),
+        (shifted(eastward(), SINCE_1970), math.nan, "1970-01-01T00:01:"),
+        (shifted(eastward(), -ROLLOVER_S), math.nan, "1998-12-"),
+        (shifted(eastward(), 2e9), math.nan, "2081-12-"),
+        (shifted(eastward() + calls(CLOCK_S), SINCE_1970), CLOCK_S, "SYSTEM_TIME"),
+        (shifted(eastward() + calls(CLOCK_S - ROLLOVER_S), SINCE_1970), math.nan, "1970-01-01"),
+        (eastward() + calls(CLOCK_S + 3600), CLOCK_S + 3600, "3600 s behind"),
+        (eastward() + calls(CLOCK_S + 0.5), CLOCK_S, None),
+        # The computer's clock is set on the way.
+        (shifted(eastward()[:14], SINCE_1970) + eastward()[14:], CLOCK_S, None),
+        # A single damaged time is no clock.
+        (
+            [*shifted(eastward(80), SINCE_1970), (CLOCK_S, "SYSTEM_TIME", {"time_boot_ms": 0, "time_unix_usec": 0})],
+            math.nan,
+            "1970",
+        ),
+    ],
+)
+def test_a_clock_that_cannot_be_is_none_unless_the_vehicle_tells_it(fly, said, start_utc_s, words):
+    for name in ("flight.tlog", "flight.bin"):
+        flown = fly(tlog(sorted(said, key=lambda row: row[0])), name)
+        assert flown.at(1.5).altitude_m == pytest.approx(56, abs=0.1) and flown.time_s[-1] < 25
+        np.testing.assert_allclose(flown.start_utc_s, start_utc_s, atol=0.02, rtol=0)
+        assert (words is None) == (not flown.notes) and all(words in note for note in flown.notes)
+
+
+def test_a_sender_whose_own_clock_stands_still_has_the_times_of_reception(fly):
+    said = [(t, name, {**fields, "time_boot_ms": 0}) for t, name, fields in eastward(8)]
+    assert np.ptp(fly(tlog(said), "flight.tlog").time_s) == pytest.approx(1.75)
+
+
+def receiver(fix: int, lat: float = 48.1, ellipsoid_m: float = 0.0, **more) -> dict:
+    place = {"lat": round(lat * 1e7), "lon": 115_000_000, "alt": 560_000, "vel": 700, "fix_type": fix}
+    rest = {"time_usec": 0, "eph": 100, "epv": 100, "cog": 0, "satellites_visible": 9}
+    return {**place, **rest, "alt_ellipsoid": round(ellipsoid_m * 1000), **more}
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_of_two_receivers_the_one_with_a_fix_is_used(fly, fused):
+    second = {"dgps_numch": 0, "dgps_age": 0}
+    said = []
+    for i in range(10):
+        time_s = CLOCK_S + i / 5
+        said += [(time_s, "GPS_RAW_INT", receiver(1, 0.0)), (time_s, "GPS2_RAW", receiver(3, 48.1, 607.0, **second))]
+        said += [(time_s, "GLOBAL_POSITION_INT", global_position(5000 + 200 * i, 0, 0, 50))] if fused else []
+    flown = fly(tlog(said), "flight.tlog")
+    np.testing.assert_allclose(flown.place, [[11.5, 48.1]] * 10)
+    assert flown.above_ellipsoid_m[5] == 607 and flown.above_sea_m[5] == (150 if fused else 560)
+    note = "GPS2_RAW component 1 is taken, with 10 fixes, left out are GPS_RAW_INT component 1 (0)"
+    assert any(note in one for one in flown.notes)
+
+
 # -- PX4 ---------------------------------------------------------------------------------------------------------------
 
 GLOBAL: tuple = (
@@ -216,41 +392,70 @@ def test_a_px4_log_that_is_cut_or_has_a_damaged_time_is_read_as_far_as_it_goes(f
     assert len(flown) == 49 and np.ptp(flown.time_s) == pytest.approx(4.9)
 
 
-# -- NMEA 0183 ---------------------------------------------------------------------------------------------------------
+_REST = ("float vel_m_s", "uint8_t fix_type")
+_PLACES = ("double latitude_deg", "double longitude_deg", "double altitude_msl_m", "double altitude_ellipsoid_m")
+GPS = ("uint64_t time_utc_usec", *_PLACES, *_REST)
+OLD_GPS = ("uint64_t time_utc_usec", *(f"int32_t {name}" for name in ("lat", "lon", "alt", "alt_ellipsoid")), *_REST)
+UTC_US = 1_618_986_658_000_000
 
 
-def gga(clock: str, quality: int = 1) -> str:
-    return sentence(f"GPGGA,{clock},4807.0380,N,01131.0000,W,{quality},08,0.9,545.4,M,46.9,M,,")
+def fixes(fix: int, latitude: float = 47.4, utc_us: int = UTC_US, count: int = 20) -> list:
+    place = (latitude, 8.5, 488.0, 535.0) if fix else (0.0,) * 4
+    return [(i * 200_000, utc_us + i * 200_000 if fix else 0, *place, 5.5, fix) for i in range(count)]
 
 
-def test_places_heights_speeds_and_headings_of_a_receiver(fly):
-    lines = []
-    for i in range(5):
-        rmc = f"GNRMC,12351{i}.50,A,4807.0380,N,01131.0000,W,10.0,084.4,230394,003.1,W"
-        lines += [gga(f"12351{i}.50"), sentence(rmc), sentence("HEHDT,274.0,T"), sentence("PUBX,00,1,2"), "noise"]
-    flown = fly("\r\n".join(lines), "track.nmea", clock_offset_s=1.0)
-    assert flown.time_s.tolist() == [1, 2, 3, 4, 5]
-    np.testing.assert_allclose(flown.place, [[-(11 + 31 / 60), 48 + 7.038 / 60]] * 5)
-    assert flown.above_sea_m.tolist() == [545.4] * 5 and np.isnan(flown.altitude_m).all()
-    np.testing.assert_allclose(flown.speed_m_s, 10 * 1852 / 3600)
-    np.testing.assert_allclose(np.degrees(flown.vehicle_heading_rad), 274)
-    assert not any("left out" in note for note in flown.notes)
-    assert flown.start_utc_s == 764_426_110.5 - 1.0  # 1994-03-23T12:35:10.5Z is the first
+def old_fixes(fix: int) -> list:
+    return [
+        (*row[:2], *(round(v * by) for v, by in zip(row[2:6], (1e7, 1e7, 1e3, 1e3), strict=True)), *row[6:])
+        for row in fixes(fix)
+    ]
 
 
-def test_time_goes_on_over_midnight_and_without_a_fix_nothing_is_known(fly):
-    flown = fly("\n".join([gga("235958"), gga("235959", quality=0), gga("000000"), gga("000001")]), "track.nmea")
-    assert flown.time_s.tolist() == [0, 1, 2, 3]
-    assert np.isnan(flown.place[:, 0]).tolist() == [False, True, False, False]
-    assert math.isnan(flown.at(1.2).place[0])
+INVALID = (
+    ("double lat", "double lon", "float alt", "bool lat_lon_valid"),
+    [(i * 100_000, 0, 0, 0, 0) for i in range(40)],
+)
 
 
-def test_a_damaged_sentence_is_left_out_unless_none_has_a_checksum(fly):
-    lines = [gga("120000"), gga("120001").replace("545.4", "945.4"), gga("120002"), gga("120003")[:30]]
-    flown = fly("\n".join(lines), "track.nmea")
-    assert flown.time_s.tolist() == [0, 2] and flown.above_sea_m.tolist() == [545.4] * 2
-    assert any("line 2" in note and "2 lines are left out" in note for note in flown.notes)
-    assert len(fly("\n".join(line.split("*")[0] for line in lines[:3]), "track.nmea")) == 3
+@pytest.mark.parametrize(
+    ("topics", "taken"),
+    [
+        ({"sensor_gps": (GPS, fixes(0)), "sensor_gps 1": (GPS, fixes(3))}, "sensor_gps 1"),
+        ({"sensor_gps": (GPS, fixes(3)), "sensor_gps 1": (GPS, fixes(0))}, "sensor_gps 0"),
+        ({"sensor_gps 3": (GPS, fixes(0)), "sensor_gps 5": (GPS, fixes(4))}, "sensor_gps 5"),
+        ({"sensor_gps": (GPS, fixes(3, 10.0, count=5)), "sensor_gps 1": (GPS, fixes(3))}, "sensor_gps 1"),
+        ({"sensor_gps": (GPS, fixes(3)), "sensor_gps 1": (GPS, fixes(3, 10.0))}, "sensor_gps 0"),
+        ({"vehicle_gps_position": (GPS, fixes(0)), "sensor_gps 1": (GPS, fixes(3))}, "sensor_gps 1"),
+        (
+            {"vehicle_gps_position": (OLD_GPS, old_fixes(0)), "vehicle_gps_position 1": (OLD_GPS, old_fixes(3))},
+            "vehicle_gps_position 1",
+        ),
+        ({"vehicle_global_position": INVALID, "sensor_gps": (GPS, fixes(3))}, None),
+    ],
+)
+def test_of_px4s_receivers_the_one_with_fixes_is_used(fly, topics, taken):
+    flown = fly(ulog(topics), "flight.ulg")
+    np.testing.assert_allclose(flown.place[:20], [[8.5, 47.4]] * 20)
+    values = flown.above_sea_m[3], flown.above_ellipsoid_m[3], flown.speed_m_s[3], flown.start_utc_s
+    assert values == pytest.approx((488, 535, 5.5, UTC_US / 1e6))
+    assert taken is None or any(f"several receivers report: {taken} is taken" in note for note in flown.notes)
+
+
+def test_a_px4_log_whose_receivers_have_no_fix_says_so(fly, refused):
+    none = {"sensor_gps": (GPS, fixes(0)), "sensor_gps 1": (GPS, fixes(1, 0.0))}
+    flown = fly(ulog({**none, "vehicle_local_position": (LOCAL[0][:5], [row[:6] for row in LOCAL[1]])}), "flight.ulg")
+    assert np.isnan(flown.place).all() and any("nothing in the log has a fix" in note for note in flown.notes)
+    assert "holds a place" in refused(read_telemetry, ulog(none), "a.ulg")
+
+
+@pytest.mark.parametrize(
+    ("utc_us", "words"), [(UTC_US - round(ROLLOVER_S * 1e6), "2001-09-"), (315_964_800_000_000, "1980-01-06")]
+)
+def test_a_receivers_clock_that_cannot_be_is_none(fly, utc_us, words):
+    flown = fly(ulog({"sensor_gps": (GPS, fixes(3, utc_us=utc_us))}), "flight.ulg")
+    assert math.isnan(flown.start_utc_s) and any(words in note and "cannot be" in note for note in flown.notes)
+    mixed = {"sensor_gps": (GPS, fixes(3, utc_us=utc_us)), "sensor_gps 1": (GPS, fixes(3))}
+    assert fly(ulog(mixed), "flight.ulg").start_utc_s == pytest.approx(UTC_US / 1e6)
 
 
 # -- Files of no use ---------------------------------------------------------------------------------------------------
@@ -266,9 +471,8 @@ BATTERY = ulog({"battery_status": (("float voltage",), [(0, 12.0)])})
         ("a.ulg", b"XX" + BATTERY, "does not begin as a PX4 log"),
         ("a.ulg", BATTERY[:12], "damaged from its beginning"),
         ("a.ulg", b"", "is empty"),
-        ("a.nmea", (sentence("GPGSV,1,1,00") + "\n").encode() * 3, "no NMEA sentence gives"),
         ("a.bin", b"\x00\x00\x00\x20ftypisom" + bytes(90), "is a video"),
-        ("a.bin", b"\xa3\x95\x80\x80" + bytes(90), "DataFlash"),
+        ("a.bin", b"\xa3\x95\x80\x80" + bytes(90), "the DataFlash log has no position, height or attitude"),
         ("a.bin", np.random.default_rng(0).bytes(500), "none of the kinds"),
     ],
 )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.io.flights import START_US, attitude, local_set, packet, spread, transport_stream
+from tests.io.flights import PLACE, START_US, attitude, local_set, packet, spread, transport_stream
 from torchvision_dddas.geo.projection import axes_of
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.attitude import angles, axes, axes_of_quaternion
@@ -149,3 +149,101 @@ def test_a_damaged_stream_is_read_around_the_damage(fly_packets, damage, least, 
 )
 def test_a_stream_without_whole_metadata_is_refused(refused, payload, kind, words):
     assert words in refused(read_telemetry, transport_stream([0, 3600], [(0, payload)] * 9, kind), "a.ts")
+
+
+def sum_of(content: bytes, flip: int = 0) -> int:
+    return sum(byte << (8 * ((i + 1 + flip) % 2)) for i, byte in enumerate(content)) & 0xFFFF
+
+
+def resummed(content: bytes, checksum: int) -> bytes:
+    return content[:-2] + (checksum & 0xFFFF).to_bytes(2, "big")
+
+
+# Of two lengths: the second of two packets has one more tag.
+PACKETS = [packet(i, {56: bytes([10 + i])} | ({5: spread(i, 0, 360, 2)} if i % 2 else {})) for i in range(12)]
+
+
+@pytest.mark.parametrize(
+    "checksum",
+    [
+        lambda c: sum_of(c[17:-2]),
+        lambda c: sum_of(c[17:-4]),
+        lambda c: sum_of(c[16:-2]),
+        lambda c: sum_of(c[:-4]),
+        lambda c: sum_of(c[:-2], flip=1),
+        lambda c: sum_of(c[:-2]) + 77,
+        lambda c: int.from_bytes(sum_of(c[:-2]).to_bytes(2, "big"), "little"),
+        lambda c: sum(c[:-2]),
+        lambda c: 0,
+        lambda c: 0xFFFF,
+    ],
+)
+@pytest.mark.parametrize("in_stream", [False, True])
+def test_packets_whose_checksums_are_all_wrong_in_the_same_way_are_read(fly, checksum, in_stream):
+    packets = [resummed(one, checksum(one)) for one in PACKETS]
+    times = [3600 * i for i in range(12)]
+    stream = transport_stream(times, list(zip(times, packets, strict=True)))
+    flown = fly(*((stream, "a.ts") if in_stream else (b"".join(packets), "a.klv")))
+    assert len(flown) == 12 and flown.speed_m_s.round().tolist() == [10 + i for i in range(12)]
+    assert any("wrong in the same way" in note for note in flown.notes)
+    # Damaged packets are still found by them, if they depend on the content at all.
+    damaged = [one[:22] + bytes([one[22] ^ 4]) + one[23:] if i in (3, 7) else one for i, one in enumerate(packets)]
+    if checksum(PACKETS[0]) not in (0, 0xFFFF):
+        flown = fly(b"".join(damaged), "a.klv")
+        assert len(flown) == 10 and any("2 of 12 packets are damaged" in note for note in flown.notes)
+
+
+def test_packets_whose_checksums_are_wrong_in_different_ways_are_refused(refused):
+    rng = np.random.default_rng(0)
+    packets = [resummed(one, int(rng.integers(1 << 16))) for one in PACKETS]
+    assert "none of 12 MISB ST 0601 packets is whole" in refused(read_telemetry, b"".join(packets), "a.klv")
+
+
+def test_of_whole_packets_one_with_a_wrong_checksum_is_left_out(fly):
+    packets = [resummed(one, 0) if i == 3 else one for i, one in enumerate(PACKETS)]
+    flown = fly(b"".join(packets), "a.klv")
+    assert len(flown) == 11 and any("1 of 12 packets are damaged" in note for note in flown.notes)
+
+
+def test_packets_without_a_checksum_are_read_with_a_warning(fly):
+    packets = [one[:16] + bytes([len(one) - 21]) + one[17:-4] for one in PACKETS]
+    flown = fly(b"".join(packets), "a.klv")
+    assert len(flown) == 12 and any("no checksum" in note for note in flown.notes)
+
+
+@pytest.mark.parametrize(
+    "lead", [b"\0", bytes.fromhex("000001fc004084"), bytes(30_000), b"hello, world\n", b"\xff" * 7]
+)
+@pytest.mark.parametrize("name", ["a.klv", "a.bin"])
+def test_bytes_before_the_first_key_are_left_out(fly, lead, name):
+    for content in (lead + b"".join(PACKETS), b"".join(lead + one for one in PACKETS)):
+        flown = fly(content, name)
+        assert len(flown) == 12
+        assert any(f"{len(lead)} bytes before the first key" in note for note in flown.notes)
+
+
+@pytest.mark.parametrize(
+    ("tags", "ellipsoid_m", "altitude_m"),
+    [
+        ({75: spread(1033, -900, 19000, 2)}, 1033, math.nan),
+        ({104: ((1500 + 900) * 2**7).to_bytes(3, "big")}, 1500, math.nan),
+        ({75: spread(1033, -900, 19000, 2), 104: ((1500 + 900) * 2**7).to_bytes(3, "big")}, 1500, math.nan),
+        ({75: spread(1033, -900, 19000, 2), 78: spread(201, -900, 19000, 2)}, 1033, 832),
+        # The ground above the sea and the vehicle above the ellipsoid have no common zero.
+        ({75: spread(1033, -900, 19000, 2), 25: spread(201, -900, 19000, 2)}, 1033, math.nan),
+    ],
+)
+def test_heights_above_the_ellipsoid_are_never_above_the_sea(fly, tags, ellipsoid_m, altitude_m):
+    place = {tag: value for tag, value in PLACE.items() if tag != 15}
+    packets = [local_set({2: (START_US + i * 40_000).to_bytes(8, "big"), **place, **tags}) for i in range(5)]
+    flown = fly(b"".join(packets), "a.klv")
+    np.testing.assert_allclose(flown.above_ellipsoid_m, ellipsoid_m, atol=0.2)
+    np.testing.assert_allclose(flown.altitude_m, altitude_m, atol=0.4)
+    assert np.isnan(flown.above_sea_m).all()
+    assert any("ellipsoid" in note for note in flown.notes) == math.isnan(altitude_m)
+
+
+def test_a_camera_without_a_clock_has_none(fly):
+    packets = [local_set({2: (i * 40_000).to_bytes(8, "big"), **PLACE}) for i in range(5)]
+    flown = fly(b"".join(packets), "a.klv")
+    assert math.isnan(flown.start_utc_s) and any("1970-01-01" in note for note in flown.notes)

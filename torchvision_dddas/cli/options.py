@@ -38,7 +38,9 @@ StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
 Telemetry = Annotated[
     Path | None,
-    typer.Option("--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, KLV, NMEA."),
+    typer.Option(
+        "--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
+    ),
 ]
 Poses = Annotated[
     list[Path] | None,

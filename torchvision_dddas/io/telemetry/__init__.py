@@ -1,7 +1,7 @@
 """What the vehicle reports of itself, from whatever recorded it, as one record.
 
-Own tables, DJI's subtitles, MAVLink and PX4 logs, MISB ST 0601 inside MPEG-TS, NMEA 0183. The kind is found by the
-content of the file, then by its name.
+Own tables, DJI's subtitles, logs of MAVLink, PX4 and ArduPilot, MISB ST 0601 inside MPEG-TS, NMEA 0183. The kind is
+found by the content of the file, then by its name.
 """
 
 import codecs
@@ -9,18 +9,19 @@ import re
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry.autopilots import MAGIC, looks_like_tlog, read_tlog, read_ulog
+from torchvision_dddas.io.telemetry import dataflash, px4
+from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
+from torchvision_dddas.io.telemetry.nmea import SENTENCE, read_nmea
 from torchvision_dddas.io.telemetry.record import KINDS
 from torchvision_dddas.io.telemetry.tables import parse_time_zone, read_telemetry_table
-from torchvision_dddas.io.telemetry.text_logs import read_nmea, read_subtitles
+from torchvision_dddas.io.telemetry.text_logs import read_subtitles
 from torchvision_dddas.types import Telemetry
 
 __all__ = ["read_telemetry"]
 
 _STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 4)}
 _OTHERS = {
-    b"\xa3\x95\x80": "is an ArduPilot DataFlash log; convert it: mavlogdump.py --format csv, or give the .tlog",
     b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
 }
 
@@ -39,23 +40,29 @@ def read_telemetry(
     zone = parse_time_zone(time_zone)
     try:
         with path.open("rb") as file:
-            head = file.read(4096)
+            beginning = file.read(1 << 16)
     except OSError as error:
         raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
-    suffix = path.suffix.lower()
+    head, suffix = beginning[:4096], path.suffix.lower()
     if not head.strip() and suffix != ".csv":
         raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
-    if head.startswith(MAGIC):
-        return read_ulog(path, clock_offset_s)
+    if head.startswith(px4.MAGIC):
+        return px4.read_ulog(path, clock_offset_s)
+    if dataflash.MAGIC in head:
+        return dataflash.read_dataflash(path, None, clock_offset_s)
     if head.startswith(KEY):
         return read_misb(path, None, clock_offset_s)
-    # What is damaged at its beginning still has its name.
-    if (layout := spacing(head) or _STREAMS.get(suffix)) is not None:
+    text = _text(beginning)
+    # What is damaged at its beginning still has its name. In text a letter may stand where packets begin.
+    if (layout := (spacing(head) if text is None else None) or _STREAMS.get(suffix)) is not None:
         return read_misb(path, layout, clock_offset_s)
+    if KEY in beginning or suffix == ".klv":
+        return read_misb(path, None, clock_offset_s)
     if looks_like_tlog(head) or suffix == ".tlog":
         return read_tlog(path, clock_offset_s)
-    text = _text(head)
-    if text is not None and re.search(r"\$[A-Z]{2}[A-Z]{3},", text):
+    if text is not None and dataflash.IN_TEXT.search(text):
+        return dataflash.read_dataflash(path, _text(path.read_bytes()) or "", clock_offset_s)
+    if text is not None and (re.search(r"\$[A-Z]{5},", text) or SENTENCE.search(text)):
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
         return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s, zone)

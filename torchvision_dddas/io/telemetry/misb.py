@@ -2,9 +2,10 @@
 
 import bisect
 import math
+import re
 import struct
 from collections.abc import Iterator
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,16 +47,22 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
     Times are the stream's, since its first picture; without them the sets' own stamps, the first of which is aligned
     with the last picture before it. Raises InputError without intact metadata.
     """
-    log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0)
+    log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0, height_zero="ground")
     content = path.read_bytes()
     pieces = [Piece(math.nan, 0.0, content)] if layout is None else _read_stream(log, content, *layout)
     starts = [0, *accumulate(len(piece.content) for piece in pieces)]
-    found = list(local_sets(b"".join(piece.content for piece in pieces)))
+    stream = b"".join(piece.content for piece in pieces)
+    found = list(local_sets(stream))
     whole = [one for one in found if one.whole]
     if not found:
         raise log.refuse("its metadata has no MISB ST 0601 packet, nothing begins with the key of one")
+    if 2 * len(whole) < len(found):
+        whole = _summed_otherwise(log, stream) or whole
     if not whole:
-        raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: their checksums are wrong")
+        why = "they are cut off, or their checksums are wrong in different ways"
+        raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: {why}")
+    if found[0].place and layout is None:
+        log.note(f"{found[0].place} bytes before the first key are no part of a packet and left out")
     if len(whole) < len(found):
         log.note(f"{len(found) - len(whole)} of {len(found)} packets are damaged or cut off and left out")
     times, start_utc_s = _times(log, whole, [pieces[bisect.bisect_right(starts, one.place) - 1] for one in whole])
@@ -93,7 +100,9 @@ def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
 
     above_sea, ground = column(15, -900, 19000), column(25, -900, 19000)
     above_ground = np.array([imap(one.tags.get(113), -900, 40000) for one in whole])
-    if not np.isfinite(above_ground).any() and np.isfinite(ground).any():
+    ellipsoid = first_known(np.array([imap(one.tags.get(104), -900, 40000) for one in whole]), column(75, -900, 19000))
+    above_middle = first_known(above_sea - ground, ellipsoid - column(78, -900, 19000))
+    if not np.isfinite(above_ground).any() and np.isfinite(above_middle).any():
         log.note("the altitude above ground is that above the ground in the picture's middle")
     vehicle_heading = np.radians(column(5, 0, 360))
     vehicle_pitch = np.radians(first_known(column(90, -90, 90, True), column(6, -20, 20, True)))
@@ -106,7 +115,8 @@ def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
         "longitude_deg": column(14, -180, 180, True),
         "latitude_deg": column(13, -90, 90, True),
         "above_sea_m": above_sea,
-        "altitude_m": first_known(above_ground, above_sea - ground),
+        "above_ellipsoid_m": ellipsoid,
+        "altitude_m": first_known(above_ground, above_middle),
         "speed_m_s": column(56, 0, 255),
         "heading_rad": heading,
         "pitch_rad": pitch,
@@ -138,6 +148,39 @@ def local_sets(content: bytes) -> Iterator[LocalSet]:
         place = content.find(KEY, following)
 
 
+def _summed_otherwise(log: Log, content: bytes) -> list[LocalSet]:
+    """The packets of an encoder that sums other bytes, or none; empty if the checksums are wrong in different ways.
+
+    A sum of other bytes, from another start or in another order, differs from the given one by the same number in each
+    packet.
+    """
+    keys = [found.start() for found in re.finditer(re.escape(KEY), content)]
+    framed: list[tuple[int, int, LocalSet]] = []  # begin of the value, end
+    for place, following in pairwise([*keys, len(content)]):
+        size, begin = _length(content, place + len(KEY))
+        if begin + size <= following and (tags := _tags(content[begin : begin + size])):
+            framed.append((begin, begin + size, LocalSet(place, tags, True)))
+    if not any(_CHECKSUM in one.tags for *_, one in framed):
+        log.note("the packets have no checksum: damage in them goes unnoticed")
+        return [one for *_, one in framed]
+    begins, ends, places = np.array([(begin, end, one.place) for begin, end, one in framed]).T
+    given = np.array([int.from_bytes(content[end - 2 : end], "big") for end in ends])
+    sums = _Sums(content)
+    pairs = [sums.by_turns(start, ends - tail) for start in (places, places + len(KEY), begins) for tail in (2, 4)]
+    rules = [rule for a, b in pairs for rule in ((a << 8) + b, (b << 8) + a, a + b)]
+    alike, right = np.zeros(len(given), bool), rules[0] & 0xFFFF
+    for total in (*rules, 0 * given):
+        for written in (given, given >> 8 | (given & 0xFF) << 8):
+            apart = (written - total) & 0xFFFF
+            is_usual = apart == (usual := np.bincount(apart).argmax())
+            is_sure = usual == 0 or (is_usual.sum() > 2 and len(np.unique(right[is_usual])) > 1)
+            if is_sure and is_usual.sum() > max(alike.sum(), len(given) / 2):
+                alike = is_usual
+    if alike.any():
+        log.note("the checksums are wrong in the same way throughout: an encoder sums other bytes; packets are read")
+    return [framed[i][2] for i in np.flatnonzero(alike)]
+
+
 def _length(content: bytes, place: int) -> tuple[int, int]:
     """A length in BER, short or long, and where its value begins; a length without end where it is cut off."""
     first = content[place] if place < len(content) else 0xFF
@@ -160,6 +203,11 @@ class _Sums:
             mine = values.copy()
             mine[1 - odd :: 2] = 0
             self._running.append(np.append(np.uint16(0), np.cumsum(mine, dtype=np.uint16)))
+
+    def by_turns(self, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The sums of the first, third, ... bytes of some parts, and of the second, fourth, ... ones."""
+        even, odd = (one[end].astype(int) - one[begin] for one in self._running)
+        return np.where(begin % 2, odd, even), np.where(begin % 2, even, odd)
 
     def are_right(self, begin: int, end: int) -> bool:
         """Whether the two bytes before the end are the sum of all before them: the first, third, ... count 256 fold."""

@@ -1,8 +1,9 @@
 """One record of a flight from the samples of any log: checked, and resampled at common times."""
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,11 +11,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.types import Telemetry
 
-KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, MPEG-TS with MISB ST 0601, or NMEA 0183"
+KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, ArduPilot .bin or .log, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
 OWN = "table"
 """The kind of own tables, which may lack a place."""
 
+# No log is older, and none of the future. A GPS receiver whose count of weeks has rolled over is 1024 weeks early.
+_FIRST_CLOCK_S, _DAY_S = 1_230_768_000.0, 86_400.0  # 2009-01-01
 # A barometer's zero drifts by metres in a flight; an altitude below this has another origin than the ground.
 _DEEP_M = -5.0
 # Values outside are damage.
@@ -40,6 +43,7 @@ class Log:
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
     jitter_s: how far time may run back; more is another recording, or damage.
+    height_zero: what altitude_m counts from, as in Telemetry.
     samples: column of the record -> rows (N, 3) of time, value (NaN where unknown) and place in the file. Positions are
     longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any value, of each row of a log whose
     rows hold all quantities, also of empty rows.
@@ -50,6 +54,7 @@ class Log:
     where: str = "line"
     bridge_s: float = 0.0
     jitter_s: float = 1.0
+    height_zero: Literal["ground", "takeoff", "unknown"] = "takeoff"
     notes: list[str] = field(default_factory=list)
     samples: dict[str, Any] = field(default_factory=dict)
     moments: Any = field(default_factory=list)
@@ -73,6 +78,11 @@ class Log:
         """The error to raise, with the file and the place."""
         place = f", {self.where} {where:.0f}" if where is not None else ""
         return InputError(f"telemetry {self.path}{place}: {text}")
+
+
+def is_clock(utc_s: Any) -> Any:
+    """Whether seconds since 1970, a number or an array, can be the time of a log."""
+    return (utc_s >= _FIRST_CLOCK_S) & (utc_s <= max(time.time(), _FIRST_CLOCK_S) + _DAY_S)
 
 
 def build_record(
@@ -110,8 +120,14 @@ def build_record(
         columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic)
         if np.isfinite(columns["speed_m_s"]).any():
             log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
+    clock_s = start_utc_s + start
+    if np.isfinite(clock_s) and not is_clock(clock_s):
+        date = np.datetime64(int(np.clip(clock_s, -1e11, 1e11)), "s")
+        log.note(f"the log's clock says {date}, which cannot be: the time of day is unknown")
+        clock_s = np.nan
     others: dict[str, Any] = {
-        name: columns.get(name, unknown) for name in (*_TURNING, "above_sea_m", "pitch_rad", "hfov_rad")
+        name: columns.get(name, unknown)
+        for name in (*_TURNING, "above_sea_m", "above_ellipsoid_m", "pitch_rad", "hfov_rad")
     }
     return Telemetry(
         times + clock_offset_s,
@@ -120,7 +136,8 @@ def build_record(
         place,
         geographic,
         **others,
-        start_utc_s=float(start_utc_s + start - clock_offset_s),
+        height_zero=log.height_zero,
+        start_utc_s=float(clock_s - clock_offset_s),
         origin=f"{log.path.name} ({log.kind})",
         notes=tuple(log.notes),
     )
@@ -235,6 +252,10 @@ def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
         log.note("the log holds no place")
     if "altitude_m" not in samples:
         log.note("the log holds no altitude above ground")
+        if "above_ellipsoid_m" in samples and "above_sea_m" not in samples:
+            log.note(
+                "its heights count from the ellipsoid: without the geoid they tell none above the sea or the ground"
+            )
         return
     deep = samples["altitude_m"][:, 1] < _DEEP_M
     if deep.any():

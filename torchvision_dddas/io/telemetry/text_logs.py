@@ -1,15 +1,13 @@
-"""Telemetry in text: DJI's subtitle files in any dialect, and NMEA 0183 sentences of a receiver."""
+"""DJI's subtitle files in any dialect, as telemetry."""
 
 import math
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime, tzinfo
+from datetime import tzinfo
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry.record import Log, build_record
 from torchvision_dddas.io.telemetry.tables import UNKNOWN_ZONE, convert, hfov_of_focal, parse_date, quantity_of, to_utc
 from torchvision_dddas.types import Telemetry
@@ -27,8 +25,6 @@ _PAIR = (
     re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
     re.compile(rf"\s*(?:[:=]\s*)?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])", re.IGNORECASE),
 )
-# Sentences have 82 characters. The expression that takes them apart needs time as the square of their length.
-_LONGEST_SENTENCE = 1000
 _OPTICS = ("focal_len", "fnum", "dzoom_ratio")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 
@@ -205,78 +201,3 @@ def _note_lacking(log: Log, lacking: dict[str, list[int]], last: int, count: int
         else:
             also = f", as do {len(others)} more of {count}" if others else ""
             log.note(f"line {first}: the subtitle {what}{also}; unknown there")
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# NMEA 0183: sentences of a receiver, one a line.
-
-_KNOT = 1852 / 3600
-_DAY_S = 86_400.0
-_KINDS = {"GGA", "RMC", "GLL", "VTG", "HDT", "THS"}
-
-
-def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
-    """GGA, RMC and GLL for places, RMC and VTG for the speed, HDT and THS for the vehicle's heading.
-
-    A receiver's height is above the sea: above ground nothing is known. Times since the first sentence that has one.
-    Raises InputError where no sentence is whole or none has a time.
-    """
-    try:
-        import pynmea2
-    except ImportError:
-        raise InputError(
-            f"telemetry {path} is NMEA 0183, which needs pynmea2: pip install 'torchvision-dddas[telemetry]'"
-        ) from None
-    log = Log(path, "NMEA 0183", bridge_s=1.0)
-    bad: list[int] = []
-    first_s = last_s = utc_s = math.nan  # times of day of the first and the latest sentence; the clock at the first
-    days = 0
-    has_checksums = "*" in text
-    for number, line in enumerate(text.splitlines(), 1):
-        begin = line.find("$")
-        if begin < 0 or line[begin + 3 : begin + 6] not in _KINDS:
-            continue
-        if len(line) - begin > _LONGEST_SENTENCE:
-            bad.append(number)
-            continue
-        try:
-            sentence = pynmea2.parse(line[begin:].strip(), check=has_checksums)
-            time = getattr(sentence, "timestamp", None)
-            if time is not None and not isinstance(time, str):
-                now_s = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
-                days += now_s < last_s - _DAY_S / 2  # time goes on over midnight
-                first_s, last_s = now_s if math.isnan(first_s) else first_s, now_s
-                date = getattr(sentence, "datestamp", None)
-                if date is not None and math.isnan(utc_s):
-                    midnight_s = datetime(date.year, date.month, date.day, tzinfo=UTC).timestamp()
-                    utc_s = midnight_s + first_s - days * _DAY_S
-            if not math.isnan(first_s):
-                for name, value in _sentence_values(sentence).items():
-                    log.add(name, last_s + days * _DAY_S - first_s, value, number)
-        except (pynmea2.ParseError, ValueError, TypeError, AttributeError):
-            bad.append(number)
-    if bad:
-        log.note(f"line {bad[0]}: not a whole sentence or its checksum is wrong; {len(bad)} lines are left out")
-    if not log.samples:
-        raise log.refuse("no NMEA sentence gives a place or a heading together with a time")
-    return build_record(log, clock_offset_s, utc_s)
-
-
-def _sentence_values(sentence: Any) -> dict[str, float]:
-    kind = sentence.sentence_type
-    values: dict[str, float] = {}
-    if kind in ("GGA", "RMC", "GLL"):
-        is_fixed = int(sentence.gps_qual or 0) > 0 if kind == "GGA" else sentence.status == "A"
-        is_fixed = is_fixed and bool(sentence.lat) and bool(sentence.lon)
-        values["longitude_deg"] = sentence.longitude if is_fixed else math.nan
-        values["latitude_deg"] = sentence.latitude if is_fixed else math.nan
-        if kind == "GGA":
-            is_known = is_fixed and sentence.altitude is not None
-            values["above_sea_m"] = float(sentence.altitude) if is_known else math.nan
-        if kind == "RMC" and sentence.spd_over_grnd is not None:
-            values["speed_m_s"] = float(sentence.spd_over_grnd) * _KNOT if is_fixed else math.nan
-    elif kind == "VTG" and sentence.spd_over_grnd_kmph is not None:
-        values["speed_m_s"] = float(sentence.spd_over_grnd_kmph) / 3.6
-    elif kind in ("HDT", "THS") and sentence.heading:
-        values["vehicle_heading_rad"] = math.radians(float(sentence.heading))
-    return values

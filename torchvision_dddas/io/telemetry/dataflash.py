@@ -1,0 +1,103 @@
+"""ArduPilot's DataFlash logs, binary and as text: messages whose columns the log itself describes."""
+
+import re
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from torchvision_dddas.io.telemetry.autopilots import NAMES, Topic, Topics, add_topic, build_flight, column, start_clock
+from torchvision_dddas.io.telemetry.record import Log
+from torchvision_dddas.types import Telemetry
+
+MAGIC = b"\xa3\x95\x80\x80"
+"""The beginning of the message that describes descriptions, the first one of a binary log."""
+IN_TEXT = re.compile(r"^FMT, ?\d+, ?\d+, ?\w+, ?\w+", re.MULTILINE)
+"""A description in a log as text."""
+_HEAD, _FMT = MAGIC[:2], MAGIC[2]
+# The letters of a format that NumPy calls otherwise, and how many units of a letter make one.
+_TYPES = {"M": "b", "g": "e", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "n": "S4", "N": "S16"}
+_TYPES |= dict.fromkeys("aZ", "S64") | {letter: letter for letter in "bBhHiIfdqQ"}
+_PER_UNIT = dict.fromkeys("cCeE", 1e2) | {"L": 1e7}
+# UTC is behind GPS time by 14 s, and by one more since each of these weeks.
+_WEEK_S, _GPS_EPOCH_S, _LEAP_WEEKS = 604_800, 315_964_800, (1512, 1695, 1851, 1930)
+
+
+@np.errstate(invalid="ignore", over="ignore")  # where a log is damaged a number may be any bits
+def read_dataflash(path: Path, text: str | None, clock_offset_s: float) -> Telemetry:
+    """Positions, heights and attitudes of an ArduPilot log; times since the first. text: of a log that is text.
+
+    Raises InputError if it has none.
+    """
+    log = Log(path, "ArduPilot DataFlash log", "byte" if text is None else "line", bridge_s=1.0)
+    topics: Topics = {}
+    for name, topic in _binary(log, path.read_bytes()) if text is None else _written(log, text):
+        # In old GPS messages TimeMS counts the milliseconds of the week, and T those of the autopilot.
+        for clock, per_second in (("TimeUS", 1e6), ("T", 1e3), ("TimeMS", 1e3)):
+            if clock in topic:
+                add_topic(topics, name, "", topic | {"time_s": topic[clock] / per_second})
+                break
+    if not topics:
+        raise log.refuse("the DataFlash log has no position, height or attitude")
+    receivers = [topic for name in ("GPS", "GPS2") for topic in topics.get(name, {}).values()]
+    return build_flight(log, topics, clock_offset_s, start_clock(map(_clock, receivers)))
+
+
+def _clock(receiver: Topic) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds since 1970 in UTC, 0 without a fix, and the autopilot's times."""
+    week, week_ms = (column(receiver, a if a in receiver else b) for a, b in (("GWk", "Week"), ("GMS", "TimeMS")))
+    utc_s = _GPS_EPOCH_S + week * _WEEK_S + week_ms / 1e3 - 14 - np.searchsorted(_LEAP_WEEKS, week, side="right")
+    return np.where((column(receiver, "Status") >= 2) & (week > 0), utc_s, 0), receiver["time_s"]
+
+
+def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
+    """Yield the messages that are read, by name. A message is whole if another one, or nothing, follows."""
+    formats: dict[int, tuple[str, int, str, list[str]]] = {_FMT: ("FMT", 89, "", [])}
+    places: dict[int, list[int]] = {}
+    place = lost = first = 0
+    while place + 3 <= len(content):
+        name, size, *_ = formats.get(content[place + 2], ("", 0)) if content.startswith(_HEAD, place) else ("", 0)
+        end = place + size
+        if size < 3 or not (content.startswith(_HEAD, end) or end == len(content)):
+            end = following if (following := content.find(_HEAD, place + 1)) > 0 else len(content)
+            lost, first = lost + end - place, first or place
+        elif name == "FMT":
+            number, length, *texts = struct.unpack_from("<BB4s16s64s", content, place + 3)
+            name, letters, fields = (one.split(b"\0")[0].decode("latin-1") for one in texts)
+            formats[number] = name, length, letters, fields.split(",")
+        elif name in NAMES:
+            places.setdefault(content[place + 2], []).append(place)
+        place = end
+    if lost:
+        log.note(f"byte {first}: {lost} bytes are no whole messages and left out")
+    for number, where in places.items():
+        name, size, letters, fields = formats[number]
+        row = np.dtype([(f"{i}", "<" + _TYPES.get(letter, "S1")) for i, letter in enumerate(letters)])
+        if row.itemsize == size - 3 and len(fields) == len(letters):
+            rows = np.frombuffer(b"".join(content[place + 3 : place + size] for place in where), row)
+            numbers = [(i, letter) for i, letter in enumerate(letters) if row[i].kind != "S"]
+            topic = {fields[i]: rows[f"{i}"] / _PER_UNIT.get(letter, 1) for i, letter in numbers}
+            yield name, topic | {"where": np.array(where)}
+
+
+def _written(log: Log, text: str) -> Iterator[tuple[str, Topic]]:
+    """Yield the messages of a log as text that are read, by name. Its numbers are in the units of their columns."""
+    fields: dict[str, list[str]] = {}
+    rows: dict[str, list[list[float]]] = {}
+    bad: list[int] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        name, _, rest = line.partition(",")
+        cells = [cell.strip() for cell in rest.split(",")] if name == "FMT" or name in fields else []
+        if name == "FMT" and len(cells) > 4 and cells[2] in NAMES:
+            fields[cells[2]] = cells[4:]
+        elif name in fields:
+            try:
+                values = dict(zip(fields[name], map(float, cells), strict=True))
+                rows.setdefault(name, []).append([*values.values(), number])
+            except ValueError:
+                bad.append(number)
+    if bad:
+        log.note(f"line {bad[0]}: {len(bad)} messages are cut off or garbled and left out")
+    for name, found in rows.items():
+        yield name, dict(zip((*fields[name], "where"), np.array(found).T, strict=True))

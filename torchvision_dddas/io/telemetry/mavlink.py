@@ -1,0 +1,239 @@
+"""MAVLink telemetry logs: messages, each behind the time at which a ground station received it."""
+
+import binascii
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry.autopilots import NAMES, Topics, add_topic, build_flight, start_clock
+from torchvision_dddas.io.telemetry.record import Log, is_clock
+from torchvision_dddas.types import Telemetry
+
+_V1, _V2 = 0xFE, 0xFD
+_MAGIC = re.compile(bytes([0x5B, _V1, _V2, 0x5D]))  # either of them
+_SIGNED = 0x01
+_MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+_V2_MIRRORED, _SIGNED_MIRRORED = _MIRROR[_V2], _MIRROR[_SIGNED]
+_LATEST_US = 7_258_118_400_000_000  # the year 2200; a computer without a clock begins in 1970
+_PLACES = ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "GPS2_RAW")
+_OF_PARTS = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS", "CAMERA_FOV_STATUS")
+_HEARTBEAT, _SYSTEM_TIME = 0, 2
+_ENOUGH = 5  # of these two messages that tell something, of a sender
+# Kinds of senders in heartbeats (MAV_TYPE): ground stations and antenna trackers; and parts of a vehicle.
+_STATIONS, _PARTS = {5, 6}, {18, 26, 27, *range(30, 35), *range(36, 43), 44, 48}
+# Without a heartbeat the numbers tell: stations have a higher system or this component, autopilots are component 1.
+_LAST_VEHICLE, _STATION_COMPONENT, _AUTOPILOT = 250, 190, 1
+# Clocks further apart than this differ by more than the delay of messages.
+_APART_S = 60.0
+
+Sender = tuple[int, int]
+"""System and component."""
+Row = tuple[float, Any, int]
+"""The time of reception, the message and its first byte."""
+
+
+def read_tlog(path: Path, clock_offset_s: float) -> Telemetry:
+    """Positions and attitudes of one vehicle, never of a ground station; times since the first one.
+
+    Raises InputError if no vehicle reports any.
+    """
+    log = Log(path, "MAVLink log", "byte", bridge_s=2.0)
+    topics, clock_s = _mavlink_topics(log)
+    for fused in topics.get("GLOBAL_POSITION_INT", {}).values():
+        fused["speed"] = np.hypot(fused["vx"], fused["vy"])
+    return build_flight(log, topics, clock_offset_s, clock_s)
+
+
+def _mavlink_topics(log: Log) -> tuple[Topics, float]:
+    """The messages of one vehicle by name and sender, at the times of `_sending_times`, and the clock at time 0."""
+    try:
+        from pymavlink.dialects.v20 import all as dialect
+    except ImportError:
+        raise InputError(
+            f"telemetry {log.path} is a MAVLink log, which needs pymavlink: pip install 'torchvision-dddas[telemetry]'"
+        ) from None
+    numbers = {n for n, kind in dialect.mavlink_map.items() if kind.msgname in (*NAMES, "HEARTBEAT", "SYSTEM_TIME")}
+    decoder = dialect.MAVLink(None)
+    content = log.path.read_bytes()
+    rows: dict[Sender, list[Row]] = {}
+    kinds: dict[Sender, int] = {}
+    heard = Counter[tuple[Sender, int]]()
+    bad: list[int] = []
+    count = 0
+    extras = {number: _MIRROR[kind.crc_extra : kind.crc_extra + 1] for number, kind in dialect.mavlink_map.items()}
+    for place, end, number in _frames(log, content, extras):
+        count += 1
+        if number not in numbers:
+            continue
+        first = place + (13 if content[place + 8] == _V2 else 11)
+        sender = content[first], content[first + 1]
+        if heard[sender, number] >= _ENOUGH:
+            continue
+        try:
+            message = decoder.decode(bytearray(content[place + 8 : end]))
+        except (dialect.MAVError, ValueError, TypeError):
+            bad.append(place)
+            continue
+        if number == _HEARTBEAT:
+            kinds[sender] = message.type
+        else:
+            came_s = int.from_bytes(content[place : place + 8], "big") / 1e6
+            rows.setdefault(sender, []).append((came_s, message, place))
+        if number in (_HEARTBEAT, _SYSTEM_TIME):
+            heard[sender, number] += number == _HEARTBEAT or is_clock(message.time_unix_usec / 1e6)
+    if bad:
+        log.note(f"{len(bad)} of {count} messages are damaged and left out, the first at byte {bad[0]}")
+    if all(message.get_type() == "SYSTEM_TIME" for part in rows.values() for _, message, _ in part):
+        raise log.refuse(f"none of its {count} MAVLink messages has a position, a height or an attitude")
+    chosen, others = _choose_vehicle(log, rows, kinds)
+    topics: Topics = {}
+    came = np.array([came_s for part in rows.values() for came_s, *_ in part])
+    is_timed = bool(is_clock(came).sum() > max(1, 0.01 * len(came)))  # a single damaged time is no clock
+    for sender, part in sorted(rows.items(), key=lambda item: (item[0][0] != chosen[0], item[0])):
+        if sender[0] in others:
+            continue
+        label = f"component {sender[1]}" + f" of system {sender[0]}" * (sender[0] != chosen[0])
+        times = _sending_times(log, part, is_timed)
+        indices: dict[str, list[int]] = {}
+        for i, (_, message, _) in enumerate(part):
+            indices.setdefault(message.get_type(), []).append(i)
+        for name, index in indices.items():
+            if sender == chosen or name in _OF_PARTS:
+                messages = [part[i][1] for i in index]
+                topic = {field: np.array([getattr(m, field) for m in messages]) for field in messages[0].fieldnames}
+                topic |= {"time_s": times[index], "where": np.array([part[i][2] for i in index])}
+                add_topic(topics, name, label, topic)
+    return topics, _clock(log, topics, is_timed)
+
+
+def _choose_vehicle(log: Log, rows: Mapping[Sender, list[Row]], kinds: Mapping[Sender, int]) -> tuple[Sender, set[int]]:
+    """The vehicle with the most places, rather an autopilot than a part; no ground station, else InputError is raised.
+
+    kinds: of the senders, MAV_TYPE in their heartbeats. Also returns the systems that are left out.
+    """
+    stations = {system for (system, _), kind in kinds.items() if kind in _STATIONS}
+    places = Counter(
+        sender
+        for sender, part in rows.items()
+        for _, m, _ in part
+        if m.get_type() in _PLACES and (m.lat != 0 or m.lon != 0) and getattr(m, "fix_type", 3) > 1
+    )
+
+    def trust(sender: Sender) -> int:
+        kind, (system, component) = kinds.get(sender), sender
+        if kind in _STATIONS or component == _STATION_COMPONENT:
+            return 0
+        if kind is None:
+            return 0 if system in stations or system > _LAST_VEHICLE else 1 + (component == _AUTOPILOT)
+        return 1 if kind in _PARTS else 3
+
+    # A station may send nothing but its place, under any number and without heartbeats. A vehicle sends more.
+    talks = {sender: len({m.get_type() for _, m, _ in part}) > 1 for sender, part in rows.items()}
+    chosen = max(
+        sorted(rows), key=lambda s: (trust(s) // 3, min(trust(s), places[s], 1), trust(s), talks[s], places[s])
+    )
+    if not trust(chosen):
+        raise log.refuse("only ground stations speak in it; give the log that holds the vehicle's messages")
+    others = [s for s in sorted(places) if s != chosen]
+    names = [f"{system}" if system != chosen[0] else f"its component {component}" for system, component in others]
+    names = [name + " (ground station)" * (not trust(s)) for name, s in zip(names, others, strict=True)]
+    if others:
+        log.note(f"several vehicles report: system {chosen[0]} is taken, left out are {', '.join(names[:9])}")
+    return chosen, {s[0] for s in rows if places[s] or not trust(s)} - {chosen[0]}
+
+
+def _clock(log: Log, topics: Topics, is_timed: bool) -> float:
+    """What makes seconds since 1970 of the station's times: 0, or what the vehicle's SYSTEM_TIME says."""
+    told = [(topic["time_unix_usec"] / 1e6, topic["time_s"]) for topic in topics.get("SYSTEM_TIME", {}).values()]
+    behind_s = start_clock(told)
+    if not told or not is_clock(behind_s + told[0][1][0]) or (is_timed and abs(behind_s) < _APART_S):
+        return 0.0  # if the station's clock cannot be right either, the record says so
+    log.note(f"the station's clock is {behind_s:.0f} s behind the vehicle's SYSTEM_TIME, which is taken")
+    return behind_s
+
+
+def _sending_times(log: Log, part: list[Row], is_timed: bool) -> np.ndarray:
+    """When a sender sent each message, by its own clock. is_timed: whether the station has a clock.
+
+    Messages arrive in bursts, a second late or more; at 20 m/s that is 20 m. The smallest delay counts as zero. A
+    message without a time has that of the one before. If the clocks drift apart, the times of reception are kept.
+    """
+    came = np.array([came_s for came_s, *_ in part])
+    came[is_timed & ~is_clock(came)] = np.nan  # before the station's clock was set, or damaged
+    sent = np.array([getattr(message, "time_boot_ms", np.nan) / 1e3 for _, message, _ in part])
+    is_known, is_usable = np.isfinite(sent), np.isfinite(sent + came)
+    if len(set(sent[is_usable])) > 1:
+        apart, span_s = (came - sent)[is_usable], float(np.ptp(sent[is_usable]))
+        alike = np.abs(apart - np.median(apart)) < 5 + 0.01 * span_s
+        if alike.mean() >= 0.9:  # a few may be damaged: no checksum covers the times
+            log.jitter_s = math.inf  # messages are sorted by time
+            latest = np.maximum.accumulate(np.where(is_known, np.arange(len(sent)), np.argmax(is_known)))
+            return sent[latest] + np.percentile(apart[alike], 1)
+        log.note("the vehicle's clock and the station's drift apart: times are those of reception")
+    if np.isnan(came).any():
+        log.note(f"{np.isnan(came).sum()} messages came at times that cannot be and are left out")
+    return came
+
+
+def looks_like_tlog(head: bytes) -> bool:
+    """Whether eight bytes of time are followed by a message, and that by the next one."""
+    for place in range(min(len(head), 1024)):
+        end = _end(head, place)
+        if end is not None and int.from_bytes(head[place : place + 8], "big") < _LATEST_US:
+            return end >= len(head) - 8 or head[end + 8] in (_V1, _V2)
+    return False
+
+
+def _frames(log: Log, content: bytes, extras: Mapping[int, bytes]) -> Iterator[tuple[int, int, int]]:
+    """Start (of its time), end and number of each message; other bytes are skipped. extras: see `_is_whole`."""
+    place, lost, lost_first = 0, 0, 0
+    mirrored = content.translate(_MIRROR)
+    while place + 16 <= len(content):
+        end = _end(content, place)
+        if end is not None and end > len(content):
+            break
+        if end is not None:
+            code = content[place + 15 : place + 18] if content[place + 8] == _V2 else content[place + 13 : place + 14]
+            number = int.from_bytes(code, "little")
+            is_followed = end == len(content) or (end + 8 < len(content) and content[end + 8] in (_V1, _V2))
+            if is_followed or (number in extras and _is_whole(mirrored, place + 8, end, extras[number])):
+                yield place, end, number
+                place = end
+                continue
+        nearest = _MAGIC.search(content, place + 9)
+        following = nearest.start() - 8 if nearest is not None else len(content)
+        lost, lost_first = lost + following - place, lost_first or place
+        place = following
+    if place < len(content):
+        log.note(f"byte {place}: the file ends within a message; it was cut off")
+    if lost:
+        log.note(f"byte {lost_first}: {lost} bytes are no MAVLink messages and left out")
+
+
+def _end(content: bytes, place: int) -> int | None:
+    """End of the message that begins here, or None."""
+    if place + 12 > len(content):
+        return None
+    if content[place + 8] == _V1:
+        return place + 16 + content[place + 9]
+    if content[place + 8] == _V2:
+        return place + 20 + content[place + 9] + (13 if content[place + 10] & _SIGNED else 0)
+    return None
+
+
+def _is_whole(mirrored: bytes, begin: int, end: int, extra: bytes) -> bool:
+    """Whether the checksum of a message is right, CRC-16/MCRF4XX.
+
+    mirrored: the log with the bits of each byte in reverse, to which the checksum of `binascii` is the same, and fast:
+    every byte may look like the beginning of a message. extra: what its kind adds to the checksum, in reverse as well.
+    """
+    if mirrored[begin] == _V2_MIRRORED and mirrored[begin + 2] & _SIGNED_MIRRORED:
+        end -= 13
+    found = binascii.crc_hqx(extra, binascii.crc_hqx(mirrored[begin + 1 : end - 2], 0xFFFF))
+    return mirrored[end - 2 : end] == found.to_bytes(2, "big")
