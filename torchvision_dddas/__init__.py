@@ -42,10 +42,10 @@ def open_video(spec: "str | Path", **options: Any) -> "Source":
     options: rate_hz, full_scale, single, as `io.sources.open_source` has them. A simulated clip can be steered.
     Raises InputError with one line when it cannot be read.
     """
-    text = str(spec)
-    if not text.startswith("sim:"):
-        from torchvision_dddas.io.sources import open_source
+    from torchvision_dddas.io.sources import names_file, open_source
 
+    text = str(spec)
+    if not text.startswith("sim:") or names_file(text):
         return open_source(spec, **options)
     from torchvision_dddas.errors import InputError
     from torchvision_dddas.simulation import open_scenario  # takes 0.4 s to import

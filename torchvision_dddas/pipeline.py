@@ -205,9 +205,10 @@ class Pipeline:
             self.telemetry = self._watch.locator.site.telemetry
             self.notes += more
         self._clip_rate_hz = rate_hz
-        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures)
+        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures, rate_hz=rate_hz)
         self._crowds = CrowdIdentities() if self.settings.crowds.join_m and self._watch is not None else None
         self._waiting: dict[int, WatchedScene] = {}
+        self._watched: WatchedScene | None = None  # the last one
         return self._engine or load_engine(self._backend, self.settings)
 
     def _build_watch(self, size_px: tuple[int, int], rate_hz: float) -> LandmarkWatch:
@@ -232,8 +233,11 @@ class Pipeline:
         if self._watch is not None:
             if self._mission is not None:
                 self._mission.take_reports(scene)
-            watched = group_crowds(self._watch.update(scene), self._watch.locator, self._clip_rate_hz)
-            scene = watched.scene
+            if scene.repeats and self._watched is not None:
+                watched = _repeated(self._watched, scene)
+            else:
+                watched = group_crowds(self._watch.update(scene), self._watch.locator, self._clip_rate_hz)
+            self._watched, scene = watched, watched.scene
             if not self._pictures:
                 watched = replace(watched, scene=replace(scene, frame=without_picture(scene.frame)))
             self._waiting[scene.frame.number] = watched
@@ -273,6 +277,13 @@ def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Setti
     return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
+def _repeated(watched: WatchedScene, scene: Scene) -> WatchedScene:
+    """A scene that repeats a watched one."""
+    same = replace(scene, detections=watched.scene.detections, mask=watched.scene.mask, core=watched.scene.core)
+    fixed = watched.fixed.repeated(scene.frame.number, scene.frame.time_s)
+    return replace(watched, scene=same, fixed=fixed)
+
+
 def _with_crowd_identities(
     tracked: TrackedFrame, watched: WatchedScene, locator: AerialLocator, crowds: CrowdIdentities
 ) -> TrackedFrame:
@@ -282,7 +293,7 @@ def _with_crowd_identities(
     box, middle = tracks.box_px[seen], tracked.detections.middle_px[tracks.row[seen]]
     middle = np.where(np.isfinite(middle), middle, box[:, :2] + (box[:, 2:] - 1) / 2)
     place, radius = locator.ground_places(fix, middle), locator.ground_radii(fix, box)
-    return replace(tracked, tracks=crowds.rename(tracks, locator.time_s(tracked.number), place, radius))
+    return replace(tracked, tracks=crowds.rename(tracks, locator.time_of(fix), place, radius))
 
 
 def _locate(tracked: TrackedFrame, past: Sequence[WatchedScene], locator: AerialLocator) -> FrameResult:

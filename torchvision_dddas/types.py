@@ -766,6 +766,7 @@ class CameraPose:
 class Fix:
     """The georeference of one frame, with its uncertainty.
 
+    time_s: since the clip's first frame, of the moment that the picture shows; NaN: that of the frame's number.
     by: its source: pose, homography, paper, telemetry (no usable landmark), or "" (none: see cause).
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
     image_from_ground: (3, 3) from local metres to undistorted pixels (paper: distorted), if there is no pose.
@@ -788,6 +789,7 @@ class Fix:
     freedom: int = 0
     changes: tuple[str, ...] = ()
     cause: str = ""
+    time_s: float = float("nan")
 
     @property
     def is_used(self) -> tuple[bool, ...]:
@@ -982,6 +984,8 @@ class Scene:
     interval_frames: the detection interval in force. seconds: time spent per stage.
     step: background motion since the previous frame, or None.
     core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.
+    repeats: the number of the earlier frame whose picture this one repeats, and whose result it has; 0: none. It is no
+    look at the scene: leave it out of what follows targets.
     """
 
     frame: Frame
@@ -994,6 +998,7 @@ class Scene:
     seconds: dict[str, float] = field(default_factory=dict)
     step: Registration | None = None
     core: np.ndarray | None = None
+    repeats: int = 0
 
     @property
     def camera_motion(self) -> np.ndarray | None:
@@ -1009,7 +1014,7 @@ class TrackedFrame:
     tracks: those with an identity, and boxes that bridge gaps.
     now_from_before: (3, 3) pixel homography from the frame tracked before; None: no motion, or unknown.
     lines: (N,) int64, lines of the detections in their file; empty for own ones.
-    cause: why there is no result. adjustments, seconds: as in Scene.
+    cause: why there is no result. adjustments, seconds, repeats: as in Scene.
     """
 
     number: int
@@ -1021,6 +1026,7 @@ class TrackedFrame:
     cause: str = ""
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    repeats: int = 0
 
     @property
     def untracked(self) -> list[int]:
@@ -1058,6 +1064,11 @@ class FrameResult:
     def number(self) -> int:
         """1-based number of the frame."""
         return self.tracked.number
+
+    @property
+    def repeats(self) -> int:
+        """As in Scene."""
+        return self.tracked.repeats
 
     @property
     def tracks(self) -> Tracks:

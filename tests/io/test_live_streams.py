@@ -7,7 +7,8 @@ import pytest
 
 from tests.io.clips import number_of, picture, write_by_av, write_images, write_video
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.live_streams import AvStream, OpenedStream, first_picture, open_stream
+from torchvision_dddas.io.captures import AvCapture, open_by_opencv
+from torchvision_dddas.io.live_streams import OpenedStream, first_picture, open_stream
 
 LIMITS_S = (5.0, 5.0)
 STAMPS_MS = list(range(0, 600, 100))
@@ -25,7 +26,7 @@ def pictures(stream):
 
 def test_both_drivers_give_the_same_pictures(tmp_path):
     film = write_video(tmp_path / "film.avi", "MJPG")
-    by_av, by_opencv = AvStream(str(film), "film", LIMITS_S), OpenedStream(str(film), "film", LIMITS_S)
+    by_av, by_opencv = (OpenedStream(opens(str(film), "film")) for opens in (AvCapture, open_by_opencv))
     assert by_av.rate_hz == pytest.approx(by_opencv.rate_hz)
     ours, theirs = pictures(by_av), pictures(by_opencv)
     assert [number_of(image) for image in ours] == [number_of(image) for image in theirs] != []
@@ -41,12 +42,18 @@ def test_a_stream_that_changes_its_size_gives_pictures_of_both_sizes(tmp_path):
     assert {image.shape[:2] for image in pictures(open_stream(str(joined), "joined", LIMITS_S))} == {(48, 64), (48, 96)}
 
 
+def test_an_address_is_not_read_by_opencv_which_squeezes_pictures_of_another_size(monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"rtsp://127.0.0.1:9/live needs PyAV: pip install"):
+        open_stream("rtsp://127.0.0.1:9/live", "rtsp://127.0.0.1:9/live", LIMITS_S)
+
+
 def test_damage_costs_pictures_and_not_the_stream(tmp_path):
     film = write_by_av(tmp_path / "film.ts", "libx264", STAMPS_MS)
     data = bytearray(film.read_bytes())
     data[len(data) // 2 :][:188] = bytes(188)
     film.write_bytes(bytes(data[: len(data) // 2]) + bytes(400) + bytes(data[len(data) // 2 + 400 :]))
-    assert 1 <= len(pictures(AvStream(str(film), "film", LIMITS_S))) <= len(STAMPS_MS)
+    assert 1 <= len(pictures(OpenedStream(AvCapture(str(film), "film", LIMITS_S)))) <= len(STAMPS_MS)
 
 
 @pytest.mark.parametrize("without_av", [False, True])
@@ -65,6 +72,6 @@ def test_options_of_ffmpeg_are_read_as_opencv_reads_them(tmp_path, monkeypatch):
     folder = write_images(tmp_path / "images", range(7, 10))
     monkeypatch.setenv("OPENCV_FFMPEG_CAPTURE_OPTIONS", "start_number;8|framerate;5")
     stream = open_stream(str(folder / "frame%d.png"), "images", LIMITS_S)
-    assert isinstance(stream, AvStream) and stream.rate_hz == 5.0
+    assert stream.rate_hz == 5.0
     assert np.array_equal(first_picture(stream, "images"), picture(8))
     stream.release()

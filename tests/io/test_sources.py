@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.io.clips import mark_rotated, number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
+from torchvision_dddas import open_video
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import open_source
 
@@ -40,6 +41,7 @@ def test_a_whole_video_is_read_in_order_with_its_times(tmp_path, name, codec, in
     assert [frame.time_s for frame in frames] == pytest.approx((numbers - 1) / 10, abs=1e-3)
     assert frames[0].image.shape == (48, 64, 3) and frames[0].image.dtype == np.uint8
     assert (source.last, source.problems, source.exact) == (30, [], True)
+    assert source.notes == []  # type: ignore[attr-defined]
     assert open_source(tmp_path / name, rate_hz=25).rate_hz == 25
 
 
@@ -131,6 +133,110 @@ def test_a_clip_of_varying_rate_is_numbered_by_counting_and_timed_by_its_stamps(
     frames = list(source)
     assert [frame.number for frame in frames] == list(range(1, 31)) and source.problems == []
     assert [frame.time_s for frame in frames] == pytest.approx((stamps - stamps[0]) / 1000, abs=2e-3)
+    assert len(source.notes) == 1 and "the frame rate varies" in source.notes[0]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["cam1:2024-05-01.mp4", "file:1.mp4", "camera:0.mp4", "sim:four.mp4", "http:a.mp4"])
+def test_a_colon_in_a_files_name_begins_no_address(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    write_video(tmp_path / "clip.mp4", "mp4v", frames=4).rename(tmp_path / name)
+    for opened in (open_video(name), open_video(tmp_path / name)):
+        assert [frame.number for frame in opened] == [1, 2, 3, 4]
+
+
+def write_with_cover(path: Path, marked: bool, is_first: bool = True) -> Path:
+    """A film of 12 pictures and a cover, which is marked as one or is a picture in a stream of its own."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as file:
+
+        def add(codec, size, pix_fmt):
+            stream = file.add_stream(codec, rate=10)
+            (stream.width, stream.height), stream.pix_fmt = size, pix_fmt
+            return stream
+
+        kinds = [("mjpeg", (80, 80), "yuvj420p"), ("libx264", (64, 48), "yuv420p")]
+        streams = [add(*kind) for kind in (kinds if is_first else kinds[::-1])]
+        cover, film = streams if is_first else streams[::-1]
+        if marked:
+            cover.disposition = av.stream.Disposition.attached_pic
+        for stream, numbers in ((cover, [40]), (film, range(1, 13))):
+            for number in numbers:
+                image = picture(number, stream.width, stream.height)
+                file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
+            file.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "marked", "is_first"),
+    [
+        ("c.mkv", False, True),
+        ("c.mkv", True, True),
+        ("c.mov", False, True),
+        ("c.mkv", False, False),
+        ("c.mp4", True, True),
+    ],
+)
+def test_the_cover_of_a_film_is_not_read_in_its_place(tmp_path, name, marked, is_first):
+    source = open_source(write_with_cover(tmp_path / name, marked, is_first))
+    assert source.size == (64, 48)
+    assert [frame.number for frame in source] == list(range(1, 13)) and source.problems == []
+
+
+def write_changing(folder: Path, kind: str, sizes: list[tuple[int, int]], each: int = 20) -> Path:
+    """Films of several sizes in one file; the time stamps of each part begin anew."""
+    if kind == "mjpeg":
+        shots = [picture(n, *size) for size in sizes for n in range(1, each + 1)]
+        parts = [cv2.imencode(".jpg", image)[1].tobytes() for image in shots]
+    elif kind == "mpg2.ts":
+        parts = [write_video(folder / f"{k}.ts", "mpg2", each, size, 25).read_bytes() for k, size in enumerate(sizes)]
+    else:
+        codec, ending = kind.split(".")
+        stamps = list(range(0, 100 * each, 100))
+        parts = [
+            write_by_av(folder / f"{k}.{ending}", codec, stamps, size).read_bytes() for k, size in enumerate(sizes)
+        ]
+    path = folder / f"joined.{kind.split('.')[-1]}"
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["libx264.ts", "mpg2.ts", "libx264.h264", "mjpeg"])
+@pytest.mark.parametrize("second", [(48, 36), (96, 72), (48, 64)])
+def test_a_film_that_changes_its_size_is_refused_and_never_squeezed(tmp_path, kind, second):
+    seen: list[tuple[int, ...]] = []
+    film = iter(open_source(write_changing(tmp_path, kind, [(64, 48), second])))
+    with pytest.raises(InputError, match=f"is {second[0]}x{second[1]} but the first is 64x48"):
+        seen.extend(frame.image.shape for frame in film)
+    assert 18 <= len(seen) <= 20 and set(seen) == {(48, 64, 3)}
+
+
+def test_a_tolerant_reader_goes_on_with_a_size_that_lasts(tmp_path):
+    source = open_source(write_changing(tmp_path, "mjpeg", [(64, 48), (96, 72), (64, 48)], each=30))
+    source.tolerant = True  # type: ignore[attr-defined]
+    widths = [frame.image.shape[1] for frame in source]
+    assert widths == [64] * 30 + [96] * 21 + [64] * 21 and source.size == (64, 48)
+    assert len(source.problems) == 18 and all("left out" in str(problem) for problem in source.problems)
+
+
+def test_time_stamps_that_begin_anew_in_the_middle_go_on(tmp_path):
+    frames = list(open_source(write_changing(tmp_path, "mpg2.ts", [(64, 48)] * 2, each=40)))
+    assert [frame.number for frame in frames] == list(range(1, len(frames) + 1)) and len(frames) >= 78
+    assert [frame.time_s for frame in frames] == pytest.approx(np.arange(len(frames)) / 25, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rate", "stamps", "hz"),
+    [
+        (10, np.arange(30) * 40, 25.0),
+        (10, np.round(np.arange(30) * 1000 / 30), 30.0),  # stamps in whole milliseconds
+        (10, np.arange(30) * 40 + 3000 * (np.arange(30) > 20), 25.0),
+        (10, np.arange(30) * 100, 10.0),
+    ],
+)
+def test_a_rate_that_the_time_stamps_contradict_is_measured(tmp_path, rate, stamps, hz):
+    source = open_source(write_by_av(tmp_path / "clip.mkv", "mjpeg", stamps.astype(int).tolist()))
+    assert source.rate_hz == pytest.approx(hz, rel=0.005)
 
 
 class ScriptedCapture:

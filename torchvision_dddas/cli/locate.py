@@ -81,6 +81,7 @@ def aerial(
     from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
     from torchvision_dddas.io.output import AerialRecorder, parse_save
     from torchvision_dddas.io.run_inputs import AerialInput, locator_facts, map_site, read_locator
+    from torchvision_dddas.io.sources import frame_times
 
     if landmarks is None and telemetry is None:
         raise InputError("locating from the air needs --telemetry FILE or --landmarks FILE; got neither")
@@ -91,11 +92,11 @@ def aerial(
     refuse_own_input(inputs, [out / name for name in AerialRecorder.files], "folder with --out")
     with AerialRecorder(out, names) as output:
         read = read_detections(table)
-        size, rate_hz = None, rate
+        size, rate_hz, times_s = None, rate, None
         if clip:
             source = open_video(clip, rate_hz=rate)
             check_within_clip(read, source)
-            size, rate_hz = source.size, source.rate_hz
+            size, rate_hz, times_s = source.size, source.rate_hz, frame_times(source)
         locator, notes = read_locator(
             given, settings, size, rate_hz, backend.value, (read.first, read.last), "table", clip, extent=read.extent
         )
@@ -116,7 +117,7 @@ def aerial(
                 "file for this size?"
             )
         count = len(frames_to_locate(read, locator.site.landmarks))
-        record_results(output, record, locator.locate_table(read), "locate", count, quiet)
+        record_results(output, record, locator.locate_table(read, times_s), "locate", count, quiet)
     files = [name for name in AerialRecorder.files if (out / name).exists()]
     first = f"{record.frames} frames, {record.targets} detections"
     print_located(closing_lines([first, *position_lines(record)], record, out, files), record, out, quiet)

@@ -158,13 +158,18 @@ def record_results(
     source: "Source | None" = None,
 ) -> None:
     """Write every result and show how far the clip is; the source's reading problems are recorded even if it fails."""
+    repeats = 0
     try:
         with progress(name, count, quiet) as tick:
             for result in results:
                 output.write(result)
+                repeats += getattr(result, "repeats", 0) > 0
                 tick()
     finally:
         record.problems += [str(problem) for problem in source.problems] if source is not None else []
+        record.notes += getattr(source, "notes", [])
+    if repeats:
+        record.notes.append(f"{repeats} of {record.frames} frames repeat the picture before, and have its result")
 
 
 def folders_for(inputs: Sequence[str], out: Path) -> list[Path]:

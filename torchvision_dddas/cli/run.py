@@ -116,7 +116,7 @@ def run(
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
         _refuse(others, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
-    if clip.startswith(SIMULATED) and not live:
+    if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, **beside}
         inputs["--interval"] = None if interval == 1 else interval
         _refuse(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")

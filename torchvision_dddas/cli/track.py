@@ -129,4 +129,4 @@ def _track(
     if table is not None:
         return track_clip(source, table, engine, settings, interval, backend)
     scenes = detect_motion(source, settings, engine)
-    return track_scenes(scenes, settings, interval, source.size, backend=backend)
+    return track_scenes(scenes, settings, interval, source.size, backend=backend, rate_hz=source.rate_hz)

@@ -30,6 +30,7 @@ from torchvision_dddas.detection.motion_history import MotionHistory
 from torchvision_dddas.detection.observation import Observation, Target, build_detections, draw_targets, observe
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
+from torchvision_dddas.detection.repeats import RepeatRule
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain, near_gaps
 from torchvision_dddas.runtime import wants_torch
@@ -43,6 +44,9 @@ _BLANK_LEVELS = 1.0
 _MIN_FRAMES = 3  # that a window needs
 _JUDGED_FRAMES = 5  # that persistence uses: two before and two after the frame
 _TORCH_BATCH = 8
+# Repeats of a picture that are held until the next picture comes: of a recording, and where results are waited for.
+_MOST_REPEATS, _MOST_REPEATS_LIVE = 1000, 3
+_STILL = Registration(np.eye(3), 0, 0, 0.0, 0.0)
 
 
 def detect_motion(
@@ -65,6 +69,8 @@ def detect_motion(
         telemetry.check_overlap((count - 1) / rate_hz)
     detector = MotionDetector(settings, backend, rate_hz, telemetry, batch)
     live_telemetry = getattr(source, "telemetry", None)
+    if live_telemetry is not None:  # a loop is closed over the source: each frame needs its result at once
+        detector._most_repeats = 0
     for image in source:
         frame = detector._as_frame(image)
         if live_telemetry is not None:
@@ -101,20 +107,23 @@ def check_length(frames: int) -> None:
 
 @dataclass
 class _Slot:
-    """One frame in flight. look: its number if frames that are skipped on purpose did not count.
+    """One frame in flight. look: its number if frames that are skipped on purpose, or repeated, did not count.
 
-    step: registration to the next frame; None while unknown and at the end. interval: 0 until it is chosen.
+    passed: those frames since the slot before. step: registration to the next slot; None while unknown and at the end.
+    interval: 0 until it is chosen. repeats: the frames that repeat this one.
     """
 
     frame: Frame
     view: View
     look: int
+    passed: int
     is_blank: bool
     distance: DistanceSettings
     adjustments: tuple[Adjustment, ...]
     seconds: dict[str, float]
     step: Registration | None = None
     interval: int = 0
+    repeats: list[Frame] = field(default_factory=list)
     observation: Observation = field(default_factory=Observation)
     cause: str = ""
 
@@ -128,7 +137,8 @@ class MotionDetector:
     """Finds what moves against the background in the frames of a moving camera.
 
     Feed it every frame in order with `update`; it returns the scenes that no later frame can change any more, at most
-    two detection intervals late. `flush` returns the rest at the end.
+    two detection intervals late. `flush` returns the rest at the end. A frame that repeats the one before is no look at
+    the scene: it gets the scene of that one, and counts for no interval.
     """
 
     def __init__(
@@ -155,8 +165,11 @@ class MotionDetector:
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
         self._total = 0
         self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest one
-        self._last_number = 0  # of the scenes returned
-        self._skipped = 0  # frames skipped on purpose so far
+        self._returned = self._last  # of the scenes returned
+        self._skipped = 0  # frames skipped on purpose, or repeated, so far
+        self._passed = 0  # those since the latest slot
+        self._repeats, self._most_repeats = RepeatRule(), _MOST_REPEATS
+        self._held: tuple[Adjustment, ...] = ()  # of repeated frames
         self._ended = False
         self._flows: deque[float] = deque(maxlen=self.settings.interval.memory_frames)
         self._costs: deque[float] = deque(maxlen=self.settings.interval.memory_frames)  # seconds that looks took
@@ -170,7 +183,7 @@ class MotionDetector:
 
         frame: a Frame, or an image (H, W) or (H, W, 3) BGR uint8, which follows the last frame.
         adjustments: changes of parameters before it, for the record in its scene.
-        Raises InputError for any other image.
+        Raises InputError for any other image, and for one of another size than the images before.
         """
         return list(self._settle(self._as_frame(frame), adjustments))
 
@@ -201,6 +214,12 @@ class MotionDetector:
             raise InputError(
                 f"an image must be uint8 of shape (H, W) or (H, W, 3), got {image.dtype} of shape {image.shape}"
             )
+        size, before = image.shape[1::-1], self._last.image.shape[1::-1]
+        if self._total and size != before:
+            raise InputError(
+                f"a frame of {size[0]}x{size[1]} follows frame {self._last.number} of {before[0]}x{before[1]}; all "
+                "frames of a clip must have one size: begin anew with another MotionDetector"
+            )
         if isinstance(frame, Frame):
             return frame
         return Frame(self._last.number + 1, self._last.number / self.rate_hz, image)
@@ -210,23 +229,37 @@ class MotionDetector:
         start = time.perf_counter()
         if not self._total:
             self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1])[0])
-        self._skipped += frame.skipped
         view = self.engine.prepare(frame.image)
-        is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
-        seconds = {"prepare": time.perf_counter() - start}
-        look = frame.number - self._skipped
-        self._slots.append(_Slot(frame, view, look, is_blank, self._distance, adjustments, seconds))
-        self._last = frame
-        self._total += 1
+        repeats = self._at(self._total - 1).repeats if self._total else []
+        most = _MOST_REPEATS_LIVE if np.isfinite(frame.taken_s) else self._most_repeats
+        if self._repeats.is_repeat(view.grey) and len(repeats) < most:
+            self._last = replace(frame, image=self._last.image)  # one picture for all of them
+            repeats.append(self._last)
+            self._passed += frame.skipped + 1
+            self._held += adjustments
+            return
+        self._add(frame, view, self._held + adjustments, time.perf_counter() - start)
         if self._total - self._registered > self.batch:
             yield from self._advance()
 
+    def _add(self, frame: Frame, view: View, adjustments: tuple[Adjustment, ...], prepare_s: float) -> None:
+        passed, self._passed, self._held = self._passed + frame.skipped, 0, ()
+        self._skipped += passed
+        is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
+        self._last, look, seconds = frame, frame.number - self._skipped, {"prepare": prepare_s}
+        self._slots.append(_Slot(frame, view, look, passed, is_blank, self._distance, adjustments, seconds))
+        self._total += 1
+
     def _settle_rest(self, last_number: int = 0) -> Iterator[Scene]:
         """As `flush`, one scene at a time."""
+        repeats = self._slots[-1].repeats if self._slots else []
+        while repeats and self._total < _MIN_FRAMES:  # a clip in which nothing ever changes
+            self._passed = 0
+            self._add(repeats.pop(0), self._slots[-1].view, (), 0.0)
         check_length(self._total)
         self._ended = True
         yield from self._advance()
-        yield from self._fill_gap(last_number + 1, self.interval)
+        yield from self._fill_gap(last_number + 1, None, self.interval)
 
     def _advance(self) -> Iterator[Scene]:
         self._register()
@@ -296,7 +329,7 @@ class MotionDetector:
         slot.adjustments += moved
         slot.distance = self._distance
         if slot.step is not None and slot.step.reliable:
-            self._flows.append(slot.step.flow_px / (self._at(index + 1).frame.skipped + 1))
+            self._flows.append(slot.step.flow_px / (self._at(index + 1).passed + 1))
         wanted, cause = None, ""
         cost, measured = look_cost(self._costs, parameters)
         if not parameters.rule:
@@ -308,9 +341,10 @@ class MotionDetector:
             wanted = interval_from_flow(self._flows, slot.view.size[0], cost, parameters)
             cause = f"background flow {np.median(self._flows):.2f} px a frame"
         if wanted is not None:
-            wanted /= slot.frame.skipped + 1
-            if left := slot.frame.skipped:
+            wanted /= slot.passed + 1
+            if left := slot.passed:
                 cause += f", {left} frame{'s' * (left > 1)} before it dropped or left out"
+                cause += " or repeated" * (left > slot.frame.skipped)
             used = self._distance.settings
             self.interval, moved = adjust_interval(number, self.interval, wanted, cause + measured, used)
             slot.adjustments += moved
@@ -406,9 +440,13 @@ class MotionDetector:
             delay = settling_delay(slot.interval, slot.distance.settings)
             if not self._all_observed and self._emitted + delay >= self._observed:
                 break
-            yield from self._fill_gap(slot.frame.number - slot.frame.skipped, slot.interval)
-            self._last_number = slot.frame.number
-            yield self._build_scene(slot, self._emitted)
+            scene = self._build_scene(slot, self._emitted)
+            copy = replace(scene, repeats=slot.frame.number, step=_STILL, adjustments=(), seconds={})
+            for made in (scene, *(replace(copy, frame=frame) for frame in slot.repeats)):
+                yield from self._fill_gap(made.frame.number - made.frame.skipped, made.frame, slot.interval)
+                self._returned = made.frame
+                yield made
+            slot.repeats = []
             # Colour is most of the memory: the scene has it, and windows use the view's only.
             slot.frame = replace(slot.frame, image=slot.view.grey)
             self._emitted += 1
@@ -419,21 +457,24 @@ class MotionDetector:
                 self._slots.popleft()
                 self._first += 1
 
-    def _fill_gap(self, until: int, interval: int) -> Iterator[Scene]:
-        """Empty scenes for the frame numbers below `until` that could not be read."""
-        for number in range(self._last_number + 1, until):
+    def _fill_gap(self, until: int, following: Frame | None, interval: int) -> Iterator[Scene]:
+        """Empty scenes for the frame numbers below `until` that could not be read. following: the frame after them."""
+        before, step_s = self._returned, 1 / self.rate_hz
+        if following is not None and before.number:
+            step_s = (following.time_s - before.time_s) / (following.number - before.number)
+        for number in range(before.number + 1, until):
             image = np.zeros_like(self._last.image)
-            missing = Frame(number, (number - 1) / self.rate_hz, image)
+            time_s = before.time_s + (number - before.number) * step_s if before.number else (number - 1) * step_s
             detections, mask, _ = build_detections([], (image.shape[1], image.shape[0]))
+            missing = Frame(number, time_s, image)
             yield Scene(missing, mask, detections, interval, False, "the frame could not be read")
-        self._last_number = until
 
     def _build_scene(self, slot: _Slot, index: int) -> Scene:
         self._costs.append(sum(slot.seconds.values()))
         targets = slot.observation.targets
         targets = targets + self._small_targets(index, targets)
-        if slot.frame.skipped:  # what moved from look to look, per frame
-            targets = [replace(t, velocity_px=t.velocity_px / (slot.frame.skipped + 1)) for t in targets]
+        if slot.passed:  # what moved from look to look, per frame
+            targets = [replace(t, velocity_px=t.velocity_px / (slot.passed + 1)) for t in targets]
         if slot.distance.gates is not None:
             targets = [t for t in targets if slot.distance.gates.admit(t.box[2], t.box[3], t.velocity_px)]
         detections, mask, core = build_detections(targets, slot.view.size)

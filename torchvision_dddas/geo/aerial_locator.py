@@ -23,7 +23,14 @@ from torchvision_dddas.geo.aerial_targets import (
 )
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories, LandmarkUse, select_landmarks
-from torchvision_dddas.geo.plane_homography import LEAST, PlaneSolver, load_solver, locate_pixels, relative_width
+from torchvision_dddas.geo.plane_homography import (
+    LEAST,
+    PlaneSolver,
+    load_solver,
+    locate_pixels,
+    no_fix,
+    relative_width,
+)
 from torchvision_dddas.geo.projection import ground_height, surface_of
 from torchvision_dddas.geo.site import Site, build_site, complete_site, resolve_camera
 from torchvision_dddas.types import (
@@ -44,18 +51,32 @@ from torchvision_dddas.types import (
 
 # A landmark or a target may show this far beyond the picture's edge, as a share of the picture's side.
 _OUTSIDE = 0.25
+# A picture that is repeated for longer locates nothing: what it shows has moved on.
+_FROZEN_S = 0.25
 # By telemetry alone a place whose distance has a standard deviation of a larger share of itself is none.
 _VAGUE = 0.2
 
 
 @dataclass(frozen=True)
 class FrameFix:
-    """How one frame maps to the ground, and the landmarks that were used; adjustments and seconds as in Scene."""
+    """How one frame maps to the ground, and the landmarks that were used; adjustments and seconds as in Scene.
+
+    time_s: of the frame; later than fix.time_s if its picture repeats an earlier one.
+    """
 
     fix: Fix
     marks: LandmarkObservations
     adjustments: tuple[Adjustment, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
+    time_s: float = math.nan
+
+    def repeated(self, frame: int, time_s: float) -> "FrameFix":
+        """The same for a frame that repeats the picture; nothing is located by a picture that is too old."""
+        old_s, fix = time_s - self.fix.time_s, replace(self.fix, frame=frame, changes=())
+        if old_s > _FROZEN_S:
+            cause = f"the camera is frozen: the picture is that of frame {self.fix.frame}"
+            fix = no_fix(frame, self.marks, cause)
+        return FrameFix(replace(fix, time_s=self.fix.time_s), self.marks, time_s=time_s)
 
 
 class AerialLocator:
@@ -135,15 +156,19 @@ class AerialLocator:
         """Where the targets of the next frame stand. Raises InputError for anything but Tracks or a TrackedFrame."""
         if isinstance(tracks, TrackedFrame):
             targets, frame = tracked_targets(tracks, bool(self.settings.crowds.join_m)), tracks.number
+            time_s = None if tracks.frame is None else tracks.frame.time_s
         elif isinstance(tracks, Tracks):
-            targets, frame = seen_targets(tracks), tracks.frame
+            targets, frame, time_s = seen_targets(tracks), tracks.frame, None
         else:
             raise InputError(f"locate wants Tracks or a TrackedFrame, got {type(tracks).__name__}")
-        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)
+        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame), time_s), targets)
 
-    def locate_table(self, table: DetectionTable) -> Iterator[AerialLocations]:
+    def locate_table(
+        self, table: DetectionTable, times_s: Mapping[int, float] | None = None
+    ) -> Iterator[AerialLocations]:
         """Where the targets of a table stand, in each of its frames and in those between that show landmarks.
 
+        times_s: of frames, since the clip's first, where they do not follow each other at a constant rate.
         Boxes that bridge gaps and detections that no track follows have no place, as in `seen_targets`.
         """
         lasting = table.identity > 0 if table.identity is not None else np.zeros(len(table), bool)
@@ -154,11 +179,16 @@ class AerialLocator:
             rows = rows[has_place[rows]]
             feet = None if table.feet_px is None else table.feet_px[rows]
             targets = Targets(table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours)
-            yield self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame)), targets)
+            fixed = self.fix_frame(frame, self.landmarks_at(frame), (times_s or {}).get(frame))
+            yield self.locate_targets(fixed, targets)
 
     def time_s(self, frame: int) -> float:
-        """Time of a frame since the clip's first."""
+        """Time of a frame since the clip's first, at the constant rate."""
         return (frame - 1) / self.rate_hz
+
+    def time_of(self, fix: Fix) -> float:
+        """Time of the moment that the picture of a fix shows, since the clip's first frame."""
+        return fix.time_s if math.isfinite(fix.time_s) else self.time_s(fix.frame)
 
     def landmarks_at(self, frame: int) -> LandmarkObservations:
         """The landmarks of a frame whose place and height are known."""
@@ -184,8 +214,11 @@ class AerialLocator:
             altitude = math.nan
         return replace(flight, altitude_m=altitude)
 
-    def fix_frame(self, frame: int, marks: LandmarkObservations) -> FrameFix:
-        """How a frame maps to the ground. marks: those of `landmarks_at`, with their places in the picture."""
+    def fix_frame(self, frame: int, marks: LandmarkObservations, time_s: float | None = None) -> FrameFix:
+        """How a frame maps to the ground. marks: those of `landmarks_at`, with their places in the picture.
+
+        time_s: of the frame, since the clip's first; None: by its number.
+        """
         start = time.perf_counter()
         speeds = self._trajectories.speed_m_s(frame)[marks.landmark]
         rows, self._use, adjustments = select_landmarks(frame, self._use, marks, speeds, self.settings.landmarks)
@@ -193,9 +226,10 @@ class AerialLocator:
         degrees = None
         if self.settings.aerial.mode == "paper" and self.site.origin_deg is not None:
             degrees = geometry.lonlat(used.east_north_m, self.site.origin_deg), self.site.origin_deg
-        when = self.time_s(frame)
+        when = self.time_s(frame) if time_s is None else time_s
         fix = self._georeferencer.update(frame, when, self.telemetry_at(when), used, degrees)
-        return FrameFix(fix, used, adjustments, {"fix": time.perf_counter() - start})
+        seconds = {"fix": time.perf_counter() - start}
+        return FrameFix(replace(fix, time_s=when), used, adjustments, seconds, when)
 
     def locate_targets(
         self,
@@ -220,7 +254,7 @@ class AerialLocator:
         place = place[rows]
         own = (by_pixel - shared)[rows] * (point_sigma_px(targets, self.settings.aerial)[rows] ** 2)[:, None, None]
         relative = shared[rows] + own
-        when, target = self.time_s(fix.frame), targets.target[rows]
+        when, target = self.time_of(fix), targets.target[rows]
         velocity = self._speeds.update(when, np.where(targets.lasting[rows], target, -1), place, own)
         positions = Positions(
             np.full(len(rows), fix.frame),
@@ -233,8 +267,9 @@ class AerialLocator:
         )
         spent = {**(seconds or {}), **fixed.seconds, "ground": time.perf_counter() - start}
         made = (*adjustments, *fixed.adjustments)
+        at_s = fixed.time_s if math.isfinite(fixed.time_s) else when
         return AerialLocations(
-            fix.frame, when, positions, rows, relative, velocity, targets.box_px, fix, fixed.marks, made, spent
+            fix.frame, at_s, positions, rows, relative, velocity, targets.box_px, fix, fixed.marks, made, spent
         )
 
     def ground_places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
@@ -253,7 +288,7 @@ class AerialLocator:
 
         None where shadows are not used, or the camera's pose or the sun is not known.
         """
-        sun = self._sun(self.time_s(fix.frame)) if self.settings.aerial.shadows else None
+        sun = self._sun(self.time_of(fix)) if self.settings.aerial.shadows else None
         if sun is None or fix.pose is None:
             return None
         near = self.ground_places(fix, pixels)

@@ -156,21 +156,29 @@ class TargetSpeeds:
             if name < 1:
                 continue
             place, noise = east_north_m[row], covariance_m2[row]
-            lapse = time_s - self._tracks[name][0] if name in self._tracks else 0.0
-            if not 0 < lapse <= _FORGET_S:
+            lapse = time_s - self._tracks[name][0] if name in self._tracks else -1.0
+            if not 0 <= lapse <= _FORGET_S:
                 spread = np.diag([0.0, 0.0, _FASTEST_M_S**2, _FASTEST_M_S**2])
                 spread[:2, :2] = noise
                 self._tracks[name] = time_s, np.array([*place, 0.0, 0.0]), spread
                 continue
             _, state, spread = self._tracks[name]
-            move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
-            drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
-            state, spread = move @ state, move @ spread @ move.T + drive
-            # A place that is said to be exact would leave nothing to invert.
-            gain = spread[:, :2] @ np.linalg.inv(spread[:2, :2] + noise + 1e-12 * np.eye(2))
-            state, spread = state + gain @ (place - state[:2]), spread - gain @ spread[:2]
-            self._tracks[name] = time_s, state, spread
+            if lapse > 0:  # else the picture repeats the one before
+                state, spread = _corrected(state, spread, lapse, place, noise)
+                self._tracks[name] = time_s, state, spread
             if spread.diagonal()[2:].max() < _KNOWN_M_S**2:
                 velocity[row] = state[2:]
         self._tracks = {name: track for name, track in self._tracks.items() if time_s - track[0] <= _FORGET_S}
         return velocity
+
+
+def _corrected(
+    state: np.ndarray, spread: np.ndarray, lapse: float, place: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A target's state and covariance after `lapse` seconds, at which it is seen at a place."""
+    move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
+    drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
+    state, spread = move @ state, move @ spread @ move.T + drive
+    # A place that is said to be exact would leave nothing to invert.
+    gain = spread[:, :2] @ np.linalg.inv(spread[:2, :2] + noise + 1e-12 * np.eye(2))
+    return state + gain @ (place - state[:2]), spread - gain @ spread[:2]

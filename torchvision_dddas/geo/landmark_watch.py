@@ -101,7 +101,7 @@ class LandmarkWatch:
             own[[row.argmin() for row in area if np.isfinite(row).any()]] = True
             scene = without_detections(scene, own)
         spent = time.perf_counter() - start
-        fixed = self.locator.fix_frame(scene.frame.number, marks)
+        fixed = self.locator.fix_frame(scene.frame.number, marks, scene.frame.time_s)
         self._fix = fixed.fix
         found_by = dict(zip(marks.landmark.tolist(), by.tolist(), strict=True))
         return WatchedScene(

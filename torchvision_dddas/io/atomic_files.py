@@ -229,11 +229,12 @@ def _is_at(file: int, path: Path) -> bool:
 
 
 def utf8_name(path: str | Path) -> str:
-    """A name for a library that takes UTF-8 alone and may crash on any other: such a file's is a link to its folder.
+    """A name for FFmpeg, which takes `word:` at the beginning for a protocol, and UTF-8 alone.
 
-    The link lasts as long as the process. Raises InputError if it cannot be made.
+    Another name may crash it: such a file's is a link to its folder, which lasts as long as the process.
+    Raises InputError if the link cannot be made.
     """
-    name = str(path)
+    name = os.path.abspath(path) if ":" in str(path) else str(path)  # noqa: PTH100 (a link is not followed)
     if name.isascii():
         return name
     try:

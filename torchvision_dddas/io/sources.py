@@ -1,20 +1,18 @@
 """Where frames come from: video files, folders and globs of images, cameras, network streams."""
 
-import os
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
-
-# FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
-os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError, LostInputError, without_secrets
 from torchvision_dddas.io.atomic_files import utf8_name
+from torchvision_dddas.io.captures import AvCapture, Capture, announced_hz, is_live, open_capture
 from torchvision_dddas.io.images import IMAGE_SUFFIXES, images_of_folder, images_of_glob, quiet_opencv, read_image
 from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
@@ -63,16 +61,27 @@ def open_source(
     return ImageSource(files, text, rate_hz or 10.0, full_scale)
 
 
+# Pictures in a row of another size, after which a tolerant reader goes on with that size.
+_LASTING = 10
+
+
 class _Clip(ABC):
-    """What recordings share. tolerant: a frame of another size or depth is left out, else it raises InputError."""
+    """What recordings share.
+
+    tolerant: a frame of another size or depth is left out, and a size that lasts is the clip's from then on; else such
+    a frame raises InputError.
+    """
 
     exact = True
     tolerant = False
     count: int | None
+    size: tuple[int, int]
 
     def __init__(self, name: str) -> None:
         self.name, self.last = name, 0
         self.problems: list[Problem] = []
+        self.notes: list[str] = []
+        self._odd = 0  # pictures of another size in a row
 
     def __iter__(self) -> Iterator[Frame]:
         return self.every(1)
@@ -83,6 +92,16 @@ class _Clip(ABC):
 
     def _note(self, number: int, what: str) -> None:
         self.problems.append(Problem(number, what))
+
+    def _fits(self, image: np.ndarray, number: int, this: str, first: str) -> bool:
+        """Whether a picture has the clip's size. this, first: names of the picture and the first one, for messages."""
+        (width, height), size = self.size, (image.shape[1], image.shape[0])
+        self._odd = 0 if size == self.size else self._odd + 1
+        if self.tolerant and self._odd >= _LASTING:
+            self.size, self._odd = size, 0
+        if self._odd:
+            self._leave_out(number, f"{this} is {size[0]}x{size[1]} but {first} is {width}x{height}", "size")
+        return not self._odd
 
     def _leave_out(self, number: int, what: str, must: str) -> None:
         if not self.tolerant:
@@ -134,9 +153,7 @@ class ImageSource(_Clip):
             if image is None:
                 self._note(number, f"frame {number} ({file.name}) could not be decoded and was left out")
                 continue
-            if (size := (image.shape[1], image.shape[0])) != self.size:
-                what = f"{file} is {size[0]}x{size[1]} but {self.files[0].name} is {self.size[0]}x{self.size[1]}"
-                self._leave_out(number, what, "size")
+            if not self._fits(image, number, str(file), self.files[0].name):
                 continue
             if image.dtype != self._depth:
                 what = f"{file} holds {image.dtype} pixels but {self.files[0].name} {self._depth}"
@@ -160,10 +177,8 @@ class ImageSource(_Clip):
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Videos through OpenCV.
+# Videos.
 
-# FFmpeg draws any text file as an old terminal would, which is never wanted.
-_TEXT_AS_VIDEO = {b"ansi", b"xbin", b"bin "}
 # These containers count their frames; others guess from the duration, often one off.
 _EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}
 # Reads that may fail in a row before the clip counts as ended, however many frames it announced.
@@ -174,33 +189,89 @@ STALL_S = 30.0
 _STALLED = 0.9
 # How far a time stamp may lie from its place on a constant frame rate, in frames.
 _REGULAR = 0.25
+# An announced rate that differs by more from the rate of the time stamps is wrong.
+_OFF = 0.2
+# Time stamps that run back by more begin anew, as where files were joined.
+_ANEW_S = 1.0
+
+
+class _Stamps:
+    """Numbers and times of the frames of a file.
+
+    A clip of constant rate is numbered by its time stamps, which stay true when a damaged stretch comes out short or
+    out of order; other clips are numbered by counting. regular: the rate has been constant so far.
+    """
+
+    def __init__(self, own_hz: float, given_hz: float | None) -> None:
+        self.number, self.time_s, self.regular = 0, 0.0, True
+        self._own_hz, self._given_hz, self._damaged = own_hz, given_hz, False
+        self._start_s = self._before_s = 0.0
+        self._steps_ms = Counter[int]()  # between successive frames
+
+    def add(self, stamp_s: float, lost: int, damaged: bool) -> int:
+        """Number the next frame; returns how many are missing before it, or -1 if it came out of order.
+
+        lost: reads that failed before it. damaged: whether its data are.
+        """
+        self._damaged |= damaged or lost > 0
+        if not self.number or stamp_s - self._start_s < self._before_s - _ANEW_S:
+            self._start_s = stamp_s - (self._before_s + 1 / self._own_hz if self.number else 0)
+        stamp_s -= self._start_s
+        place = round(stamp_s * self._own_hz)
+        # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
+        on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR and place - self.number < _MOST_LOST
+        self.regular = self.regular and on_rate and (self._damaged or place == self.number)
+        missing = place - self.number if self.regular else lost
+        if missing < 0:
+            return -1
+        if not missing and self.number:
+            self._steps_ms[round(1000 * (stamp_s - self._before_s))] += 1
+        self.number += missing + 1
+        self._before_s = max(stamp_s, self._before_s)
+        if self._given_hz or (self.number > 1 and stamp_s <= self.time_s):  # some files carry no stamps
+            stamp_s = max((self.number - 1) / (self._given_hz or self._own_hz), self.time_s)
+        self.time_s = stamp_s
+        return missing
+
+    def describe(self) -> str:
+        """How a varying frame rate varies, in words; "" for a constant rate, and where the times are not the file's."""
+        steps = [] if self._given_hz else sorted(self._steps_ms.elements())
+        usual = steps[len(steps) // 2] if steps else 0
+        odd = sum(abs(step - usual) > max(_REGULAR * usual, 2) for step in steps)
+        if not usual or not odd:
+            return ""
+        return (
+            f"the frame rate varies: pictures are {usual} ms apart, but {odd} times {steps[0]} to {steps[-1]} ms; all "
+            "times are the file's"
+        )
 
 
 class VideoSource(_Clip):
     """A video file, a camera's index or a stream's address. Frames are BGR, also those of grey videos.
 
     A file's rotation is applied, so size is that of the upright picture. rate_hz: the file's own, unless the caller
-    gives one. Frames that cannot be decoded leave a gap in the numbers. A clip of constant rate is numbered by its time
-    stamps, which stay true when a damaged stretch comes out short or out of order; other clips are numbered by
-    counting. Time is the file's, a live stream's is the clock's.
+    gives one. Frames that cannot be decoded leave a gap in the numbers. Time is the file's, a live stream's is the
+    clock's.
     Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
     """
 
     def __init__(self, target: str | int, name: str, rate_hz: float | None = None) -> None:
         super().__init__(name)
         self._target = target
-        self._live = _is_live(target)
+        self._live = is_live(target)
         capture = self._open()
         try:
-            own_hz = announced_hz(capture)
-            count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            own_hz, count = announced_hz(capture), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             is_counted = Path(urlsplit(str(target)).path if self._live else str(target)).suffix.lower() in _EXACT_COUNT
             decoded, first = capture.read()
+            true_hz = None if self._live or not isinstance(capture, AvCapture) else capture.measure_hz()
         finally:
             capture.release()
         if not decoded:
             raise InputError(f"the first frame of {name} cannot be decoded; the file is damaged or its codec unknown")
         self.size = (first.shape[1], first.shape[0])
+        if true_hz and (own_hz is None or abs(true_hz / own_hz - 1) > _OFF):
+            own_hz, count = true_hz, 0  # the count may be by the announced rate
         self._own_hz, self._given_hz = own_hz or 10.0, rate_hz
         self.rate_hz = rate_hz or self._own_hz
         self.count = int(count) if not self._live and 0 < count < 1e8 else None
@@ -210,6 +281,7 @@ class VideoSource(_Clip):
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
         self.problems.clear()
+        self.notes.clear()
         capture = self._open()
         try:
             if not self._live:
@@ -220,49 +292,41 @@ class VideoSource(_Clip):
         finally:
             capture.release()
 
-    def _read_file(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
-        number, lost, start_s, time_s, regular, damaged = 0, 0, 0.0, 0.0, True, False
+    def _read_file(self, capture: Capture, interval: int) -> Iterator[Frame]:
+        stamps, lost = _Stamps(self._own_hz, self._given_hz), 0
         # As many reads in a row may fail as frames are still announced, and a few where none are.
-        while lost < min(max((self.count or 0) - number, 0) + 4, _MOST_LOST):
+        while lost < min(max((self.count or 0) - stamps.number, 0) + 4, _MOST_LOST):
             if not capture.grab():
                 lost += 1
                 continue
-            damaged = damaged or lost > 0
-            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            start_s = start_s if number else stamp_s
-            stamp_s -= start_s
-            place = round(stamp_s * self._own_hz)
-            # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
-            on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR
-            regular = regular and on_rate and (damaged or place == number)
-            following = place + 1 if regular else number + lost + 1
-            lost = 0
-            if following <= number:
+            concealed = getattr(capture, "concealed", False)
+            missing, lost = stamps.add(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, lost, concealed), 0
+            self.last = number = stamps.number
+            if missing < 0:
                 self._note(number, f"after frame {number} a frame came out of order and was left out")
                 continue
-            self._note_lost(number + 1, following - 1)
-            self.last = number = following
-            if self._given_hz or (number > 1 and stamp_s <= time_s):  # some files carry no stamps
-                stamp_s = max((number - 1) / self.rate_hz, time_s)
-            time_s = stamp_s
+            self._note_lost(number - missing, number - 1)
             if not is_sampled(number, interval):
                 continue
             decoded, image = capture.retrieve()
             if not decoded:
                 self._note_lost(number, number)
-            elif self._fits(image, number):
-                yield Frame(number, time_s, image)
+            elif self._fits(image, number, f"frame {number} of {self.name}", "the first"):
+                yield Frame(number, stamps.time_s, image)
+        number = self.last
+        if words := stamps.describe():
+            self.notes.append(words)
         if self.exact and self.count and self.count > number:
             # Of the frames announced, those whose data are in the file belong to the clip.
-            self.last = max(number, min(self.count, self._stored()))
+            self.last = max(number, min(self.count, self._stored(capture)))
             self._note_lost(number + 1, self.last)
         # A count guessed from the duration means something only where the rate is constant.
-        allowed = 0 if self.exact else max(2, number // 50) if regular else number
+        allowed = 0 if self.exact else max(2, number // 50) if stamps.regular else number
         if self.count and self.count - self.last > allowed:
             what = f"the clip ends after frame {self.last} but announces {self.count}: it is cut short or damaged"
             self._note(self.last + 1, what)
 
-    def _read_live(self, capture: cv2.VideoCapture, interval: int) -> Iterator[Frame]:
+    def _read_live(self, capture: Capture, interval: int) -> Iterator[Frame]:
         number, lost, read, silent_s, start_s = 0, 0, 0, 0.0, time.monotonic()
         while lost < _MOST_LOST_LIVE:
             number += 1
@@ -278,7 +342,7 @@ class VideoSource(_Clip):
             self._note_lost(number - lost, number - 1)
             lost, self.last = 0, number
             start_s = start_s if number > 1 else time.monotonic()
-            if is_wanted and self._fits(image, number):
+            if is_wanted and self._fits(image, number, f"frame {number} of {self.name}", "the first"):
                 yield Frame(number, time.monotonic() - start_s, image)
         if silent_s > _STALLED * STALL_S:
             raise LostInputError(f"{self.name} sent nothing for {silent_s:.0f} s: it ends after frame {self.last}")
@@ -291,68 +355,46 @@ class VideoSource(_Clip):
         elif first < last:
             self._note(first, f"frames {first} to {last} could not be decoded and were left out")
 
-    def _stored(self) -> int:
-        """How many frames a file holds the data of, whether or not they can be decoded."""
+    def _stored(self, read: Capture) -> int:
+        """How many frames a file that was read to its end holds the data of, whether or not they can be decoded."""
+        if isinstance(read, AvCapture):
+            return read.stored
         capture = cv2.VideoCapture(utf8_name(str(self._target)), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
         try:
-            count = 0
-            while capture.grab():
-                count += 1
+            return sum(1 for _ in iter(capture.grab, False))
         finally:
             capture.release()
-        return count
 
-    def _open(self) -> cv2.VideoCapture:
+    def _open(self) -> Capture:
         return open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
 
-    def _fits(self, image: np.ndarray, number: int) -> bool:
-        width, height = image.shape[1], image.shape[0]
-        if (width, height) != self.size:
-            what = f"frame {number} of {self.name} is {width}x{height} but the first is {self.size[0]}x{self.size[1]}"
-            self._leave_out(number, what, "size")
-        return (width, height) == self.size
 
-
-def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | None = None) -> cv2.VideoCapture:
-    """A file, a camera's index or a stream's address through OpenCV.
-
-    limits_s: after which opening a stream, and later reading from it, fails; None: after FFmpeg's own 30 s.
-    Raises InputError: cannot be opened, is no video.
-    """
-    names = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-    limits = [n for name, limit_s in zip(names, limits_s or (), strict=False) for n in (name, int(1000 * limit_s))]
-    with quiet_opencv():
-        if isinstance(target, int):
-            capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
-        else:  # other back ends than FFmpeg take a numbered image or a text file for a video
-            capture = cv2.VideoCapture(utf8_name(target), cv2.CAP_FFMPEG, limits)
-    if not capture.isOpened():
-        live = _is_live(target)
-        what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
-        raise InputError(f"cannot open {what}; " + ("is it there?" if live else "it is damaged or no video file"))
-    if int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True) in _TEXT_AS_VIDEO:
+def frame_times(source: Source) -> dict[int, float]:
+    """The time of each frame of a video file, s, by the data that it stores; empty where nothing says it."""
+    if not isinstance(source, VideoSource) or source._live:
+        return {}
+    capture, stamps, times_s = source._open(), _Stamps(source._own_hz, source._given_hz), dict[int, float]()
+    try:
+        stored = sorted(capture.stamps_s()) if isinstance(capture, AvCapture) else []
+    finally:
         capture.release()
-        raise InputError(f"{name} is a text file, not a video")
-    return capture
+    for stamp_s in stored:
+        stamps.add(stamp_s, 0, False)
+        times_s[stamps.number] = stamps.time_s
+    return times_s
 
 
-def _is_live(target: str | int) -> bool:
-    return isinstance(target, int) or "://" in target
-
-
-def announced_hz(capture: cv2.VideoCapture) -> float | None:
-    """The rate that a video or stream announces; None where nothing credible is."""
-    return credible_hz(float(capture.get(cv2.CAP_PROP_FPS)))
-
-
-def credible_hz(rate_hz: float) -> float | None:
-    """An announced rate that can be true, else None."""
-    return rate_hz if 0 < rate_hz <= 1000 else None
+def names_file(spec: str) -> bool:
+    """Whether something in the file system has this name, although it begins like `camera:` or `sim:`."""
+    try:
+        return Path(spec).exists()
+    except (OSError, ValueError):
+        return False
 
 
 def stream_target(spec: str) -> str | int | None:
-    """What OpenCV is to open for `camera:0` or an address; None for anything else. Raises InputError."""
-    if spec.startswith("camera:"):
+    """What is to be opened for `camera:0` or an address; None for anything else. Raises InputError."""
+    if spec.startswith("camera:") and not names_file(spec):
         index = spec.removeprefix("camera:")
         if not index.isdecimal() or len(index) > 4:
             raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")

@@ -150,11 +150,16 @@ class Player:
     ) -> None:
         self._recording, self._pace, self._queue, self._log = recording, pace, queue, log
         self._health, self._clock = health, clock
-        self.size, self.seeking = recording.size, False
+        self.seeking = False
         if isinstance(recording, (VideoSource, ImageSource)):
-            recording.tolerant = True  # leave out pictures of another size
+            recording.tolerant = True  # leave out single pictures of another size
         self.apart_s = 1 / (recording.rate_hz * pace) if pace else 0.0
         self.threads = [threading.Thread(target=self._play, name="playing", daemon=True)]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the pictures; a recording may change it."""
+        return self._recording.size
 
     def begin(self) -> None:
         """Start playing."""

@@ -280,7 +280,8 @@ class Receiver:
             return False
         if self._fits(image, taken_s):
             self._found()
-            self._queue.put(Frame(log.number, taken_s - self._start_s, image, 0, taken_s))
+            # The number follows the clock; the moment at which a picture comes is less even.
+            self._queue.put(Frame(log.number, (log.number - 1) / rate_hz, image, 0, taken_s))
         return True
 
     def _found(self) -> None:

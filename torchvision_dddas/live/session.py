@@ -262,7 +262,7 @@ def build_path(
     def build_person_tracker(size: tuple[int, int]) -> PersonTracker | None:
         if scorer is None:
             return None
-        tracker = FrameTracker(shedding.settings, interval, size, pictures=False)
+        tracker = FrameTracker(shedding.settings, interval, size, pictures=False, rate_hz=source.rate_hz)
         return PersonTracker(scorer, shedding.settings, interval, size, tracker)
 
     watch, watch_size = ready.watch, source.size

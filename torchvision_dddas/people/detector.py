@@ -237,6 +237,7 @@ class PersonTracker:
             return
         motion, self._steps = chain(self._steps) if self._steps else None, []
         given = TrackedFrame(number, scene.frame, Detections(kind=KIND), Tracks(number), motion, cause=scene.cause)
+        given = replace(given, repeats=scene.repeats)
         if image.shape[1::-1] == self._size and scene.cause != UNREAD:
             start = time.perf_counter()
             self._box_px = scene.detections.box_px

@@ -151,18 +151,19 @@ class ScoreTracker:
         detections: Detections,
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
+        at: float | None = None,
     ) -> list[Tracks]:
         """Add the detections of a frame, whose number is above the last one's.
 
         now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
         appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, maybe with the
-        next frame.
+        next frame. at: its number if frames had come at a constant rate; None: they did.
         """
         counts, begins = self._doubts.apply(detections.score)
         row = np.flatnonzero(counts)
         wanted = None if self.parameters.appearance == "never" else appearance
         box, score = detections.box_px[row], detections.score[row]
-        time, self._looks = frame / self.interval, self._looks + 1
+        time, self._looks = (frame if at is None else at) / self.interval, self._looks + 1
         sample = _Sample(frame, box, score, row, begins[row], now_from_before, wanted, time, self._looks)
         if self.parameters.appearance == "always":
             sample.examine("track.appearance is always")

@@ -1,5 +1,6 @@
 """Identities of detections: the public tracker, and tracking of whole clips and tables."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -35,6 +36,9 @@ WEIGHT, LOOKED = "paper.weight", "appearance.looked"
 The latter is no parameter, but named like one in the record.
 """
 
+# How far a time stamp may lie from its place at the constant rate, in frames.
+_ROUNDED = 0.05
+
 
 class Tracker:
     """Gives detections lasting identities, one sampled frame after another.
@@ -51,6 +55,7 @@ class Tracker:
         motion: bool | None = None,
         certain: bool = False,
         backend: str = "onboard",
+        rate_hz: float | None = None,
     ) -> None:
         """interval: frames from one sampled frame to the next. size: (width, height) of the pictures, None if unknown.
 
@@ -59,6 +64,7 @@ class Tracker:
         backend: torch computes the histograms and affinities of the source's association (`track.mode = paper`) of
         some frames at once, which are then settled together; auto is torch where it sees a CUDA device. The default
         association does not use it.
+        rate_hz: frames a second, where `update` is told times.
         Raises InputError for an interval below 1, a size that is not two positive numbers, and as `wants_torch`.
         """
         if not isinstance(interval, int | np.integer) or interval < 1:
@@ -66,11 +72,12 @@ class Tracker:
         if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
             raise InputError(f"size must be (width, height) in pixels, got {size}")
         self.settings, self.interval, self.size = settings or Settings(), int(interval), size
-        self._motion, self._certain = motion, certain
+        self._motion, self._certain, self._rate_hz = motion, certain, rate_hz
         self._in_batches = self.settings.track.mode == "paper" and wants_torch(backend)
         self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None
         self._frame: int | None = None
+        self._time_s, self._at = math.nan, math.nan  # of the last frame; its number if frames came at a constant rate
         self._scores: deque[np.ndarray] = deque()  # as given, of the frames that are not settled
 
     def update(
@@ -80,13 +87,15 @@ class Tracker:
         image: np.ndarray | None = None,
         frame: int | None = None,
         interval: int | None = None,
+        time_s: float = math.nan,
     ) -> list[Tracks]:
         """Add the detections of the next sampled frame; returns the frames that are settled by it.
 
         detections: a record, (N, 4) boxes x, y, width, height in pixels, or these and (N,) scores. camera_motion:
         (3, 3) pixel homography from the frame before; None: the camera stood still, or it is unknown. image: (H, W, 3)
         uint8 BGR or (H, W) grey, where appearance shall count. frame: its number; None: the last one's plus interval,
-        from 1. interval: distance from the frame before, where that is not the usual one.
+        from 1. interval: distance from the frame before, where that is not the usual one. time_s: of the frame, where
+        frames do not follow each other at a constant rate; targets are predicted by it.
         Raises InputError for other shapes, boxes without a size, values that are not finite, and a number that is not
         above the last one's.
         """
@@ -103,7 +112,8 @@ class Tracker:
         number = expected if frame is None else frame
         if self._frame is not None and number <= self._frame:
             raise InputError(f"frame {number} follows frame {self._frame}; give the frames in order, each once")
-        self._frame = number
+        self._at = self._moment(number, time_s)
+        self._frame, self._time_s = number, time_s
         if self._tracker is None:
             settings, track = self.settings, self.settings.track
             if self._motion is None:
@@ -123,6 +133,8 @@ class Tracker:
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))
         appearance = None if image is None else self._histograms(image, detections.box_px)
+        if isinstance(self._tracker, ScoreTracker):
+            return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance, self._at))
         return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
@@ -133,6 +145,16 @@ class Tracker:
     def appearance_s(self) -> float:
         """Seconds spent on histograms, some of them for earlier frames."""
         return self._histograms_s + getattr(self._tracker, "histograms_s", 0.0)
+
+    def _moment(self, number: int, time_s: float) -> float:
+        """The number that a frame would have if frames had come at a constant rate."""
+        if self._frame is None:
+            return float(number)
+        lapse = (time_s - self._time_s) * (self._rate_hz or math.nan)
+        by_number = number - self._frame
+        # Time stamps are often rounded to milliseconds.
+        is_regular = math.isnan(lapse) or abs(lapse - by_number) <= _ROUNDED or lapse <= 0
+        return self._at + (by_number if is_regular else lapse)
 
     def _histograms(self, image: np.ndarray, box_px: np.ndarray) -> Callable[[], np.ndarray]:
         boxes = PicturedBoxes(image, box_px)
@@ -197,11 +219,14 @@ class FrameTracker:
         certain: bool = False,
         pictures: bool = True,
         backend: str = "onboard",
+        rate_hz: float | None = None,
     ) -> None:
         """As Tracker. pictures: whether settled frames keep their pictures, which are most of a long run's memory."""
         self.interval, self.pictures = interval, pictures
-        self.tracker = Tracker(settings, interval, size, motion, certain, backend)
-        self._waiting: deque[TrackedFrame] = deque()
+        self.tracker = Tracker(settings, interval, size, motion, certain, backend, rate_hz)
+        self._waiting: deque[list[TrackedFrame]] = deque()  # each with the frames that repeat it
+        self._settled: TrackedFrame | None = None  # the last one
+        self._picture = 0  # number of the frame whose picture was added last
         paper = settings.paper
         self._in_force = {  # by what an Adjustment calls it
             WEIGHT: paper.weight if paper.rule == "fixed" else 1.0,
@@ -209,16 +234,25 @@ class FrameTracker:
         }
 
     def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
-        """Add a frame, whose tracks are not known yet; yields the frames that are settled by it."""
+        """Add a frame, whose tracks are not known yet; yields the frames that are settled by it.
+
+        A frame that repeats the one added before is none to the tracker, and gets its tracks.
+        """
+        if given.repeats and given.repeats == self._picture:
+            if self._waiting:
+                self._waiting[-1].append(self._without_picture(given))
+            elif self._settled is not None:
+                yield self._copied(self._without_picture(given), self._settled)
+            return
+        self._picture = given.repeats or given.number
         frame, before, start = given.frame, self.tracker.appearance_s, time.perf_counter()
         interval = max(self.interval, frame.skipped + 1) if frame is not None and frame.skipped else None
         image = frame.image if frame is not None else None
-        settled = self.tracker.update(given.detections, given.now_from_before, image, given.number, interval)
+        time_s = math.nan if frame is None else frame.time_s
+        settled = self.tracker.update(given.detections, given.now_from_before, image, given.number, interval, time_s)
         appearance_s = self.tracker.appearance_s - before
         seconds = {"appearance": appearance_s, "track": time.perf_counter() - start - appearance_s}
-        if frame is not None and not self.pictures:
-            given = replace(given, frame=without_picture(frame))
-        self._waiting.append(replace(given, seconds=given.seconds | seconds))
+        self._waiting.append([replace(self._without_picture(given), seconds=given.seconds | seconds)])
         yield from self._settle(settled)
 
     def flush(self) -> Iterator[TrackedFrame]:
@@ -227,8 +261,22 @@ class FrameTracker:
 
     def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
         for tracks in settled:
-            given = self._waiting.popleft()
-            yield replace(given, tracks=tracks, adjustments=given.adjustments + self._changes(tracks))
+            given, *repeats = self._waiting.popleft()
+            self._settled = replace(given, tracks=tracks, adjustments=given.adjustments + self._changes(tracks))
+            yield self._settled
+            for repeat in repeats:
+                yield self._copied(repeat, self._settled)
+
+    def _without_picture(self, given: TrackedFrame) -> TrackedFrame:
+        if self.pictures or given.frame is None:
+            return given
+        return replace(given, frame=without_picture(given.frame))
+
+    @staticmethod
+    def _copied(repeat: TrackedFrame, settled: TrackedFrame) -> TrackedFrame:
+        """A frame that repeats a settled one, with the tracks of that one."""
+        tracks = replace(settled.tracks, frame=repeat.number, appearance=None)
+        return replace(repeat, detections=settled.detections, tracks=tracks)
 
     def _changes(self, tracks: Tracks) -> tuple[Adjustment, ...]:
         """What is new in how a frame used appearance."""
@@ -255,9 +303,12 @@ class SceneTracker:
         size: tuple[int, int],
         pictures: bool = True,
         backend: str = "onboard",
+        rate_hz: float | None = None,
     ) -> None:
         self._interval = interval
-        self._tracker = FrameTracker(settings, interval, size, motion=True, pictures=pictures, backend=backend)
+        self._tracker = FrameTracker(
+            settings, interval, size, True, pictures=pictures, backend=backend, rate_hz=rate_hz
+        )
         self._steps: list[np.ndarray] = []
         self._adjustments: tuple[Adjustment, ...] = ()
         self._seconds: dict[str, float] = {}
@@ -273,7 +324,8 @@ class SceneTracker:
         number = scene.frame.number
         if not is_sampled(number, self._interval):
             return
-        given = TrackedFrame(number, scene.frame, scene.detections, Tracks(number), cause=scene.cause)
+        tracks = Tracks(number)
+        given = TrackedFrame(number, scene.frame, scene.detections, tracks, cause=scene.cause, repeats=scene.repeats)
         motion = chain(self._steps) if self._steps else None
         given = replace(given, now_from_before=motion, adjustments=self._adjustments, seconds=self._seconds)
         self._steps, self._adjustments, self._seconds = [], (), {}
@@ -291,9 +343,10 @@ def track_scenes(
     size: tuple[int, int],
     pictures: bool = True,
     backend: str = "onboard",
+    rate_hz: float | None = None,
 ) -> Iterator[TrackedFrame]:
-    """Identities of a clip's own detections, as by `SceneTracker`. backend: as for `Tracker`."""
-    tracker = SceneTracker(settings, interval, size, pictures, backend)
+    """Identities of a clip's own detections, as by `SceneTracker`. backend, rate_hz: as for `Tracker`."""
+    tracker = SceneTracker(settings, interval, size, pictures, backend, rate_hz)
     for scene in scenes:
         yield from tracker.update(scene)
     yield from tracker.flush()
@@ -309,8 +362,9 @@ class _TableTracker(FrameTracker):
         interval: int,
         size: tuple[float, float] | None,
         backend: str = "onboard",
+        rate_hz: float | None = None,
     ) -> None:
-        super().__init__(settings, interval, size, motion=table.own, certain=table.certain, backend=backend)
+        super().__init__(settings, interval, size, table.own, table.certain, backend=backend, rate_hz=rate_hz)
         self.table = table
 
     def add(
@@ -341,7 +395,9 @@ def track_clip(
     The camera's motion is estimated from one picture to the next that can be read. Frames that cannot be read, or lie
     after the clip's end, are tracked without picture. backend: as for `Tracker`.
     """
-    tracker, camera, number = _TableTracker(table, settings, interval, source.size, backend), CameraMotion(engine), 1
+    rate_hz = getattr(source, "rate_hz", None)
+    tracker = _TableTracker(table, settings, interval, source.size, backend, rate_hz)
+    camera, number = CameraMotion(engine), 1
     unread = "the frame could not be read"
     start = time.perf_counter()
     for frame in source.every(interval):

@@ -1,0 +1,215 @@
+"""Open videos, streams and cameras: through PyAV where it is installed, else, and for cameras, through OpenCV."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from typing import Any, Protocol, cast
+
+# FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.atomic_files import utf8_name
+from torchvision_dddas.io.images import quiet_opencv
+
+# FFmpeg draws any text file as an old terminal would, which is never wanted.
+_TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
+# A stream is the cover of the file if it is marked so (attached picture, thumbnails, still image), or if it holds one
+# picture in one of these codecs.
+_COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
+# FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
+_OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
+
+# Pictures by whose time stamps a rate is measured, and how few do not suffice.
+_MEASURED, _LEAST_MEASURED = 64, 8
+
+
+class Capture(Protocol):
+    """The calls of cv2.VideoCapture that reading needs."""
+
+    def grab(self) -> bool: ...  # noqa: D102
+    def retrieve(self) -> tuple[bool, Any]: ...  # noqa: D102
+    def read(self) -> tuple[bool, Any]: ...  # noqa: D102
+    def get(self, propId: int, /) -> float: ...  # noqa: D102
+    def release(self) -> None: ...  # noqa: D102
+
+
+def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | None = None) -> Capture:
+    """A file, a camera's index or a stream's address.
+
+    limits_s: after which opening a stream, and later reading from it, fails. Without PyAV an address is refused: OpenCV
+    (4.14) squeezes pictures of another size to the size of the first one and says nothing (OpenCV issue 27116).
+    Raises InputError: cannot be opened, is no video.
+    """
+    if isinstance(target, str):
+        try:
+            return AvCapture(target, name, limits_s)
+        except ImportError:
+            if is_live(target):
+                raise InputError(f"{name} needs PyAV: pip install 'torchvision-dddas[video]'") from None
+    return open_by_opencv(target, name)
+
+
+def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
+    """As open_capture, for a camera's index, and for a file without PyAV."""
+    with quiet_opencv():
+        if isinstance(target, int):
+            capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
+        else:  # other back ends than FFmpeg take a numbered image or a text file for a video
+            capture = cv2.VideoCapture(utf8_name(target), cv2.CAP_FFMPEG)
+    if not capture.isOpened():
+        raise InputError(_refusal(target, name))
+    code = int(capture.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little", signed=True)
+    if code.decode("latin-1") in _TEXT_AS_VIDEO:
+        capture.release()
+        raise InputError(f"{name} is a text file, not a video")
+    return capture
+
+
+class AvCapture:
+    """A file or stream through PyAV; arguments and errors of `open_capture`. Pixels are those that OpenCV gives.
+
+    A picture has the size that it was sent with. Of several streams of pictures the first that is no cover is read.
+    concealed: whether the decoder concealed errors in the picture grabbed last, or got damaged data for it.
+    stored: how many pictures the data read so far hold, whether or not they can be decoded.
+    Raises ImportError where PyAV is not installed.
+    """
+
+    def __init__(self, target: str, name: str, limits_s: tuple[float, float] | None = None) -> None:
+        import av
+        from av.video.reformatter import VideoReformatter
+
+        self._limit_s = float("inf") if limits_s is None else limits_s[1]
+        self._failures = (av.FFmpegError, OSError)
+        try:
+            where, open_any = target if is_live(target) else utf8_name(target), cast(Any, av.open)
+            known = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
+            self._container = open_any(where, options=_read_options(), timeout=limits_s, **known)
+        except (*self._failures, ValueError):
+            raise InputError(_refusal(target, name)) from None
+        videos = [video for video in self._container.streams.video if video.codec_context is not None]
+        films = [video for video in videos if not _is_cover(video)] or videos
+        if not films or films[0].codec_context.name in _TEXT_AS_VIDEO:
+            self._container.close()
+            raise InputError(f"{name} is {'a text file, not' if films else 'no'} video")
+        self._video, self._reformatter = films[0], cast(Any, VideoReformatter())
+        self._tick_s = float(self._video.time_base or 0)
+        # H.264 conceals errors, and says so, only if its slices are not decoded in parallel. Frames in parallel come
+        # late, which only matters for what is live.
+        if limits_s is None:
+            self._video.thread_type, self._video.codec_context.thread_count = "FRAME", cv2.getNumberOfCPUs()
+        elif self._video.codec_context.name == "h264":
+            self._video.codec_context.thread_count = 1
+        # Until a larger block was freed, glibc maps the memory of each picture anew, which takes 2 ms at 1080p.
+        np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
+        self._packets: Iterator[Any] = self._container.demux(self._video)
+        self._waiting: list[Any] = []  # frames of the packet read last
+        self._spoiled: set[int | None] = set()  # time stamps of damaged packets
+        self._frame: Any = None
+        self.concealed, self.stored = False, 0
+
+    def grab(self) -> bool:
+        """Wait for the next picture; False: none came, or it cannot be decoded."""
+        self._frame, until_s = None, time.monotonic() + self._limit_s
+        while not self._waiting:
+            if time.monotonic() > until_s:  # packets come, and no picture of them
+                return False
+            try:
+                packet = next(self._packets)
+            except StopIteration:
+                return False
+            except self._failures:
+                self._packets = self._container.demux(self._video)  # a generator that raised has ended
+                return False
+            self.stored += packet.size > 0
+            if packet.is_corrupt:
+                self._spoiled.add(packet.pts)
+            try:
+                self._waiting = packet.decode()
+            except self._failures:  # a damaged packet: of a file one picture is lost, a stream goes on
+                if self._limit_s == float("inf"):
+                    return False
+        self._frame = self._waiting.pop(0)
+        self.concealed = bool(self._frame.is_corrupt) or self._frame.pts in self._spoiled
+        self._spoiled.discard(self._frame.pts)
+        return True
+
+    def retrieve(self) -> tuple[bool, np.ndarray | None]:
+        """The picture grabbed last, upright, uint8 (H, W, 3) BGR; False and None where it cannot be decoded."""
+        if self._frame is None:
+            return False, None
+        with suppress(*self._failures, ValueError):
+            frame = self._reformatter.reformat(self._frame, format="bgr24", interpolation="BICUBIC")
+            plane, turns = frame.planes[0], round(self._frame.rotation / 90) % 4
+            # Not frame.to_ndarray, which copies: the array keeps the plane.
+            rows = np.frombuffer(plane, np.uint8).reshape(frame.height, plane.line_size)
+            image = rows[:, : 3 * frame.width].reshape(frame.height, frame.width, 3)
+            return True, np.ascontiguousarray(np.rot90(image, turns))
+        return False, None
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        """Grab and retrieve."""
+        return self.retrieve() if self.grab() else (False, None)
+
+    def get(self, propId: int, /) -> float:
+        """The time stamp of the picture grabbed last, the announced rate or number of pictures, as OpenCV has them."""
+        video, frame = self._video, self._frame
+        rate_hz = float(video.guessed_rate or video.average_rate or 0)
+        if propId == cv2.CAP_PROP_FPS:
+            return rate_hz
+        if propId == cv2.CAP_PROP_FRAME_COUNT:
+            return float(video.frames or int((self._container.duration or 0) / 1e6 * rate_hz + 0.5))
+        stamp = None if frame is None else frame.dts if frame.pts is None else frame.pts
+        return 0.0 if stamp is None else 1000 * self._tick_s * stamp
+
+    def stamps_s(self, most: int | None = None) -> list[float]:
+        """Time stamps of the next pictures, at most so many, as they are stored. The pictures are not read."""
+        packets, stamps = islice(self._packets, most), list[float]()
+        with suppress(*self._failures):
+            stamps.extend(self._tick_s * packet.pts for packet in packets if packet.pts is not None)
+        return stamps
+
+    def measure_hz(self) -> float | None:
+        """The usual rate of the next pictures by their time stamps, None where unknown. They are not read."""
+        steps_s = np.diff(np.unique(self.stamps_s(_MEASURED)))
+        if len(steps_s) < _LEAST_MEASURED:
+            return None
+        usual_s = np.median(steps_s)  # the mean of those near it, because stamps may be rounded to milliseconds
+        step_s = float(steps_s[abs(steps_s - usual_s) <= 0.25 * usual_s].mean())
+        return 1 / step_s if 0.001 <= step_s <= 100 else None
+
+    def release(self) -> None:
+        """Let go of the file or the connection."""
+        self._container.close()
+
+
+def is_live(target: str | int) -> bool:
+    """Whether a target is a camera's index or an address."""
+    return isinstance(target, int) or "://" in target
+
+
+def announced_hz(capture: Capture) -> float | None:
+    """The rate that a video or stream announces; None where nothing credible is."""
+    rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+    return rate_hz if 0 < rate_hz <= 1000 else None
+
+
+def _is_cover(video: Any) -> bool:
+    is_marked = int(getattr(video, "disposition", 0)) & _COVER_MARKS
+    return bool(is_marked) or (video.codec_context.name in _COVER_CODECS and video.frames <= 1)
+
+
+def _refusal(target: str | int, name: str) -> str:
+    live = is_live(target)
+    what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
+    return f"cannot open {what}; " + ("is it there?" if live else "it is damaged or no video file")
+
+
+def _read_options() -> dict[str, str]:
+    pairs = (text.split(";", 1) for text in os.environ.get(_OPTIONS, _DEFAULT_OPTIONS).split("|"))
+    return {pair[0]: pair[1] for pair in pairs if len(pair) == 2}
