@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import Adjustment, Detections, Positions, Telemetry, Tracks
+from torchvision_dddas.types import Adjustment, Detections, Positions, Telemetry, Tracks, as_picture, share_orders
 
 CORNERS = np.array([[10.0, 20, 40, 80], [0, 0, 5, 5]])
 
@@ -75,7 +76,9 @@ def test_classes_of_wrong_shapes_are_refused(classes, message):
 def test_arrays_of_several_columns_are_split_by_name():
     tracks = Tracks(3, np.array([7]), np.array([[1.0, 2, 3, 4]]), np.array([0.5]), np.array([0]))
     columns = tracks.to_columns()
-    assert list(columns) == ["identity", "x_px", "y_px", "width_px", "height_px", "score", "row", "link"]
+    box = ["x_px", "y_px", "width_px", "height_px"]
+    assert list(columns) == ["frame", "identity", *box, "score", "row", "link", "class", "class_id"]
+    assert columns["frame"].tolist() == [3]
     assert columns["width_px"].tolist() == [3] and tracks.id.tolist() == [7] and tracks.xyxy.tolist() == [[1, 2, 4, 6]]
     assert {"east_m", "north_m", "var_north_m2"} <= set(Positions().to_columns())
 
@@ -114,3 +117,144 @@ def test_a_table_becomes_a_pandas_frame_of_its_columns(monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(InputError, match="to_pandas needs pandas: pip install pandas"):
         tracks.to_pandas()
+
+
+# -- The results of other libraries ------------------------------------------------------------------------------------
+
+
+class Tensor:
+    """What this package needs of a tensor on a device: ultralytics and torchvision give such."""
+
+    def __init__(self, values):
+        self.values = np.asarray(values)
+
+    def detach(self):
+        return self
+
+    def cpu(self):
+        return self
+
+    def numpy(self):
+        return self.values
+
+
+BOXES = SimpleNamespace(
+    xyxy=Tensor(CORNERS), conf=Tensor([0.5, 0.9]), cls=Tensor([2.0, 0.0]), id=None, data=Tensor(np.zeros((2, 6)))
+)
+
+
+@pytest.mark.parametrize(
+    ("given", "label", "number"),
+    [
+        (BOXES, ["2", "0"], [2, 0]),
+        (SimpleNamespace(boxes=BOXES, names={0: "person", 2: "car"}), ["car", "person"], [2, 0]),
+        ({"boxes": Tensor(CORNERS), "scores": Tensor([0.5, 0.9]), "labels": Tensor([2, 0])}, ["2", "0"], [2, 0]),
+        ({"boxes": CORNERS, "scores": [0.5, 0.9], "labels": ["car", "person"]}, ["car", "person"], [-1, -1]),
+        (SimpleNamespace(bboxes=CORNERS, scores=[0.5, 0.9], labels=[2, -1]), ["2", ""], [2, -1]),
+    ],
+    ids=["Boxes", "Results", "torchvision", "words", "InstanceData"],
+)
+def test_results_of_other_libraries_keep_their_scores_and_classes(given, label, number):
+    found = Detections.from_supervision(given)
+    assert (found.xyxy == CORNERS).all() and found.score.tolist() == [0.5, 0.9]
+    assert (found.label.tolist(), found.class_id.tolist()) == (label, number)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (SimpleNamespace(xyxy=CORNERS), "SimpleNamespace without confidence"),
+        ([BOXES], "list without xyxy"),
+        (CORNERS, "ndarray without xyxy"),
+        (SimpleNamespace(xyxy=CORNERS, confidence=[50.0, 90.0]), "got 50 to 90; divide percent by 100"),
+        (SimpleNamespace(xyxy=CORNERS, confidence=[0.5, np.nan]), "must be finite"),
+        (SimpleNamespace(xyxy=CORNERS / 100, confidence=[0.5, 0.9]), "multiply them by its width and height"),
+    ],
+)
+def test_what_would_be_misread_is_refused_in_one_line(given, words):
+    with pytest.raises(InputError) as error:
+        Detections.from_supervision(given)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_arrays_of_other_lengths_are_no_record():
+    for columns in ({"score": np.ones(3)}, {"score": np.ones(2), "label": np.array(["car"], object)}):
+        with pytest.raises(InputError, match="of Detections must have 2 rows, got"):
+            Detections(CORNERS, **columns)
+
+
+@pytest.mark.parametrize(
+    ("box", "orders"),
+    [
+        ([[0.19, 0.19, 0.06, 0.17]], ["yolo", "xywh"]),
+        ([[0.9, 0.9, 0.1, 0.1]], ["yolo", "xywh"]),
+        ([[0.1, 0.1, 0.3, 0.5]], ["xyxy", "xywh"]),
+        ([[0.7, 0.8, 0.9, 0.9]], ["xyxy"]),
+        ([[1, 1, 1, 1]], []),
+        ([[0.5, 0.5, 1.0, 20]], []),
+        (np.zeros((0, 4)), []),
+    ],
+)
+def test_shares_of_a_picture_tell_the_orders_in_which_they_lie_inside(box, orders):
+    assert share_orders(np.array(box)) == orders
+
+
+def test_tracks_go_to_supervision_and_pandas_with_frame_and_class(monkeypatch):
+    monkeypatch.setitem(sys.modules, "supervision", SimpleNamespace(Detections=SimpleNamespace))
+    named: Any = {"label": np.array(["car", ""], object), "class_id": np.array([2, -1])}
+    tracks = Tracks(7, np.array([1, 5]), CORNERS, np.ones(2), np.arange(2), **named)
+    given = tracks.to_supervision()
+    assert given.tracker_id.tolist() == [1, 5] and given.class_id.tolist() == [2, -1]
+    assert given.data["class_name"].tolist() == ["car", ""]
+    # Its annotators colour by class: without one, they need a number all the same.
+    assert Tracks(7, np.array([1]), CORNERS[:1], np.ones(1), np.zeros(1, int)).to_supervision().class_id.tolist() == [0]
+    joined = Tracks.concat([tracks, Tracks(9, np.array([5]), CORNERS[:1], np.ones(1), np.zeros(1, int))])
+    columns = joined[1:].to_columns()
+    assert (columns["frame"].tolist(), columns["class"].tolist(), columns["class_id"].tolist()) == (
+        *([7, 9], ["", ""], [-1, -1]),
+    )
+
+
+# -- Arguments ---------------------------------------------------------------------------------------------------------
+
+GREY = np.tile(np.arange(250, dtype=np.uint8), (180, 1))
+COLOUR = np.dstack([GREY] * 3)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        COLOUR / 255.0,
+        GREY.astype(np.float32),
+        GREY.astype(np.int64),
+        GREY.astype(np.uint16) * 5 + 29315,
+        GREY > 100,
+        np.moveaxis(COLOUR, -1, 0),
+        np.moveaxis(COLOUR, -1, 0)[None] / 255.0,
+        np.dstack([COLOUR, GREY]),
+        GREY[None],
+        COLOUR[None],
+        Tensor(np.moveaxis(COLOUR, -1, 0) / 255.0),
+        np.where(GREY > 200, np.nan, GREY / 255),
+    ],
+    ids=["float", "levels", "int64", "uint16", "bool", "CHW", "NCHW", "BGRA", "1HW", "NHWC", "tensor", "NaN"],
+)
+def test_a_picture_of_another_kind_is_refused_with_the_code_that_converts_it(given):
+    with pytest.raises(InputError, match=r"frame must be uint8 of shape \(H, W\) or \(H, W, 3\), got ") as error:
+        as_picture(given)
+    code = str(error.value).partition("convert it: ")[2]
+    made = as_picture(eval(code, {"frame": given, "np": np}))
+    assert made.shape[:2] == GREY.shape and made.max() >= 200
+
+
+def test_a_single_channel_is_dropped_and_what_no_code_converts_is_named():
+    assert as_picture(GREY[..., None]).shape == GREY.shape and as_picture(COLOUR) is COLOUR
+    for given, words in ((None, "is None; could its file be read?"), ("a.png", "got str"), ([[1]], "got list")):
+        with pytest.raises(InputError, match=words):
+            as_picture(given)
+
+
+def test_the_name_of_a_configuration_is_no_settings():
+    assert check_settings(None) == Settings()
+    with pytest.raises(InputError, match=r"type Settings, got str: td\.load_settings\('fast'\) makes them"):
+        check_settings("fast")

@@ -513,7 +513,9 @@ class AerialParameters(Group):
     mode: Literal["pose", "homography", "paper"] = parameter(
         "pose", "pose: from landmarks and telemetry; homography: landmarks only; paper: as printed, in degrees"
     )
-    hfov_deg: float = parameter(70.0, "horizontal field of view where camera and telemetry give none", "deg", 1, 170)
+    hfov_deg: float = parameter(
+        70.0, "field of view where camera and telemetry give none; of the longer side unless set", "deg", 1, 170
+    )
     pitch_deg: float = parameter(
         90.0, "angle of the optical axis below the horizon if neither gives it; 90 is straight down", "deg", -90, 90
     )
@@ -609,6 +611,18 @@ class LiveParameters(Group):
         return self
 
 
+class LevelParameters(Group):
+    """How pictures of 16 bits, as those of thermal cameras, become pictures of 8 bits."""
+
+    black: int = parameter(0, "value that becomes black; both 0: black and white follow the clip", "counts", 0, 65535)
+    white: int = parameter(0, "value that becomes white", "counts", 0, 65535)
+
+    @property
+    def given(self) -> tuple[int, int] | None:
+        """Black and white as `open_video` takes them; None where the clip gives them."""
+        return (self.black, self.white) if self.white else None
+
+
 class Settings(Group):
     """All parameters, by group."""
 
@@ -631,6 +645,7 @@ class Settings(Group):
     crowds: CrowdParameters = CrowdParameters()
     steering: SteeringParameters = SteeringParameters()
     live: LiveParameters = LiveParameters()
+    levels: LevelParameters = LevelParameters()
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -740,6 +755,14 @@ def with_parameters(settings: Settings, values: Mapping[str, object], origin: st
         return Settings.model_validate(content)
     except ValidationError as error:
         raise InputError(before + _explain(error, fields)) from None
+
+
+def check_settings(settings: Any) -> Settings:
+    """The settings that a class was given, the defaults for None. Raises InputError for anything else."""
+    if settings is not None and not isinstance(settings, Settings):
+        made = f": td.load_settings({settings!r}) makes them" if isinstance(settings, str | Path) else ""
+        raise InputError(f"settings must be of type Settings, got {type(settings).__name__}{made}")
+    return settings or Settings()
 
 
 def config_names() -> list[str]:

@@ -40,6 +40,7 @@ from torchvision_dddas.types import (
     Scene,
     Telemetry,
     TrackedFrame,
+    as_picture,
 )
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ class Pipeline:
         """
         if isinstance(source, str | Path):
             # The front door lies above this module; it is asked for only here.
-            source = import_module("torchvision_dddas").open_video(str(source))
+            source = import_module("torchvision_dddas").open_video(str(source), full_scale=self.settings.levels.given)
         if not hasattr(source, "__iter__"):
             raise InputError(f"a pipeline wants a path or frames, got {type(source).__name__}")
         self._detector = None
@@ -171,9 +172,7 @@ class Pipeline:
     def update(self, frame: Frame | np.ndarray) -> list[FrameResult]:
         """Take one frame; returns the results that are settled by it. Raises InputError for anything but a picture."""
         if self._detector is None:
-            image = frame.image if isinstance(frame, Frame) else frame
-            if not isinstance(image, np.ndarray) or image.ndim < 2:
-                raise InputError(f"a frame must be a Frame or a NumPy image, got {type(frame).__name__}")
+            image = as_picture(frame.image if isinstance(frame, Frame) else frame)
             engine = self._begin((image.shape[1], image.shape[0]), self.rate_hz)
             self._detector = MotionDetector(self.settings, engine, self.rate_hz, self.telemetry)
         return [result for scene in self._detector.update(frame) for result in self._take(scene)]
@@ -267,7 +266,7 @@ def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Setti
     Returns settings and notes.
     """
     telemetry, camera = locator.site.telemetry, locator.camera
-    settings, notes = with_logged_focal(settings, telemetry, camera.size_px[0])
+    settings, notes = with_logged_focal(settings, telemetry, camera.size_px)
     if notes or telemetry is None or is_set(settings, "gates.focal_px"):
         return settings, notes
     focal = camera.focal_px[0]

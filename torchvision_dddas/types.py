@@ -1,7 +1,7 @@
 """The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, overload
@@ -32,18 +32,26 @@ class Table:
 
     @classmethod
     def concat(cls, tables: Sequence[Self]) -> Self:
-        """All rows in one table; fields that are not arrays come from the first."""
+        """All rows in one table; other fields come from the first, but the frames of rows become an array."""
         columns = [_columns(table) for table in tables]
+        for table, column in zip(tables, columns, strict=True):
+            if hasattr(table, "frame"):
+                column["frame"] = np.broadcast_to(table.frame, len(table))  # type: ignore[arg-type]
         joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
     def to_columns(self) -> dict[str, np.ndarray]:
-        """Arrays (N,) by column name; wider arrays are split: box_px into x_px, y_px, width_px, height_px."""
+        """Arrays (N,) by column name; wider arrays are split: box_px into x_px, y_px, width_px, height_px.
+
+        The frame is a column, and `label` is called `class`, as in the tables of runs.
+        """
         columns: dict[str, np.ndarray] = {}
+        if hasattr(self, "frame"):
+            columns["frame"] = np.broadcast_to(self.frame, len(self))  # type: ignore[arg-type]
         for name, values in _columns(self).items():
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-            names = _SPLIT.get(name, tuple(f"{name}_{k}" for k in range(flat.shape[1])))
-            columns |= {name: values} if values.ndim == 1 else dict(zip(names, flat.T, strict=True))
+            many = (name,) if values.ndim == 1 else tuple(f"{name}_{k}" for k in range(flat.shape[1]))
+            columns |= dict(zip(_SPLIT.get(name, many), flat.T, strict=True))
         return columns
 
     def to_pandas(self) -> Any:
@@ -55,8 +63,9 @@ class Table:
         return pandas.DataFrame(self.to_columns())
 
 
-# Names of the columns of arrays that have several.
+# Names of the columns of arrays that have several, or another name than a table's column.
 _SPLIT = {
+    "label": ("class",),
     "box_px": ("x_px", "y_px", "width_px", "height_px"),
     "window_px": ("window_x_px", "window_y_px", "window_width_px", "window_height_px"),
     "middle_px": ("middle_u_px", "middle_v_px"),
@@ -68,10 +77,12 @@ _SPLIT = {
 
 
 class Boxes(Table):
-    """A table with boxes, box_px (N, 4), and scores."""
+    """A table with boxes, box_px (N, 4), scores, and classes: names and numbers."""
 
     box_px: np.ndarray
     score: np.ndarray
+    label: np.ndarray
+    class_id: np.ndarray
 
     @property
     def xyxy(self) -> np.ndarray:
@@ -79,19 +90,35 @@ class Boxes(Table):
         return np.concatenate([self.box_px[:, :2], self.box_px[:, :2] + self.box_px[:, 2:]], axis=1)
 
     def to_supervision(self) -> Any:
-        """A supervision.Detections of the boxes. Raises InputError where supervision is not installed."""
+        """A supervision.Detections of the boxes, as its annotators draw it; class_id is 0 if no class is known.
+
+        Raises InputError where supervision is not installed.
+        """
         try:
             import supervision
         except ImportError:
             raise InputError("to_supervision needs supervision: pip install supervision") from None
-        identity, label = getattr(self, "identity", None), getattr(self, "label", None)
-        data = {"class_name": label.astype(str)} if label is not None and any(label.tolist()) else {}
-        return supervision.Detections(xyxy=self.xyxy, confidence=self.score, tracker_id=identity, data=data)
+        data = {"class_name": self.label.astype(str)} if any(self.label.tolist()) else {}
+        number = self.class_id if (self.class_id >= 0).any() else np.zeros_like(self.class_id)
+        identity = getattr(self, "identity", None)
+        return supervision.Detections(
+            xyxy=self.xyxy, confidence=self.score, class_id=number, tracker_id=identity, data=data
+        )
 
 
 def _columns(table: Any) -> dict[str, np.ndarray]:
     values = {column.name: getattr(table, column.name) for column in fields(table)}
     return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def _complete(table: Any, count: int, **unknown: Any) -> None:
+    """Fill the arrays that were not given with what is unknown. Raises InputError for arrays of other lengths."""
+    for name, values in _columns(table).items():
+        if len(values) == 0 < count and name in unknown:
+            filled = np.full((count, *values.shape[1:]), unknown[name], values.dtype)
+            object.__setattr__(table, name, filled)
+        elif len(values) not in (0, count):
+            raise InputError(f"{name} of {type(table).__name__} must have {count} rows, got {len(values)}")
 
 
 @dataclass(frozen=True)
@@ -108,6 +135,45 @@ class Frame:
     image: np.ndarray
     skipped: int = 0
     taken_s: float = float("nan")
+
+
+def as_picture(image: Any, name: str = "frame") -> np.ndarray:
+    """A picture as every part of the program takes it: uint8, (H, W) or (H, W, 3) BGR; (H, W, 1) becomes (H, W).
+
+    Raises InputError for anything else, with the code that converts it, where `frame` is what was given.
+    """
+    if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size:
+        if image.ndim == 2 or image.shape[2:] == (3,):
+            return image
+        if image.shape[2:] == (1,):
+            return image[..., 0]
+    if image is None:  # what OpenCV gives for a file that it cannot read
+        raise InputError(f"{name} is None; could its file be read? Wanted a NumPy image")
+    code, kind = "frame", type(image).__name__
+    if hasattr(image, "detach"):  # a tensor
+        image, code = image.detach().cpu().numpy(), "frame.detach().cpu().numpy()"
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{name} must be a Frame or a NumPy image, got {kind}; np.asarray or cv2.imread makes one")
+    what, shape = f"{image.dtype} of shape {image.shape}", image.shape
+    if not image.size or image.ndim not in (2, 3, 4) or image.dtype.kind not in "iufb":
+        raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}")
+    if image.ndim == 4:
+        code, shape = f"{code}[0]", shape[1:]
+    if len(shape) == 3 and shape[0] in (1, 3, 4) and shape[2] > 4:
+        code, shape = f"np.moveaxis({code}, 0, -1)", (*shape[1:], shape[0])
+        code += "[..., ::-1]" if shape[2] == 3 else ""  # colours are RGB there
+    if len(shape) == 3 and shape[2] == 4:
+        code = f"{code}[..., :3]"
+    values = np.nan_to_num(image)
+    low, high = float(values.min()), float(values.max())
+    if image.dtype.kind in "fb" and low >= 0 and high <= 1:
+        code = f"(np.nan_to_num({code}) * 255.0).round().astype(np.uint8)"
+    elif image.dtype != np.uint8 and low >= 0 and high <= 255:
+        code = f"np.nan_to_num({code}).round().astype(np.uint8)"
+    elif image.dtype != np.uint8:  # one range for the whole clip, or it flickers
+        gain = 255 / (high - low or 1)
+        code = f"((np.clip({code}, {low:.0f}, {high:.0f}) - {low:.0f}) * {gain:.6g}).astype(np.uint8)"
+    raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}; convert it: {code}")
 
 
 @dataclass(frozen=True)
@@ -173,6 +239,7 @@ class Telemetry:
     of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
     heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
+    is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
     Raises InputError for columns of other lengths and times that decrease.
     """
@@ -194,6 +261,7 @@ class Telemetry:
     above_ellipsoid_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
     height_zero: Literal["ground", "takeoff", "unknown"] = "ground"
     heading_from: str = ""
+    is_nominal: bool = False
     start_utc_s: float = float("nan")
     origin: str = ""
     notes: tuple[str, ...] = ()
@@ -213,6 +281,10 @@ class Telemetry:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def focal_px(self, size: tuple[int, int]) -> np.ndarray:
+        """(N,) focal length in pixels by the field of view, NaN where unknown. size: (width, height) of pictures."""
+        return (max(size) if self.is_nominal else size[0]) / 2 / np.tan(self.hfov_rad / 2)
 
     def at(self, time_s: float, tolerance_s: float = 1.0) -> "Flight | None":
         """The state at a time by linear interpolation, angles and longitudes the short way round.
@@ -346,8 +418,8 @@ class Detections(Boxes):
     box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
-    middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. Other unknown
-    values are NaN.
+    middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. class_id: (N,)
+    int64, its number, -1 if unknown. Other unknown values are NaN. Raises InputError for arrays of other lengths.
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -357,46 +429,114 @@ class Detections(Boxes):
     speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
     kind: str = "moving"
     middle_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    # Of objects, because one long word would widen each row of an array of characters.
     label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
-        if len(self.middle_px) == 0 < len(self.box_px):
-            object.__setattr__(self, "middle_px", np.full((len(self.box_px), 2), np.nan))
-        if len(self.label) == 0 < len(self.box_px):
-            # Of objects, because one long word would widen each row of an array of characters.
-            object.__setattr__(self, "label", np.full(len(self.box_px), "", object))
+        nan = np.nan
+        unknown = {"area_px": nan, "heading_rad": nan, "speed_px": nan, "middle_px": nan, "label": "", "class_id": -1}
+        _complete(self, len(self.box_px), **unknown)
 
     def __len__(self) -> int:
         return len(self.box_px)
 
     @classmethod
     def from_supervision(cls, detections: Any) -> Self:
-        """Detections of another detector: an object with `xyxy` (N, 4) and `confidence` (N,) or None, in pixels.
+        """Detections of another detector, in pixels: of supervision, ultralytics (Results, Boxes), torchvision, ...
 
-        Classes are those of `data["class_name"]` (N,), else of `class_id` (N,), else unknown.
-        Raises InputError for other shapes and for boxes without width or height.
+        detections: an object or a mapping that has a name of each line of _FOREIGN, arrays or tensors. Scores that are
+        None count as 1. Classes are those of `data["class_name"]` (N,), else what `names` calls the numbers.
+        Raises InputError where boxes or scores are missing, have other shapes, or are not what `check_boxes` wants.
         """
-        corners = np.asarray(getattr(detections, "xyxy", None), np.float64)
+        given, names = detections, getattr(detections, "names", {})
+        if hasattr(getattr(given, "boxes", None), "xyxy"):  # ultralytics' Results
+            given = given.boxes
+        (edges, xyxy), (conf, confidence), (_, number) = (_first_of(given, line) for line in _FOREIGN)
+        if not edges or not conf:
+            raise InputError(
+                f"from_supervision got {type(detections).__name__} without {_FOREIGN[bool(edges)][0]}; wanted the "
+                "result for one picture, or Tracker.update((boxes, scores)) with boxes x, y, width, height"
+            )
+        corners = np.asarray(xyxy, np.float64)
         if corners.ndim != 2 or corners.shape[1] != 4:
-            raise InputError(f"detections.xyxy must have the shape (N, 4), got {corners.shape}")
+            raise InputError(f"detections.{edges} must have the shape (N, 4), got {corners.shape}")
         box_px = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
         if not (np.isfinite(box_px).all() and (box_px[:, 2:] > 0).all()):
             raise InputError(
-                "detections.xyxy must hold finite left, top, right and bottom edges, right of left, below top"
+                f"detections.{edges} must hold finite left, top, right and bottom edges, right of left, below top"
             )
-        confidence = getattr(detections, "confidence", None)
-        score = np.ones(len(box_px)) if confidence is None else np.asarray(confidence, np.float64)
-        if score.shape != (len(box_px),):
-            raise InputError(f"detections.confidence must have the shape ({len(box_px)},), got {score.shape}")
-        name, classes = "data['class_name']", (getattr(detections, "data", None) or {}).get("class_name")
-        if classes is None:
-            name, classes = "class_id", getattr(detections, "class_id", None)
-        label = np.asarray([""] * len(box_px) if classes is None else classes, object)
-        if label.shape != (len(box_px),):
-            raise InputError(f"detections.{name} must have the shape ({len(box_px)},), got {label.shape}")
-        words = np.array(["" if one is None else str(one) for one in label], object)
-        unknown = np.full(len(box_px), np.nan)
-        return cls(box_px, score, box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given", label=words)
+        count, data = len(box_px), getattr(given, "data", None)
+        named = data.get("class_name") if isinstance(data, Mapping) else None
+        found = {
+            conf: np.ones(count) if confidence is None else np.asarray(confidence, np.float64),
+            "class_id": np.full(count, -1) if number is None else np.asarray(number),
+            "data['class_name']": np.full(count, None, object) if named is None else np.asarray(named, object),
+        }
+        for name, values in found.items():
+            if values.shape != (count,):
+                raise InputError(f"detections.{name} must have the shape ({count},), got {values.shape}")
+        score, number, words = found.values()
+        if number.dtype.kind not in "iuf":  # classes by their names
+            number, words = np.full(count, -1), number
+        check_boxes(box_px, score, certain=False)
+        label = np.array(["" if word is None else str(word) for word in words], object)
+        if named is None and (number >= 0).any():
+            label = np.array([names.get(int(k), str(int(k))) if k >= 0 else "" for k in number], object)
+        area_px = box_px[:, 2] * box_px[:, 3]
+        return cls(box_px, score, area_px, kind="given", label=label, class_id=number.astype(np.int64))
+
+
+_FOREIGN = (("xyxy", "boxes", "bboxes"), ("confidence", "conf", "scores"), ("class_id", "cls", "labels"))
+"""What supervision, ultralytics, torchvision, transformers and mmdetection call edges, scores and classes."""
+
+
+def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
+    """The first of the names that an object or mapping has, and its value, off any device; "" and None without one."""
+    for name in names:
+        if (name in given) if isinstance(given, Mapping) else hasattr(given, name):
+            value = given[name] if isinstance(given, Mapping) else getattr(given, name)
+            return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
+    return "", None
+
+
+def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
+    """Raises InputError for boxes (N, 4) and scores (N,) that no detector of pixels and probabilities gives.
+
+    certain: whether the scores do not count, so that they may have any scale.
+    """
+    if not (np.isfinite(box_px).all() and np.isfinite(score).all()):
+        raise InputError("boxes and scores must be finite; leave out detections that are unknown")
+    if len(box_px) and not (box_px[:, 2:] > 0).all():
+        row = int((box_px[:, 2:] <= 0).any(axis=1).argmax())
+        width, height = box_px[row, 2:]
+        raise InputError(f"width and height must be above 0 px, got {width:g} x {height:g} in box {row}")
+    if share_orders(box_px):
+        raise InputError(
+            "boxes that lie in [0, 1] are shares of a picture, not pixels: multiply them by its width and height"
+        )
+    if not certain and ((score < 0) | (score > 1)).any():
+        raise InputError(
+            f"scores must be probabilities in [0, 1], got {score.min():g} to {score.max():g}; divide percent by 100, "
+            "or take Tracker(certain=True)"
+        )
+
+
+def share_orders(box: np.ndarray) -> list[str]:
+    """The orders of columns in which boxes (N, 4) lie in a picture with sides of 1; none where they are pixels."""
+    first, last = box[:, :2], box[:, 2:]
+    orders = {"yolo": (first - last / 2, first + last / 2), "xyxy": (first, last), "xywh": (first, first + last)}
+    return [n for n, (low, high) in orders.items() if len(box) and ((low > -0.01) & (low < high) & (high < 1.01)).all()]
+
+
+def are_corners(box: np.ndarray, size: tuple[float, float] | None) -> bool:
+    """Whether the last two columns are right and bottom edges: they follow the first two, or sizes would not fit."""
+    first, last = box[:, :2], box[:, 2:]
+    if not len(box) or not (last > first).all():
+        return False
+    follow = len(box) > 4 and 4 * (last - first).var(axis=0).sum() < last.var(axis=0).sum()
+    is_beyond = size is not None and (first + last > 1.1 * np.array(size)).any(axis=1).mean() > 0.5
+    return bool(follow or (is_beyond and (last <= 1.01 * np.array(size)).all()))
 
 
 # How many boxes may lie beyond the extent of a table, and from how many rows on the extent is estimated.
@@ -411,9 +551,9 @@ class DetectionTable:
     line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
     cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
     own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
-    label: (N,) str, the class, empty if unknown; None if not given.
+    label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
     kind: (N,) str, what a row is; of `dddas track` detection, bridge (nothing was seen there: a box between two
-    detections) or untracked (a detection without identity). None if not given.
+    detections) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
     """
 
     path: str
@@ -428,6 +568,8 @@ class DetectionTable:
     ours: bool = False
     label: np.ndarray | None = None
     kind: np.ndarray | None = None
+    class_id: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -469,6 +611,11 @@ class DetectionTable:
         width, height = np.sort(likely[:, :2] + likely[:, 2:], axis=0)[-1 - _STRAYS]
         return float(width), float(height)
 
+    def classes(self, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        """Name and number of the class of each of some rows, as in Detections."""
+        label = np.full(len(self), "", object) if self.label is None else self.label
+        return label[rows], (np.full(len(self), -1) if self.class_id is None else self.class_id)[rows]
+
     def rows(self, frame: int) -> slice:
         """Where the rows of a frame are."""
         return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
@@ -495,11 +642,9 @@ class DetectionTable:
     def at(self, frame: int) -> Detections:
         """The detections of a frame, of kind `given`."""
         here = self.rows(frame)
-        box_px = self.box_px[here]
-        unknown = np.full(len(box_px), np.nan)
-        label = np.zeros(0, object) if self.label is None else self.label[here]
+        box_px, (label, class_id) = self.box_px[here], self.classes(here)
         area_px = box_px[:, 2] * box_px[:, 3]
-        return Detections(box_px, self.score[here], area_px, unknown, unknown, kind="given", label=label)
+        return Detections(box_px, self.score[here], area_px, kind="given", label=label, class_id=class_id)
 
 
 @dataclass(frozen=True)
@@ -818,6 +963,7 @@ class Positions(Table):
     frame: (N,) int64 from 1. target: (N,) int64, the identity, else the row within the frame, from 1.
     east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN where unknown. score: (N,) in [0, 1].
     origin_deg: WGS84 longitude and latitude of east = north = 0. lonlat_deg: (N, 2). Both None without an origin.
+    label, class_id: (N,) as in Detections.
     """
 
     frame: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -827,6 +973,11 @@ class Positions(Table):
     score: np.ndarray = field(default_factory=lambda: np.zeros(0))
     origin_deg: tuple[float, float] | None = None
     lonlat_deg: np.ndarray | None = None
+    label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        _complete(self, len(self.frame), label="", class_id=-1)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -951,6 +1102,8 @@ class Tracks(Boxes):
     row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
     link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
     could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
+    label, class_id: of the detection, as there; of a bridging box those of the identity before. frame: its number, of
+    a table that `concat` joins (N,).
     appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
     """
 
@@ -961,10 +1114,11 @@ class Tracks(Boxes):
     row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     link: np.ndarray = field(default_factory=lambda: np.zeros(0))
     appearance: AppearanceUse | None = None
+    label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
-        if len(self.link) == 0 < len(self.identity):
-            object.__setattr__(self, "link", np.full(len(self.identity), np.nan))
+        _complete(self, len(self.identity), link=np.nan, label="", class_id=-1)
 
     def __len__(self) -> int:
         return len(self.identity)

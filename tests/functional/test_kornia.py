@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.errors import InputError
 
 MOTION = torch.tensor([[[1.05, 0.04, -3.0], [-0.02, 0.97, 2.0], [2e-4, -1e-4, 1.0]]], dtype=torch.float64)
 
@@ -156,3 +157,21 @@ def test_a_homography_is_kornias_fit_of_the_pairs_that_have_a_weight():
     assert valid.all()
     torch.testing.assert_close(found, kornia.geometry.find_homography_dlt(points, seen, weights), rtol=1e-6, atol=1e-8)
     torch.testing.assert_close(found, MOTION.expand(3, 3, 3), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "src", "M"),
+    [
+        ("M", torch.rand(1, 1, 8, 9), torch.eye(3)),
+        ("M", torch.rand(1, 1, 8, 9), np.eye(3)),
+        ("M", torch.rand(2, 1, 8, 9), torch.eye(3)[None]),
+        ("src", torch.rand(3, 8, 9), torch.eye(3)[None]),
+        ("src", np.zeros((8, 9, 3), np.uint8), torch.eye(3)[None]),
+        ("src", np.zeros((8, 9), np.float32), torch.eye(3)[None]),
+    ],
+)
+def test_warping_what_is_no_batch_is_refused_with_the_code_that_makes_one(name, src, M):
+    with pytest.raises(InputError, match=rf"^{name} (must be|has)") as error:
+        F.warp_perspective(src, M, (8, 9))
+    made = eval(str(error.value).rpartition(": ")[2], {"torch": torch, "src": src, "M": M})
+    assert F.warp_perspective(**{"src": src, "M": M, name: made}, dsize=(8, 9)).shape[-2:] == (8, 9)

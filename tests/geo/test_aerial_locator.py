@@ -7,17 +7,18 @@ import pytest
 
 from tests.overflight import COLOURS_TOML, Overflight, pictures
 from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.detection import with_logged_focal
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
 from torchvision_dddas.geo.aerial_targets import Targets, reference_points
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.camera_files import read_aerial_camera, read_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.types import Detections, Elevation, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Camera, Detections, Elevation, Frame, Registration, Scene, Telemetry, Tracks
 
 
 def hill(east_north):
@@ -189,3 +190,72 @@ def test_a_site_whose_parts_contradict_each_other_is_refused(prepared, change, w
     telemetry = None if "telemetry" in change else replace(site.telemetry, **change)
     with pytest.raises(InputError, match=words):
         build_site(change.get("landmarks", site.landmarks), telemetry)
+
+
+# -- Lenses ------------------------------------------------------------------------------------------------------------
+
+DOWN_AT_50_M = (
+    "{n}\n00:00:{s:02d},000 --> 00:00:{t:02d},000\n[latitude: 48.137100] [longitude: 11.575300] "
+    "[rel_alt: 50.0 abs_alt: 569.8] [gb_yaw: 0.0 gb_pitch: -90.0 gb_roll: 0.0] "
+    "[focal_len: 24.00] [fnum: 1.7] [dzoom_ratio: {zoom}]\n\n"
+)
+
+
+@pytest.fixture
+def hovering(tmp_path):
+    """The log of a drone that looks straight down from 50 m with a lens of 24 mm, "as for 36 mm"."""
+
+    def write(zooms=("1.00",) * 4):
+        path = tmp_path / "flight.SRT"
+        rows = [DOWN_AT_50_M.format(n=k + 1, s=k, t=k + 1, zoom=zoom) for k, zoom in enumerate(zooms)]
+        path.write_text("".join(rows))
+        return read_telemetry(path)
+
+    return write
+
+
+def metres_right(locator, frame, pixels=100.0):
+    """How far to the right of the middle a target stands that is seen so many pixels there."""
+    width, height = locator.camera.size_px
+    box = np.array([[width / 2 - 0.5 + pixels, height / 2 - 0.5, 1.0, 1.0]])
+    seen = Tracks(frame, np.array([1]), box, np.ones(1), np.zeros(1, int))
+    return locator.locate(seen).positions.east_north_m[0, 0]
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (720, 1280), (1080, 1080), (1440, 1080)])
+def test_a_focal_length_as_for_36_mm_holds_along_the_longer_side_of_the_pictures(hovering, size):
+    locator = AerialLocator(None, hovering(), size_px=size, rate_hz=1)
+    focal_px = 24 / 36 * max(size)
+    assert metres_right(locator, 1) == pytest.approx(100 / focal_px * 50, rel=1e-3)
+    assert any(f"nominal focal length, {focal_px:.0f} px" in note and "crops" in note for note in locator.notes)
+    settings, (note,) = with_logged_focal(Settings(), hovering(), size)
+    assert settings.gates.focal_px == pytest.approx(focal_px) and f"{focal_px:.0f} px" in note
+
+
+def test_a_field_of_view_that_is_no_nominal_one_is_that_of_the_width():
+    flown = Telemetry(np.zeros(3), np.full(3, 50.0), np.zeros(3), hfov_rad=np.full(3, np.radians(60)))
+    assert flown.focal_px((720, 1280)) == pytest.approx(360 / np.tan(np.radians(30)))
+    # A guess is that of the longer side; what somebody sets is what it says.
+    for parameters, half in (({}, 640), ({"aerial.hfov_deg": 70.0}, 360)):
+        camera, known, _ = resolve_camera(None, (720, 1280), None, with_parameters(Settings(), parameters))
+        assert not known and camera.focal_px[0] == pytest.approx(half / np.tan(np.radians(35)))
+
+
+def test_a_camera_file_that_names_the_lens_overrides_the_logs_nominal_focal_length(hovering, tmp_path):
+    (tmp_path / "c.toml").write_text("focal_px = 1000\nwidth_px = 720\nheight_px = 1280\n")
+    for camera in (
+        read_aerial_camera(tmp_path / "c.toml", None),
+        Camera("c", (720, 1280), (1000, 1000), (359.5, 639.5)),
+    ):
+        locator = AerialLocator(camera, hovering(), rate_hz=1)
+        assert metres_right(locator, 1) == pytest.approx(5, rel=1e-3)
+        assert any("camera c, 1000 px, is used, not the log's nominal 853 px" in note for note in locator.notes)
+    # What the log says of the zoom holds also then.
+    locator = AerialLocator(camera, hovering(("1.00", "1.00", "2.00", "2.00")), rate_hz=1)
+    assert [metres_right(locator, frame) for frame in (1, 2, 3, 4)] == pytest.approx([5, 5, 2.5, 2.5], rel=1e-3)
+    assert any("times a zoom of up to 2.00" in note for note in locator.notes)
+    # A file that names no lens leaves the log's.
+    (tmp_path / "c.toml").write_text("width_px = 720\nheight_px = 1280\n")
+    locator = AerialLocator(read_aerial_camera(tmp_path / "c.toml", None), hovering(("1.00", "2.00")), rate_hz=1)
+    assert [metres_right(locator, frame) for frame in (1, 2)] == pytest.approx([5 / 0.8533, 2.5 / 0.8533], rel=1e-3)
+    assert any("853 to 1707 px by its zoom" in note for note in locator.notes)

@@ -53,7 +53,7 @@ def test_small_covariances_are_read_back_as_they_are_and_unknown_cells_as_unknow
     run(tmp_path, [unknown], origin=None)
     assert [name for name, value in rows(tmp_path / "positions.csv")[0].items() if value == ""] == [
         *("var_east_m2", "cov_east_north_m2", "var_north_m2"),
-        *("relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s"),
+        *("relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s", "class", "class_id"),
     ]
     assert np.isnan(read_positions(tmp_path / "positions.csv").covariance_m2).all()
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.detection_tables import (
     MOT_NAMES,
+    ORDERS,
     check_table,
     read_detections,
     read_header,
@@ -162,6 +164,99 @@ def test_the_words_of_a_table_are_kept_for_a_copy_with_more_columns(write):
     header, rows = read_rows(write("2 1 0 0 5 5 0.50 x\n1 1 0 0 5 5\n"))
     assert header == [*MOT_NAMES, "column_8"] and rows[0] == ["1", "1", "0", "0", "5", "5", "", ""]
     assert read_header(write("")) == []
+
+
+# -- Boxes of other kinds than x, y, width, height in pixels -----------------------------------------------------------
+
+PLACES = np.array([[20 + 7 * k, 30 + 3 * k, 12 + k % 2, 25 + k % 3] for k in range(12)], float)  # x, y, width, height
+SHAPE = (320, 240)
+
+
+def unique(values: Any) -> set:
+    return set(values.tolist())
+
+
+def in_order(order: str, shares: bool) -> np.ndarray:
+    first, size = PLACES[:, :2], PLACES[:, 2:]
+    box = {"xywh": PLACES, "xyxy": np.c_[first, first + size], "yolo": np.c_[first + size / 2, size]}[order]
+    return box / (*SHAPE, *SHAPE) if shares else box
+
+
+def lines_of(box: np.ndarray, second: object = -1, score: object = 0.5, sep: str = ",") -> str:
+    return "".join(
+        sep.join(map(str, (k, second, *(f"{v:.7f}" for v in row), score))) + "\n" for k, row in enumerate(box, 1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("order", "shares", "given"),
+    [
+        ("yolo", True, None),
+        ("xyxy", True, None),
+        ("xyxy", False, None),
+        ("xywh", False, None),
+        *((order, shares, order) for order in ("yolo", "xyxy", "xywh") for shares in (True, False)),
+    ],
+)
+def test_the_order_of_a_box_comes_from_its_numbers_or_is_given(write, order, shares, given):
+    table = read_detections(write(lines_of(in_order(order, shares))), given, SHAPE)
+    np.testing.assert_allclose(table.box_px, PLACES, atol=1e-3)
+    assert bool(table.notes) == (shares or (order, given) == ("xyxy", None))
+
+
+@pytest.mark.parametrize("shares", [True, False])
+@pytest.mark.parametrize(("order", "names"), [(order, names) for order, several in ORDERS.items() for names in several])
+def test_columns_of_other_programs_are_known_by_their_names(write, order, names, shares):
+    header = f"frame_index,tracker_id,{names.replace(' ', ',')},confidence"
+    table = read_detections(write(header + "\n" + lines_of(in_order(order, shares), 4)), None, SHAPE)
+    np.testing.assert_allclose(table.box_px, PLACES, atol=1e-3)
+    assert (table.frame[-1], unique(table.identity), set(table.score)) == (12, {4}, {0.5})
+
+
+def test_the_class_of_yolo_is_kept_and_shares_without_a_size_are_refused(write, refused):
+    table = read_detections(write(lines_of(in_order("yolo", True), 0, sep=" ")), None, SHAPE)
+    assert set(table.at(1).class_id) == {0} and set(table.at(1).label) == {"0"} and unique(table.identity) == {-1}
+    assert "are shares of a picture (yolo or xywh), whose size is not known" in refused(
+        read_detections, lines_of(in_order("yolo", True))
+    )
+
+
+@pytest.mark.parametrize("first", [0, 1, 7])
+def test_a_folder_of_yolos_labels_is_read_frame_by_frame(tmp_path, first):
+    for k, row in enumerate(in_order("yolo", True)):
+        (tmp_path / f"clip_{first + k}.txt").write_text("2 {:.7f} {:.7f} {:.7f} {:.7f} 0.9 5\n\n".format(*row) * 2)
+    (tmp_path / "classes.txt").write_text("person\ncar\n")
+    table = read_detections(tmp_path, None, SHAPE)
+    np.testing.assert_allclose(table.box_px[::2], PLACES, atol=1e-3)
+    assert (table.first, table.last, set(table.score), unique(table.class_id)) == (
+        first or 1,
+        (first or 1) + 11,
+        {0.9},
+        {2},
+    )
+    # With the pictures of the clip their names count.
+    named = read_detections(tmp_path, None, SHAPE, [f"clip_{first + k}" for k in range(12)])
+    assert (named.first, named.last) == (1, 12)
+    (tmp_path / "clip_x.txt").write_text("0 0.5 0.5 0.1 0.1\n")
+    with pytest.raises(InputError, match=r"clip_x\.txt belongs to no picture"):
+        read_detections(tmp_path, None, SHAPE)
+    (tmp_path / "clip_x.txt").rename(tmp_path / "clip_99.txt").write_text("0 0.1 0.1 0.2 0.2 0.3 0.3 0.4 0.1\n")
+    with pytest.raises(InputError, match=r"clip_99\.txt, line 1: 9 columns; wanted class cx cy w h"):
+        read_detections(tmp_path, None, SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("scores", "read_as", "note"),
+    [
+        ((87, 92, 40), [0.87, 0.92, 0.4], "read as percent"),
+        ((87.5, 92, 40), [87.5, 92, 40], ""),
+        ((1, 1, 0), [1, 1, 0], ""),
+        ((0.3, "", 0.4), [0.3, 1, 0.4], "1 of 3 rows have no score"),
+    ],
+)
+def test_scores_in_percent_and_missing_ones_are_noted(read, scores, read_as, note):
+    table = read("".join(f"{k},-1,{10 * k},2,30,4,{score}\n" for k, score in enumerate(scores, 1)))
+    assert table.score.tolist() == read_as and note in " ".join(table.notes)
 
 
 # -- Whether a table fits its clip -------------------------------------------------------------------------------------

@@ -59,10 +59,12 @@ def test_every_detection_is_in_the_csv_with_its_line_and_what_became_of_it(tmp_p
     assert text.count("\n") == 2
 
 
-def test_a_bridge_has_the_class_of_the_box_before(tmp_path):
+def test_classes_of_tracks_are_written_and_read_back(tmp_path):
     boxes = np.array([[0, 0, 9, 9], [20, 0, 9, 9], [40, 0, 9, 9.0]])
     found = Detections(boxes, np.ones(3), kind="given", label=np.array(["car", "red, large", "dog"]))
-    tracks = Tracks(1, np.array([5, 8]), boxes[:2], np.ones(2), np.array([1, 0]))
+    label = np.array(["red, large", "car"], object)
+    number, row = np.array([3, -1]), np.array([1, 0])
+    tracks = Tracks(1, np.array([5, 8]), boxes[:2], np.ones(2), row, label=label, class_id=number)
     first = TrackedFrame(1, None, found, tracks)
     last = TrackedFrame(2, None, Detections(), replace(tracks, row=np.full(2, -1)))
     _, rows = written(track_tables(tmp_path), tmp_path, first, last)
@@ -71,7 +73,7 @@ def test_a_bridge_has_the_class_of_the_box_before(tmp_path):
         *(("5", "red, large"), ("8", "car")),
     ]
     again = read_detections(tmp_path / "tracks.csv")
-    assert again.label is not None and again.at(2).label.tolist() == ["red, large", "car"]
+    assert again.at(2).label.tolist() == ["red, large", "car"] and again.at(2).class_id.tolist() == [3, -1]
 
 
 def test_heading_and_speed_are_over_the_ground_and_a_frame(tmp_path):

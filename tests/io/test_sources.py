@@ -1,6 +1,7 @@
 """Videos, folders and globs: what is whole is read, what is damaged is reported, and every frame keeps its number."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -354,6 +355,108 @@ def test_a_given_scale_saturates_what_is_above_it_and_says_so_once(tmp_path):
     source = open_source(tmp_path / "grey", full_scale=1500)
     assert [int(frame.image.max()) for frame in source] == [170, 255, 255]
     assert [problem.frame for problem in source.problems] == [2]
+
+
+def thermal(levels: int = 120) -> list[np.ndarray]:
+    """Twelve 8-bit pictures whose values fill less than the range, as a camera stretches a scene of few degrees."""
+    ground = np.random.default_rng(0).normal(130, levels / 8, (96, 128))
+    still = np.clip(cv2.GaussianBlur(ground, (3, 3), 0.7), 130 - levels / 2, 130 + levels / 2)
+    films = np.tile(still, (12, 1, 1))
+    for k, film in enumerate(films):
+        film[40:52, 4 + 8 * k : 10 + 8 * k] = 130 + levels / 2
+    return list(films.round().astype(int))
+
+
+def stored(folder: Path, images: list[np.ndarray]) -> Path:
+    for k, image in enumerate(images):
+        save(folder / f"{k:02d}.png", np.clip(image, 0, 65535).astype(np.uint16))
+    return folder
+
+
+def stated(source: Any) -> str:
+    return str(source.levels)
+
+
+def spoiled(image: np.ndarray, k: int) -> np.ndarray:
+    image = image * 5 + 29315
+    image[3 * k, 7], image[5, 9], image[60, 61] = 65535, 0, 65535
+    return image
+
+
+@pytest.mark.parametrize(
+    "store",
+    [
+        lambda image, k: image,
+        lambda image, k: image * 257,
+        lambda image, k: image * 16,
+        lambda image, k: image * 5 + 29315,
+        lambda image, k: image * 64 + 2000,
+        lambda image, k: image * 4 + 7000 + 40 * k,  # the sensor warms up
+        lambda image, k: image * 5 + 29315 + 900 * (k > 5),  # and calibrates itself
+        lambda image, k: np.full_like(image, 9000) if k == 7 else image * 3 + 9000,  # behind its shutter
+        spoiled,
+    ],
+    ids=["plain", "x257", "12 bits", "thermal", "14 bits", "drift", "jump", "shutter", "bad pixels"],
+)
+def test_what_a_thermal_camera_stores_in_16_bits_is_read_as_its_8_bit_picture(tmp_path, store):
+    images = thermal()
+    source = open_source(stored(tmp_path, [store(image, k) for k, image in enumerate(images)]))
+    apart = [frame.image.astype(int) - image for frame, image in zip(source, images, strict=True)]
+    offset = [float(np.median(difference)) for difference in apart]
+    same = [(a == o).mean() for a, o in zip(apart, offset, strict=True)]
+    assert min([*same[:7], *same[8:]]) > 0.999
+    assert {problem.frame for problem in source.problems} <= {8}
+
+
+@pytest.mark.parametrize("drift", [0, -13, 300])
+def test_the_range_of_many_values_is_that_of_most_pixels_and_follows_a_drift(tmp_path, drift):
+    rng = np.random.default_rng(1)
+    images = [image * 7 + rng.integers(0, 7, image.shape) + 20000 + drift * k for k, image in enumerate(thermal())]
+    for image in images:
+        image[:10, :10] = 60000  # the sun, on a hundredth of the picture
+    source = open_source(stored(tmp_path, images))
+    first, *others = [frame.image for frame in source]
+    low, high = np.percentile(first, [5, 95])
+    assert high - low == pytest.approx(255 / 2.5, rel=0.1)  # as much contrast as a thermal camera's own 8 bits
+    for image in others:
+        assert 10 < np.percentile(image, 5) < np.percentile(image, 95) < 245
+        assert image[40:52].max() > np.percentile(image, 95) + 10  # the target stands out
+        assert np.ptp(image[20:30].astype(float)) == pytest.approx(np.ptp(first[20:30].astype(float)), abs=12)
+    assert "taken from the clip" in stated(source) and source.problems == []
+
+
+def test_a_given_range_holds_for_the_whole_clip_and_the_range_is_stated(tmp_path):
+    images = [image * 5 + 29315 for image in thermal()]
+    source = open_source(stored(tmp_path, images), full_scale=(29315, 30590))
+    for frame, image in zip(source, thermal(), strict=True):
+        np.testing.assert_array_equal(frame.image, image)
+    assert "values from 29315 to 30590" in stated(source)
+    assert stated(open_source(write_images(tmp_path / "bytes"))) == "None"
+    for scale in ((5, 5), (9, 5), (0, 70000), (-1, 5)):
+        with pytest.raises(InputError, match="black below white"):
+            open_source(tmp_path, full_scale=scale)
+
+
+@pytest.mark.parametrize(("form", "bits"), [("gray16le", 16), ("gray12le", 12)])
+def test_grey_videos_of_more_than_8_bits_are_read_whole(tmp_path, form, bits):
+    av, path = pytest.importorskip("av"), tmp_path / "clip.mkv"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, form
+        for k, image in enumerate(thermal()):
+            frame = av.VideoFrame.from_ndarray((image * 5 + 29315).astype(np.uint16), format="gray16le")
+            frame = frame.reformat(format=form)
+            frame.pts = k
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    source = open_source(path)
+    for _ in range(2):
+        frames = list(source)
+        assert len(frames) == 12 and frames[0].image.shape == (96, 128, 3)
+        if bits == 16:
+            levels = np.array([frame.image[..., 0] for frame in frames], int)
+            assert len(np.unique(levels - thermal())) == 1
+        assert source.problems == []
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

@@ -343,3 +343,24 @@ def test_the_exported_graph_gives_the_same_masks_for_clips_it_was_not_made_with(
         (found,) = session.run(None, dict(zip(names, (clip.numpy(), step.numpy()), strict=True)))
         wanted = model(clip, step).mask
         assert wanted.any() and (found != wanted.numpy()).mean() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("spoil", "code"),
+    [
+        (lambda clip: clip.half(), "clip.float()"),
+        (lambda clip: clip.bfloat16(), "clip.float()"),
+        (lambda clip: (clip * 255).to(torch.uint8), "clip.float() / 255"),
+        (lambda clip: clip * 255, "clip / 255"),
+        (lambda clip: clip.index_fill(3, torch.tensor([3]), torch.nan), "clip.nan_to_num()"),
+        (lambda clip: clip - 0.5, "clip.clamp(0, 1)"),
+    ],
+    ids=["half", "bfloat16", "bytes", "levels", "NaN", "below 0"],
+)
+def test_a_clip_of_another_range_or_precision_is_refused_with_the_code_that_converts_it(spoil, code) -> None:
+    segmenter, given = MotionSegmenter(), spoil(torch.rand(1, 3, 1, 48, 64))
+    with pytest.raises(InputError) as error:
+        segmenter(given)
+    message = str(error.value)
+    assert message.endswith(f"convert it: {code}") and "\n" not in message
+    assert segmenter(eval(code, {"clip": given})).mask.shape == (1, 3, 1, 48, 64)

@@ -118,11 +118,11 @@ def test_unreadable_frames_are_black_with_the_cause():
 @pytest.mark.parametrize(
     ("image", "says"),
     [
-        (np.zeros((200, 100), np.float32), "frame 1 holds float32 pixels; wanted 8 bits"),
-        (np.full((200, 100, 3), np.nan), "frame 1 holds float64 pixels, NaN among them"),
-        (np.zeros((200, 100, 4), np.uint8), "200 x 100 x 4; wanted height x width, or these x 1 or 3 channels"),
-        (np.zeros((0, 100), np.uint8), "0 x 100"),
-        (np.uint8(3), "a single uint8; wanted height x width"),
+        (np.zeros((200, 100), np.float32), "frame 1 must be uint8 of shape (H, W) or (H, W, 3), got float32"),
+        (np.full((200, 100, 3), np.nan), "got float64 of shape (200, 100, 3); convert it: (np.nan_to_num(frame)"),
+        (np.zeros((200, 100, 4), np.uint8), "got uint8 of shape (200, 100, 4); convert it: frame[..., :3]"),
+        (np.zeros((0, 100), np.uint8), "got uint8 of shape (0, 100)"),
+        (np.uint8(3), "a Frame or a NumPy image, got uint8"),
         (None, "is None; could its file be read?"),
     ],
 )
@@ -138,7 +138,7 @@ def test_the_public_detector_takes_one_picture_or_several(monkeypatch):
     picture = np.zeros((160, 120), np.uint8)
     alone, both = detector(picture), detector([picture, picture])
     assert len(both) == 2 and len(alone) == len(both[0]) == len(both[1])
-    with pytest.raises(InputError, match="float64 pixels"):
+    with pytest.raises(InputError, match="got float64"):
         detector(np.zeros((160, 120)))
     with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
         detector([picture, np.zeros((20, 10), np.uint8)])

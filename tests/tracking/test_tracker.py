@@ -238,7 +238,7 @@ def test_every_change_of_whether_appearance_is_looked_at_is_an_adjustment_with_i
         ({"detections": np.array([[0, 0, 0, 5.0]])}, "above 0 px, got 0 x 5 in box 0"),
         ({"detections": "boxes"}, "Detections record"),
         ({"detections": np.ones((1, 4)), "camera_motion": np.eye(2)}, r"\(3, 3\) homography"),
-        ({"detections": np.ones((1, 4)), "image": np.zeros((4, 4))}, "uint8, got"),
+        ({"detections": np.ones((1, 4)), "image": np.zeros((4, 4))}, "image must be uint8"),
         ({"detections": np.ones((1, 4)), "frame": 3}, "frame 3 follows frame 3"),
     ],
 )
@@ -267,3 +267,31 @@ def test_without_pictures_the_identities_are_the_same_and_no_picture_is_held():
         np.testing.assert_array_equal(without.tracks.identity, with_picture.tracks.identity)
         np.testing.assert_array_equal(without.tracks.box_px, with_picture.tracks.box_px)
     assert any(len(f.tracks) for f in tracked[1])
+
+
+def test_classes_stay_with_their_identities_also_where_a_detection_is_missing():
+    tracker, settled = Tracker(size=(640, 480)), []
+    for k in range(12):
+        box = np.array([[50.0 + 4 * k, 60, 30, 60], [400 - 5 * k, 200, 60, 30]])[: 1 if k in (5, 6) else 2]
+        classes: Any = {"label": np.array(["person", "car"], object), "class_id": np.array([0, 2])}
+        rows = {name: values[: len(box)] for name, values in classes.items()}
+        settled += tracker.update(Detections(box, np.full(len(box), 0.9), kind="given", **rows), frame=k + 1)
+    settled += tracker.flush()
+    assert any((tracks.row < 0).any() for tracks in settled)
+    for tracks in settled:
+        for identity, label, number in zip(tracks.identity, tracks.label, tracks.class_id, strict=True):
+            assert (label, number) == (("person", 0), ("car", 2))[identity - 1]
+
+
+@pytest.mark.parametrize(
+    ("boxes", "scores", "words"),
+    [
+        ([[0.2, 0.3, 0.1, 0.2]], [0.9], "multiply them by its width and height"),
+        ([[10, 20, 30, 40]], [87.0], "divide percent by 100, or take Tracker"),
+        ([[500, 300, 560, 420]], [0.9], "look like xyxy; wanted x, y, width, height"),
+        ([[10 * k, 20 + 7 * k, 10 * k + 31, 71 + 7 * k] for k in range(1, 6)], [0.9] * 5, "look like xyxy"),
+    ],
+)
+def test_arrays_of_boxes_that_would_be_misread_are_refused(boxes, scores, words):
+    with pytest.raises(InputError, match=words):
+        Tracker(size=(640, 480)).update((np.array(boxes, float), np.array(scores)))

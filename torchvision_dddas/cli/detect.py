@@ -75,12 +75,12 @@ def detect_clip(
 
     refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
     with DetectionRecorder(folder, save) as output:
-        source = open_video(clip, rate_hz=rate_hz)
+        source = open_video(clip, rate_hz=rate_hz, full_scale=settings.levels.given)
         parameters = settings.aerial
         flight = None
         if telemetry is not None:
             flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone)
-        settings, more = with_logged_focal(settings, flight, source.size[0])
+        settings, more = with_logged_focal(settings, flight, source.size)
         engine = load_engine(backend, settings)
         facts = {
             "input": clip,

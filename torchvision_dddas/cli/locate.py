@@ -9,6 +9,7 @@ import typer
 from torchvision_dddas.cli.exits import NOTHING_LOCATED, say
 from torchvision_dddas.cli.options import (
     Backend,
+    BoxFormat,
     Config,
     EngineOption,
     Out,
@@ -60,6 +61,7 @@ def aerial(
         str | None, typer.Option(metavar="CLIP", help="The clip itself, for its rate and its picture size.")
     ] = None,
     background: Background = None,
+    box_format: BoxFormat = None,
     out: Out = Path("dddas-positions"),
     config: Config = None,
     set_: Overrides = None,
@@ -78,7 +80,8 @@ def aerial(
     from torchvision_dddas.config import load_config
     from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
+    from torchvision_dddas.io.camera_files import read_camera_keys
+    from torchvision_dddas.io.detection_tables import check_within_clip, read_for_clip
     from torchvision_dddas.io.output import AerialRecorder, parse_save
     from torchvision_dddas.io.run_inputs import AerialInput, locator_facts, map_site, read_locator
     from torchvision_dddas.io.sources import frame_times
@@ -91,10 +94,11 @@ def aerial(
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
     refuse_own_input(inputs, [out / name for name in AerialRecorder.files], "folder with --out")
     with AerialRecorder(out, names) as output:
-        read = read_detections(table)
+        source = open_video(clip, rate_hz=rate) if clip else None
+        keys = {} if camera is None else read_camera_keys(camera, is_aerial=True)
+        read = read_for_clip(table, box_format, source, (keys.get("width_px"), keys.get("height_px")))
         size, rate_hz, times_s = None, rate, None
-        if clip:
-            source = open_video(clip, rate_hz=rate)
+        if source is not None:
             check_within_clip(read, source)
             size, rate_hz, times_s = source.size, source.rate_hz, frame_times(source)
         locator, notes = read_locator(
@@ -103,7 +107,7 @@ def aerial(
         check_table(read, locator)
         facts = {"input": table, **given.facts, "rows": len(read), **locator_facts(locator)}
         record = output.begin({**facts, "settings": settings.model_dump()}, map_site(locator, background))
-        record.notes += notes
+        record.notes += [*read.notes, *notes]
         for name, kind in (("bridges", "bridge"), ("untracked", "untracked")):
             record.counts[name] = int(read.of_kind(kind).sum())
         if not len(read):
@@ -132,6 +136,7 @@ def ground(
     ],
     camera: Annotated[list[Path], typer.Option(metavar="FILE", help="The TOML of each table's camera.")],
     poses: Poses = None,
+    box_format: BoxFormat = None,
     out: Out = Path("dddas-positions"),
     config: Config = None,
     set_: Overrides = None,
@@ -158,8 +163,8 @@ def ground(
         raise InputError(f"{len(tables)} tables and {len(poses)} files of poses; give one --poses for each, or none")
     refuse_own_input([*tables, *camera, *poses], [out / name for name in GroundRecorder.files], "folder with --out")
     with GroundRecorder(out) as output:
-        read = [read_detections(table) for table in tables]
         cameras = [read_camera(file) for file in camera]
+        read = [read_detections(path, box_format, one.size_px) for path, one in zip(tables, cameras, strict=True)]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
         locator = GroundLocator(cameras, settings, poses=where, rate_hz=rate)
         frames = locator.locate_tables(read)
@@ -174,7 +179,7 @@ def ground(
         names = [f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1)]
         record = output.begin(facts, names, locator.origin_deg is not None)
         missing = (describe_missing(file, pose) for file, pose in zip(camera, where, strict=True))
-        record.notes += [note for note in missing if note]
+        record.notes += [*(note for table in read for note in table.notes), *(note for note in missing if note)]
         record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
             record.notes.append("the tables have no rows: nobody to locate")

@@ -24,6 +24,14 @@ class Backend(StrEnum):
     onboard = "onboard"
 
 
+class BoxOrder(StrEnum):
+    """The orders of a box's columns that --box-format names."""
+
+    xywh = "xywh"
+    xyxy = "xyxy"
+    yolo = "yolo"
+
+
 CLIP = "A video file, a folder or glob of images, camera:0 or rtsp://..."
 
 Config = Annotated[
@@ -41,6 +49,10 @@ Telemetry = Annotated[
     typer.Option(
         "--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
     ),
+]
+BoxFormat = Annotated[
+    BoxOrder | None,
+    typer.Option(help="What a box's columns are: left, top, size; corners; centre, size. [default: by the table]"),
 ]
 Poses = Annotated[
     list[Path] | None,

@@ -54,7 +54,7 @@ def people(
     from torchvision_dddas import open_video
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.detection_tables import check_within_clip, read_detections
+    from torchvision_dddas.io.detection_tables import check_within_clip, read_for_clip
     from torchvision_dddas.io.output import PeopleRecorder, clip_facts, parse_save
     from torchvision_dddas.people import detector
     from torchvision_dddas.people.pyramid import levels
@@ -69,8 +69,8 @@ def people(
             given = [Path(clip), *([] if around is None else [around])]
             refuse_own_input(given, [folder / name for name in PeopleRecorder.files], "folder with --out")
             with PeopleRecorder(folder, names) as output:
-                table = read_detections(around) if around is not None else None
-                source = open_video(clip, rate_hz=rate, single=True)
+                source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given, single=True)
+                table = read_for_clip(around, None, source) if around is not None else None
                 if table is not None:
                     check_within_clip(table, source)
                 try:
@@ -90,7 +90,7 @@ def people(
                 record = output.begin(facts, source.rate_hz, is_single)
                 frames = detector.detect_in_clip(source, scorer, settings, table)
                 record_results(output, record, frames, source.name, source.count, quiet, source)
-                record.notes += [] if table is None else _notes(record, str(around), table, source)
+                record.notes += [] if table is None else [*table.notes, *_notes(record, str(around), table, source)]
             files = ["detections.csv", "detections.txt", *(overlay for _ in names), "run.json"]
             print_lines(closing_lines(_counts(record), record, folder, files), quiet)
             done.append(folder.name)

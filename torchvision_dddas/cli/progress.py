@@ -168,6 +168,8 @@ def record_results(
     finally:
         record.problems += [str(problem) for problem in source.problems] if source is not None else []
         record.notes += getattr(source, "notes", [])
+        if levels := getattr(source, "levels", None):
+            record.notes.append(str(levels))
     if repeats:
         record.notes.append(f"{repeats} of {record.frames} frames repeat the picture before, and have its result")
 

@@ -149,7 +149,7 @@ def run(
     files = given.files if given is not None else [telemetry] if telemetry is not None else []
     refuse_own_input([Path(clip), *files], [out / name for name in PipelineRecorder.files], "folder with --out")
     with PipelineRecorder(out, names) as output:
-        source = open_video(clip, rate_hz=rate)
+        source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given)
         ready = prepare_run(given, telemetry, settings, source, backend.value, clip)
         facts: dict[str, Any] = {
             "input": clip,

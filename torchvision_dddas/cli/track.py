@@ -9,6 +9,7 @@ import typer
 from torchvision_dddas.cli.options import (
     CLIP,
     Backend,
+    BoxFormat,
     Config,
     EngineOption,
     Out,
@@ -33,8 +34,9 @@ def track(
     clip: Annotated[str | None, typer.Argument(metavar="INPUT", help=CLIP)] = None,
     detections: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="MOTChallenge text, or detections.csv. [default: detect in INPUT]"),
+        typer.Option(metavar="FILE", help="MOTChallenge text, a CSV, or YOLO's labels. [default: detect in INPUT]"),
     ] = None,
+    box_format: BoxFormat = None,
     interval: Annotated[int, typer.Option(metavar="D", help="Track at every D-th frame: 1, 1+D, 1+2D, ...")] = 1,
     out: Out = Path("dddas-tracks"),
     config: Config = None,
@@ -57,7 +59,7 @@ def track(
     from torchvision_dddas.config import load_config
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.io.detection_tables import check_table, read_detections
+    from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
     from torchvision_dddas.io.run_inputs import clip_notes
     from torchvision_dddas.types import is_sampled
@@ -72,8 +74,8 @@ def track(
     inputs = [Path(name) for name in (clip, detections) if name is not None]
     refuse_own_input(inputs, [out / name for name in TrackRecorder.files], "folder with --out")
     with TrackRecorder(out, names) as output:
-        table = read_detections(detections) if detections is not None else None
-        source = open_video(clip, rate_hz=rate) if clip is not None else None
+        source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given) if clip is not None else None
+        table = read_for_clip(detections, box_format, source) if detections is not None else None
         notes = check_table(table, interval, source) if table is not None else []
         engine = load_engine(backend.value, settings) if source is not None else None
         facts = {

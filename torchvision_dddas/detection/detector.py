@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.engine import Engine, View, Window
 from torchvision_dddas.detection.interval import (
@@ -34,7 +34,7 @@ from torchvision_dddas.detection.repeats import RepeatRule
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain, near_gaps
 from torchvision_dddas.runtime import wants_torch
-from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry
+from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry, as_picture
 
 Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
 """Called before a frame is taken: returns the settings from then on, and the record of what changed."""
@@ -153,9 +153,12 @@ class MotionDetector:
 
         batch: windows given to the engine at once, by default 8 for torch and 1 otherwise. Scenes do not depend on it.
         """
-        self.settings = settings or Settings()
+        self.settings = check_settings(settings)
         self.engine = load_engine(backend, self.settings) if isinstance(backend, str) else backend
         self.batch = batch or (_TORCH_BATCH if self.engine.name == "torch" else 1)
+        if not rate_hz > 0 or not isinstance(telemetry, Telemetry | None):
+            got = f"{rate_hz} and {type(telemetry).__name__}"
+            raise InputError(f"rate_hz must be positive and telemetry of td.read_telemetry(path), got {got}")
         self.rate_hz, self.telemetry = rate_hz, telemetry
         self.interval = self.settings.interval.frames
         self._slots: deque[_Slot] = deque()
@@ -207,13 +210,7 @@ class MotionDetector:
             self._distance = settings_at(distance_m, self.rate_hz, settings)
 
     def _as_frame(self, frame: Frame | np.ndarray) -> Frame:
-        image = frame.image if isinstance(frame, Frame) else frame
-        if not isinstance(image, np.ndarray):
-            raise InputError(f"a frame must be a Frame or a NumPy image, got {type(image).__name__}")
-        if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or image.shape[2:] == (3,)):
-            raise InputError(
-                f"an image must be uint8 of shape (H, W) or (H, W, 3), got {image.dtype} of shape {image.shape}"
-            )
+        image = as_picture(frame.image if isinstance(frame, Frame) else frame)
         size, before = image.shape[1::-1], self._last.image.shape[1::-1]
         if self._total and size != before:
             raise InputError(
@@ -221,14 +218,14 @@ class MotionDetector:
                 "frames of a clip must have one size: begin anew with another MotionDetector"
             )
         if isinstance(frame, Frame):
-            return frame
+            return frame if image is frame.image else replace(frame, image=image)
         return Frame(self._last.number + 1, self._last.number / self.rate_hz, image)
 
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
         """As `update`, one scene at a time."""
         start = time.perf_counter()
         if not self._total:
-            self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1])[0])
+            self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1::-1])[0])
         view = self.engine.prepare(frame.image)
         repeats = self._at(self._total - 1).repeats if self._total else []
         most = _MOST_REPEATS_LIVE if np.isfinite(frame.taken_s) else self._most_repeats

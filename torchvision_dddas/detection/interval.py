@@ -1,6 +1,5 @@
 """What flight and scene decide about detection: the interval, the frames of a window, and the sizes of targets."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -188,15 +187,17 @@ def pixels_per_metre(distance_m: float, focal_px: float) -> float:
     return focal_px / max(distance_m, 1.0)
 
 
-def with_logged_focal(settings: Settings, telemetry: Telemetry | None, width_px: int) -> tuple[Settings, list[str]]:
+def with_logged_focal(
+    settings: Settings, telemetry: Telemetry | None, size: tuple[int, int]
+) -> tuple[Settings, list[str]]:
     """Set gates.focal_px by the telemetry's field of view, unless it is set. Returns settings and notes.
 
-    width_px: of the pictures.
+    size: (width, height) of the pictures.
     """
-    known = np.zeros(0) if telemetry is None else telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)]
-    if not len(known) or is_set(settings, "gates.focal_px"):
+    known = np.zeros(0) if telemetry is None else telemetry.focal_px(size)
+    if not np.isfinite(known).any() or is_set(settings, "gates.focal_px"):
         return settings, []
-    focal = width_px / 2 / math.tan(float(np.median(known)) / 2)
+    focal = float(np.nanmedian(known))
     note = f"gates.focal_px is {focal:.0f} px by the log's field of view, so that sizes in metres hold"
     return with_parameters(settings, {"gates.focal_px": focal}), [note]
 

@@ -33,8 +33,12 @@ def warp_perspective(
     pixels of the result to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px,
     32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
     whole: return bytes, halves rounded up; the pictures are grey levels up to 255. Raises InputError for another
-    padding_mode.
+    padding_mode, and for what is no batch of pictures and of as many matrices.
     """
+    check_batch("src", src, "(B, C, H, W)", 4)
+    check_batch("M", M, "(B, 3, 3)", 3)
+    if not is_traced() and len(M) != len(src):
+        raise InputError(f"M has {len(M)} matrices for {len(src)} pictures: M.expand(len(src), -1, -1)")
     if padding_mode not in ("zeros", "border"):
         raise InputError(f"padding_mode must be zeros or border, got {padding_mode}; Kornia's function has others")
     height, width = src.shape[-2:]
@@ -62,6 +66,18 @@ def warp_perspective(
 
     step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)
     return torch.cat([sample(y[top : top + step]) for top in range(0, rows, step)], -2)
+
+
+def check_batch(name: str, value: object, shape: str, axes: int) -> None:
+    """Raises InputError, with the code that makes one, for what is no tensor with so many axes."""
+    if isinstance(value, Tensor) and value.dim() == axes:
+        return
+    code, got = name, f"{type(value).__name__} {tuple(getattr(value, 'shape', ()))}"
+    if not isinstance(value, Tensor):
+        code = f"torch.as_tensor({name})"
+        code += ".permute(2, 0, 1) / 255" if axes == 4 and getattr(value, "ndim", 0) == 3 else ""
+    missing = axes - len(getattr(value, "shape", ()))
+    raise InputError(f"{name} must be a tensor {shape}, got {got}: " + f"({code})" + "[None]" * max(missing, 0))
 
 
 def seen_columns(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_targets import (
     Targets,
@@ -32,7 +32,7 @@ from torchvision_dddas.geo.plane_homography import (
     relative_width,
 )
 from torchvision_dddas.geo.projection import ground_height, surface_of
-from torchvision_dddas.geo.site import Site, build_site, complete_site, resolve_camera
+from torchvision_dddas.geo.site import Site, build_site, complete_site, fit_lens, resolve_camera
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,
@@ -111,7 +111,7 @@ class AerialLocator:
                 raise InputError(f"AerialLocator got {type(value).__name__} where a {kind.__name__} is wanted")
         if not rate_hz > 0:
             raise InputError(f"rate_hz must be positive, got {rate_hz}")
-        settings = settings or Settings()
+        settings = check_settings(settings)
         site = replace(build_site(landmarks, telemetry), elevation=elevation)
         site, completed = complete_site(site, camera, settings)
         camera, focal_known, notes = resolve_camera(camera, size_px, site.telemetry, settings)
@@ -149,6 +149,8 @@ class AerialLocator:
 
     def set_site(self, site: Site) -> None:
         """Take over what landmarks and vehicle have reported by now, in the metres of the site so far."""
+        if site.telemetry is not None:
+            site = replace(site, telemetry=fit_lens(site.telemetry, self.camera))
         self.site = site
         self._trajectories = LandmarkTrajectories(site.landmarks, self.settings.landmarks, self.rate_hz)
 
@@ -178,7 +180,8 @@ class AerialLocator:
             rows = np.arange(len(table))[table.rows(frame)]
             rows = rows[has_place[rows]]
             feet = None if table.feet_px is None else table.feet_px[rows]
-            targets = Targets(table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours)
+            places = table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours
+            targets = Targets(*places, classes=table.classes(rows))
             fixed = self.fix_frame(frame, self.landmarks_at(frame), (times_s or {}).get(frame))
             yield self.locate_targets(fixed, targets)
 
@@ -264,6 +267,7 @@ class AerialLocator:
             targets.score[rows],
             origin,
             None if origin is None else geometry.lonlat(place, origin),
+            *(() if targets.classes is None else (column[rows] for column in targets.classes)),
         )
         spent = {**(seconds or {}), **fixed.seconds, "ground": time.perf_counter() - start}
         made = (*adjustments, *fixed.adjustments)

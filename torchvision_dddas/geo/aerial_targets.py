@@ -26,7 +26,7 @@ class Targets:
     box_px: (N, 4). target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is
     an identity. score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; or None.
     bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v to use instead of the box's centre;
-    None, or NaN in a row: use the centre.
+    None, or NaN in a row: use the centre. classes: names and numbers (N,), as in Detections.
     """
 
     box_px: np.ndarray
@@ -36,6 +36,7 @@ class Targets:
     feet_px: np.ndarray | None = None
     bodies: bool = False
     middle_px: np.ndarray | None = None
+    classes: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | None = None) -> Targets:
@@ -48,7 +49,8 @@ def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | N
     seen = tracks.row >= 0
     middle = None if middle_px is None else middle_px[tracks.row[seen]]
     score = tracks.score[seen].clip(0, 1)
-    return Targets(tracks.box_px[seen], tracks.identity[seen], seen[seen], score, bodies=bodies, middle_px=middle)
+    box_px, identity, classes = tracks.box_px[seen], tracks.identity[seen], (tracks.label[seen], tracks.class_id[seen])
+    return Targets(box_px, identity, seen[seen], score, None, bodies, middle, classes)
 
 
 def tracked_targets(tracked: TrackedFrame, with_middles: bool) -> Targets:

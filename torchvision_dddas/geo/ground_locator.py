@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.types import (
@@ -77,7 +77,7 @@ class GroundLocator:
         to fuse.
         """
         self.cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
-        self.settings, self.rate_hz = settings or Settings(), rate_hz
+        self.settings, self.rate_hz = check_settings(settings), rate_hz
         self.poses = list(poses) or [None] * len(self.cameras)
         if not self.cameras or not all(isinstance(camera, Camera) for camera in self.cameras):
             raise InputError("GroundLocator wants one Camera or several, got another type or none")
@@ -159,16 +159,21 @@ class GroundLocator:
             (view,), (own,), (seen,) = views, located, team
             target, place, covariance, score = view.target[own], seen.east_north_m, seen.covariance_m2, view.score[own]
             degrees = None if view.lonlat_deg is None else view.lonlat_deg[own]
-            members = np.arange(len(own))[:, None]
+            members, (label, number) = np.arange(len(own))[:, None], view.table.classes(own)
         else:
             members, place, covariance = fuse(team, self.settings.ground.gate_sigmas)
             people = [[(v, located[v][r]) for v, r in enumerate(row) if r >= 0] for row in members.tolist()]
             target = self._numbers([[(v, int(views[v].target[r])) for v, r in person] for person in people])
-            score = np.array([max(views[v].score[r] for v, r in person) for person in people], float)
+            best = [max(person, key=lambda seen: float(views[seen[0]].score[seen[1]])) for person in people]
+            score = np.array([views[v].score[r] for v, r in best], float)
+            classes = [view.table.classes(slice(None)) for view in views]
+            label, number = (np.array([classes[v][k][r] for v, r in best], (object, int)[k]) for k in (0, 1))
             degrees = None if self.origin_deg is None else geometry.lonlat(place, self.origin_deg)
         return GroundLocations(
             frame,
-            Positions(np.full(len(place), frame), target, place, covariance, score, self.origin_deg, degrees),
+            Positions(
+                np.full(len(place), frame), target, place, covariance, score, self.origin_deg, degrees, label, number
+            ),
             members,
             Sightings.concat(sightings),
             np.repeat(np.arange(len(rows)), [len(own) for own in rows]),

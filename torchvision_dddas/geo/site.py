@@ -218,7 +218,6 @@ def resolve_camera(
     Raises InputError where the size is not known, or the camera's is another than that of the pictures.
     """
     parameters, notes = settings.aerial, list[str]()
-    wide = telemetry.hfov_rad[np.isfinite(telemetry.hfov_rad)] if telemetry is not None else np.zeros(0)
     if camera is not None:
         if size is not None and tuple(camera.size_px) != tuple(size):
             raise InputError(
@@ -230,10 +229,6 @@ def resolve_camera(
         # A value set by hand overrides the file.
         if is_set(settings, "aerial.focal_sigma") or not math.isfinite(camera.focal_px[0]):
             camera = replace(camera, focal_sigma=parameters.focal_sigma)
-        if math.isfinite(camera.focal_px[0]):
-            if any(abs(math.log(_focal_px(camera.size_px, hfov) / camera.focal_px[0])) > _OTHER for hfov in wide[:1]):
-                notes.append(f"the focal length of camera {camera.name} is not used: the telemetry's field of view is")
-            return camera, True, notes
         size = camera.size_px
     if size is None and parameters.mode != "pose":
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
@@ -242,15 +237,49 @@ def resolve_camera(
             "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
             "--set aerial.mode=homography, which needs neither"
         )
-    focal = _focal_px(size, float(np.median(wide)) if len(wide) else math.radians(parameters.hfov_deg))
+    logged = np.zeros(0) if telemetry is None else telemetry.focal_px(size)[np.isfinite(telemetry.hfov_rad)]
+    is_nominal = telemetry is not None and telemetry.is_nominal and len(logged) > 0
+    if camera is not None and math.isfinite(camera.focal_px[0]):
+        if is_nominal:
+            zoom = f", times a zoom of up to {logged.max() / logged.min():.2f}" if _is_zoomed(logged) else ""
+            notes.append(
+                f"the focal length of camera {camera.name}, {camera.focal_px[0]:.0f} px{zoom}, is used, not the log's "
+                f"nominal {logged.min():.0f} px"
+            )
+        elif any(abs(math.log(focal / camera.focal_px[0])) > _OTHER for focal in logged[:1]):
+            notes.append(f"the focal length of camera {camera.name} is not used: the telemetry's field of view is")
+        return camera, True, notes
+    # Unless somebody says so, a camera that stands upright does not see more than one that lies.
+    guessed_px = (size[0] if is_set(settings, "aerial.hfov_deg") else max(size)) / 2
+    focal = float(np.median(logged)) if len(logged) else guessed_px / math.tan(math.radians(parameters.hfov_deg) / 2)
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    made = Camera("camera", size, (focal, focal), middle, focal_sigma=parameters.focal_sigma)
+    made = Camera("camera", size, (focal, focal), middle, focal_sigma=parameters.focal_sigma, given=frozenset())
     made = made if camera is None else replace(camera, focal_px=(focal, focal))
-    if len(wide) or parameters.mode != "pose":
-        return made, bool(len(wide)), notes
+    if is_nominal:
+        px = f"{logged.min():.0f} to {logged.max():.0f} px by its zoom" if _is_zoomed(logged) else f"{focal:.0f} px"
+        notes.append(
+            f"the log's nominal focal length, {px}, is taken along the pictures' longer side. A video mode that "
+            "crops sees less; the camera's file (focal_px) overrides it"
+        )
+    if len(logged) or parameters.mode != "pose":
+        return made, bool(len(logged)), notes
     note = f"neither the camera file nor telemetry gives the field of view: using {parameters.hfov_deg:g} degrees"
     return made, False, [*notes, f"{note} (aerial.hfov_deg)"]
 
 
-def _focal_px(size: tuple[int, int], hfov_rad: float) -> float:
-    return size[0] / 2 / math.tan(hfov_rad / 2)
+def _is_zoomed(focal_px: np.ndarray) -> bool:
+    return bool(np.nanmax(focal_px) > (1 + _OTHER) * np.nanmin(focal_px))
+
+
+def fit_lens(telemetry: Telemetry, camera: Camera) -> Telemetry:
+    """The telemetry with the field of view along u of the camera's pictures.
+
+    A nominal focal length is along their longer side. Where the camera's file names the lens, the log's nominal one
+    tells no more than how far that is zoomed.
+    """
+    if not telemetry.is_nominal or not np.isfinite(telemetry.hfov_rad).any():
+        return telemetry
+    focal = telemetry.focal_px(camera.size_px)
+    if camera.knows("focal_px"):
+        focal = camera.focal_px[0] * focal / np.nanmin(focal) if _is_zoomed(focal) else np.full_like(focal, np.nan)
+    return replace(telemetry, hfov_rad=2 * np.arctan(camera.size_px[0] / 2 / focal), is_nominal=False)

@@ -128,7 +128,7 @@ def _build_camera(path: str | Path, size_px: tuple[int, int] | None = None, is_a
         if key in numbers
     }
     return Camera(
-        given=frozenset(fields),
+        given=frozenset([*fields, *(["focal_px"] if lenses else [])]),
         name=content.get("name", Path(path).stem),
         size_px=(width, height),
         focal_px=(focal, numbers.get("focal_v_px", focal)),

@@ -22,6 +22,8 @@ _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
 # A stream is the cover of the file if it is marked so (attached picture, thumbnails, still image), or if it holds one
 # picture in one of these codecs.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
+# FFmpeg's tag of grey pictures of 16 bits, lowest byte first: of the deeper ones OpenCV (4.14) gives these alone.
+_GREY16 = b"Y1\x00\x10"
 # FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
@@ -68,7 +70,35 @@ def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
     if code.decode("latin-1") in _TEXT_AS_VIDEO:
         capture.release()
         raise InputError(f"{name} is a text file, not a video")
+    if _grey_form(capture) == _GREY16 and not is_live(target):
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     return capture
+
+
+def _grey_form(capture: cv2.VideoCapture) -> bytes:
+    """The tag of grey pictures of more than 8 bits; nothing for others."""
+    tag = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).to_bytes(4, "little", signed=True)
+    return tag if b"Y1\x00" in (tag[:3], tag[:0:-1]) else b""
+
+
+def deep_grey_note(capture: Capture) -> str:
+    """What to tell the user of grey pictures whose lower bits are lost without PyAV; nothing for others."""
+    if not isinstance(capture, cv2.VideoCapture) or _grey_form(capture) in (b"", _GREY16):
+        return ""
+    return "the greys have more than 8 bits, of which the upper 8 are read: install PyAV, or store them as gray16le"
+
+
+def sample_pictures(capture: Capture, count: int) -> list[np.ndarray]:
+    """Up to `count` - 1 pictures spread over the rest of a file. The capture is of no use for reading in order then."""
+    found = []
+    for share in np.linspace(0, 1, count)[1:]:
+        if isinstance(capture, AvCapture):
+            capture.seek(float(share))
+        elif isinstance(capture, cv2.VideoCapture):
+            capture.set(cv2.CAP_PROP_POS_FRAMES, int(share * max(capture.get(cv2.CAP_PROP_FRAME_COUNT) - 1, 0)))
+        decoded, image = capture.read()
+        found += [image] * decoded
+    return found
 
 
 class AvCapture:
@@ -107,6 +137,8 @@ class AvCapture:
             self._video.codec_context.thread_count = 1
         # Until a larger block was freed, glibc maps the memory of each picture anew, which takes 2 ms at 1080p.
         np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
+        form = self._video.format
+        self._is_deep = limits_s is None and form is not None and form.name.startswith("gray") and _bits_of(form) > 8
         self._packets: Iterator[Any] = self._container.demux(self._video)
         self._waiting: list[Any] = []  # frames of the packet read last
         self._spoiled: set[int | None] = set()  # time stamps of damaged packets
@@ -140,10 +172,16 @@ class AvCapture:
         return True
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """The picture grabbed last, upright, uint8 (H, W, 3) BGR; False and None where it cannot be decoded."""
+        """The picture grabbed last, upright, BGR; False and None where it cannot be decoded.
+
+        uint8 (H, W, 3), or uint16 (H, W) of a file with grey pictures of more than 8 bits.
+        """
         if self._frame is None:
             return False, None
         with suppress(*self._failures, ValueError):
+            if self._is_deep:
+                deep: np.ndarray = self._frame.to_ndarray(format="gray16le")
+                return True, np.ascontiguousarray(np.rot90(deep, round(self._frame.rotation / 90) % 4))
             frame = self._reformatter.reformat(self._frame, format="bgr24", interpolation="BICUBIC")
             plane, turns = frame.planes[0], round(self._frame.rotation / 90) % 4
             # Not frame.to_ndarray, which copies: the array keeps the plane.
@@ -167,6 +205,12 @@ class AvCapture:
         stamp = None if frame is None else frame.dts if frame.pts is None else frame.pts
         return 0.0 if stamp is None else 1000 * self._tick_s * stamp
 
+    def seek(self, share: float) -> None:
+        """Go to the picture that can be decoded alone before a share of the file's length."""
+        with suppress(*self._failures):
+            self._container.seek(int(share * (self._container.duration or 0)))
+        self._packets, self._waiting = self._container.demux(self._video), []
+
     def stamps_s(self, most: int | None = None) -> list[float]:
         """Time stamps of the next pictures, at most so many, as they are stored. The pictures are not read."""
         packets, stamps = islice(self._packets, most), list[float]()
@@ -186,6 +230,10 @@ class AvCapture:
     def release(self) -> None:
         """Let go of the file or the connection."""
         self._container.close()
+
+
+def _bits_of(form: Any) -> int:
+    return max((component.bits for component in form.components), default=0)
 
 
 def is_live(target: str | int) -> bool:

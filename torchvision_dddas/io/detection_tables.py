@@ -1,16 +1,21 @@
-"""Detections from a table: MOTChallenge text of any tool, or a CSV with named columns as `dddas detect` writes it."""
+"""Detections from a table: MOTChallenge text of any tool, a CSV with named columns, or a folder of YOLO's labels."""
 
+import os
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.images import natural_order
 from torchvision_dddas.io.tables import (
     BOX,
     FARTHEST,
     FRAME,
     Column,
+    CsvTable,
     CsvText,
     Schema,
     check_crowding,
@@ -18,7 +23,7 @@ from torchvision_dddas.io.tables import (
     read_csv,
     read_table,
 )
-from torchvision_dddas.types import DetectionTable, Source, is_sampled
+from torchvision_dddas.types import DetectionTable, Source, are_corners, is_sampled, share_orders
 
 MOT_NAMES = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
 """The columns of MOTChallenge text, which has no first line that names them."""
@@ -28,6 +33,19 @@ FEET = ("feet_u_px", "feet_v_px")
 
 CLASS = ("class", "class_name", "label")
 """Names that the column of classes may have; the first that is there counts."""
+
+ORDERS = {
+    "yolo": ("x_center y_center width height", "cx cy w h", "xc yc w h"),
+    "xyxy": ("x1 y1 x2 y2", "xmin ymin xmax ymax", "x_min y_min x_max y_max", "left top right bottom"),
+    "xywh": ("x y w h", "x y width height", "left top width height", "bb_left bb_top bb_width bb_height"),
+}
+"""Orders of a box's four columns, with names that other programs give them; yolo: the centre, and the size."""
+
+_OWN_NAMES = {
+    **dict.fromkeys(("frame_id", "frame_index", "frame_number"), "frame"),
+    **dict.fromkeys(("id", "track_id", "tracker_id"), "identity"),
+    **dict.fromkeys(("confidence", "conf"), "score"),
+}
 
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
@@ -40,9 +58,10 @@ REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
 SCHEMA = Schema(
     "detections",
     FRAME,
-    *BOX,
+    *(replace(column, low=-FARTHEST) for column in BOX),  # in any order
     Column("score", ".6g", may_be_empty=True),
     Column("identity"),
+    Column("class_id", "d", -1, 2**53, is_whole=True, may_be_empty=True),
     Column("kind"),
     Column("cut", "d", 0, 1, is_whole=True, may_be_empty=True, wanted="1 where the border cuts it, else 0"),
     *(Column(name, ".2f", -FARTHEST, FARTHEST, may_be_empty=True, wanted="pixels") for name in FEET),
@@ -50,16 +69,27 @@ SCHEMA = Schema(
 )
 
 
-def read_detections(path: str | Path) -> DetectionTable:
+def read_detections(
+    path: str | Path, order: str | None = None, size: tuple[float, float] | None = None, pictures: Sequence[str] = ()
+) -> DetectionTable:
     """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
 
-    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET and CLASS may be
-    there; any other and all that follows the score are ignored. Rows may come in any order; blank lines are skipped.
+    Or a folder of YOLO's labels, `class cx cy w h [score]`, a file a picture. pictures: their names without endings, in
+    order; else the number at the end of a file's name is its frame. order: of a box's columns, one of ORDERS; None: as
+    names and numbers tell. size: (width, height) of the pictures; boxes within [0, 1] are shares of it.
+    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET, CLASS, `class_id`
+    may be there; any other and all that follows the score are ignored. Rows may come in any order.
     A table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
-    range, a few scores outside [0, 1] (see FEW_SHARE).
+    range, a few scores outside [0, 1] (see FEW_SHARE), shares where the size is not known.
     """
-    text, is_named = _read_cells(path, "detections")
+    is_folder = os.path.isdir(path)  # noqa: PTH112 (pathlib raises for a name that no file can have)
+    text, is_named = _read_labels(Path(path), pictures) if is_folder else _read_cells(path, "detections")
+    for kind, names in ORDERS.items() if is_named and not set(REQUIRED) <= set(text.header) else ():
+        for known in (several.split() for several in names):
+            if set(known) <= set(text.header):
+                own, order = dict(zip(known, REQUIRED[1:], strict=True)), order or kind
+                text = text._replace(header=[own.get(name, name) for name in text.header])
     if not is_named:
         for line, row in zip(text.line, text.rows, strict=True):
             if len(row) < 6:
@@ -68,7 +98,17 @@ def read_detections(path: str | Path) -> DetectionTable:
         text = CsvText([*MOT_NAMES], text.line, [[*row[:7], ""][:7] for row in text.rows])
     table = read_table(path, SCHEMA, REQUIRED, text=text)
     check_crowding(table["frame"], f"detections {path}")
-    score = np.where(np.isnan(table["score"]), 1.0, table["score"])
+    box_px, order, notes = _in_pixels(table, order, size, is_named, path)
+    for k, column in enumerate(BOX):
+        is_wrong = box_px[:, k] < column.low
+        table.refuse(is_wrong, f"{column.name} is '{box_px[is_wrong, k][:1].sum():g}'; wanted {column.wanted}")
+    has_none = np.isnan(table["score"])
+    if has_none.any() and not has_none.all():
+        notes.append(f"{has_none.sum()} of {len(table)} rows have no score: they count as certain")
+    score = np.where(has_none, 1.0, table["score"])
+    if (score == np.round(score)).all() and score.min(initial=0) >= 0 and 20 <= score.max(initial=0) <= 100:
+        score = score / 100
+        notes.append("scores are whole numbers up to 100: they were read as percent")
     is_outside = (score < 0) | (score > 1)
     # One score of 1.3 among thousands of probabilities must not make all of these certain.
     if 0 < is_outside.sum() < FEW_SHARE * len(score):
@@ -80,22 +120,86 @@ def read_detections(path: str | Path) -> DetectionTable:
     identity = parse_numbers(table.columns.get("identity", [""] * len(table)))
     is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
     kinds = set(table.columns.get("kind", ()))
+    class_id = table.columns.get("class_id")
+    if order == "yolo" and not is_named:
+        class_id, is_identity = identity, np.zeros(len(table), bool)
     label = next((table.columns[name] for name in CLASS if name in table), None)
-    order = np.argsort(table["frame"], kind="stable")
+    if class_id is not None:
+        class_id = np.where(np.isfinite(class_id), class_id, -1).astype(np.int64)
+        label = [str(k) if k >= 0 else "" for k in class_id.tolist()] if label is None else label
+    rows = np.argsort(table["frame"], kind="stable")
     return DetectionTable(
         str(path),
-        table["frame"][order].astype(np.int64),
-        table.stack(*REQUIRED[1:])[order],
-        score[order],
-        table.line[order],
+        table["frame"][rows].astype(np.int64),
+        box_px[rows],
+        score[rows],
+        table.line[rows],
         own=kinds == {"moving"},
-        identity=np.where(is_identity, identity, -1).astype(np.int64)[order],
-        cut=table["cut"][order] > 0 if "cut" in table else None,
-        feet_px=table.stack(*FEET)[order] if set(FEET) <= table.columns.keys() else None,
+        identity=np.where(is_identity, identity, -1).astype(np.int64)[rows],
+        cut=table["cut"][rows] > 0 if "cut" in table else None,
+        feet_px=table.stack(*FEET)[rows] if set(FEET) <= table.columns.keys() else None,
         ours=kinds == {"moving"} or {"identity", "kind", "row", "speed_px_per_frame"} <= set(table.header),
-        label=None if label is None else np.array(label, object)[order],
-        kind=np.array(table["kind"])[order] if kinds else None,
+        label=None if label is None else np.array(label, object)[rows],
+        kind=np.array(table["kind"])[rows] if kinds else None,
+        class_id=None if class_id is None else class_id[rows],
+        notes=tuple(notes),
     )
+
+
+def _in_pixels(
+    table: CsvTable, order: str | None, size: tuple[float, float] | None, is_named: bool, path: str | Path
+) -> tuple[np.ndarray, str, list[str]]:
+    """Boxes (N, 4) as x, y, width, height in pixels, the order of the columns, and notes. Raises InputError."""
+    box, notes = table.stack(*REQUIRED[1:]), list[str]()
+    shares, found = share_orders(box), order or "xywh"
+    if order is None and shares:
+        found = "xyxy" if "xyxy" in shares and are_corners(box, (1, 1)) else shares[0]
+    elif order is None and not is_named and are_corners(box, size):
+        found = "xyxy"
+        notes.append("by their numbers the boxes are corners, and were read as xyxy; --box-format says it otherwise")
+    if shares and size is None:
+        raise InputError(
+            f"detections {path}: boxes in [0, 1] are shares of a picture ({' or '.join(shares)}), whose "
+            "size is not known: give the clip too, or boxes in pixels"
+        )
+    if shares and size is not None:
+        box = box * np.array([*size, *size])
+        notes.append(f"boxes lie in [0, 1]: they were read as {found} in shares of {size[0]:g} x {size[1]:g} px")
+    first, last = box[:, :2], box[:, 2:]
+    if found == "xyxy":
+        return np.c_[first, last - first], found, notes
+    return np.c_[first - last / 2, last] if found == "yolo" else box, found, notes
+
+
+def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
+    """The cells of a folder of YOLO's labels, as those of a table. Raises InputError with file and line."""
+    files = sorted((f for f in folder.glob("*.txt") if f.stem != "classes"), key=lambda file: natural_order(file.name))
+    ends = [re.search(r"[0-9]{1,9}$", file.stem) for file in files]
+    first = min((int(end[0]) for end in ends if end), default=1)
+    places = {name: number for number, name in enumerate(pictures, 1)}
+    lines, rows = list[int](), list[list[str]]()
+    for file, end in zip(files, ends, strict=True):
+        number = places.get(file.stem) if places else int(end[0]) + (first == 0) if end else None
+        if number is None:
+            raise InputError(f"{file} belongs to no picture: wanted the name of one, or a name that ends in its number")
+        for line, row in enumerate(read_csv(file, "labels", has_header=False).rows, 1):
+            cells = row if len(row) > 1 else row[0].split()
+            if not 5 <= len(cells) <= 7:
+                raise InputError(f"labels {file}, line {line}: {len(cells)} columns; wanted class cx cy w h [score]")
+            lines.append(line)
+            rows.append([str(number), *cells[:6]])
+    if not files:
+        raise InputError(f"folder {folder} holds no labels (a .txt file for each picture)")
+    return CsvText([*MOT_NAMES], lines, rows), False
+
+
+def read_for_clip(
+    path: Path, order: str | None, source: Source | None, size: tuple[float | None, float | None] = (None, None)
+) -> DetectionTable:
+    """`read_detections` for a clip, whose size counts before the one that is given. Raises InputError as it does."""
+    size = size if source is None else source.size
+    known = (size[0], size[1]) if size[0] and size[1] else None
+    return read_detections(path, order, known, [file.stem for file in getattr(source, "files", ())])
 
 
 def read_header(path: str | Path) -> list[str]:
@@ -129,7 +233,8 @@ def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
     # The first name may be empty: so a table with an index begins.
     first, *_ = [*" ".join(rows[0]).split(), ""] if rows else [""]
     if first[:1].isalpha() and first.lower() not in ("nan", "inf", "infinity"):
-        return CsvText(rows[0], line[1:], rows[1:]), True
+        header = [_OWN_NAMES.get(name, name) if _OWN_NAMES.get(name) not in rows[0] else name for name in rows[0]]
+        return CsvText(header, line[1:], rows[1:]), True
     rows = [row if len(row) > 1 else row[0].split() for row in rows]
     widest = max((len(row) for row in rows), default=len(MOT_NAMES))
     header = [*MOT_NAMES, *(f"column_{place}" for place in range(len(MOT_NAMES) + 1, widest + 1))]
@@ -150,7 +255,7 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
         return [f"{name} holds no rows"]
     if source is not None:
         check_within_clip(table, source)
-    notes = []
+    notes = [*table.notes]
     left_out = len(table) - int(is_sampled(table.frame, interval).sum())
     if left_out == len(table):
         sampled = ", ".join(str(1 + k * interval) for k in range(3))
@@ -171,7 +276,9 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
         notes.append("all rows are moving targets of dddas detect: every row counts as certain")
     elif not table.probable:
         low, high = table.score.min(), table.score.max()
-        notes.append(f"scores from {low:g} to {high:g} are no probabilities: every row counts as certain")
+        notes.append(
+            f"scores from {low:g} to {high:g} are no probabilities: every row counts as certain (divide percent by 100)"
+        )
     if source is not None:
         low, high = table.box_px[:, :2], table.box_px[:, :2] + table.box_px[:, 2:]
         if outside := int(((high <= 0) | (low >= source.size)).any(axis=1).sum()):

@@ -107,7 +107,7 @@ def prepare_run(
             flight = _read_telemetry(telemetry, settings, clip)
         if given is not None:
             _check_unused(given, source.size)
-        settings, more = with_logged_focal(settings, flight, source.size[0])
+        settings, more = with_logged_focal(settings, flight, source.size)
         notes += [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
     return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
 

@@ -12,31 +12,53 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError, LostInputError, without_secrets
 from torchvision_dddas.io.atomic_files import utf8_name
-from torchvision_dddas.io.captures import AvCapture, Capture, announced_hz, is_live, open_capture
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, images_of_folder, images_of_glob, quiet_opencv, read_image
+from torchvision_dddas.io.captures import (
+    AvCapture,
+    Capture,
+    announced_hz,
+    deep_grey_note,
+    is_live,
+    open_capture,
+    sample_pictures,
+)
+from torchvision_dddas.io.images import (
+    IMAGE_SUFFIXES,
+    Levels,
+    images_of_folder,
+    images_of_glob,
+    quiet_opencv,
+    read_image,
+)
 from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
 _WANTED = "a video file, a folder or glob of images, camera:0, rtsp://... or sim:SCENARIO"
 
 
 def open_source(
-    spec: str | Path, *, rate_hz: float | None = None, full_scale: int | None = None, single: bool = False
+    spec: str | Path,
+    *,
+    rate_hz: float | None = None,
+    full_scale: int | tuple[int, int] | None = None,
+    single: bool = False,
 ) -> Source:
     """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`.
 
-    rate_hz: frames a second; None takes the video's own, and 10 for images. full_scale: see ImageSource.
+    rate_hz: frames a second; None takes the video's own, and 10 for images.
+    full_scale: of 16-bit pictures the value that becomes white (255), or those that become black and white. None: they
+    are taken from the clip, as `images.Levels` says; the source's `levels` tells them.
     single: a file that is one image is a clip of one frame; else it is refused, since nothing can move in it.
     Raises InputError with one line when it cannot be read.
     """
     text = str(spec)
     if rate_hz is not None and not 0 < rate_hz <= 1000:
         raise InputError(f"the frame rate must be more than 0 and at most 1000 per second, got {rate_hz}")
-    if full_scale is not None and not 1 <= full_scale <= 65535:
-        raise InputError(f"the full scale must be between 1 and 65535, got {full_scale}")
+    scale = (0, full_scale) if isinstance(full_scale, int) else full_scale
+    if scale is not None and not (len(scale) == 2 and 0 <= scale[0] < scale[1] <= 65535):
+        raise InputError(f"the full scale must be black below white, both between 0 and 65535, got {full_scale}")
     if not text:
         raise InputError(f"the input's name is empty; wanted {_WANTED}")
     if (target := stream_target(text)) is not None:
-        return VideoSource(target, without_secrets(text), rate_hz)
+        return VideoSource(target, without_secrets(text), rate_hz, scale)
     path = Path(text)
     try:
         path.stat()
@@ -45,7 +67,7 @@ def open_source(
     except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered, a name with a NUL
         raise InputError(f"{text[:200]} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
-        return VideoSource(text, text, rate_hz)
+        return VideoSource(text, text, rate_hz, scale)
     if path.is_file() and not single:
         raise InputError(
             f"{path} is one image, not a clip; give its folder, or a glob in quotes such as 'frames/*.png'"
@@ -58,7 +80,7 @@ def open_source(
         files = images_of_glob(text)
     else:
         raise InputError(f"{path} does not exist; wanted {_WANTED}")
-    return ImageSource(files, text, rate_hz or 10.0, full_scale)
+    return ImageSource(files, text, rate_hz or 10.0, scale)
 
 
 # Pictures in a row of another size, after which a tolerant reader goes on with that size.
@@ -70,8 +92,11 @@ class _Clip(ABC):
 
     tolerant: a frame of another size or depth is left out, and a size that lasts is the clip's from then on; else such
     a frame raises InputError.
+
+    levels: how 16-bit pictures become 8-bit ones; None for other pictures.
     """
 
+    levels: Levels | None = None
     exact = True
     tolerant = False
     count: int | None
@@ -103,6 +128,23 @@ class _Clip(ABC):
             self._leave_out(number, f"{this} is {size[0]}x{size[1]} but {first} is {width}x{height}", "size")
         return not self._odd
 
+    def _begin(self) -> None:
+        self.problems.clear()
+        self._saturated = False
+        if self.levels is not None:
+            self.levels.begin()
+
+    def _to_bytes(self, image: np.ndarray, number: int) -> np.ndarray:
+        """The picture in 8 bits; note once where much of it is beyond the range."""
+        if self.levels is None:
+            return image
+        image, is_beyond = self.levels.to_bytes(image)
+        if is_beyond and not self._saturated:
+            self._saturated, levels = True, self.levels
+            what = f"over 5 % of frame {number} lies beyond {levels.black:.0f} to {levels.white:.0f}: it is cut there"
+            self._note(number, what)
+        return image
+
     def _leave_out(self, number: int, what: str, must: str) -> None:
         if not self.tolerant:
             raise InputError(f"{what}; all frames of a clip must have one {must}")
@@ -112,7 +154,6 @@ class _Clip(ABC):
 # --------------------------------------------------------------------------------------------------------------------
 # Images.
 
-_SENSOR_BITS = (8, 10, 12, 14, 16)
 _SAMPLES = 9
 
 
@@ -120,14 +161,15 @@ class ImageSource(_Clip):
     """The files of a folder or glob in natural order (frame2 before frame10), one a frame.
 
     rate_hz: images carry no frame rate, so the caller gives one.
-    full_scale: the 16-bit value that becomes white (255). One value serves the whole clip, so that brightness does not
-    flicker. By default nine images spread over the clip are read, and it is the top of the smallest sensor (8, 10,
-    12, 14 or 16 bits) that holds their brightest pixel. Brighter pixels elsewhere saturate, which is recorded once.
+    scale: of 16-bit images the values that become black and white; by default nine images spread over the clip give
+    them. A picture of which much lies beyond saturates, which is recorded once.
     The first image decides whether the clip is grey or colour; the others follow it.
     Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
     """
 
-    def __init__(self, files: Sequence[Path], name: str, rate_hz: float = 10.0, full_scale: int | None = None) -> None:
+    def __init__(
+        self, files: Sequence[Path], name: str, rate_hz: float = 10.0, scale: tuple[int, int] | None = None
+    ) -> None:
         super().__init__(name)
         if not files:
             raise InputError(f"{name} holds no images")
@@ -139,12 +181,14 @@ class ImageSource(_Clip):
             raise InputError(f"{self.files[0]} holds {first.dtype} pixels; wanted 8 or 16 bits")
         self.size = (first.shape[1], first.shape[0])
         self._depth, self._grey = first.dtype, first.ndim == 2
-        self.full_scale = (full_scale or self._sensor_top()) if self._depth == np.uint16 else 255
+        if self._depth == np.uint16:
+            samples = np.unique(np.linspace(0, len(files) - 1, _SAMPLES if scale is None else 1).astype(int))
+            images = (first, *(read_image(self.files[i]) for i in samples[1:]))
+            self.levels = Levels([i for i in images if i is not None and i.dtype == np.uint16], scale)
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the other files are not opened."""
-        self.problems.clear()
-        saturated = False
+        self._begin()
         for number, file in enumerate(self.files, start=1):
             self.last = number
             if not is_sampled(number, interval):
@@ -159,21 +203,10 @@ class ImageSource(_Clip):
                 what = f"{file} holds {image.dtype} pixels but {self.files[0].name} {self._depth}"
                 self._leave_out(number, what, "depth")
                 continue
-            if self._depth == np.uint16:
-                if not saturated and image.max() > self.full_scale:
-                    saturated = True
-                    what = f"frame {number} ({file.name}) holds {image.max()}; above {self.full_scale} all is white"
-                    self._note(number, what)
-                image = cv2.convertScaleAbs(image, alpha=255.0 / self.full_scale)
+            image = self._to_bytes(image, number)
             if self._grey != (image.ndim == 2):
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if self._grey else cv2.COLOR_GRAY2BGR)
             yield Frame(number, (number - 1) / self.rate_hz, image)
-
-    def _sensor_top(self) -> int:
-        samples = np.unique(np.linspace(0, len(self.files) - 1, _SAMPLES).astype(int))
-        images = (read_image(self.files[i]) for i in samples)
-        brightest = max(int(image.max()) for image in images if image is not None)
-        return next(2**bits - 1 for bits in _SENSOR_BITS if brightest < 2**bits)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -255,7 +288,9 @@ class VideoSource(_Clip):
     Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
     """
 
-    def __init__(self, target: str | int, name: str, rate_hz: float | None = None) -> None:
+    def __init__(
+        self, target: str | int, name: str, rate_hz: float | None = None, scale: tuple[int, int] | None = None
+    ) -> None:
         super().__init__(name)
         self._target = target
         self._live = is_live(target)
@@ -265,6 +300,8 @@ class VideoSource(_Clip):
             is_counted = Path(urlsplit(str(target)).path if self._live else str(target)).suffix.lower() in _EXACT_COUNT
             decoded, first = capture.read()
             true_hz = None if self._live or not isinstance(capture, AvCapture) else capture.measure_hz()
+            if decoded and first.dtype == np.uint16:
+                self.levels = Levels([first, *sample_pictures(capture, _SAMPLES if scale is None else 1)], scale)
         finally:
             capture.release()
         if not decoded:
@@ -280,7 +317,7 @@ class VideoSource(_Clip):
 
     def every(self, interval: int) -> Iterator[Frame]:
         """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
-        self.problems.clear()
+        self._begin()
         self.notes.clear()
         capture = self._open()
         try:
@@ -312,6 +349,8 @@ class VideoSource(_Clip):
             if not decoded:
                 self._note_lost(number, number)
             elif self._fits(image, number, f"frame {number} of {self.name}", "the first"):
+                image = self._to_bytes(image, number)
+                image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
                 yield Frame(number, stamps.time_s, image)
         number = self.last
         if words := stamps.describe():
@@ -366,7 +405,10 @@ class VideoSource(_Clip):
             capture.release()
 
     def _open(self) -> Capture:
-        return open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
+        capture = open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
+        if note := deep_grey_note(capture):
+            self._note(1, note)
+        return capture
 
 
 def frame_times(source: Source) -> dict[int, float]:

@@ -36,6 +36,7 @@ class LiveSource:
 
     count: int | None = None
     exact = False
+    levels: object = None
 
     def __init__(
         self,
@@ -44,7 +45,7 @@ class LiveSource:
         health: Health | None = None,
         *,
         rate_hz: float | None = None,
-        full_scale: int | None = None,
+        full_scale: int | tuple[int, int] | None = None,
         opener: Callable[[], Stream] | None = None,
         clock: Clock | None = None,
         waiting: Callable[[], object] | None = None,
@@ -67,6 +68,7 @@ class LiveSource:
             self._feed = Player(recording, self.parameters.pace, *shared)
             self.rate_hz = recording.rate_hz
             self.recorded = recording.count if recording.exact else None
+            self.levels = getattr(recording, "levels", None)
             return
         limit_s = self.parameters.stall_s
         where = text if target is None else target

@@ -109,7 +109,14 @@ def run_live(
                 _print_event(events[0])
 
         try:
-            source = LiveSource(clip, live, health, rate_hz=rate_hz, waiting=waiting if wait else None)
+            source = LiveSource(
+                clip,
+                live,
+                health,
+                rate_hz=rate_hz,
+                full_scale=settings.levels.given,
+                waiting=waiting if wait else None,
+            )
         except DeadCamera as error:
             _print(str(error))
             return HUNG
@@ -124,6 +131,7 @@ def run_live(
             check_length(source.recorded)
         prepare = partial(prepare_run, given, telemetry, settings, source, backend, clip)
         ready = prepare()
+        ready.notes.extend([str(source.levels)] if source.levels else [])
         flight, is_recording, offset_s = ready.flight, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
         if flight is not None:

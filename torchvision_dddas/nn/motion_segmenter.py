@@ -24,7 +24,7 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
-from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, HALF, WHITE, Settings, exposure_step
+from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, HALF, WHITE, Settings, check_settings, exposure_step
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.difference import absolute_difference
 from torchvision_dddas.functional.filters import is_above, to_bytes
@@ -169,7 +169,7 @@ class MotionSegmenter(nn.Module):
         if softness < 0:
             raise InputError(f"softness must be 0 or more, got {softness}")
         _check_names(tuned)
-        self.settings, self.softness, self.whole = settings or Settings(), softness, whole
+        self.settings, self.softness, self.whole = check_settings(settings), softness, whole
         self.registration = Registration(self.settings.registration)
         self.tuned = {name: name.replace(".", "_") for name in tuned}
         for name, attribute in self.tuned.items():
@@ -432,11 +432,20 @@ def _check_names(names: Iterable[str]) -> None:
 
 
 def _check_clip(clip: Tensor, later_from_earlier: Tensor | None) -> None:
-    shape = tuple(clip.shape)
-    if clip.dim() != 5 or shape[1] < 1 or shape[2] not in (1, 3) or not clip.is_floating_point():
-        raise InputError(
-            f"a clip must be floats (batch, frames, 1 or 3, height, width) in [0, 1], got {clip.dtype} {shape}"
-        )
+    shape = tuple(getattr(clip, "shape", ()))
+    if not isinstance(clip, Tensor) or len(shape) != 5 or shape[1] < 1 or shape[2] not in (1, 3):
+        what = f"{getattr(clip, 'dtype', type(clip).__name__)} {shape}"
+        raise InputError(f"a clip must be floats (batch, frames, 1 or 3, height, width) in [0, 1], got {what}")
+    code = ""
+    if clip.dtype not in (torch.float32, torch.float64):
+        code = "clip.float()" if clip.is_floating_point() else "clip.float() / 255"
+    elif clip.numel() and F.may_branch(clip):  # what lies on a GPU is not read
+        low, high = (float(end) for end in clip.aminmax())
+        if not (low >= 0 and high <= 1):
+            code = "clip.nan_to_num()" if low != low else "clip / 255" if low >= 0 and high > 2 else "clip.clamp(0, 1)"
+    if code:
+        what = str(clip.dtype) if clip.dtype not in (torch.float32, torch.float64) else f"{low:g} to {high:g}"
+        raise InputError(f"a clip must be float32 or float64 in [0, 1], got {what}; convert it: {code}")
     if later_from_earlier is not None and tuple(later_from_earlier.shape) != (shape[0], shape[1] - 1, 3, 3):
         wanted, got = (shape[0], shape[1] - 1, 3, 3), tuple(later_from_earlier.shape)
         raise InputError(f"later_from_earlier must be {wanted}, one matrix a step, got {got}")

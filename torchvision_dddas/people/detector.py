@@ -3,11 +3,11 @@
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol, overload
+from typing import Any, Protocol, overload
 
 import numpy as np
 
-from torchvision_dddas.config import PeopleParameters, Settings
+from torchvision_dddas.config import PeopleParameters, Settings, check_settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.people import pyramid
@@ -26,6 +26,7 @@ from torchvision_dddas.types import (
     Scene,
     TrackedFrame,
     Tracks,
+    as_picture,
     is_sampled,
 )
 
@@ -42,7 +43,7 @@ class PersonDetector:
 
         Raises InputError for an unknown backend, and a classifier or graphs that cannot be read or do not fit.
         """
-        self.parameters = (settings or Settings()).people
+        self.parameters = check_settings(settings).people
         self.scorer = load_scorer(self.parameters, backend)
 
     @overload
@@ -54,8 +55,9 @@ class PersonDetector:
 
         Raises InputError for another shape or type, and a picture that is smaller than the window.
         """
-        if isinstance(images, np.ndarray) and images.ndim < 4:
-            return detect_people([images], self.scorer, self.parameters)[0]
+        several: Any = images
+        if not isinstance(several, Iterable) or isinstance(several, str) or getattr(several, "ndim", 4) < 4:
+            return detect_people([several], self.scorer, self.parameters)[0]
         return detect_people(list(images), self.scorer, self.parameters)
 
 
@@ -96,7 +98,7 @@ def detect_people(
     regions: Sequence[Regions] | None = None,
 ) -> list[People]:
     """The people of pictures, searched everywhere or in regions of each. Raises InputError as `detect_in_clip`."""
-    images = [check_image(image, f"picture {i}") for i, image in enumerate(images, start=1)]
+    images = [as_picture(image, f"picture {i}") for i, image in enumerate(images, start=1)]
     parts = []
     for i, image in enumerate(images):
         size = image.shape[1], image.shape[0]
@@ -116,21 +118,6 @@ def _score_people(
         size = image.shape[1], image.shape[0]
         found.append(people_from_windows(*pyramid.windows(wanted, maps, size, parameters), size, parameters))
     return found
-
-
-def check_image(image: np.ndarray, name: str) -> np.ndarray:
-    """A picture as the backends take it: (H, W) or (H, W, 3) uint8. Raises InputError for anything else."""
-    if image is None:  # what OpenCV gives for a file that it cannot read
-        raise InputError(f"{name} is None; could its file be read? Wanted an array of height x width pixels")
-    image = np.asarray(image)
-    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (1, 3)) or 0 in image.shape:
-        shape = " x ".join(map(str, image.shape))
-        what = f"an array of {shape}" if image.ndim else f"a single {image.dtype.type.__name__}"
-        raise InputError(f"{name} is {what}; wanted height x width, or these x 1 or 3 channels (BGR)")
-    if image.dtype != np.uint8:
-        nan = ", NaN among them" if image.dtype.kind == "f" and bool(np.isnan(image).any()) else ""
-        raise InputError(f"{name} holds {image.dtype} pixels{nan}; wanted 8 bits (uint8), 0 to 255")
-    return image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
 
 
 def detect_in_clip(
@@ -178,7 +165,7 @@ def detect_in_clip(
     start = time.perf_counter()
     for frame in source:
         read = time.perf_counter()
-        image = check_image(frame.image, f"frame {frame.number}")
+        image = as_picture(frame.image, f"frame {frame.number}")
         if frame.number > number:
             yield from search_waiting()
             yield from unread(range(number, frame.number), image.shape)
@@ -242,7 +229,7 @@ class PersonTracker:
             start = time.perf_counter()
             self._box_px = scene.detections.box_px
             plan = self._search.plan(number, self._size)
-            image = check_image(image, f"frame {number}")
+            image = as_picture(image, f"frame {number}")
             (people,) = _score_people([image], [plan.parts], self._scorer, self._search.parameters)
             self._search.update(number, people, plan)
             unknown = np.full(len(people), np.nan)

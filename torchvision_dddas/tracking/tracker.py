@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.runtime import wants_torch
@@ -25,9 +25,14 @@ from torchvision_dddas.types import (
     Source,
     TrackedFrame,
     Tracks,
+    are_corners,
+    as_picture,
+    check_boxes,
     is_sampled,
 )
 
+_MOST_CLASSES = 10_000  # identities of which the class is kept; those seen longest ago are forgotten
+_TRIED = 100
 MOTION = "moving"
 """The kind of detections that the motion detector makes."""
 WEIGHT, LOOKED = "paper.weight", "appearance.looked"
@@ -71,14 +76,16 @@ class Tracker:
             raise InputError(f"interval must be a whole number of frames from 1, got {interval}")
         if size is not None and (len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size)):
             raise InputError(f"size must be (width, height) in pixels, got {size}")
-        self.settings, self.interval, self.size = settings or Settings(), int(interval), size
+        self.settings, self.interval, self.size = check_settings(settings), int(interval), size
         self._motion, self._certain, self._rate_hz = motion, certain, rate_hz
         self._in_batches = self.settings.track.mode == "paper" and wants_torch(backend)
         self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None
         self._frame: int | None = None
         self._time_s, self._at = math.nan, math.nan  # of the last frame; its number if frames came at a constant rate
-        self._scores: deque[np.ndarray] = deque()  # as given, of the frames that are not settled
+        self._tried = np.zeros((0, 4))  # boxes that were given as arrays, until their order is beyond doubt
+        self._given: deque[Detections] = deque()  # of the frames that are not settled
+        self._classes: dict[int, tuple[str, int]] = {}  # of the detection before, by identity
 
     def update(
         self,
@@ -99,15 +106,18 @@ class Tracker:
         Raises InputError for other shapes, boxes without a size, values that are not finite, and a number that is not
         above the last one's.
         """
-        detections = _check_detections(detections)
+        is_moving = isinstance(detections, Detections) and detections.kind == MOTION
+        is_array = not isinstance(detections, Detections)
+        detections = _check_detections(detections, bool(self._certain or self._motion or is_moving))
+        if is_array and len(self._tried) < _TRIED:
+            self._tried = np.concatenate([self._tried, detections.box_px])
+            if are_corners(self._tried, self.size):
+                raise InputError("boxes look like xyxy; wanted x, y, width, height: boxes[:, 2:] -= boxes[:, :2]")
         if camera_motion is not None:
             camera_motion = np.asarray(camera_motion, float)
             if camera_motion.shape != (3, 3) or not np.isfinite(camera_motion).all():
                 raise InputError(f"camera_motion must be a finite (3, 3) homography; got shape {camera_motion.shape}")
-        if image is not None and (
-            image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,))
-        ):
-            raise InputError(f"image must be (H, W, 3) or (H, W) uint8, got {image.shape} {image.dtype}")
+        image = None if image is None else as_picture(image, "image")
         expected = 1 if self._frame is None else self._frame + (interval or self.interval)
         number = expected if frame is None else frame
         if self._frame is not None and number <= self._frame:
@@ -129,17 +139,17 @@ class Tracker:
                 self._tracker = SourceTracker(settings, self.interval, self.size)
             else:
                 self._tracker = ScoreTracker(settings, self.interval, self.size, confirmed=self._motion)
-        self._scores.append(detections.score)
+        self._given.append(detections)
         if self._motion or self._certain:
             detections = replace(detections, score=np.ones(len(detections)))
         appearance = None if image is None else self._histograms(image, detections.box_px)
         if isinstance(self._tracker, ScoreTracker):
-            return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance, self._at))
-        return self._with_given_scores(self._tracker.feed(number, detections, camera_motion, appearance))
+            return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance, self._at))
+        return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
         """The frames that are not settled yet, at the end of a run."""
-        return self._with_given_scores(self._tracker.end()) if self._tracker is not None else []
+        return self._as_given(self._tracker.end()) if self._tracker is not None else []
 
     @property
     def appearance_s(self) -> float:
@@ -170,17 +180,27 @@ class Tracker:
 
         return compute
 
-    def _with_given_scores(self, settled: list[Tracks]) -> list[Tracks]:
+    def _as_given(self, settled: list[Tracks]) -> list[Tracks]:
+        """The tracks with the scores and classes of their detections; bridges have the class that was seen last."""
         found = []
         for tracks in settled:
-            given, score = self._scores.popleft(), np.array(tracks.score, float)
+            given, score = self._given.popleft(), np.array(tracks.score, float)
             is_detection = tracks.row >= 0
-            score[is_detection] = given[tracks.row[is_detection]]
-            found.append(replace(tracks, score=score))
+            score[is_detection] = given.score[tracks.row[is_detection]]
+            classes = []
+            for identity, row in zip(tracks.identity.tolist(), tracks.row.tolist(), strict=True):
+                seen = self._classes.pop(identity, ("", -1))
+                classes.append((given.label[row], given.class_id[row]) if row >= 0 else seen)
+                self._classes[identity] = classes[-1]
+            while len(self._classes) > _MOST_CLASSES:
+                del self._classes[next(iter(self._classes))]
+            label = np.array([name for name, _ in classes], object)
+            number = np.array([number for _, number in classes], np.int64)
+            found.append(replace(tracks, score=score, label=label, class_id=number))
         return found
 
 
-def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]") -> Detections:
+def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]", certain: bool) -> Detections:
     if isinstance(given, Detections):
         box, score = given.box_px, given.score
     else:
@@ -195,16 +215,10 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
         raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
     if score.shape != (len(box),):
         raise InputError(f"scores must be one a box, ({len(box)},); got {score.shape}")
-    if not (np.isfinite(box).all() and np.isfinite(score).all()):
-        raise InputError("boxes and scores must be finite; leave out detections that are unknown")
-    if len(box) and not (box[:, 2:] > 0).all():
-        row = int((box[:, 2:] <= 0).any(axis=1).argmax())
-        width, height = box[row, 2:]
-        raise InputError(f"width and height must be above 0 px, got {width:g} x {height:g} in box {row}")
+    check_boxes(box, score, certain)
     if isinstance(given, Detections):
         return given
-    unknown = np.full(len(box), np.nan)
-    return Detections(box, score, box[:, 2] * box[:, 3], unknown, unknown, kind="given")
+    return Detections(box, score, box[:, 2] * box[:, 3], kind="given")
 
 
 class FrameTracker:

@@ -19,10 +19,11 @@ from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
 from torchvision_dddas.functional import step
 from torchvision_dddas.people import pyramid
-from torchvision_dddas.people.detector import WindowScorer, check_image, load_scorer
+from torchvision_dddas.people.detector import WindowScorer, load_scorer
 from torchvision_dddas.people.suppression import body_sides, log_odds, people_from_windows
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import with_tensors
+from torchvision_dddas.types import as_picture
 
 MOST = 80
 """Pictures of a clip at most, evenly over it: scoring takes about a second each, and only six numbers are tuned."""
@@ -77,7 +78,7 @@ class PeopleFamily(Family):
         wanted = {numbers[i * len(numbers) // count] for i in range(count)}
         for frame in open_clip(clip):
             if frame.number in wanted:
-                image = check_image(frame.image, f"{clip.name}, frame {frame.number}")
+                image = as_picture(frame.image, f"{clip.name}, frame {frame.number}")
                 yield frame.number, score_picture(image, truth, frame.number, settings.people, scorer)
 
     def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:

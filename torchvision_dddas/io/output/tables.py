@@ -42,15 +42,16 @@ from torchvision_dddas.types import (
     TrackedFrame,
 )
 
+_CLASS = (Column("class"), Column("class_id", ".0f"))
 TRACKS = Schema(
     "tracks",
     *(FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION),
-    *(Column("link", ".3f", may_be_empty=True), Column("class")),
+    *(Column("link", ".3f", may_be_empty=True), *_CLASS),
 )
 """tracks.csv. kind: `detection`, `bridge` for a box between two detections, `untracked` for one without identity.
 
 row: the detection's line in the file it comes from, or its number in the frame. Heading and speed are over the ground.
-link: as in Tracks, empty where unknown. class: of the detection, for a bridge of the identity's box before.
+link: as in Tracks, empty where unknown. class, class_id: of the detection, for a bridge of the identity's box before.
 """
 
 _FEET = (Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"))
@@ -104,7 +105,6 @@ _AERIAL = (
 def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
     """tracks.txt and tracks.csv, with heading and speed since the box before for identities that have one."""
     trails = Trails(length=2)
-    known: dict[int, str] = {}  # class of the latest detection by identity
 
     def motion(identity: int) -> tuple[float, float]:
         trail = trails.places[identity]
@@ -117,11 +117,6 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
         trails.add(tracked)
         tracks, given, loose = tracked.tracks, tracked.detections, tracked.untracked
         lines = tracked.lines if len(tracked.lines) else np.arange(1, len(given) + 1)
-        labels = given.label.tolist()
-        seen = zip(tracks.identity.tolist(), tracks.row.tolist(), strict=True)
-        known.update({identity: labels[row] for identity, row in seen if row >= 0})
-        for identity in known.keys() - trails.places.keys():
-            del known[identity]
         moves = [motion(identity) for identity in tracks.identity.tolist()] + [(math.nan, math.nan)] * len(loose)
         return {
             **_named(BOX, np.concatenate([tracks.box_px, given.box_px[loose]])),
@@ -133,7 +128,7 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
             "heading_deg": [heading for heading, _ in moves],
             "speed_px_per_frame": [speed for _, speed in moves],
             "link": [*tracks.link.tolist(), *[None] * len(loose)],
-            "class": [*(known.get(identity, "") for identity in tracks.identity.tolist()), *(labels[k] for k in loose)],
+            **_class_rows(np.r_[tracks.label, given.label[loose]], np.r_[tracks.class_id, given.class_id[loose]]),
         }
 
     return TableFiles({folder / "tracks.txt": (MOT_TRACKS, track_rows), folder / "tracks.csv": (TRACKS, rows)})
@@ -164,7 +159,7 @@ def people_tables(folder: Path) -> TableFiles[PeopleFrame]:
 
 def aerial_tables(folder: Path, has_degrees: bool) -> TableFiles[AerialLocations]:
     """positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known."""
-    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *_AERIAL)
+    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *_AERIAL, *_CLASS)
 
     def rows(located: AerialLocations) -> Rows:
         return {
@@ -214,7 +209,7 @@ def upper_edge_deg(pose: CameraPose) -> float:
 
 def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> TableFiles[GroundLocations]:
     """positions.csv and sightings.csv. cameras: their names."""
-    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"))
+    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *_CLASS)
 
     def rows(located: GroundLocations) -> Rows:
         return {**_position_rows(located.positions), "cameras": (located.members >= 0).sum(axis=1)}
@@ -289,7 +284,7 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResu
         own = _position_rows(located.positions)
         return {name: np.asarray(values)[confirmed.row] for name, values in own.items()} | _confirmation_rows(confirmed)
 
-    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION)
+    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION, *_CLASS)
     return TableFiles({folder / "confirmed.csv": (schema, rows)}, is_optional=True)
 
 
@@ -353,7 +348,12 @@ def _position_rows(positions: Positions) -> dict[str, Any]:
         "frame": positions.frame,
         "target": positions.target,
         "score": positions.score,
+        **_class_rows(positions.label, positions.class_id),
     }
+
+
+def _class_rows(label: np.ndarray, class_id: np.ndarray) -> dict[str, np.ndarray]:
+    return {"class": label, "class_id": np.where(class_id < 0, np.nan, class_id)}
 
 
 def _variances(covariance_m2: np.ndarray) -> np.ndarray:

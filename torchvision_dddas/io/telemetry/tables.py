@@ -280,7 +280,8 @@ def _read_program_table(
         hfov = hfov_of_focal(*("" if i is None else cells[i] for i in optics)) if optics[0] is not None else None
         if hfov is not None:
             log.add("hfov_rad", moment - first, hfov, number)
-            log.note("the field of view is that of a focal length for a picture 36 mm wide")
+            log.is_nominal = True
+            log.note("the field of view is that of a focal length as for a picture with a longer side of 36 mm")
     if not log.moments:
         raise InputError(f"telemetry {log.path} has a header but no rows")
     if filmed > 0 and not clock_offset_s:

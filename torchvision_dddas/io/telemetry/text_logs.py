@@ -168,7 +168,8 @@ def _quantities(log: Log, text: str, tuples: dict[str, Numbers], is_swapped: boo
     hfov = hfov_of_focal(*(optics.get(name, "").replace(",", ".") for name in _OPTICS))
     if hfov is not None:
         values["hfov_rad"] = hfov
-        log.note("the field of view is that of a focal length for a picture 36 mm wide")
+        log.is_nominal = True
+        log.note("the field of view is that of a focal length as for a picture with a longer side of 36 mm")
     if values.get("longitude_deg") == values.get("latitude_deg") == values.get("above_sea_m") == 0.0:
         values["above_sea_m"] = math.nan  # no fix
     return values
