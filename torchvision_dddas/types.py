@@ -450,6 +450,7 @@ class Detections(Boxes):
         Raises InputError where boxes or scores are missing, have other shapes, or are not what `check_boxes` wants.
         """
         given, names = detections, getattr(detections, "names", {})
+        names = names if isinstance(names, Mapping) else dict(enumerate(names))
         if hasattr(getattr(given, "boxes", None), "xyxy"):  # ultralytics' Results
             given = given.boxes
         (edges, xyxy), (conf, confidence), (_, number) = (_first_of(given, line) for line in _FOREIGN)

@@ -208,6 +208,10 @@ _FREQUENT = 2e-4
 _SENSOR_BITS = (8, 10, 12, 14, 16)
 
 
+Scale = tuple[int, int] | None
+"""The values of 16-bit pictures that become black and white; None: the clip gives them."""
+
+
 class Levels:
     """How the 16-bit pictures of a clip become 8-bit ones: by one gain, so that they do not flicker.
 
@@ -217,7 +221,7 @@ class Levels:
     the range follows by as few whole levels as will do.
     """
 
-    def __init__(self, samples: Sequence[np.ndarray], given: tuple[int, int] | None = None) -> None:
+    def __init__(self, samples: Sequence[np.ndarray], given: Scale = None) -> None:
         """given: black and white, which stay then."""
         self.is_given, self._core, self._most = given is not None, 0.0, 0.0
         self._black, self.width = (0.0, 0.0) if given is None else (float(given[0]), float(given[1] - given[0]))
@@ -265,11 +269,7 @@ class Levels:
         self._black = black - (black - frequent[0]) % step if is_whole and len(frequent) > 1 and black else black
 
     def __str__(self) -> str:
-        whence = "as levels.black and levels.white say"
-        if not self.is_given:
-            whence = "taken from the clip; levels.black and levels.white set them"
-            if self.black != self._black:
-                whence = f"at the end, after a drift of {self.black - self._black:.0f}, " + whence
+        whence = "as given" if self.is_given else "taken from the clip; levels.black and levels.white set them"
         return f"16-bit pictures: values from {self.black:.0f} to {self.white:.0f} become black to white, {whence}"
 
 

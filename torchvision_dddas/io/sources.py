@@ -24,6 +24,7 @@ from torchvision_dddas.io.captures import (
 from torchvision_dddas.io.images import (
     IMAGE_SUFFIXES,
     Levels,
+    Scale,
     images_of_folder,
     images_of_glob,
     quiet_opencv,
@@ -35,11 +36,7 @@ _WANTED = "a video file, a folder or glob of images, camera:0, rtsp://... or sim
 
 
 def open_source(
-    spec: str | Path,
-    *,
-    rate_hz: float | None = None,
-    full_scale: int | tuple[int, int] | None = None,
-    single: bool = False,
+    spec: str | Path, *, rate_hz: float | None = None, full_scale: int | Scale = None, single: bool = False
 ) -> Source:
     """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`.
 
@@ -140,9 +137,8 @@ class _Clip(ABC):
             return image
         image, is_beyond = self.levels.to_bytes(image)
         if is_beyond and not self._saturated:
-            self._saturated, levels = True, self.levels
-            what = f"over 5 % of frame {number} lies beyond {levels.black:.0f} to {levels.white:.0f}: it is cut there"
-            self._note(number, what)
+            self._saturated = True
+            self._note(number, f"over 5 % of frame {number} lies beyond the range and is cut; {self.levels}")
         return image
 
     def _leave_out(self, number: int, what: str, must: str) -> None:
@@ -167,9 +163,7 @@ class ImageSource(_Clip):
     Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
     """
 
-    def __init__(
-        self, files: Sequence[Path], name: str, rate_hz: float = 10.0, scale: tuple[int, int] | None = None
-    ) -> None:
+    def __init__(self, files: Sequence[Path], name: str, rate_hz: float = 10.0, scale: Scale = None) -> None:
         super().__init__(name)
         if not files:
             raise InputError(f"{name} holds no images")
@@ -288,9 +282,7 @@ class VideoSource(_Clip):
     Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
     """
 
-    def __init__(
-        self, target: str | int, name: str, rate_hz: float | None = None, scale: tuple[int, int] | None = None
-    ) -> None:
+    def __init__(self, target: str | int, name: str, rate_hz: float | None = None, scale: Scale = None) -> None:
         super().__init__(name)
         self._target = target
         self._live = is_live(target)

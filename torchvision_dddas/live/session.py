@@ -109,14 +109,8 @@ def run_live(
                 _print_event(events[0])
 
         try:
-            source = LiveSource(
-                clip,
-                live,
-                health,
-                rate_hz=rate_hz,
-                full_scale=settings.levels.given,
-                waiting=waiting if wait else None,
-            )
+            scale, told_by = settings.levels.given, waiting if wait else None
+            source = LiveSource(clip, live, health, rate_hz=rate_hz, full_scale=scale, waiting=told_by)
         except DeadCamera as error:
             _print(str(error))
             return HUNG
