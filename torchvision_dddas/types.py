@@ -127,7 +127,8 @@ class Frame:
 
     number: 1-based position in the clip. time_s: seconds since the clip's first frame.
     image: uint8, (H, W) grey or (H, W, 3) BGR. skipped: frames before it that were left out on purpose.
-    taken_s: capture time by the monotonic clock; NaN for a recording.
+    taken_s: capture time by the monotonic clock; NaN for a recording. damaged: the decoder concealed errors in it or in
+    an earlier picture that it builds on.
     """
 
     number: int
@@ -135,6 +136,7 @@ class Frame:
     image: np.ndarray
     skipped: int = 0
     taken_s: float = float("nan")
+    damaged: bool = False
 
 
 def as_picture(image: Any, name: str = "frame") -> np.ndarray:

@@ -27,6 +27,8 @@ _GREY16 = b"Y1\x00\x10"
 # FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
+# Pictures after which a stream without key frames has replaced what was damaged.
+_HEALED = 250
 # Pictures by whose time stamps a rate is measured, and how few do not suffice.
 _MEASURED, _LEAST_MEASURED = 64, 8
 
@@ -106,6 +108,7 @@ class AvCapture:
 
     A picture has the size that it was sent with. Of several streams of pictures the first that is no cover is read.
     concealed: whether the decoder concealed errors in the picture grabbed last, or got damaged data for it.
+    damaged: the same, or it may build on such a picture: until the next key frame, or for _HEALED pictures.
     stored: how many pictures the data read so far hold, whether or not they can be decoded.
     Raises ImportError where PyAV is not installed.
     """
@@ -143,7 +146,8 @@ class AvCapture:
         self._waiting: list[Any] = []  # frames of the packet read last
         self._spoiled: set[int | None] = set()  # time stamps of damaged packets
         self._frame: Any = None
-        self.concealed, self.stored = False, 0
+        self.concealed = self.damaged = False
+        self.stored, self._since = 0, _HEALED  # pictures since errors were concealed
 
     def grab(self) -> bool:
         """Wait for the next picture; False: none came, or it cannot be decoded."""
@@ -164,10 +168,13 @@ class AvCapture:
             try:
                 self._waiting = packet.decode()
             except self._failures:  # a damaged packet: of a file one picture is lost, a stream goes on
+                self._since = 0
                 if self._limit_s == float("inf"):
                     return False
         self._frame = self._waiting.pop(0)
         self.concealed = bool(self._frame.is_corrupt) or self._frame.pts in self._spoiled
+        self._since = 0 if self.concealed else _HEALED if self._frame.key_frame else self._since + 1
+        self.damaged = self._since < _HEALED
         self._spoiled.discard(self._frame.pts)
         return True
 

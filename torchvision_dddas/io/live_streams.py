@@ -48,6 +48,11 @@ class OpenedStream:
         """Whether the decoder concealed errors in the picture grabbed last; False where it does not say."""
         return getattr(self._capture, "concealed", False)
 
+    @property
+    def damaged(self) -> bool:
+        """As `concealed`, also where the picture may build on such a one."""
+        return getattr(self._capture, "damaged", False)
+
     def grab(self) -> bool:
         """Wait for the next picture; False: none came."""
         return self._capture.grab()

@@ -343,7 +343,7 @@ class VideoSource(_Clip):
             elif self._fits(image, number, f"frame {number} of {self.name}", "the first"):
                 image = self._to_bytes(image, number)
                 image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-                yield Frame(number, stamps.time_s, image)
+                yield Frame(number, stamps.time_s, image, damaged=getattr(capture, "damaged", False))
         number = self.last
         if words := stamps.describe():
             self.notes.append(words)

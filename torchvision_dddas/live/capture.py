@@ -192,7 +192,7 @@ class Player:
                 self._log.number = frame.number
                 self._log.captured(taken_s)
                 if queue.wanted(frame.number):
-                    queue.put(Frame(frame.number, frame.time_s, frame.image, 0, taken_s))
+                    queue.put(replace(frame, skipped=0, taken_s=taken_s))
         except Exception as error:  # ends the recording: results of the frames so far still come
             self._log.report(f"the recording cannot be read further: {error}")
         finally:

@@ -281,7 +281,8 @@ class Receiver:
         if self._fits(image, taken_s):
             self._found()
             # The number follows the clock; the moment at which a picture comes is less even.
-            self._queue.put(Frame(log.number, (log.number - 1) / rate_hz, image, 0, taken_s))
+            damaged = getattr(stream, "damaged", False)
+            self._queue.put(Frame(log.number, (log.number - 1) / rate_hz, image, 0, taken_s, damaged))
         return True
 
     def _found(self) -> None:

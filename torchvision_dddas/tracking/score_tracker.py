@@ -34,6 +34,7 @@ _RECENT = 3  # looks in which a track must have been seen to show how targets mo
 _LEAVING_FRAMES, _LEAVING_LOOKS = 15, 3  # for which a target is predicted to go on; later it may have stopped or turned
 _DOUBTS = 500  # detections that the usual doubt is taken of
 _LEAST_DOUBT, _LEAST_SCORE = 0.01, 1e-3
+_DAMAGED_HITS = 5  # detections that confirm a track in damaged pictures: what looks like a target there is soon gone
 _LONE_LOOKS = 2  # after which a detection that was not continued stays alone
 _LONE_SHARE = 0.01  # of detections that stay alone, from which a single one confirms no track
 
@@ -86,6 +87,7 @@ class _Sample:
     appearance: Callable[[], np.ndarray] | None
     time: float
     look: int
+    damaged: bool = False
     examined: str = ""
 
     def __post_init__(self) -> None:
@@ -152,19 +154,20 @@ class ScoreTracker:
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
         at: float | None = None,
+        damaged: bool = False,
     ) -> list[Tracks]:
         """Add the detections of a frame, whose number is above the last one's.
 
         now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
         appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, maybe with the
-        next frame. at: its number if frames had come at a constant rate; None: they did.
+        next frame. at: its number if frames had come at a constant rate; None: they did. damaged: see Frame.
         """
         counts, begins = self._doubts.apply(detections.score)
         row = np.flatnonzero(counts)
         wanted = None if self.parameters.appearance == "never" else appearance
         box, score = detections.box_px[row], detections.score[row]
         time, self._looks = (frame if at is None else at) / self.interval, self._looks + 1
-        sample = _Sample(frame, box, score, row, begins[row], now_from_before, wanted, time, self._looks)
+        sample = _Sample(frame, box, score, row, begins[row], now_from_before, wanted, time, self._looks, damaged)
         if self.parameters.appearance == "always":
             sample.examine("track.appearance is always")
         if not self.parameters.look_ahead:
@@ -315,7 +318,8 @@ class ScoreTracker:
         number, at = np.concatenate([continued.number, begun.number]), np.concatenate([detections, new])
         link = np.concatenate([link, np.full(len(new), np.nan)])
         self.smoother.add(
-            now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step, link, self._trusts_single
+            *(now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step, link, self._trusts_single),
+            least=_DAMAGED_HITS if now.damaged else 1,
         )
         looks = now.look - self.tracks.look
         self._seen += len(now.row)

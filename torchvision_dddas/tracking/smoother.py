@@ -72,14 +72,15 @@ class FixedLagSmoother:
         now_from_before: np.ndarray | None,
         link: np.ndarray | None = None,
         trusts_single: bool = True,
+        least: int = 1,
     ) -> None:
         """Add a frame: numbers of tracks (N,), their boxes, scores and rows among the frame's detections.
 
         link: (N,) as in Tracks; None: unknown. trusts_single: whether one detection of score 1 confirms a track; else
-        it takes two.
+        it takes two. least: how many it takes at least.
         """
         links = np.full(len(tracks), np.nan) if link is None else link
-        least = min(self.hits, 1 if trusts_single else 2)
+        certain = max(least, min(self.hits, 1 if trusts_single else 2))
         self.steps.append(now_from_before)
         self.has_moved |= now_from_before is not None
         pending = _Pending(frame, self.count)
@@ -89,7 +90,7 @@ class FixedLagSmoother:
         for number, box, confidence, at, likely in zip(*columns, strict=True):
             observation = _Observation(frame, pending.index, box, confidence, at, likely)
             self.counts[number] = self.counts.get(number, 0) + 1
-            if self.counts[number] >= (least if confidence >= 1 else self.hits):
+            if self.counts[number] >= (certain if confidence >= 1 else max(least, self.hits)):
                 self.confirmed.add(number)
             past = self.observations.setdefault(number, deque(maxlen=self.kept))
             if past and 1 < pending.index - past[-1].index <= FILLED + 1:

@@ -95,6 +95,7 @@ class Tracker:
         frame: int | None = None,
         interval: int | None = None,
         time_s: float = math.nan,
+        damaged: bool = False,
     ) -> list[Tracks]:
         """Add the detections of the next sampled frame; returns the frames that are settled by it.
 
@@ -103,6 +104,7 @@ class Tracker:
         uint8 BGR or (H, W) grey, where appearance shall count. frame: its number; None: the last one's plus interval,
         from 1. interval: distance from the frame before, where that is not the usual one. time_s: of the frame, where
         frames do not follow each other at a constant rate; targets are predicted by it.
+        damaged: as in Frame; targets that are first seen there must be seen for longer.
         Raises InputError for other shapes, boxes without a size, values that are not finite, and a number that is not
         above the last one's.
         """
@@ -144,7 +146,7 @@ class Tracker:
             detections = replace(detections, score=np.ones(len(detections)))
         appearance = None if image is None else self._histograms(image, detections.box_px)
         if isinstance(self._tracker, ScoreTracker):
-            return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance, self._at))
+            return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance, self._at, damaged))
         return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
@@ -263,7 +265,10 @@ class FrameTracker:
         interval = max(self.interval, frame.skipped + 1) if frame is not None and frame.skipped else None
         image = frame.image if frame is not None else None
         time_s = math.nan if frame is None else frame.time_s
-        settled = self.tracker.update(given.detections, given.now_from_before, image, given.number, interval, time_s)
+        settled = self.tracker.update(
+            *(given.detections, given.now_from_before, image, given.number, interval, time_s),
+            damaged=frame is not None and frame.damaged,
+        )
         appearance_s = self.tracker.appearance_s - before
         seconds = {"appearance": appearance_s, "track": time.perf_counter() - start - appearance_s}
         self._waiting.append([replace(self._without_picture(given), seconds=given.seconds | seconds)])
