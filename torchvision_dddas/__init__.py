@@ -4,8 +4,13 @@ The public names below are loaded when first used (PEP 562), so that `import tor
 neither torch nor OpenCV.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+# ONNX Runtime 1.29 and newer write a device id and a database of events below the home directory and send the events to
+# their maker. They read this variable when they are loaded, and a call of `disable_telemetry_events` comes too late.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from pathlib import Path

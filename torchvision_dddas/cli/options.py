@@ -63,12 +63,14 @@ Jobs = Annotated[
     int | None, typer.Option(metavar="N", help="Processes of one thread. [default: one per core; 1 without Dask]")
 ]
 Scheduler = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler such as tcp://host:8786, instead of --jobs.")
+    str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler such as tls://host:8786, instead of --jobs.")
 ]
 WorkerSilent = Annotated[
     float | None,
     typer.Option(
-        metavar="S", min=1, help="A process of --jobs silent for so long is replaced, its clip left out. [default: 60]"
+        metavar="S",
+        min=1,
+        help="A process of --jobs silent for so long is replaced, its clip begun again. [default: 60]",
     ),
 ]
 CacheFolder = Annotated[

@@ -4,8 +4,9 @@ import hashlib
 import io
 import json
 import os
+import subprocess
+import sys
 import time
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,8 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.studies import cache
-from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, digest, files_digest, pack, unpack
+from torchvision_dddas.evaluation.studies.cache import Cache, digest, files_digest, pack, unpack
 from torchvision_dddas.evaluation.studies.records import Found
-from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.stages import STAGES
 from torchvision_dddas.io.atomic_files import PartFile
 
 KEY, OTHER = "ab" + "0" * 62, "cd" + "0" * 62
@@ -113,14 +112,6 @@ def test_a_cache_that_cannot_be_written_is_one_line_and_leaves_nothing(tmp_path,
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["file"]
 
 
-def test_records_that_travel_with_a_job_are_used_and_new_ones_come_back() -> None:
-    there = CarriedRecords({})
-    there.put(KEY, FOUND)
-    back = CarriedRecords(there.made)
-    assert pack(back.get(KEY)) == WHOLE and back.made == {}
-    assert CarriedRecords({KEY: WHOLE[:-1]}).get(KEY) is None
-
-
 def old(path, text: str):
     path.write_text(text)
     os.utime(path, (1e9, 1e9))
@@ -150,27 +141,26 @@ def test_a_file_is_read_again_only_after_a_change_and_one_just_written_is_not_re
 
 
 @pytest.mark.parametrize(
-    ("path", "changes", "leaves"),
+    ("path", "counts"),
     [
-        ("detection/detector.py", {"motion", "location"}, {"people", "score"}),
-        ("tracking/__init__.py", {"tracking", "association", "location"}, {"people", "score"}),
-        ("evaluation/metrics/boxes.py", {"score"}, set(STAGES)),
-        ("people/detector.py", {"people"}, {"motion", "tracking", "association", "score"}),
-        ("graphs/manifest.json", {*STAGES, "score"}, set()),
-        ("evaluation/report/__init__.py", set(), {*STAGES, "score"}),
+        *(("detection/detector.py", True), ("evaluation/metrics/boxes.py", True), ("graphs/manifest.json", True)),
+        *(("cli/run.py", False), ("live/runner.py", False), ("evaluation/report/__init__.py", False)),
     ],
 )
-def test_changed_code_changes_the_digests_of_what_imports_it_and_no_others(monkeypatch, path, changes, leaves) -> None:
-    functions: dict[str, Any] = dict[str, Any](STAGES.items()) | {"score": score}
-
-    def digests():
-        return {name: cache.code_digest.__wrapped__(function) for name, function in functions.items()}
-
-    before, real, changed_file = digests(), cache._file_digest, cache.PACKAGE / path
+def test_results_depend_on_the_code_that_a_study_can_run(monkeypatch, path, counts) -> None:
+    find_digest = cache.code_digest.__wrapped__
+    before, real, changed_file = find_digest("onboard"), cache._file_digest, cache.PACKAGE / path
     assert changed_file.is_file()
     monkeypatch.setattr(cache, "_file_digest", lambda read: "other" if read == changed_file else real(read))
-    changed = {name for name, found in digests().items() if found != before[name]}
-    assert changed >= changes and not changed & leaves
+    assert (find_digest("onboard") != before) == counts
+
+
+def test_no_stage_or_score_imports_code_that_does_not_count() -> None:
+    modules = ("torchvision_dddas.evaluation.studies.stages", "torchvision_dddas.evaluation.studies.scoring")
+    above = tuple(f"torchvision_dddas.{folder.replace('/', '.')}" for folder in cache._ABOVE)
+    program = f"import sys, {', '.join(modules)}; print([name for name in sys.modules if name.startswith({above})])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
 def test_entries_written_after_a_time_are_told_from_older_ones(tmp_path):

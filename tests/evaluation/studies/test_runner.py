@@ -8,7 +8,6 @@ import pytest
 from tests.evaluation.studies import world
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Source
-from torchvision_dddas.evaluation.studies import jobs
 from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.evaluation.studies.jobs import Workers
 from torchvision_dddas.evaluation.studies.records import Spec
@@ -84,7 +83,10 @@ def test_a_repeated_study_starts_no_worker_and_gives_the_same_bytes(study, tmp_p
     first = run_study(study, tmp_path, cache=tmp_path / "cache")
     assert not left.exists()
     with monkeypatch.context() as alone:
-        alone.setattr(jobs, "_start_local", lambda *given: pytest.fail("a worker was started"))
+        alone.setattr(
+            "torchvision_dddas.evaluation.studies.cluster.start_local",
+            lambda *given: pytest.fail("a worker was started"),
+        )
         with Workers(2) as two:
             again = run_study(study, tmp_path, two, cache=tmp_path / "cache")
     assert again.facts["computed"] == 0 < first.facts["computed"]

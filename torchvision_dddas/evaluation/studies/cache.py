@@ -3,7 +3,6 @@
 A key is the digest of the settings, the content of the files, and the source code and libraries that compute a result.
 """
 
-import ast
 import dataclasses
 import hashlib
 import io
@@ -12,12 +11,11 @@ import os
 import platform
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -198,26 +196,6 @@ class Cache:
         return False
 
 
-class CarriedRecords(Cache):
-    """A cache that travels with a job to another machine: known records there; new ones, in `made`, back."""
-
-    def __init__(self, known: dict[str, bytes]) -> None:
-        self._known = known
-        self.notes: list[str] = []
-        self.made: dict[str, bytes] = {}
-
-    def read(self, key: str) -> bytes | None:
-        """The bytes of an entry, unchecked; None if there is none."""
-        return self.made.get(key) or self._known.get(key)
-
-    def write(self, key: str, content: bytes) -> None:
-        """Keep the bytes of a record."""
-        self.made[key] = content
-
-    def _drop(self, key: str) -> bool:
-        return False  # the cache that it comes from notes the damage
-
-
 def write_scores(folder: Path, name: str, cases: Iterable[ScoredCase]) -> None:
     """Write scores.bin, whole or not at all. Raises OSError."""
     ordered = tuple(sorted(cases, key=lambda case: (case.task, case.clip)))
@@ -244,78 +222,29 @@ def read_scores(folder: Path) -> ScoredStudy:
 
 PACKAGE = Path(__file__).resolve().parents[2]
 
-_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "pymap3d", "av")
-_ENGINE_LIBRARIES = {"torch": ("torch", "kornia")}
+_ABOVE = ("cli", "live", "tuning", "export", "evaluation/report")
+"""Folders of the package that no stage and no score imports: a change there leaves results as they are."""
+
+_LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "pymap3d", "av", "torch", "kornia")
 _SETTLED_S = 2.0  # a file that was written a moment ago may be written again within one tick of its time stamp
 
 
 @cache
-def code_digest(function: Callable[..., Any], engine: str = "") -> str:
-    """The digest of the code that a function can run: its own module, and all that it imports from this package.
+def code_digest(backend: str) -> str:
+    """The digest of all that results depend on beside their inputs.
 
-    The import graph is read from the sources. Data files of the package, versions of libraries (those of an engine
-    too) and the processor's architecture count as well.
+    It covers the files of the package, data files too, the versions of the libraries, torch's only if it is the
+    backend, and the processor's architecture. Machines where it is the same get the same results.
     """
-    files = {PACKAGE.parent / Path(*function.__module__.split(".")).with_suffix(".py")}
-    waiting = set(_modules_used(function, set()))
-    while waiting:
-        module = PACKAGE.parent / Path(*waiting.pop().split("."))
-        for path in (module.with_suffix(".py"), module / "__init__.py"):
-            if path not in files and path.is_file():
-                files.add(path)
-                waiting |= set(_imports(path))
-    files |= {path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
-    content = {path.relative_to(PACKAGE).as_posix(): _file_digest(path) for path in sorted(files)}
+    above = tuple(PACKAGE / folder for folder in _ABOVE)
+    files = [path for path in sorted(PACKAGE.rglob("*")) if path.is_file() and path.suffix != ".pyc"]
+    files = [path for path in files if not any(path.is_relative_to(folder) for folder in above)]
+    content = {path.relative_to(PACKAGE).as_posix(): _file_digest(path) for path in files}
     libraries = {}
-    for name in (*_LIBRARIES, *_ENGINE_LIBRARIES.get(engine, ())):
-        try:
+    for name in _LIBRARIES[: None if backend == "torch" else -2]:
+        with suppress(PackageNotFoundError):
             libraries[name] = version(name)
-        except PackageNotFoundError:
-            libraries[name] = ""
     return digest(VERSION, content, libraries, platform.machine())
-
-
-def _modules_used(function: Callable[..., Any], seen: set[Any]) -> Iterator[str]:
-    """Names of the modules whose functions, classes or constants a function uses, directly or in its own module."""
-    if not isinstance(function, FunctionType) or function in seen:
-        return
-    seen.add(function)
-    for name in _names(function.__code__):
-        used = function.__globals__.get(name, name)
-        module = used.__name__ if isinstance(used, ModuleType) else getattr(used, "__module__", used)
-        if module != function.__module__:
-            if isinstance(module, str) and module.startswith(PACKAGE.name):
-                yield module
-        else:
-            for part in vars(used).values() if isinstance(used, type) else (used,):
-                yield from _modules_used(part, seen)
-
-
-def _names(code: CodeType) -> Iterator[str]:
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _names(constant)
-
-
-@cache
-def _imports(path: Path) -> tuple[str, ...]:
-    """Names that may be modules of this package, which a file imports anywhere but for types alone."""
-    found: list[str] = []
-    waiting: list[Any] = ast.parse(path.read_bytes()).body
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-        elif isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            waiting += node.orelse
-        else:  # statements alone, for no expression imports
-            for name in ("body", "orelse", "finalbody", "handlers", "cases"):
-                part = getattr(node, name, ())
-                waiting += part if isinstance(part, list) else ()
-    return tuple(name for name in found if name.split(".")[0] == PACKAGE.name)
 
 
 def _file_digest(path: Path) -> str:

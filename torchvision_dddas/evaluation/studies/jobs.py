@@ -1,15 +1,11 @@
 """Jobs: one clip from its files to its measures, each stage from the cache or computed; shared among processes by Dask.
 
-One job at a time needs no Dask. Workers of a cluster read the clips' files where this machine has them, so that folders
-must be shared. Their results come back, and this machine keeps them.
+One job at a time needs no Dask. Workers of a cluster read the clips' files, and keep results in the cache, where this
+machine has them: both folders must be shared.
 """
 
-import atexit
-import logging
-import multiprocessing
 import os
 import queue
-import signal
 import sys
 import time
 import traceback
@@ -18,7 +14,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import chain, islice
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +22,11 @@ import cv2
 from torchvision_dddas.config import Group, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.studies.cache import Cache, CarriedRecords, code_digest, digest, files_digest
+from torchvision_dddas.evaluation.studies.cache import Cache, code_digest, digest, files_digest
 from torchvision_dddas.evaluation.studies.records import Found, Task
 from torchvision_dddas.evaluation.studies.scoring import score
 from torchvision_dddas.evaluation.studies.stages import (
     PARAMETER_GROUPS,
-    STAGES,
     OnFrame,
     allowed_tasks,
     files_of,
@@ -44,26 +38,18 @@ from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.runtime import VERSION
 
 MAX_DEATHS = 3
-"""If so many workers die over a job, its clip is left out."""
-
-CONNECT_S = 5.0
-"""How long a scheduler may take to answer."""
+"""If so many workers die over a job, or give no sign, its clip is left out."""
 
 NO_WORKER_S = 30.0
 """How long a scheduler may be without any worker."""
 
 SILENT_S = 60.0
-"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip is left out."""
+"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip begins again."""
 
 _POLL_S = _REPORT_S = 0.25
-_LATE_S = 0.5  # after a signal, workers that were about to start have started by then
-_LONGEST_STEP_S = 1.0  # counted of the time between two polls: longer, and this process was stopped, too
 _TOPIC = "dddas-frames"
-_ONE_THREAD = {
-    **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
-    "OMP_WAIT_POLICY": "PASSIVE",
-}
-_INSTALL = "dask and distributed; pip install 'torchvision-dddas[distributed]'"
+_CLUSTER = "torchvision_dddas.evaluation.studies.cluster"  # imported only where it is needed, as Dask is an extra
+_INSTALL = "dask, distributed and cryptography; pip install 'torchvision-dddas[distributed]'"
 
 
 @dataclass(frozen=True)
@@ -129,7 +115,7 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
             if before.cause:
                 raise InputError(before.cause)
             found = digest(
-                ("found", task, code_digest(STAGES[task], job.backend), job.backend),
+                ("found", task, code_digest(job.backend), job.backend),
                 {group: _content(getattr(settings, group)) for group in PARAMETER_GROUPS[task]},
                 files_digest(files, memory),
                 clip.rate_hz,
@@ -143,7 +129,7 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
                 rest = {name: value for name, value in vars(clip.truth).items() if name not in ("masks", "place")}
                 whole = (numbers, files_digest([clip.truth.masks[number] for number in numbers], memory), rest)
             known = (clip.still, clip.shows, whole)
-            keys[task] = Done(task, found, digest("scored", task, code_digest(score), found, job.interval, known))
+            keys[task] = Done(task, found, digest("scored", task, found, job.interval, known))
         except InputError as error:
             keys[task] = Done(task, cause=str(error))
     return keys
@@ -152,11 +138,6 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
 def _content(group: Group) -> tuple[dict[str, Any], list[str]]:
     """The values of a group of settings, and which of them are set: a value that is set wins over a log's."""
     return group.model_dump(), sorted(group.model_fields_set)
-
-
-def code_identity(backend: str) -> str:
-    """The digest of all code that finds and scores. Machines where it is the same get the same results."""
-    return digest(code_digest(score), *(code_digest(stage, backend) for stage in STAGES.values()))
 
 
 def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
@@ -226,33 +207,33 @@ class Workers:
 
     jobs: how many; 1 is this process itself; None is one per core, or 1 without Dask. scheduler: the address of a Dask
     scheduler, whose workers are taken instead. Local workers start when they are first needed. silent_s: a local worker
-    that gives no sign for so long is replaced, and its clip is left out; a scheduler has its own limit. Raises
-    InputError if Dask is needed and not installed, or the scheduler does not answer.
+    that gives no sign for so long counts as dead; a scheduler has its own limit. Raises InputError if Dask is needed
+    and not installed, or the scheduler does not answer.
     """
 
     def __init__(self, jobs: int | None = None, scheduler: str | None = None, silent_s: float = SILENT_S) -> None:
-        has_dask = find_spec("distributed") is not None
-        if scheduler is not None and not has_dask:
-            raise InputError(f"--scheduler needs {_INSTALL}")
+        has_dask = all(find_spec(name) is not None for name in ("distributed", "cryptography"))
         if jobs is None:
             cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
             jobs = cores if has_dask else 1
         if jobs < 1:
             raise InputError(f"--jobs must be 1 or more, got {jobs}")
-        if jobs > 1 and not has_dask:
-            raise InputError(f"--jobs {jobs} needs {_INSTALL}, or take --jobs 1")
+        if not has_dask and (jobs > 1 or scheduler is not None):
+            asked = f"--jobs {jobs}" if scheduler is None else "--scheduler"
+            raise InputError(f"{asked} needs {_INSTALL}, or take --jobs 1")
         self._jobs, self._scheduler, self._silent_s, self._stack = jobs, scheduler, silent_s, ExitStack()
         self._client: Any = None
-        self._silence: _Silence | None = None
 
     def __enter__(self) -> "Workers":
         if self._scheduler is not None:
-            self._client = self._stack.enter_context(_connect(self._scheduler))
+            from torchvision_dddas.evaluation.studies.cluster import connect
+
+            self._client = self._stack.enter_context(connect(self._scheduler))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and self._scheduler is None:
-            _kill_local(self._client)
+        if kind is not None and self._scheduler is None and (cluster := sys.modules.get(_CLUSTER)) is not None:
+            cluster.kill_local(self._client)
         self._stack.close()
 
     def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
@@ -271,8 +252,9 @@ class Workers:
 
     def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
         if self._client is None:
-            self._client = _start_local(self._jobs, self._stack)
-            self._silence = _Silence(self._client.cluster, self._silent_s)
+            from torchvision_dddas.evaluation.studies.cluster import start_local
+
+            self._client = start_local(self._jobs, MAX_DEATHS, self._silent_s, self._stack)
         client, running, news = self._client, dict[Any, Job](), queue.SimpleQueue[Any]()
         client.subscribe_topic(_TOPIC, lambda event: news.put(event[1]))
         alone_since = time.monotonic()
@@ -281,12 +263,8 @@ class Workers:
                 # No more jobs than threads: Dask blames a worker's death on the jobs that wait there, too.
                 threads = sum(client.nthreads().values())
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
-                    store: Cache = cache
-                    if self._scheduler is not None:
-                        wanted = {key: cache.read(key) for done in keys.values() for key in (done.found, done.scored)}
-                        store = CarriedRecords({key: known for key, known in wanted.items() if known is not None})
-                    code = "" if self._scheduler is None else code_identity(job.backend)
-                    future = client.submit(_do_remotely, job, keys, store, code, pure=False)
+                    code = "" if self._scheduler is None else code_digest(job.backend)
+                    future = client.submit(_do_remotely, job, keys, cache, code, pure=False)
                     running[future] = job
                     future.add_done_callback(news.put)
                 if threads and not running:
@@ -297,10 +275,6 @@ class Workers:
                     raise InputError(
                         f"the scheduler {self._scheduler} has had no worker for {NO_WORKER_S:g} s; {self._advice()}"
                     )
-                for key in self._silence.end_workers() if self._silence else ():
-                    for future in [future for future in running if future.key == key]:
-                        client.cancel([future], force=True)
-                        on_event(_left_out(running.pop(future), f"its worker gave no sign for {self._silent_s:g} s"))
                 with suppress(queue.Empty):
                     new = news.get(timeout=_POLL_S)
                     if new in running:
@@ -319,18 +293,17 @@ class Workers:
         from distributed import KilledWorker
 
         try:
-            done, notes, made = future.result()
+            done, notes = future.result()
         except KilledWorker as error:
-            deaths = error.allowed_failures + 1
-            return _left_out(
-                job, f"its worker died {deaths} times; is there memory enough for {job.clip.name} and {job.backend}?"
-            )
+            cause = f"its worker died or gave no sign {error.allowed_failures + 1} times; "
+            cause += f"is there memory enough for {job.clip.name} and {job.backend}?"
+            return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
         except InputError:
             raise
         except Exception as error:  # `do_job` raises none: the worker cannot even start it
             raise InputError(f"a worker cannot do jobs ({type(error).__name__}: {error}); {self._advice()}") from None
-        for key, content in made.items():
-            cache.write(key, content)
+        if not all(cache.path(key).exists() for d in done if not d.cause for key in (d.found, d.scored)):
+            raise InputError(f"workers do not write to {cache.folder}; give a --cache that all machines share")
         return Event(job, done, note=notes)
 
     def _advice(self) -> str:
@@ -340,47 +313,14 @@ class Workers:
         )
 
 
-def _left_out(job: Job, cause: str) -> Event:
-    return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
-
-
-class _Silence:
-    """How long each worker of a local cluster has given no sign: its process is stopped, or hangs in a library."""
-
-    def __init__(self, cluster: Any, limit_s: float) -> None:
-        self._cluster, self._limit_s, self._polled_s = cluster, limit_s, time.monotonic()
-        self._silent: dict[str, tuple[float, float]] = {}  # by address: the time of the last sign, the silence since
-
-    def end_workers(self) -> list[str]:
-        """End workers that were silent for longer than the limit; the keys of their jobs. Dask starts others."""
-        now_s, keys = time.monotonic(), list[str]()
-        step_s, self._polled_s = min(now_s - self._polled_s, _LONGEST_STEP_S), now_s
-        known, self._silent = self._silent, {}
-        for address, worker in list(self._cluster.scheduler.workers.items()):
-            seen, silent_s = known.get(address, (worker.last_seen, 0.0))
-            silent_s = silent_s + step_s if seen == worker.last_seen else 0.0
-            self._silent[address] = (worker.last_seen, silent_s)
-            if silent_s > self._limit_s:
-                keys += [task.key for task in list(worker.processing)]
-                for nanny in list(self._cluster.workers.values()):
-                    if nanny.worker_address == address and nanny.pid:
-                        self._silent.pop(address, None)
-                        with suppress(ProcessLookupError):
-                            os.kill(nanny.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
-        return keys
-
-
-def _do_remotely(job: Job, keys: Keys, store: Cache, code: str) -> tuple[tuple[Done, ...], str, dict[str, bytes]]:
-    """A job on a worker: its outcome, notes, and records that have to travel back. code: what its package must be."""
+def _do_remotely(job: Job, keys: Keys, cache: Cache, code: str) -> tuple[tuple[Done, ...], str]:
+    """A job on a worker: its outcome and notes. code: what the digest of its package must be."""
     from distributed import get_worker
 
-    if code and code_identity(job.backend) != code:
+    if code and code_digest(job.backend) != code:
         raise InputError(f"a worker has another version of the package, its libraries or code; wanted {VERSION}")
     worker = get_worker()
-    done, notes = _do_on_one_thread(
-        job, keys, store, lambda event: worker.log_event(_TOPIC, (job.number, event.frames))
-    )
-    return done, notes, store.made if isinstance(store, CarriedRecords) else {}
+    return _do_on_one_thread(job, keys, cache, lambda event: worker.log_event(_TOPIC, (job.number, event.frames)))
 
 
 @contextmanager
@@ -398,83 +338,3 @@ def _one_thread(backend: str) -> Iterator[None]:
     finally:
         for set_threads, before in libraries:
             set_threads(before)
-
-
-def _start_local(jobs: int, stack: ExitStack) -> Any:
-    """A client of new processes on this machine, which end with the stack."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    _start_tracker()
-    limits = {"allowed-failures": MAX_DEATHS - 1, "worker-ttl": None}  # silent workers are ended here
-    with dask.config.set({f"distributed.scheduler.{name}": limit for name, limit in limits.items()}):
-        cluster = LocalCluster(
-            n_workers=jobs,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            memory_limit=None,
-            silence_logs=logging.CRITICAL,
-            env=_ONE_THREAD,
-        )
-    stack.enter_context(cluster)
-    return stack.enter_context(Client(cluster, set_as_default=False))
-
-
-def _kill_local(client: Any) -> None:
-    """End the workers of this machine at once: what is finished is in the cache, and Dask would wait for the rest.
-
-    client: None if a signal came while they started; what Dask says of that is no concern of the user's.
-    """
-    if "distributed" not in sys.modules:
-        return
-    from distributed.deploy.spec import close_clusters
-
-    for name in ("asyncio", "tornado"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    atexit.unregister(close_clusters)
-    for nanny in client.cluster.workers.values() if client is not None else ():
-        nanny.close_gracefully()  # else it starts another worker
-    # Those that were about to start would write a traceback once this process has gone.
-    until_s = time.monotonic() + (_LATE_S if client is None else 0.0)
-    while True:
-        for child in multiprocessing.active_children():
-            if child.name.startswith("Dask Worker"):
-                child.kill()
-        if time.monotonic() >= until_s:
-            return
-        time.sleep(0.01)
-
-
-def _start_tracker() -> None:
-    """Start the process that cleans up behind workers: it heeds no SIGHUP, as it heeds no Ctrl-C and no SIGTERM."""
-    if hasattr(signal, "pthread_sigmask") and hasattr(signal, "SIGHUP"):
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
-        try:
-            resource_tracker.ensure_running()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _connect(scheduler: str) -> Any:
-    """A client of a scheduler. Raises InputError if it cannot be reached."""
-    from distributed import Client
-    from distributed.comm.addressing import parse_address, parse_host_port
-    from distributed.comm.registry import get_backend
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # lost workers are reported here anyway
-    try:
-        # Checked before there is a client, which would complain about a bad address again as it ends.
-        scheme, host = parse_address(scheduler)
-        get_backend(scheme)
-        if scheme in ("tcp", "tls"):
-            parse_host_port(host)
-        return Client(scheduler, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError, ImportError) as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise InputError(
-            f"no Dask scheduler answers at {scheduler} ({first}); wanted an address as tcp://host:8786, where "
-            "`dask scheduler` runs"
-        ) from None

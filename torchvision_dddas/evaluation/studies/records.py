@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-if TYPE_CHECKING:  # otherwise code that finds would seem to depend on code that scores; see cache.code_digest
+if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.evaluation.datasets.record import Clip, Source
     from torchvision_dddas.evaluation.metrics.registry import Counts

@@ -23,7 +23,7 @@ from torchvision_dddas.evaluation.datasets import kinds
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics.registry import GROUPS
 from torchvision_dddas.evaluation.report import study_report
-from torchvision_dddas.evaluation.studies.cache import SCORES, Cache, cache_folder, write_scores
+from torchvision_dddas.evaluation.studies.cache import SCORES, Cache, cache_folder, code_digest, write_scores
 from torchvision_dddas.evaluation.studies.jobs import (
     Done,
     Event,
@@ -31,7 +31,6 @@ from torchvision_dddas.evaluation.studies.jobs import (
     Keys,
     OnEvent,
     Workers,
-    code_identity,
     find_cached,
     make_keys,
 )
@@ -168,7 +167,7 @@ def plan_study(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
                 left_out.append(f"{clip.name}: {_why_no_task(spec, clip, allowed)}")
     if not jobs:
         raise InputError(f"no clip is left to evaluate by {spec.name}{_why_no_clip(clips, names, left_out)}")
-    facts = {"datasets": sets, "backend": backend, "code": code_identity(backend)}
+    facts = {"datasets": sets, "backend": backend, "code": code_digest(backend)}
     return Plan(settings, tuple(jobs.values()), tuple(left_out), tuple(notes), facts)
 
 
