@@ -556,6 +556,9 @@ class AerialParameters(Group):
     time_zone: str = parameter(
         "", "of a log whose dates are in local time: a name, Europe/Berlin, or hours from UTC, +02:00"
     )
+    order: Literal["auto", "lat-lon", "lon-lat"] = parameter(
+        "auto", "of two coordinates in one field of a log, GPS(48.1, 11.5); auto: as its program writes them"
+    )
 
 
 class CrowdParameters(Group):

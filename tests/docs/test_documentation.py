@@ -22,8 +22,7 @@ from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.io.telemetry import autopilots, nmea, read_telemetry
-from torchvision_dddas.io.telemetry.tables import quantity_of
+from torchvision_dddas.io.telemetry import autopilots, nmea
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {
@@ -183,25 +182,6 @@ def test_the_path_of_a_drones_log_alone_can_be_followed(tmp_path: Path, monkeypa
         for row in found
     ]
     assert len(found) > 20 and np.median(missed) < 3.0
-
-
-def test_the_fields_of_subtitles_that_the_page_lists_are_read_and_no_others(tmp_path: Path) -> None:
-    table = PAGES["commands.md"].split("What is read of a DJI `.SRT`")[1].split("**Landmarks**")[0]
-    rows = [line.split("|")[2] for line in table.splitlines() if line.startswith("| ")][2:]
-    keys = [key for row in rows for key in re.findall(r"`([^`]+)`", row) if "(" not in key]
-    optics = {"focal_len", "dzoom_ratio"}
-    assert {"rel_alt", "gb_pitch", "H.S", "compass heading"} | optics <= set(keys)
-    assert [key for key in keys if key not in optics and quantity_of(key) is None] == []
-    others = re.findall(r"`([^`]+)`", table.split("All else")[1])
-    assert len(others) == 4 and [key for key in others if quantity_of(key)] == []
-    (tmp_path / "a.srt").write_text(
-        "1\n00:00:00,000 --> 00:00:01,000\nGPS(11.5, 48.1, 412.0M) H: 30m "
-        "[focal_len: 24.00] [dzoom_ratio: 2.00] G.PRY(-40, 1, 20) F.PRY(0, 0, 25)\n\n"
-    )
-    read = read_telemetry(tmp_path / "a.srt")
-    assert (read.above_sea_m[0], read.altitude_m[0]) == (412.0, 30.0)
-    angles = np.degrees([read.heading_rad, read.pitch_rad, read.roll_rad, read.vehicle_heading_rad, read.hfov_rad])
-    assert angles[:, 0] == pytest.approx([20, 40, 1, 25, 2 * np.degrees(np.arctan(18 / 48))])
 
 
 @pytest.mark.slow

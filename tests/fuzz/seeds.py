@@ -105,6 +105,16 @@ TEXT: dict[str, tuple[str, ...]] = {
             "32.2,-110.9,{even},-90,x,1683000000{i}00",
         ),
         "frame,latitude,longitude,altitude\n1,32.2,-110.9,50\n2,32.2,-110.9,51\n3,32.2,-110.9,52\n",
+        "sep=;\n"
+        + _rows(
+            "CUSTOM.date [local];CUSTOM.updateTime [local];OSD.flyTime;OSD.latitude;OSD.longitude;OSD.height [ft];"
+            "GIMBAL.pitch;CAMERA.isVideo",
+            "26.08.2022;1:12:47,0{i} PM;0m 0,{i}s;41,6;-91,5;{even},5;-60,0;True",
+        ),
+        "# by a program\n"
+        + _rows("Date,Time,GPS,Alt(m),Yaw(rad),fix_type", "8/26/2022,15:41:0{i}.9,48.1{i}N 11.5W,5{i},1.5,3"),
+        "time\tlat\tlon\talt_ellipsoid\tundulation\tzoom\tfocal_len\ns\tdeg\tdeg\tft\tm\t\t\n"
+        + _rows("0\t481\t115\t1\t1\t179\t24", "{i}00\t4810000{i}\t115000000\t{even}\t47\t1790\t240").replace("time", "t"),  # noqa: E501
     ),
     "subtitles": (
         _subtitles(
@@ -113,6 +123,11 @@ TEXT: dict[str, tuple[str, ...]] = {
             "[gb_yaw: -162.8 gb_pitch: -30.0 gb_roll: 1.0]</font>"
         ),
         _subtitles("HOME(-58.4,-34.7) 2017.07.03 10:15:0{i}\nGPS(-58.4,-34.7,19) BAROMETER:2{i}.1"),
+        _subtitles("GPS(48.1,11.5,569.{i}) BAROMETER(9{i}.2) [Gimbal: Yaw:1.0, Pitch:-30.0] [Drone: Yaw:2.0]"),
+        _subtitles(
+            "SrtCnt : {i}\n2024-05-27 13:1{i}:00,033,060\n[latitude: 53.3{i}] [longitude: 6.4] [altitude: 35.4] "
+            "[focal_len: 52.00] [dzoom_ratio: 17871, delta:0]"
+        ).replace("000", "1824"),
         _subtitles(
             "F/2.8, SS 200, ISO 100, EV 0, GPS (8.5, 47.3, 19), D 24.5m, H {i}.0m, H.S 1.4m/s, V.S 0.1m/s, "
             "F.PRY (1.0°, -3.8°, 30.0°), G.PRY (-30.0°, 0.0°, 29.8°)"

@@ -150,7 +150,10 @@ def columns_of(name: str) -> list[str]:
     return sorted({cell for content in BY_NAME[name].seeds() for cell in content.decode().split("\n")[0].split(",")})
 
 
-@pytest.mark.parametrize("name", ["detections as CSV", "positions CSV", "landmarks CSV", "poses CSV", "telemetry CSV"])
+_TELEMETRY = ["telemetry CSV", "tables of other programs"]
+
+
+@pytest.mark.parametrize("name", ["detections as CSV", "positions CSV", "landmarks CSV", "poses CSV", *_TELEMETRY])
 @settings(derandomize=True, max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_table_of_any_cells_is_taken_or_refused(tmp_path_factory: pytest.TempPathFactory, name: str, data) -> None:

@@ -138,7 +138,7 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
         ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
         (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
         ("1,-1,2,3,4", "5 columns; wanted frame,id,x,y,w,h[,score]"),
-        ("1;-1;2;3;4;5", "1 column; wanted"),
+        ("1:-1:2:3:4:5", "1 column; wanted"),
         ("frame,x,y\n1,2,3", "lacks x_px, y_px, width_px, height_px; its columns are frame, x, y"),
         ("hello world", "its columns are hello world"),
         (f"{NAMED}\n1,2,3,4", "line 2: 4 columns; the first line names 5"),

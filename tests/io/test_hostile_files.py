@@ -70,7 +70,7 @@ def test_subtitles_with_endless_words_are_read(tmp_path, words):
 def test_many_subtitles_without_a_time_are_noted_once(tmp_path):
     timeless = "Latitude: 1.5 Longitude: 2.5\n\n" * 40_000
     with pytest.raises(InputError, match="nothing in it"):
-        read(tmp_path / "b.srt", "GPS (1,2)\n\n" + timeless)
+        read(tmp_path / "b.srt", "GPS (1,2,3)\n\n" + timeless)
     dated = "2024-01-01 00:00:00\nGPS (1,2,3) H:5m\n\n"
     found = read(tmp_path / "c.srt", dated + timeless)
     assert sum("without time" in note for note in found.notes) == 1

@@ -46,6 +46,42 @@ def test_columns_in_any_order_with_others_between_and_a_byte_order_mark(tmp_path
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        "frame;name;east_m\n1;a, b;-1,5\n2;c;10,25\n",
+        "frame;name;east_m\n1;a, b;-1.5\n2;c;10.25\n",
+        "frame\tname\teast_m\n1\ta, b\t-1,5\n2\tc\t10,25\n",
+        "frame|name|east_m\n1|a, b|-1.5\n2|c|10.25\n",
+        'frame,name,east_m\n1,"a, b","-1,5"\n2,c,"10,25"\n',
+        "sep=;\nframe;name;east_m\n1;a, b;-1,5\n2;c;10,25\n",
+        '"sep=,"\nframe,name,east_m\n1,"a, b",-1.5\n2,c,10.25\n',
+        '\n\nframe,name,east_m\n1,"a, b",-1.5\n2,c,10.25\n',
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_the_separator_and_the_decimal_sign_follow_from_the_first_lines(tmp_path, text, encoding):
+    path = tmp_path / "t.csv"
+    path.write_text(text, encoding=encoding)
+    read = read_table(path, PLACES, ("frame",))
+    assert (read["frame"].tolist(), read["east_m"].tolist()) == ([1, 2], [-1.5, 10.25])
+    assert read.columns["name"] == ["a, b", "c"] and read.line[-1] == len(text.splitlines())
+
+
+def test_commas_between_thousands_are_no_decimal_ones_and_neither_are_unsure_ones(tmp_path, refused):
+    path = tmp_path / "t.csv"
+    path.write_text('frame,east_m,north_m\n"1,000",1.5,2.5\n')
+    assert read_table(path, PLACES)["frame"].tolist() == [1000]
+    line = refused(lambda path: read_table(path, PLACES), 'frame,east_m\n1,"1,000"\n')
+    assert "line 2: east_m is '1,000'; wanted a number" in line
+
+
+def test_text_that_is_no_utf_8_is_that_of_windows(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_bytes("frame;name\n1;Höhe\n".encode("cp1252"))
+    assert read_table(path, PLACES).columns["name"] == ["Höhe"]
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("name,east_m\na,1\n", "lacks frame; its columns are name, east_m, wanted frame,east_m"),

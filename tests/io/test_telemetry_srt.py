@@ -83,8 +83,8 @@ def test_speed_and_attitudes_of_aircraft_and_gimbal_are_told_apart(fly):
 
 
 def test_one_place_of_a_file_that_can_be_no_latitude_settles_the_order_for_all(read):
-    found = read("GPS(80.5,10.5,16) BAROMETER:1", "GPS(90.5,10.5,16) BAROMETER:1")
-    assert found.place.tolist() == [[80.5, 10.5], [90.5, 10.5]]
+    found = read("GPS(89.9995,10.5,16) BAROMETER:1", "GPS(90.0005,10.5,16) BAROMETER:1")
+    assert found.place.tolist() == [[89.9995, 10.5], [90.0005, 10.5]]
     assert not any("order" in note for note in found.notes)
     assert any("order" in note for note in read("GPS(80.5,10.5,16) BAROMETER:1").notes)
 
@@ -120,7 +120,7 @@ def test_a_file_that_ends_within_a_subtitle_is_read_as_far_as_it_goes_and_says_w
     assert np.isnan(found.altitude_m).tolist() == [False] * 5 + [True]
     assert np.isnan(found.place).any(axis=1).tolist() == [False] * 5 + [True]
     (note,) = [note for note in found.notes if "lacks" in note]
-    assert "line 32" in note and "altitude_m, latitude_deg, longitude_deg" in note and "incomplete" in note
+    assert "line 32" in note and "above_takeoff_m, latitude_deg, longitude_deg" in note and "incomplete" in note
 
 
 def test_a_subtitle_between_others_that_lacks_the_place_is_not_bridged(read):
@@ -158,6 +158,135 @@ def test_a_file_of_no_use_is_refused_in_one_line(refused, text, words):
 def test_the_kind_of_a_file_goes_by_its_content_not_its_name(fly):
     assert fly(timed(KEYED.format(n=1, ms=0)), "telemetry.txt").altitude_m.tolist() == [5.4]
     assert fly("time_s,altitude_m\n0,20\n", "telemetry.txt").altitude_m.tolist() == [20]
+
+
+@pytest.mark.parametrize(
+    "groups",
+    [
+        "[Gimbal: Yaw:10.0, Pitch:-45.0, Roll:1.0] [Drone: Yaw:2.0, Pitch:-3.1, Roll:1.5]",
+        "[Drone: Yaw:2.0, Pitch:-3.1, Roll:1.5] [Gimbal: Yaw:10.0, Pitch:-45.0, Roll:1.0]",
+        "[drone : yaw = 2.0, pitch = -3.1] [Gimbal : yaw = 10.0, pitch = -45.0, roll = 1.0]",
+        "[drone_yaw: 2.0 drone_pitch: -3.1 drone_roll: 1.5] [gb_yaw: 10.0 gb_pitch: -45.0 gb_roll: 1.0]",
+        "[gimbal_pitch: -45.0 gimbal_yaw: 10.0 gimbal_roll: 1.0] yaw: 2.0",
+    ],
+)
+def test_the_angles_of_camera_and_aircraft_are_told_apart_in_any_order(read, groups):
+    found = read(f"[latitude: 48.1] [longitude: 11.5] {groups}")
+    angles = [found.heading_rad[0], found.pitch_rad[0], found.roll_rad[0], found.vehicle_heading_rad[0]]
+    np.testing.assert_allclose(np.degrees(angles), [10, 45, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("zooms", "degrees", "note"),
+    [
+        (["1.79"], 21.89, None),
+        (["179"], 21.89, "counted in 1/100: 179 is 1.79"),
+        (["1790"], 21.89, "counted in 1/1000"),
+        (["17871"], 21.92, "counted in 1/10000: 17871 is 1.7871"),
+        (["10000", "120000"], 3.31, "counted in 1/10000"),
+        (["0"], 38.19, "a zoom of 0 cannot be"),
+    ],
+)
+def test_a_zoom_may_be_in_any_scale(read, zooms, degrees, note):
+    found = read(
+        *(f"[focal_len: 52.00] [dzoom_ratio: {zoom}, delta:0] [latitude: 48] [longitude: 11]" for zoom in zooms)
+    )
+    assert np.degrees(found.hfov_rad[-1]) == pytest.approx(degrees, abs=0.01)
+    assert [text for text in found.notes if "zoom" in text and (note or "none") in text] or note is None
+
+
+@pytest.mark.parametrize(
+    ("body", "altitude_m", "above_sea_m", "zero"),
+    [
+        ("SrtCnt : 1, DiffTime : 33ms\n[latitude: 0.41] [longitude: 36.8] [altitude: 35.4]", 35.4, None, "takeoff"),
+        ("FrameCnt : 1\n[latitude: -36.8] [longtitude: 74.6] [altitude: 28.7]", None, 28.7, "takeoff"),
+        ("[latitude: -36.8] [longitude: 74.6] [altitude: 28.7]", None, 28.7, "unknown"),
+        ("GPS(48.1,11.5,569.8) BAROMETER(91.2) HOME(48.1,11.5)", 91.2, 569.8, "takeoff"),
+        ("GPS (48.1, 11.5, 569.8), H 91.2m", 91.2, 569.8, "takeoff"),
+        ("GPS(11.5,48.1,16) BAROMETER(300ft)", 91.44, None, "takeoff"),
+    ],
+)
+def test_a_height_counts_from_where_its_dialect_has_it(read, body, altitude_m, above_sea_m, zero):
+    found = read(body)
+    heights = [math.nan if height is None else height for height in (altitude_m, above_sea_m)]
+    np.testing.assert_allclose([found.altitude_m[0], found.above_sea_m[0]], heights)
+    assert found.height_zero == zero
+    assert bool([note for note in found.notes if "takeoff_above_sea_m" in note]) == (zero == "unknown")
+
+
+@pytest.mark.parametrize(
+    ("body", "place"),
+    [
+        ("GPS(48.1371,11.5753,569.800) BAROMETER(91.2)", [11.5753, 48.1371]),
+        ("GPS(48.1371,11.5753,52.5M) BAROMETER:9.2", [11.5753, 48.1371]),
+        ("GPS(11.5753,48.1371,16) BAROMETER:9.2", [11.5753, 48.1371]),
+        ("GPS(48.1371,111.5753) BAROMETER:9.2", [111.5753, 48.1371]),
+    ],
+)
+def test_the_dialect_tells_which_coordinate_comes_first(read, body, place):
+    assert read(body, body).place.tolist() == [place] * 2
+
+
+def test_two_coordinates_alone_need_an_order(fly):
+    text = timed("GPS(48.1, 11.5) BAROMETER:9.2")
+    with pytest.raises(InputError, match=r"GPS\(...\) may be lat-lon or lon-lat; wanted aerial\.order=lat-lon or"):
+        fly(text, "flight.SRT")
+    assert fly(text, "flight.SRT", order="lat-lon").place.tolist() == [[11.5, 48.1]]
+    assert fly(text, "flight.SRT", order="lon-lat").place.tolist() == [[48.1, 11.5]]
+
+
+@pytest.mark.parametrize(
+    ("timings", "times"),
+    [
+        (
+            ["00:00:00,000 --> 00:00:00,998", "00:00:00,998 --> 00:00:00,1824", "00:00:00,1824 --> 00:00:01,857"],
+            [0, 0.998, 1.824],
+        ),
+        (
+            ["00:00:00,0 --> 00:00:00,33", "00:00:00,33 --> 00:00:00,100", "00:00:00,100 --> 00:00:01,0"],
+            [0, 0.033, 0.1],
+        ),
+        (["00:00:00,000000 --> 00:00:00,500000", "00:00:00,500000 --> 00:00:01,000000"], [0, 0.5]),
+        (["00:00:00.5 --> 00:00:01.0", "00:00:01.0 --> 00:00:01.5"], [0.5, 1]),
+    ],
+)
+def test_milliseconds_may_be_over_999_or_without_zeros(fly, timings, times):
+    text = "\n".join(f"{k}\n{timing}\n[latitude: 1] [longitude: 2] [rel_alt: 3]\n" for k, timing in enumerate(timings))
+    np.testing.assert_allclose(fly(text, "flight.SRT").time_s, times)
+
+
+def flight(hour: int, latitude: float, count: int = 5) -> list[str]:
+    return [
+        f"2024-05-27 {hour}:10:{k:02d}.000\n[latitude: {latitude}] [longitude: 6.4] [rel_alt: {k}.0]"
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("bodies", "before_s", "after_s"),
+    [
+        ([*flight(13, 53.0), *flight(15, 53.0001)], 4, 5),  # the date jumps
+        ([body.split("\n")[1] for body in [*flight(13, 53.0), *flight(13, 54.0)]], 4, 5),  # the place jumps
+    ],
+)
+def test_a_jump_of_date_or_place_splits_a_file_into_flights(read, bodies, before_s, after_s):
+    found = read(*bodies)
+    assert [note for note in found.notes if "these are several flights" in note]
+    between = found.at((before_s + after_s) / 2)
+    assert math.isnan(between.place[0]) and math.isnan(between.altitude_m)
+    assert np.isfinite([found.at(before_s).place, found.at(after_s).place]).all()
+
+
+def test_times_that_begin_again_go_on_by_their_dates(fly):
+    found = fly(timed(*flight(13, 53.0)) + "\n" + timed(*flight(15, 53.5)), "flight.SRT")
+    assert found.at(3600.0) is None or math.isnan(found.at(3600.0).altitude_m)
+    assert found.at(7203.0).place == pytest.approx((6.4, 53.5)) and found.at(3.0).place == pytest.approx((6.4, 53.0))
+
+
+def test_a_time_lapse_whose_dates_run_fast_is_one_flight(read):
+    bodies = [f"2024-05-27 13:{k:02d}:00.000\n[latitude: 53] [longitude: 6.4] [rel_alt: {k}.0]" for k in range(20)]
+    found = read(*bodies)
+    assert not [note for note in found.notes if "flights" in note] and found.at(4.5).altitude_m == 4.5
 
 
 LOCAL = """1

@@ -79,7 +79,7 @@ def detect_clip(
         parameters = settings.aerial
         flight = None
         if telemetry is not None:
-            flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone)
+            flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone, parameters.order)
         settings, more = with_logged_focal(settings, flight, source.size)
         engine = load_engine(backend, settings)
         facts = {

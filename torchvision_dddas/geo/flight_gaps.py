@@ -37,6 +37,8 @@ def fill_gaps(
         if used:
             words = "it is taken" if len(used) == 1 else "they are taken"
             notes.append(f"the log does not say {', '.join(used)}: {words} from camera {camera.name}")
+        if np.array_equal(telemetry.altitude_m, telemetry.above_sea_m):
+            notes.append("the heights of the log count from the take-off point: above the sea they would lie below it")
         reasons: dict[str, list[str]] = {}
         for key in (key for key in known_keys(camera) if key not in used):
             reasons.setdefault(_why_unused(key, telemetry), []).append(key)
@@ -86,10 +88,14 @@ def _take_from_camera(telemetry: Telemetry, camera: Camera, has_ground: bool) ->
     if "roll_deg" in known and _lacks(telemetry, "roll_rad"):
         give("roll_deg", "roll_rad", camera.roll_rad)
     above_sea = not _lacks(telemetry, "above_sea_m")
-    if _lacks(telemetry, "altitude_m") and not (above_sea and has_ground):
+    is_open = telemetry.height_zero == "unknown" and "takeoff_above_sea_m" in known
+    if _lacks(telemetry, "altitude_m") and (is_open or not (above_sea and has_ground)):
         if "takeoff_above_sea_m" in known and above_sea:
             used.append("takeoff_above_sea_m")
-            filled["altitude_m"] = telemetry.above_sea_m - camera.takeoff_above_sea_m
+            altitude_m = telemetry.above_sea_m - camera.takeoff_above_sea_m
+            # Heights that would be below the take-off point throughout are counted from it.
+            is_from_takeoff = is_open and not (altitude_m > 0).any()
+            filled["altitude_m"] = telemetry.above_sea_m if is_from_takeoff else altitude_m
         elif "height_m" in known:
             give("height_m", "altitude_m", camera.height_m, "altitude_sigma_m", "height_sigma_m")
     return replace(telemetry, **filled), used  # type: ignore[arg-type]

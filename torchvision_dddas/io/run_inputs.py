@@ -134,7 +134,8 @@ def _read_flight(given: AerialInput, settings: Settings, clip: str | None) -> tu
 
 
 def _read_telemetry(path: Path, settings: Settings, clip: str | None) -> Telemetry:
-    return read_telemetry(path, settings.aerial.clock_offset_s, clip, settings.aerial.time_zone)
+    aerial = settings.aerial
+    return read_telemetry(path, aerial.clock_offset_s, clip, aerial.time_zone, aerial.order)
 
 
 def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:

@@ -1,8 +1,11 @@
 """Tables as text files, CSV and MOTChallenge: a schema names the columns once, for the reader and for the writer."""
 
+import codecs
 import csv
 import io
 import math
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -186,26 +189,79 @@ class CsvText(NamedTuple):
     rows: list[list[str]]
 
 
+# The beginning of a file tells how it is written.
+_HEAD_BYTES, _HEAD_LINES = 65_536, 50
+_QUOTED, _SEP_LINE = re.compile(r'"[^"]*"'), re.compile(r'"?sep=([,;|\t])"?')
+_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*(?:[eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d+)?")
+
+
+def _from_windows(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("cp1252"), error.end
+
+
+codecs.register_error("windows", _from_windows)
+
+
 def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvText:
     """Read the cells of a CSV. what: what the file holds, for messages. has_header: whether line 1 names the columns.
 
+    Cells are parted by commas, semicolons, tabs or bars, and numbers may have decimal commas; the first lines tell.
+    A line `sep=;` is left out. Text is UTF-8, UTF-16 with its mark, or Windows-1252.
     Raises InputError: unreadable, no CSV text.
     """
     name = f"{what} {path}".strip()
     lines, rows = list[int](), list[list[str]]()
     try:
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, skipinitialspace=True)
-            header = [cell.strip() for cell in next(reader, [])] if has_header else []
+        with Path(path).open("rb") as raw:
+            head = raw.read(_HEAD_BYTES)
+        is_wide = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        encoding, errors = ("utf-16", "strict") if is_wide else ("utf-8-sig", "windows")
+        separator, comma = _find_format(head.decode(encoding, "replace"))
+        with Path(path).open(newline="", encoding=encoding, errors=errors) as file:
+            reader = csv.reader(file, delimiter=separator, skipinitialspace=True)
             for row in reader:
-                if row and any(cells := [cell.strip() for cell in row]):
+                if any(cells := list(map(str.strip, row))):
                     lines.append(reader.line_num)
                     rows.append(cells)
     except OSError as error:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
+    except (UnicodeError, csv.Error) as error:
         raise InputError(f"{name} is no CSV text: {error}") from None
-    return CsvText(header, lines, rows)
+    if comma is not None:
+        form = _NUMBER if comma else _THOUSANDS
+        rows = [[c.replace(",", comma) if "," in c and form.fullmatch(c) else c for c in row] for row in rows]
+    if rows and _SEP_LINE.fullmatch(separator.join(rows[0])):
+        del lines[0], rows[0]
+    return CsvText(rows[0], lines[1:], rows[1:]) if has_header and rows else CsvText([], lines, rows)
+
+
+def _find_format(head: str) -> tuple[str, str | None]:
+    """The sign between cells, and what stands for a comma in a number: "." for a decimal one, "" between thousands."""
+    lines = [line for line in head.splitlines() if line.strip()][:_HEAD_LINES]
+    told = _SEP_LINE.fullmatch(lines[0]) if lines else None
+    bare = [_QUOTED.sub("", line) for line in lines]
+
+    def rank(sign: str) -> tuple[int, float]:
+        """How many lines have equally many cells, and the share of numbers in these."""
+        counts = Counter(count for line in bare if (count := line.count(sign)))
+        cells = [cell.strip() for line in bare for cell in line.split(sign)]
+        return max(counts.values(), default=0), sum(map(bool, map(_NUMBER.fullmatch, cells))) / max(len(cells), 1)
+
+    separator = told[1] if told is not None else max(",;\t|", key=rank)
+    try:
+        cells = [cell.strip() for row in csv.reader(lines, delimiter=separator, skipinitialspace=True) for cell in row]
+    except csv.Error:
+        return separator, None
+    numbers = [cell for cell in cells if _NUMBER.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
+    commas = [cell for cell in numbers if "," in cell]
+    points = sum("." in cell for cell in numbers if "," not in cell)
+    is_thousands = all(map(_THOUSANDS.fullmatch, commas))
+    if 10 * points > len(commas):
+        return separator, "" if commas and is_thousands else None
+    # Where each comma may part thousands, only the semicolon tells: it is there because commas are decimal.
+    return separator, "." if separator == ";" or not is_thousands else None
 
 
 class CsvTable:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry import dataflash, px4
+from torchvision_dddas.io.telemetry.clocks import parse_time_zone
 from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
 from torchvision_dddas.io.telemetry.nmea import SENTENCE, read_nmea
 from torchvision_dddas.io.telemetry.record import KINDS
-from torchvision_dddas.io.telemetry.tables import parse_time_zone, read_telemetry_table
+from torchvision_dddas.io.telemetry.tables import read_telemetry_table
 from torchvision_dddas.io.telemetry.text_logs import read_subtitles
 from torchvision_dddas.types import Telemetry
 
@@ -27,12 +28,17 @@ _OTHERS = {
 
 
 def read_telemetry(
-    path: str | Path, clock_offset_s: float = 0.0, clip: str | Path | None = None, time_zone: str = ""
+    path: str | Path,
+    clock_offset_s: float = 0.0,
+    clip: str | Path | None = None,
+    time_zone: str = "",
+    order: str = "auto",
 ) -> Telemetry:
     """What a vehicle reports of itself. clock_offset_s: added to its times to get those since the clip's first frame.
 
     clip: the video that it belongs to; of use for a table that counts frames instead of telling times. time_zone: of
-    dates that say none, a name of the IANA data base or hours from UTC; "" leaves their clock unknown.
+    dates that say none, a name of the IANA data base or hours from UTC; "" leaves their clock unknown. order: "lat-lon"
+    or "lon-lat" for two coordinates in one field, whose order else the program tells.
     Raises InputError in one line where the file cannot be read or nothing in it can be used. What can be read of a
     damaged file is returned, and its notes say what could not.
     """
@@ -65,9 +71,9 @@ def read_telemetry(
     if text is not None and (re.search(r"\$[A-Z]{5},", text) or SENTENCE.search(text)):
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
-        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s, zone)
-    if suffix == ".csv" or (text is not None and "," in text):
-        return read_telemetry_table(path, clock_offset_s, clip, zone)
+        return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s, zone, order)
+    if suffix == ".csv" or (text is not None and re.search(r"[,;\t|]", text)):
+        return read_telemetry_table(path, clock_offset_s, clip, zone, order)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
     known = (words for mark, words in _OTHERS.items() if mark in head[:12])

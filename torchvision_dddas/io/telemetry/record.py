@@ -1,14 +1,16 @@
 """One record of a flight from the samples of any log: checked, and resampled at common times."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.errors import InputError, printable
 from torchvision_dddas.geometry import DEGREE_M
+from torchvision_dddas.io.telemetry.fields import HEIGHTS, POSSIBLE
 from torchvision_dddas.types import Telemetry
 
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, ArduPilot .bin or .log, MPEG-TS with MISB ST 0601, or NMEA 0183"
@@ -20,8 +22,10 @@ OWN = "table"
 _FIRST_CLOCK_S, _DAY_S = 1_230_768_000.0, 86_400.0  # 2009-01-01
 # A barometer's zero drifts by metres in a flight; an altitude below this has another origin than the ground.
 _DEEP_M = -5.0
-# Values outside are damage.
-_POSSIBLE = {"altitude_m": (-1e4, 1e5), "above_sea_m": (-1e4, 1e5), "speed_m_s": (0.0, 1e3), "hfov_rad": (1e-3, np.pi)}
+# A vehicle does not go further between two samples, unless they are of two flights.
+_JUMP_M, _SPLIT_S, _STRAY = 200.0, 1e-3, 2
+# Two heights that differ by less everywhere are the same.
+_ALIKE_M = 0.5
 # A pause of this many median sample intervals, and of this many seconds, is a gap: nothing is known within it.
 _GAP_SHARE, _GAP_S = 10.0, 5.0
 # A log with nothing but these is refused.
@@ -43,10 +47,10 @@ class Log:
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
     jitter_s: how far time may run back; more is another recording, or damage. is_nominal: as in Telemetry.
-    height_zero: what altitude_m counts from, as in Telemetry.
-    samples: column of the record -> rows (N, 3) of time, value (NaN where unknown) and place in the file. Positions are
-    longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any value, of each row of a log whose
-    rows hold all quantities, also of empty rows.
+    height_zero: what altitude_m counts from, as in Telemetry. splits: times at which another flight begins.
+    samples: column of the record, or another quantity of `fields` -> rows (N, 3) of time, value (NaN where unknown) and
+    place in the file. Positions are longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any
+    value, of each row of a log whose rows hold all quantities, also of empty rows.
     """
 
     path: Path
@@ -56,6 +60,7 @@ class Log:
     jitter_s: float = 1.0
     height_zero: Literal["ground", "takeoff", "unknown"] = "takeoff"
     is_nominal: bool = False
+    splits: list[float] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     samples: dict[str, Any] = field(default_factory=dict)
     moments: Any = field(default_factory=list)
@@ -71,9 +76,25 @@ class Log:
             self.samples[quantity] = rows[~np.isnan(rows[:, 1])] if known else rows
 
     def note(self, text: str) -> None:
-        """Note what the user should know, once."""
+        """Note what the user should know, once. It may hold text of the file."""
+        text = printable(" ".join(text.split()))
         if text not in self.notes:
             self.notes.append(text)
+
+    def latitude_first(self, pairs: np.ndarray, told: str, asked: str, what: str) -> bool:
+        """Whether of two coordinates, (N, 2), the first is the latitude. told, asked: by the dialect and by the user.
+
+        what: that holds them, in words. Raises InputError where nothing tells the order.
+        """
+        is_beyond = (np.abs(pairs) > 90).any(axis=0)
+        if asked == "auto" and is_beyond[0] != is_beyond[1]:
+            return bool(is_beyond[1])
+        order = told if asked == "auto" else asked
+        if not order:
+            raise self.refuse(f"{what} may be lat-lon or lon-lat; wanted aerial.order=lat-lon or aerial.order=lon-lat")
+        if asked == "auto":
+            self.note(f"{what} is taken as {order}, as this dialect has it; aerial.order may tell another order")
+        return order == "lat-lon"
 
     def refuse(self, text: str, where: float | None = None) -> InputError:
         """The error to raise, with the file and the place."""
@@ -103,6 +124,8 @@ def build_record(
     _drop_impossible(log, samples)
     _check_globe(log, samples)
     samples = {name: rows for name, rows in samples.items() if np.isfinite(rows[:, 1]).any()}
+    _settle_heights(log, samples)
+    _split_flights(log, samples)
     if not set(samples) - _NOT_ALONE:
         raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
     _note_altitude(log, samples)
@@ -118,7 +141,7 @@ def build_record(
     place = np.stack([columns.get(name, unknown) for name in pair], axis=1)
     place[~np.isfinite(place).all(axis=1)] = np.nan
     if "speed_m_s" not in columns and np.isfinite(place).all(axis=1).sum() > 2:
-        columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic)
+        columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic, log.splits)
         if np.isfinite(columns["speed_m_s"]).any():
             log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
     clock_s = start_utc_s + start
@@ -218,16 +241,17 @@ def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
 
 
 def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Set impossible values to NaN."""
+    """Set impossible values to NaN, but for places, see `_check_globe`."""
     for name, rows in samples.items():
-        low, high = _POSSIBLE.get(name, (-np.inf, np.inf))
+        low, high = (-np.inf, np.inf) if "itude_deg" in name else POSSIBLE.get(name, (-np.inf, np.inf))
         is_infinite = np.isinf(rows[:, 1])
         is_beyond = ((rows[:, 1] < low) | (rows[:, 1] > high)) & ~is_infinite
         for wrong in (is_infinite, is_beyond):
             if wrong.any():
                 _, value, where = rows[wrong.argmax()]
-                what = "infinite" if np.isinf(value) else f"{value:g}"
-                log.note(f"{log.where} {where:.0f}: {name} is {what}, which cannot be; {wrong.sum()} left out")
+                what = "infinite" if np.isinf(value) else f"{np.degrees(value) if name.endswith('_rad') else value:g}"
+                title = name.replace("_rad", "_deg")
+                log.note(f"{log.where} {where:.0f}: {title} is {what}, which cannot be; {wrong.sum()} left out")
                 rows[wrong, 1] = np.nan
 
 
@@ -248,6 +272,62 @@ def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
             log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
 
 
+def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Make altitude_m and above_sea_m of the heights that a log holds; note what is assumed of them."""
+    unsaid = "the file does not say where the {} is zero; above the {} is assumed"
+    takeoff, ground, height, bare, geoid = (samples.pop(name, None) for name in HEIGHTS)
+    if takeoff is None and ground is None and height is not None:
+        log.note(unsaid.format("height", "take-off point"))
+        takeoff = height
+    for rows, zero in ((ground, "ground"), (takeoff, "takeoff")):
+        if rows is not None:
+            samples["altitude_m"], log.height_zero = rows, zero
+    ellipsoid, lower = samples.get("above_ellipsoid_m"), samples.get("altitude_m")
+    if ellipsoid is not None and geoid is not None and "above_sea_m" not in samples:
+        up_m = np.interp(ellipsoid[:, 0], geoid[:, 0], geoid[:, 1])
+        samples["above_sea_m"] = ellipsoid - up_m[:, None] * [0, 1, 0]
+        log.note("the heights above the sea are those above the ellipsoid less the log's own height of the geoid")
+    if bare is None or "above_sea_m" in samples:
+        return
+    if lower is None:
+        log.height_zero = "unknown"
+        log.note(
+            f"{unsaid.format('altitude', 'sea')}; if from the take-off, takeoff_above_sea_m = 0 in the camera's file"
+        )
+    else:
+        apart_m = np.abs(np.interp(bare[:, 0], lower[:, 0], lower[:, 1]) - bare[:, 1])
+        if len(known_m := apart_m[np.isfinite(apart_m)]) and known_m.max() < _ALIKE_M:
+            return
+        log.note(unsaid.format("altitude", "sea"))
+    samples["above_sea_m"] = bare
+
+
+def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
+    """Split the log where its place jumps: nothing is known between two flights, nor of one or two places astray."""
+    for pair, scale in ((("longitude_deg", "latitude_deg"), DEGREE_M), (("east_m", "north_m"), 1.0)):
+        east, north = (samples.get(name, np.zeros((0, 3))) for name in pair)
+        known = np.flatnonzero(np.isfinite(east[:, 1] + north[:, 1])) if len(east) == len(north) else np.zeros(0, int)
+        if len(known) > 1:
+            times, place = east[known, 0], np.stack([east[known, 1], north[known, 1]], axis=1) * scale
+            if scale == DEGREE_M:
+                place[:, 0] = np.unwrap(place[:, 0], period=360 * scale) * np.cos(np.radians(north[known[0], 1]))
+            steps_s, away_m = np.diff(times), np.linalg.norm(np.diff(place, axis=0), axis=1)
+            is_jump = away_m > np.maximum(_JUMP_M, POSSIBLE["speed_m_s"][1] * steps_s)
+            log.splits += (times[:-1] + np.minimum(steps_s / 2, _SPLIT_S))[is_jump].tolist()
+            flight = np.append(0, np.cumsum(is_jump))
+            count = np.bincount(flight)[flight]
+            east[known[(count <= _STRAY) & (count.max() > 2 * _STRAY)], 1] = np.nan
+    if log.splits:
+        times_s = ", ".join(f"{time_s:.1f}" for time_s in sorted(log.splits)[:5])
+        log.note(
+            f"the date or the place jumps after {times_s} s: these are several flights, with nothing known between"
+        )
+        gaps = np.column_stack([log.splits, np.full((len(log.splits), 2), np.nan)])
+        for name, rows in samples.items():
+            rows = np.concatenate([rows, gaps])
+            samples[name] = rows[np.argsort(rows[:, 0], kind="stable")]
+
+
 def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Note where there is no place or no altitude, or one below the ground."""
     if not {"latitude_deg", "east_m"} & set(samples) and log.kind != OWN:
@@ -255,9 +335,7 @@ def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
     if "altitude_m" not in samples:
         log.note("the log holds no altitude above ground")
         if "above_ellipsoid_m" in samples and "above_sea_m" not in samples:
-            log.note(
-                "its heights count from the ellipsoid: without the geoid they tell none above the sea or the ground"
-            )
+            log.note("its heights count from the ellipsoid: without the geoid they tell none above sea or ground")
         return
     deep = samples["altitude_m"][:, 1] < _DEEP_M
     if deep.any():
@@ -292,14 +370,17 @@ def _longest_silence_s(known: np.ndarray, bridge_s: float) -> float:
 # Speed over ground from places, where a log does not have it.
 
 
-def _speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) -> tuple[np.ndarray, float]:
+def _speed_from_places(
+    time_s: np.ndarray, place: np.ndarray, geographic: bool, splits: Sequence[float]
+) -> tuple[np.ndarray, float]:
     """Speed as the slope of a line fitted to the places around each time, m/s, and the time span of the fit, s.
 
     time_s: (N,) rising. place: (N, 2) degrees or metres, NaN where unknown: there the speed is NaN, and where
-    the places span too short a time.
+    the places span too short a time. splits: times over which no line is fitted.
     """
     known = np.isfinite(place).all(axis=1)
     speed = np.full(len(time_s), np.nan)
+    flight = np.searchsorted(np.sort(splits), time_s[known])
     times = time_s[known] - time_s[known][0]
     metres = place[known] - place[known][0]
     if geographic:
@@ -307,8 +388,8 @@ def _speed_from_places(time_s: np.ndarray, place: np.ndarray, geographic: bool) 
         metres *= DEGREE_M * np.array([np.cos(np.radians(place[known][0, 1])), 1.0])
     wanted_s = min(_step_m(place[known], geographic) / _STEP_M_S, _MOST_S)
     half_s = max(wanted_s, _LEAST_S, 2.0 * float(np.median(np.diff(times))))
-    low = np.searchsorted(times, times - half_s - 1e-6)
-    high = np.searchsorted(times, times + half_s + 1e-6)
+    low = np.maximum(np.searchsorted(times, times - half_s - 1e-6), np.searchsorted(flight, flight))
+    high = np.minimum(np.searchsorted(times, times + half_s + 1e-6), np.searchsorted(flight, flight, "right"))
     count, span_s = high - low, times[high - 1] - times[low]
     # Sums over each span are differences of running sums.
     terms = np.column_stack([times, times**2, metres, metres * times[:, None]])

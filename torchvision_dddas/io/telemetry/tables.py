@@ -2,310 +2,281 @@
 
 import math
 import re
-from datetime import UTC, datetime, timedelta, timezone, tzinfo
-from functools import cache
+from datetime import tzinfo
 from pathlib import Path
-from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.sources import open_source
-from torchvision_dddas.io.tables import Column, CsvText, Schema, read_csv, read_table
+from torchvision_dddas.io.tables import PLACES, Column, CsvText, Schema, parse_numbers, read_csv, read_table
+from torchvision_dddas.io.telemetry.clocks import read_times, settle_times
+from torchvision_dddas.io.telemetry.fields import (
+    FIELDS,
+    UNITS,
+    Known,
+    Names,
+    field_of_view,
+    looks_alike,
+    names_of_table,
+)
 from torchvision_dddas.io.telemetry.record import KINDS, OWN, Log, build_record
 from torchvision_dddas.types import Telemetry
 
-PAIRS = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
-_ANY = (-math.inf, math.inf, "")
-_COMPASS = (-360.0, 360.0, "clockwise from true north, -360 to 360")
-_LOCAL = (-1e7, 1e7, "metres from the origin, -1e7 to 1e7")
-_OPTIONAL = {
-    "altitude_m": _ANY,
-    "speed_m_s": (0.0, math.inf, "the speed over ground, 0 or more"),
-    "longitude_deg": _ANY,
-    "latitude_deg": _ANY,
-    "east_m": _LOCAL,
-    "north_m": _LOCAL,
-    "above_sea_m": _ANY,
-    "heading_deg": _COMPASS,
-    # A gimbal that looks straight down reports 90.2 as well as 89.8.
-    "pitch_deg": (-180.0, 180.0, "how far the camera looks below the horizon, -180 to 180"),
-    "roll_deg": (-180.0, 180.0, "clockwise, -180 to 180"),
-    "hfov_deg": (0.0, 180.0, "the width of the field of view, 0 to 180"),
-    "vehicle_heading_deg": _COMPASS,
-}
+_PLACE = PLACES[0]
+_KNOWN = {field.quantity: Known(field, math.pi / 180 if field.kind == "angle" else 1.0) for field in FIELDS}
+# Columns of own tables; their pitch is counted down.
+_OWN = {"altitude_m": "above_ground_m", "heading_deg": "heading_rad", "pitch_deg": "pitch_rad", "roll_deg": "roll_rad"}
+_OWN |= {"hfov_deg": "hfov_rad", "vehicle_heading_deg": "vehicle_heading_rad"}
+_OWN |= {name: name for name in ("speed_m_s", *_PLACE, *PLACES[1], "above_sea_m")}
 SCHEMA = Schema(
     "telemetry",
     Column("time_s", "g", -1e10, 1e10, wanted="seconds since the clip's first frame"),
     *(
-        Column(name, "g", low, high, may_be_empty=True, wanted=wanted)
-        for name, (low, high, wanted) in _OPTIONAL.items()
+        # Whether longitude and latitude are swapped is told later.
+        Column(name, "g", *((-math.inf, math.inf) if name in _PLACE else field[2:4]), may_be_empty=True)
+        for name, field in ((name, _KNOWN[quantity].field) for name, quantity in _OWN.items())
     ),
 )
+# Where one of these is known, the other is not read.
+_BETTER = {"above_ground_m": {"above_takeoff_m"}, "bare_height_m": {"above_takeoff_m", "above_ground_m"}}
+_BETTER |= {"bare_altitude_m": {"above_sea_m"}, "geoid_m": {"above_sea_m"}}
+# The names stand in one of so many rows and cells; before them are lines about the flight.
+_PREAMBLE, _CELLS = 60, 1000
+# So many columns of a quantity are tried for one that is not empty, read for times, and named in a note.
+_TRIED, _CLOCKS, _LISTED = 4, 8, 12
+_UNKNOWN = {"nan", "na", "n/a", "null", "none", "no data", "inf", "-inf", "-", "--", "---"}
+_ON = {"1", "1.0", "true", "yes", "on", "video", "recording", "started"}
+_PART = r"(\d{1,3}(?:[.,]\d{1,12})?)"
+_ANGLE = re.compile(rf"([NSEW-])? ?{_PART} ?[°d:]? ?(?:{_PART} ?['′m:]? ?)?(?:{_PART} ?[\"″s]? ?)?([NSEW])?", re.I)
 
 
-def read_telemetry_table(path: Path, clock_offset_s: float, clip: Path | None, zone: tzinfo | None = None) -> Telemetry:
-    """Read an own table, which has a column time_s, or that of another program. zone: of dates that say none.
+def read_telemetry_table(
+    path: Path, clock_offset_s: float, clip: Path | None, zone: tzinfo | None = None, order: str = "auto"
+) -> Telemetry:
+    """Read an own table, whose columns are all in SCHEMA, or that of another program.
 
-    Raises InputError with file and line: as read_table, no rows, half a place, a time before the one above it.
+    zone, order: of dates that say no zone, and of a cell with two coordinates; see `read_telemetry`.
+    Raises InputError with file and line: unreadable, no time, no rows, nothing of use; and of an own table as
+    read_table, half a place, a time before the one above it.
     """
-    text = read_csv(path, "telemetry")
-    plain = {name: _plain(name) for name in set(text.header)}
-    names = {name for name, _ in plain.values()}
-    if "time_s" in text.header or not (names & (_TIMES | {"frame"}) and names & set(QUANTITY)):
+    _, lines, rows = read_csv(path, "telemetry", has_header=False)
+    names = Names()
+    known = (sum(names.find(_bare(title)) is not None for title in row[:_CELLS]) for row in rows[:_PREAMBLE])
+    place = next((place for place, count in enumerate(known) if count > 1), 0)
+    header = [_bare(title) for title in rows[place]] if rows else []
+    text = CsvText(header, lines[place + 1 :], rows[place + 1 :])
+    if rows and rows[place] in text.rows:  # the names may come again
+        kept = [k for k, row in enumerate(text.rows) if row != rows[place]]
+        text = CsvText(header, [text.line[k] for k in kept], [text.rows[k] for k in kept])
+    if set(header) <= set(SCHEMA.names):
         return _read_own(path, text, clock_offset_s)
-    columns = [plain[name] for name in text.header]
-    return _read_program_table(Log(path, "flight log table"), text, columns, clock_offset_s, clip, zone)
+    return _Table(path, text).read(clock_offset_s, clip, zone, order)
+
+
+def _bare(title: str) -> str:
+    return title.lstrip("#%/ ")
+
+
+def _no_log(path: Path) -> InputError:
+    return InputError(
+        f"telemetry {path} looks like no log: its first line names none of {', '.join(SCHEMA.names)}; wanted {KINDS}, "
+        "of which a CSV needs time_s and altitude_m, or a place"
+    )
 
 
 def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
-    known = [name for name in SCHEMA.names if name in text.header]
-    if not known:
-        raise InputError(
-            f"telemetry {path} looks like no log: its first line names none of {', '.join(SCHEMA.names)}; wanted "
-            f"{KINDS}, of which a CSV needs time_s and altitude_m, or a place"
-        )
-    is_placed = any(set(pair) & set(known) for pair in PAIRS)
-    heights = () if is_placed or "above_sea_m" in known else ("altitude_m",)  # the camera's file may say the height
-    table = read_table(path, SCHEMA, ("time_s", *heights), is_ragged=True, text=text)
-    pairs = [pair for pair in PAIRS if set(pair) & set(known)]
-    for pair in pairs:
-        if missing := set(pair) - set(known):
-            raise InputError(f"telemetry {path} lacks {missing.pop()}; wanted {' and '.join(pair)}")
+    if not text.header:
+        raise _no_log(path)
+    pairs = [pair for pair in PLACES if set(pair) & set(text.header)]
     if len(pairs) > 1:
         raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind, leave the other out")
-    if not len(table):
-        raise InputError(f"telemetry {path} has a header but no rows")
+    # The camera's file may say the height.
+    wanted = pairs[0] if pairs else () if "above_sea_m" in text.header else ("altitude_m",)
+    table = read_table(path, SCHEMA, ("time_s", *wanted), is_ragged=True, text=text)
+    table.require_rows()
     time_s = table["time_s"]
     if (is_back := np.diff(time_s) < 0).any():
         row = int(np.argmax(is_back)) + 1
         raise table.error(f"time_s runs back from {time_s[row - 1]:g} to {time_s[row]:g}; sort it by time", row)
     log = Log(path, OWN, moments=np.column_stack([time_s, time_s, table.line]))
-    for name in known[1:]:
-        is_angle = name.endswith("_deg") and name not in PAIRS[0]
-        values = {name.replace("_deg", "_rad"): np.radians(table[name])} if is_angle else {name: table[name]}
-        log.add_all(time_s, table.line, values, known=True)
+    for name in SCHEMA.names[1:]:
+        if name in table:
+            values = {_OWN[name]: table[name] * _KNOWN[_OWN[name]].scale}
+            log.add_all(time_s, table.line, values, known=True)
     return build_record(log, clock_offset_s)
-
-
-# --------------------------------------------------------------------------------------------------------------------
-# What makers call the same thing: from a key and its unit to a quantity of the record.
-
-_KEYS = {
-    "latitude_deg": "latitude lat gpslatitude gpslat",
-    "longitude_deg": "longitude longtitude lon lng long gpslongitude gpslon",
-    "altitude_m": "relalt relativealtitude relativeheight heightabovetakeoff altitudeagl heightagl altagl agl "
-    "altitudem height barometer baro hb h",
-    "above_sea_m": "absalt absolutealtitude altitudeabovesealevel abovesea amsl altitudemsl altmsl msl gpsaltitude "
-    "gpsalt altitude alt",
-    "speed_m_s": "h.s speed groundspeed hspeed horizontalspeed velocity",
-    "heading_rad": "gbyaw gimbalyaw gimbalheading",
-    "pitch_rad": "gbpitch gimbalpitch",
-    "roll_rad": "gbroll gimbalroll",
-    "vehicle_heading_rad": "heading yaw compassheading flightyaw uavyaw",
-    "hfov_rad": "hfov horizontalfov",
-}
-QUANTITY = {key: quantity for quantity, keys in _KEYS.items() for key in keys.split()}
-"""Quantity by key, without capitals, blanks, dashes and underscores; of several, the first is the best."""
-
-_UNITS = {
-    "ft": 0.3048, "feet": 0.3048, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kph": 1 / 3.6, "mph": 0.44704, "kn": 1852 / 3600,
-    "knots": 1852 / 3600, "kt": 1852 / 3600, "kts": 1852 / 3600, "cm": 0.01, "mm": 0.001,
-}  # fmt: skip
-_DATE = re.compile(
-    r"(\d{4})[./-](\d{1,2})[./-](\d{1,2})[ T]+(\d{1,2}):(\d{1,2}):(\d{1,2})"
-    r"(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*(Z|[+-]\d{2}:?\d{2})?"
-)
-UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
-"""The note on a log whose dates say no zone."""
-
-_CLOCK = re.compile(r"(\d{1,9}):(\d{1,9}):(\d+(?:\.\d+)?)")
-# Half the width of the picture whose focal length is given for one 36 mm wide.
-_HALF_WIDTH_MM = 18.0
-
-
-@cache
-def quantity_of(key: str) -> str | None:
-    """The quantity of a key, however it is written; None for any other key."""
-    return QUANTITY.get(re.sub(r"[\s_-]", "", key.lower()))
-
-
-def convert(key: str, value: float, unit: str = "") -> tuple[str, float] | None:
-    """The quantity of a key and its value in the record's units and signs; None for any other key."""
-    quantity = quantity_of(key)
-    if quantity is None:
-        return None
-    unit = unit.lower()
-    value *= _UNITS.get(unit, 1.0)
-    if quantity.endswith("_rad") and unit not in ("rad", "radians"):
-        value = math.radians(value)
-    # A gimbal's pitch is counted up from the horizon, the record's down.
-    return quantity, 0.0 - value if quantity == "pitch_rad" else value
-
-
-def parse_date(text: str) -> tuple[float, bool] | None:
-    """Seconds since 1970 of the first date with a time in a text, and whether it has a zone; else UTC is assumed.
-
-    None without a date. Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`.
-    """
-    found = _DATE.search(text)
-    if found is None:
-        return None
-    *whole, fraction, micro, zone = found.groups(default="")
-    try:
-        year, month, day, hour, minute, second = map(int, whole)
-        moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
-    except ValueError:
-        return None
-    seconds = moment.timestamp() + float(f"0.{fraction}{micro if len(fraction) == 3 else ''}0")
-    if zone not in ("", "Z"):
-        away = timedelta(hours=int(zone[1:3]), minutes=int(zone[-2:])).total_seconds()
-        seconds -= math.copysign(away, float(zone[0] + "1"))
-    return seconds, bool(zone)
-
-
-def parse_time_zone(text: str) -> tzinfo | None:
-    """The zone of a name, Europe/Berlin, or of hours from UTC, +02:00; None for "". Raises InputError otherwise."""
-    text = text.strip()
-    if not text:
-        return None
-    if found := re.fullmatch(r"([+-])(\d{1,2})(?::?([0-5]\d))?", text):
-        away = timedelta(hours=int(found[2]), minutes=int(found[3] or 0))
-        if away < timedelta(hours=24):
-            return timezone(-away if found[1] == "-" else away)
-    try:
-        return ZoneInfo(text)
-    except (KeyError, ValueError, OSError):
-        raise InputError(
-            f"aerial.time_zone '{text[:40]}' is not known; wanted a name such as Europe/Berlin, or hours from UTC such "
-            "as +02:00"
-        ) from None
-
-
-def to_utc(local_s: float, zone: tzinfo) -> float:
-    """Seconds since 1970 of a date in a time zone that `parse_date` has taken for UTC."""
-    moment = datetime.fromtimestamp(local_s, UTC).replace(tzinfo=zone)
-    return local_s - (moment.utcoffset() or timedelta()).total_seconds()
-
-
-def hfov_of_focal(focal_text: str, fnum_text: str, zoom_text: str) -> float | None:
-    """Width of the field of view, rad, from a focal length as that of a 36 mm wide picture; None if it is none.
-
-    Some write both it and the aperture times ten and a hundred: 240 beside 280 is 24 mm at f/2.8.
-    """
-    focal, fnum, zoom = map(_to_float, (focal_text, fnum_text, zoom_text))
-    if "." not in focal_text and focal >= 100 and not fnum < 100:
-        focal /= 10
-    focal *= zoom if 1 <= zoom <= 100 else 1.0
-    return 2 * math.atan(_HALF_WIDTH_MM / focal) if 8 <= focal <= 2000 else None
-
-
-def _to_float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
 
 
 # --------------------------------------------------------------------------------------------------------------------
 # Tables of other programs.
 
-_TIMES = {"time", "timestamp", "datetime", "date", "utc", "t", "seconds", "flytime", "elapsed", "elapsedtime"}
-_OPENING, _NOT_IN_NAMES = re.compile(r"[(\[]"), re.compile(r"[\s_-]|^osd\.|(?<=^gimbal)\.")
-_PER_SECOND = {"s": 1.0, "seconds": 1.0, "ms": 1e3, "millisecond": 1e3, "milliseconds": 1e3, "us": 1e6}
 
+class _Table:
+    """A table. columns: quantity -> place and meaning of its columns, the best first. used: places of those read."""
 
-def _plain(name: str) -> tuple[str, str]:
-    """A column's name without blanks and capitals, and its unit: `Speed (mph)`, `OSD.height [ft]`, `GIMBAL.pitch`."""
-    # The first bracket is looked for alone: an expression for all of it would try each one in a name full of them.
-    opening, unit = _OPENING.search(name), ""
-    if opening is not None and name.endswith((")", "]")):
-        name, unit = name[: opening.start()].rstrip(), name[opening.end() : -1]
-    return _NOT_IN_NAMES.sub("", name.lower()), unit.lower()
+    def __init__(self, path: Path, text: CsvText) -> None:
+        self.header, self.lines, self.rows = text
+        self.names = names_of_table(self.header)
+        self.log = Log(path, f"table of {self.names.program or 'another program'}")
+        units = self._take_units()
+        self.columns: dict[str, list[tuple[int, Known]]] = {}
+        for place, title in enumerate(self.header):
+            if (known := self.names.find(title)) is not None:
+                known = known.in_unit(units[place]) or known if place < len(units) else known
+                self.columns.setdefault(known.field.quantity, []).append((place, known))
+        for columns in self.columns.values():
+            columns.sort(key=lambda column: column[1].rank)
+        self.used: set[int] = set()
 
+    def _take_units(self) -> list[str]:
+        """The units of a line below the names, which is left out; none where there is no such line."""
+        first = [cell.strip("()[]").lower() for cell in self.rows[0]] if self.rows else []
+        is_unit = any(cell in units and not cell.isdigit() for cell in first for units in UNITS.values())
+        if not is_unit or np.isfinite(parse_numbers(first)).any():
+            return []
+        del self.rows[0], self.lines[0]
+        return first
 
-def _read_program_table(
-    log: Log,
-    text: CsvText,
-    columns: list[tuple[str, str]],
-    clock_offset_s: float,
-    clip: Path | None,
-    zone: tzinfo | None,
-) -> Telemetry:
-    """Rows at dates, times of day, numbers of seconds, or frames of a clip. columns: as `_plain` gives them.
+    def cells(self, place: int) -> list[str]:
+        """A column as text, "" where a row ends before it."""
+        self.used.add(place)
+        return [row[place] if place < len(row) else "" for row in self.rows]
 
-    Raises InputError with the line for a time that is none, and where frames are counted and no clip is given.
-    """
-    names, units = zip(*columns, strict=True)
-    is_timed = not _TIMES.isdisjoint(names)
-    clock = next(i for i, name in enumerate(names) if name in (_TIMES if is_timed else ("frame",)))
-    rate_hz = math.nan
-    if not is_timed:
-        if clip is None:
-            raise InputError(f"telemetry {log.path} has frames and no times; give its clip, or a column time_s")
-        rate_hz = open_source(clip).rate_hz
-    # For each quantity the column with the best of its names.
-    ranks = {key: rank for rank, key in enumerate(QUANTITY)}
-    best: dict[str, tuple[int, int]] = {}
-    for i, name in enumerate(names):
-        if name in QUANTITY:
-            best[QUANTITY[name]] = min(best.get(QUANTITY[name], (len(ranks), i)), (ranks[name], i))
-    used = sorted(i for _, i in best.values())
-    if {names[i] for i in used} & {"altitude", "alt"}:
-        log.note("the file does not say where the altitude is zero; above the sea is assumed")
-    optics = [names.index(key) if key in names else None for key in ("focallen", "fnum", "dzoomratio")]
-    films = names.index("isvideo") if "isvideo" in names else clock  # whether the camera records at the time
-    wanted = {clock, films, *used, *(i for i in optics if i is not None)}
-    first = begin = filmed = math.nan
-    is_zoned = False
-    for number, row in zip(text.line, text.rows, strict=True):
-        cells = {i: row[i] if i < len(row) else "" for i in wanted}
-        if is_timed:
-            moment, has_zone = _moment(cells[clock], units[clock])
-            is_zoned = is_zoned or has_zone
-        else:
-            count = _to_float(cells[clock])
-            begin = min(count, 1.0) if math.isnan(begin) else begin  # frames are counted from 0 or from 1
-            moment = (count - begin) / rate_hz
-        if not math.isfinite(moment):
-            raise log.refuse(f"'{cells[clock]}' is no time; wanted a date with a time, or seconds", number)
-        first = (moment if is_timed else 0.0) if math.isnan(first) else first
-        log.moments.append((moment - first, 0.0, number))
-        if films != clock and math.isnan(filmed) and _to_float(cells[films]) == 1:
-            filmed = moment - first
-        for i in used:
-            value = _to_float(cells[i])
-            if math.isfinite(value) and (found := convert(names[i], value, units[i])):
-                log.add(found[0], moment - first, found[1], number)
-        hfov = hfov_of_focal(*("" if i is None else cells[i] for i in optics)) if optics[0] is not None else None
-        if hfov is not None:
-            log.add("hfov_rad", moment - first, hfov, number)
-            log.is_nominal = True
-            log.note("the field of view is that of a focal length as for a picture with a longer side of 36 mm")
-    if not log.moments:
-        raise InputError(f"telemetry {log.path} has a header but no rows")
-    if filmed > 0 and not clock_offset_s:
-        log.note(
-            f"the log says that the camera began to film {filmed:.1f} s after its first row, and times count from that "
-            f"row: aerial.clock_offset_s={-filmed:.1f} counts them from where the film begins"
+    def texts(self, quantity: str) -> list[str]:
+        """The first column of a quantity that is not empty; empty cells where there is none."""
+        tried = (self.cells(place) for place, _ in self.columns.get(quantity, ())[:_TRIED])
+        return next((cells for cells in tried if any(cells)), [""] * len(self.rows))
+
+    def numbers(self, quantity: str) -> np.ndarray | None:
+        """The same in the record's unit and sign, (N,), NaN where there is no number; None if there is none at all."""
+        for place, known in self.columns.get(quantity, ())[:_TRIED]:
+            cells = self.cells(place)
+            values = parse_numbers(cells)
+            rows = [row for row in np.flatnonzero(np.isinf(values)).tolist() if cells[row].lower() not in _UNKNOWN]
+            if known.field.kind == "degrees":
+                values[rows] = [_angle(cells[row])[0] for row in rows]
+                rows = [row for row in rows if math.isnan(values[row])]
+            values[np.isinf(values)] = np.nan
+            if np.isfinite(values).any():
+                if rows:
+                    what = f"{self.header[place]} is '{cells[rows[0]][:40]}', which is no number"
+                    self.log.note(f"line {self.lines[rows[0]]}: {what}; {len(rows)} left out")
+                return values * known.scale
+            self.used.discard(place)
+        return None
+
+    def read(self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str) -> Telemetry:
+        """The record of the table."""
+        log = self.log
+        if not self.columns:
+            raise _no_log(log.path)
+        if not self.columns.keys() & {"time", "frame"}:
+            titles = ", ".join(filter(None, self.header[:20]))
+            raise InputError(f"telemetry {log.path} lacks a time; its columns are {titles}, wanted seconds or dates")
+        if not self.rows:
+            raise InputError(f"telemetry {log.path} has a header but no rows")
+        if "time_s" in self.header and len(others := set(self.header) - set(SCHEMA.names)) < len(self.header) - 1:
+            log.note(f"no own table has the columns {', '.join(sorted(others)[:_LISTED])}: read as another program's")
+        values = self._quantities(order)
+        time_s, start_utc_s = self._times(values, zone) if "time" in self.columns else (self._frames(clip), math.nan)
+        where, is_known = np.array(self.lines, float), np.isfinite(time_s)
+        if not is_known.all():
+            (place, _), *_ = self.columns.get("time") or self.columns["frame"]
+            row = int((~is_known).argmax())
+            text = f"'{self.cells(place)[row][:40]}' is no time"
+            if 2 * is_known.sum() <= len(time_s):
+                raise log.refuse(f"{text}; wanted a date with a time, or seconds", where[row])
+            log.note(f"line {where[row]:.0f}: {text}; {(~is_known).sum()} rows without a time are left out")
+        log.moments = np.column_stack([time_s, time_s, where])[is_known]
+        for quantity, column in values.items():
+            log.add_all(time_s[is_known], where[is_known], {quantity: column[is_known]}, known=True)
+        if "filming" in self.columns and not clock_offset_s:
+            self._note_film(time_s)
+        # Columns that look like what a record holds, those of unknown meaning first.
+        unused = [title for place, title in enumerate(self.header) if place not in self.used]
+        more_known = [title for title in unused if self.names.find(title) is not None]
+        if listed := [t for t in unused if self.names.find(t) is None and looks_alike(t)] + more_known:
+            more = f" and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+            log.note(f"columns that are not used: {', '.join(listed[:_LISTED])}{more}")
+        return build_record(log, clock_offset_s, start_utc_s)
+
+    def _quantities(self, order: str) -> dict[str, np.ndarray]:
+        """The columns of the record, (N,) each, NaN where unknown."""
+        values = dict[str, np.ndarray]()
+        for quantity, kind, *_ in FIELDS:
+            is_wanted = kind not in ("text", "number", "time") and not _BETTER.get(quantity, set()) & values.keys()
+            if is_wanted and (column := self.numbers(quantity)) is not None:
+                values[quantity] = column
+        if "place" in self.columns and not values.keys() >= set(_PLACE):
+            values |= self._pairs(order)
+        if values.keys() >= set(_PLACE):
+            for name, negative in zip(_PLACE, "WS", strict=True):
+                sides = self.texts(name.replace("_deg", "_side"))
+                values[name] *= [-1 if side[:1].upper() == negative else 1 for side in sides]
+            known = np.concatenate([values[name][np.isfinite(values[name])] for name in _PLACE])
+            if len(known) and np.abs(known).max() > 1000 and (known == np.round(known)).all():
+                values |= {name: values[name] * 1e-7 for name in _PLACE}  # autopilots write degrees times 1e7
+            if (fix := self.numbers("fix")) is not None:
+                fixed = {*_PLACE, "above_sea_m"} & values.keys()
+                values |= {name: np.where(fix < 2, np.nan, values[name]) for name in fixed}
+        if "focal_mm" in self.columns and "hfov_rad" not in values:
+            values["hfov_rad"], notes = field_of_view(*map(self.texts, ("focal_mm", "f_number", "zoom")))
+            self.log.is_nominal = True
+            self.log.notes += notes
+        return values
+
+    def _pairs(self, order: str) -> dict[str, np.ndarray]:
+        """Longitudes and latitudes of a column with both."""
+        signs = (";", "/", ", ", None, ",")
+        parts = [
+            [two for sign in signs if len(two := cell.strip("()[]").split(sign)) == 2] for cell in self.texts("place")
+        ]
+        angles = [[_angle(part) for part in (two[0] if two else ("", ""))] for two in parts]
+        pairs, sides = (
+            np.array([[value for value, _ in two] for two in angles]),
+            {side for (_, side), _ in angles if side},
         )
-    if not is_zoned and parse_date(text.rows[0][clock]) is not None:
-        if zone is None:
-            log.note(UNKNOWN_ZONE)
-        else:
-            first, is_zoned = to_utc(first, zone), True
-    return build_record(log, clock_offset_s, first if is_zoned else math.nan)
+        is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, self.names.order, order, "a cell")
+        return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
+
+    def _times(self, values: dict[str, np.ndarray], zone: tzinfo | None) -> tuple[np.ndarray, float]:
+        """Seconds since the first row, (N,), and when that was since 1970."""
+        columns = self.columns["time"][:_CLOCKS]
+        read = [read_times(self.header[place], self.cells(place), known) for place, known in columns]
+        step_m = math.nan
+        if values.keys() >= set(_PLACE):
+            east, north = (np.diff(values[name]) * DEGREE_M for name in _PLACE)
+            steps_m = np.hypot(east * np.cos(np.radians(values["latitude_deg"][1:])), north)
+            step_m = float(np.median(steps_m[np.isfinite(steps_m)])) if np.isfinite(steps_m).any() else math.nan
+        time_s, start_utc_s, titles = settle_times(self.log, read, step_m, zone)
+        self.used -= {place for place, _ in columns if self.header[place] not in titles}
+        return time_s, start_utc_s
+
+    def _frames(self, clip: Path | None) -> np.ndarray:
+        """The same from the numbers of a clip's frames, which count from 0 or from 1."""
+        if clip is None:
+            raise InputError(f"telemetry {self.log.path} has frames and no times; give its clip, or a column time_s")
+        if (count := self.numbers("frame")) is None:
+            return np.full(len(self.rows), np.nan)
+        return (count - min(float(count[np.isfinite(count)][0]), 1.0)) / open_source(clip).rate_hz
+
+    def _note_film(self, time_s: np.ndarray) -> None:
+        """Note when the camera begins to record."""
+        is_on = np.array([cell.lower() in _ON for cell in self.texts("filming")])
+        begins = time_s[is_on & ~np.append(False, is_on[:-1])]
+        if (begins > 0).any():
+            more = f" and again at {', '.join(f'{begin:.1f}' for begin in begins[1:6])} s" if len(begins) > 1 else ""
+            self.log.note(
+                f"the log says that the camera began to film {begins[0]:.1f} s after its first row{more}, and times "
+                f"count from that row: aerial.clock_offset_s={-begins[0]:.1f} counts them from where the film begins"
+            )
 
 
-def _moment(text: str, unit: str) -> tuple[float, bool]:
-    """Seconds of a date, a time of day or a number, and whether they are since 1970 in UTC."""
-    if date := parse_date(text):
-        return date[0], date[1] or unit == "utc"
-    if clock := _CLOCK.fullmatch(text):
-        return int(clock[1]) * 3600 + int(clock[2]) * 60 + float(clock[3]), False
-    value = _to_float(text)
-    is_since_1970 = value > 1e9
-    # Without a unit the size decides: of times since 1970, 10 digits are seconds, 13 milli- and 16 microseconds.
-    per_second = _PER_SECOND.get(unit, 1e6 if value > 1e14 else 1e3 if value > 1e11 else 1.0)
-    value /= per_second
-    return value, is_since_1970 and (unit not in _PER_SECOND or value > 1e9)
+def _angle(text: str) -> tuple[float, str]:
+    """Degrees of `48.1371 N`, `48°08'13.6"N` or `48,1371`, and the side that it names; NaN for anything else."""
+    if (found := _ANGLE.fullmatch(text.strip())) is None:
+        return math.nan, ""
+    degrees, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups()[1:4])
+    side = (found[1] or found[5] or "").upper()
+    return (degrees + minutes / 60 + seconds / 3600) * (-1 if side in ("S", "W", "-") else 1), side.strip("-")

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
+from torchvision_dddas.io.telemetry.clocks import UNKNOWN_ZONE, parse_date, to_utc
+from torchvision_dddas.io.telemetry.fields import UNITS, Names, field_of_view, names_of_subtitles
 from torchvision_dddas.io.telemetry.record import Log, build_record
-from torchvision_dddas.io.telemetry.tables import UNKNOWN_ZONE, convert, hfov_of_focal, parse_date, quantity_of, to_utc
 from torchvision_dddas.types import Telemetry
 
+Values = dict[str, float]
 Numbers = list[tuple[float, str]]
 """The numbers in a pair of brackets, each with the letters beside it."""
 
-_TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,3})\s*-+>")
+_TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,9})\s*-+>(?:\s*[\d:]{5,12}[.,](\d{1,9}))?")
 _MARKUP = re.compile(r"<[^<>]*>")
 _NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
 _NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
@@ -25,31 +27,51 @@ _PAIR = (
     re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
     re.compile(rf"\s*(?:[:=]\s*)?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])", re.IGNORECASE),
 )
-_OPTICS = ("focal_len", "fnum", "dzoom_ratio")
+# [Gimbal: Yaw:1.0, Pitch:-30.0]: the names in the group get its name.
+_GROUP = re.compile(r"\[\s?(gimbal|camera|drone|aircraft)\s?:\s?(?=[A-Za-z])([^\[\]\n]{1,200})", re.IGNORECASE)
+_WORD = re.compile(r"[A-Za-z]+")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
+_OPTICS = ("focal_mm", "f_number", "zoom")
+# Dates that leave the times of the subtitles by more are those of another flight, which begins so much later.
+_DATE_JUMP_S, _SPLIT_S = 10.0, 1e-3
+_WORST = 1000
 
 
-def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | None = None) -> Telemetry:
-    """zone: of dates that say none.
+def read_subtitles(
+    path: Path, text: str, clock_offset_s: float, zone: tzinfo | None = None, order: str = "auto"
+) -> Telemetry:
+    """zone, order: of dates that say no zone, and of two coordinates; see `read_telemetry`.
 
     Raises InputError without any position, height or attitude, or if times decrease.
     """
     log = Log(path, "DJI subtitles", bridge_s=2.0)
-    subtitles = _subtitles(text)
-    tuples = [_tuples(words) for *_, words in subtitles]
-    is_swapped = _is_latitude_first(log, *([t[name] for t in tuples if name in t] for name in ("gps", "home")))
+    names = names_of_subtitles(text)
+    subtitles = _subtitles(_GROUP.sub(_with_group, text))
     dates = [parse_date(words) for *_, words in subtitles]
+    parted = [_tuples(words) for *_, words in subtitles]
+    is_swapped = _is_latitude_first(log, names, [tuples for tuples, _ in parted], order)
     first_s, is_zoned = next((date for date in dates if date), (math.nan, False))
     lacking: dict[str, list[int]] = {}
     timeless: list[int] = []
-    for (line, time_s, words), numbers, date in zip(subtitles, tuples, dates, strict=True):
+    lenses: list[dict[str, str]] = []
+    last: tuple[float, float] | None = None  # time and date of the subtitle before
+    jumps, shift_s = list[tuple[float, float]](), 0.0
+    for (line, time_s, _), (tuples, rest), date in zip(subtitles, parted, dates, strict=True):
         if math.isnan(time_s):
             time_s = date[0] - first_s if date else math.nan
         if math.isnan(time_s):
             timeless.append(line)
             continue
-        values = _quantities(log, words, numbers, is_swapped)
+        time_s += shift_s
+        if date is not None:
+            if last is not None:
+                jumps.append((last[0], date[0] - last[1] - (time_s - last[0])))
+                if time_s < last[0] < last[0] + jumps[-1][1]:  # where times begin again, dates tell how much later
+                    time_s, shift_s = time_s + jumps[-1][1], shift_s + jumps[-1][1]
+            last = time_s, date[0]
+        values, lens = _quantities(names, rest, tuples, is_swapped)
         log.moments.append((time_s, 0.0, line))
+        lenses.append(lens)
         for name in [name for name in log.samples if name not in values]:
             lacking.setdefault(name, []).append(line)
             values[name] = math.nan
@@ -58,6 +80,14 @@ def read_subtitles(path: Path, text: str, clock_offset_s: float, zone: tzinfo | 
     if timeless:
         log.note(f"line {timeless[0]}: a subtitle without time is left out, {len(timeless)} in all")
     _note_lacking(log, lacking, subtitles[-1][0] if subtitles else 0, len(subtitles))
+    usual_s = float(np.median([abs(jump_s) for _, jump_s in jumps] or [0.0]))
+    log.splits += [time_s + _SPLIT_S for time_s, jump_s in jumps if abs(jump_s) > max(_DATE_JUMP_S, 10 * usual_s)]
+    if any("focal_mm" in lens for lens in lenses):
+        hfov, notes = field_of_view(*([lens.get(name, "") for lens in lenses] for name in _OPTICS))
+        times, _, lines = np.array(log.moments).T
+        log.add_all(times, lines, {"hfov_rad": hfov})
+        log.is_nominal = True
+        log.notes += notes
     if not is_zoned and zone is not None and math.isfinite(first_s):
         first_s, is_zoned = to_utc(first_s, zone), True
     elif not is_zoned and math.isfinite(first_s):
@@ -71,14 +101,17 @@ def _subtitles(text: str) -> list[tuple[int, float, str]]:
     Subtitles begin with a timing; in a file without timings they lie between blank lines.
     """
     lines = [line.strip() for line in text.splitlines()]
-    is_timed = any(_TIMING.match(line) for line in lines)
+    timings = [_TIMING.match(line) for line in lines]
+    # Milliseconds without leading zeros, or over 999, show as fractions of different lengths.
+    sizes = {len(part) for timing in timings if timing for part in timing.groups()[3:] if part}
+    is_timed = bool(sizes)
     blocks: list[tuple[int, float, list[str]]] = []
     is_between = not is_timed
-    for number, line in enumerate(lines, 1):
-        if timing := _TIMING.match(line):
-            hours, minutes, seconds, fraction = timing.groups()
-            time_s = int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{fraction}")
-            blocks.append((number, time_s, []))
+    for number, (line, timing) in enumerate(zip(lines, timings, strict=True), 1):
+        if timing is not None:
+            hours, minutes, seconds, fraction, _ = timing.groups()
+            part_s = float(f"0.{fraction}") if len(sizes) == 1 else int(fraction) / 1000
+            blocks.append((number, int(hours) * 3600 + int(minutes) * 60 + int(seconds) + part_s, []))
         elif not line or line.isdigit():
             is_between = not is_timed
         elif is_between or blocks:
@@ -102,77 +135,59 @@ def _after_names(text: str, name: re.Pattern[str], value: re.Pattern[str]) -> It
             place = found.end()
 
 
-def _without_tuples(text: str) -> str:
-    """The text without numbers in brackets and their names."""
-    parts, place = [], 0
-    for _, found, begin in _after_names(text, *_TUPLE):
-        parts.append(text[place:begin])
-        place = found.end()
-    return " ".join([*parts, text[place:]])
-
-
-def _tuples(text: str) -> dict[str, Numbers]:
-    """Numbers in brackets by the name before them."""
+def _tuples(text: str) -> tuple[dict[str, Numbers], str]:
+    """Numbers in brackets by the name before them, and the text without these."""
     found: dict[str, Numbers] = {}
-    for name, brackets, _ in _after_names(text, *_TUPLE) if "(" in text else ():
+    parts, place = [], 0
+    for name, brackets, begin in _after_names(text, *_TUPLE) if "(" in text else ():
         inside = brackets[1]
         cells = re.split(r"[;,]\s+|;", inside) if re.search(r"[;,]\s|;", inside) else inside.split(",")
         if "." not in inside and len(cells) >= 4 and len(cells) == inside.count(",") + 1:
             cells = [",".join(cells[i : i + 2]) for i in range(0, len(cells), 2)]  # decimal commas
         matches = [_NUMERAL.search(cell) for cell in cells]
         values = [float(match[0].replace(",", ".")) if match else math.nan for match in matches]
-        letters = [_NO_LETTERS.sub("", cell).upper() for cell in cells]
+        # Decimals without a unit count as the letter "."
+        letters = [_NO_LETTERS.sub("", cell).upper() or "." * ("." in cell) for cell in cells]
         found["gps" if name.lower() == "rtk" else name.lower()] = list(zip(values, letters, strict=True))
-    return found
+        parts.append(text[place:begin])
+        place = brackets.end()
+    return found, " ".join([*parts, text[place:]]) if parts else text
 
 
-def _is_latitude_first(log: Log, gps: list[Numbers], home: list[Numbers]) -> bool:
-    """Whether GPS(...) has the latitude first: by values beyond 90 degrees, else by dialect.
-
-    DJI writes longitude, latitude and the number of satellites; if the third is in metres, latitude comes first.
-    """
-    pairs = np.array([[a[0][0], a[1][0]] for a in gps + home if len(a) > 1 and not a[0][1] and not a[1][1]])
-    if not len(pairs):
-        return False
-    is_first_longitude, is_second_longitude = (np.abs(pairs) > 90).any(axis=0)
-    if is_first_longitude or is_second_longitude:
-        return bool(is_second_longitude and not is_first_longitude)
-    is_metres = any(len(a) > 2 and a[2][1] == "M" for a in gps)
-    log.note(
-        f"GPS(...) is taken as {'latitude, longitude' if is_metres else 'longitude, latitude'}, as this dialect has "
-        "it: the numbers would fit either order"
-    )
-    return is_metres
+def _is_latitude_first(log: Log, names: Names, tuples: list[dict[str, Numbers]], order: str) -> bool:
+    """Whether GPS(...) has the latitude first."""
+    places = [found[name] for found in tuples for name in ("gps", "home") if name in found]
+    pairs = [(two[0][0], two[1][0]) for two in places if len(two) > 1 and {two[0][1], two[1][1]} <= {"", "."}]
+    return bool(pairs) and log.latitude_first(np.array(pairs), names.order, order, "GPS(...)")
 
 
-def _quantities(log: Log, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> dict[str, float]:
-    """Values of one subtitle by quantity."""
-    values = _place(tuples.get("gps", []), is_swapped)
-    for name, keys in _AXES.items():
-        for key, (value, _) in zip(keys, tuples.get(name, ()), strict=False):
-            if found := convert(key, value):
-                values[found[0]] = found[1]
-    optics: dict[str, str] = {}
-    for key, pair, _ in _after_names(_without_tuples(text) if tuples else text, *_PAIR):
-        number, unit = pair[1], pair[2] or ""
-        if key in _OPTICS:
-            optics[key] = number
-        # Only with a unit the letter h means the height.
-        if quantity_of(key) is None or (key.lower() == "h" and not unit):
+def _quantities(names: Names, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> tuple[Values, dict[str, str]]:
+    """Values of one subtitle by quantity, and those of the lens as text. text: without the tuples."""
+    values, lens, ranks = _place(tuples.get("gps", []), is_swapped), dict[str, str](), dict[str, int]()
+    found = [
+        (f"{key} ({letters})" if letters in ("M", "FT") else key, str(value))
+        for name, numbers in tuples.items()
+        for key, (value, letters) in zip(_AXES.get(name, (name,) * (len(numbers) == 1)), numbers, strict=False)
+    ]
+    found += [(f"{key} ({pair[2]})" if pair[2] else key, pair[1]) for key, pair, _ in _after_names(text, *_PAIR)]
+    for title, number in found:
+        known = names.find(title)
+        if known is None or known.rank >= ranks.get(known.field.quantity, _WORST):
             continue
-        found = convert(key, float(number.replace(",", ".")), unit)
-        if found and found[0] not in values:
-            values[found[0]] = found[1]
-            if key.lower() in ("altitude", "alt"):
-                log.note("the file does not say where the altitude is zero; above the sea is assumed")
-    hfov = hfov_of_focal(*(optics.get(name, "").replace(",", ".") for name in _OPTICS))
-    if hfov is not None:
-        values["hfov_rad"] = hfov
-        log.is_nominal = True
-        log.note("the field of view is that of a focal length as for a picture with a longer side of 36 mm")
-    if values.get("longitude_deg") == values.get("latitude_deg") == values.get("above_sea_m") == 0.0:
-        values["above_sea_m"] = math.nan  # no fix
-    return values
+        quantity, kind = known.field.quantity, known.field.kind
+        ranks[quantity] = known.rank
+        if quantity in _OPTICS:
+            lens[quantity] = number.replace(",", ".")
+        elif kind in UNITS and kind != "time":
+            values[quantity] = float(number.replace(",", ".")) * known.scale
+    if values.get("longitude_deg") == values.get("latitude_deg") == 0.0:  # no fix
+        values |= {name: math.nan for name in ("bare_altitude_m", "above_sea_m") if values.get(name) == 0.0}
+    return values, lens
+
+
+def _with_group(group: re.Match[str]) -> str:
+    """The names of a group, each with that of the group before it."""
+    return _WORD.sub(rf"{group[1]}.\g<0>", group[2])
 
 
 def _place(gps: Numbers, is_swapped: bool) -> dict[str, float]:
@@ -184,9 +199,9 @@ def _place(gps: Numbers, is_swapped: bool) -> dict[str, float]:
     if not values and len(gps) > 1:
         names = ("latitude_deg", "longitude_deg") if is_swapped else ("longitude_deg", "latitude_deg")
         values = {name: value for name, (value, _) in zip(names, gps, strict=False)}
-    # A third number with a unit is a height, without one the number of satellites; 0.0 m stands for none.
-    if len(gps) > 2 and gps[2][1] == "M" and gps[2][0] != 0:
-        values["above_sea_m"] = gps[2][0]
+    # A third number with a unit or decimals is a height, else the number of satellites; 0.0 m stands for none.
+    if len(gps) > 2 and gps[2][1] in ("M", ".") and gps[2][0] != 0:
+        values["bare_altitude_m"] = gps[2][0]
     return values
 
 

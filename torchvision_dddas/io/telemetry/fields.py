@@ -1,0 +1,287 @@
+"""What programs call a quantity, its units, its possible values and what it counts from; and what each program means.
+
+The readers of tables and of subtitles know no other names. docs/telemetry.md shows both tables; a test compares them.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Field(NamedTuple):
+    """A quantity. kind: which of UNITS it has. low, high: possible values, angles in degrees.
+
+    zero: what it counts from. names: without capitals, blanks, dashes and underscores, the best first. A vehicle's name
+    before them is left out; `gb`, `camera` and the like are `gimbal`.
+    """
+
+    quantity: str
+    kind: str
+    low: float
+    high: float
+    zero: str
+    names: str
+
+
+_ANY, _HEIGHT = (-math.inf, math.inf), ("length", -1000.0, 30_000.0)
+FIELDS = (
+    Field("longitude_deg", "degrees", -180, 180, "Greenwich", "longitude longtitude lon lng long gpscoord[1]"),
+    Field("latitude_deg", "degrees", -90, 90, "the equator", "latitude lat gpscoord[0]"),
+    Field("longitude_side", "text", *_ANY, "E or W", "e/w ew longitudedirection londir"),
+    Field("latitude_side", "text", *_ANY, "N or S", "n/s ns latitudedirection latdir"),
+    Field("place", "text", *_ANY, "both in one cell", "gps latlon latlong lonlat coordinates position location"),
+    Field("east_m", "length", -1e7, 1e7, "an origin, to the east", ""),
+    Field("north_m", "length", -1e7, 1e7, "an origin, to the north", ""),
+    Field("above_takeoff_m", *_HEIGHT, "the take-off point",
+          "relalt relativealtitude altituderelative relativeheight heightabovetakeoff altitudeabovetakeoff relhomealt "
+          "heightabovehome altitudeabovehome ascent barometricaltitude barometer baroaltitude baroalt baro hb h"),
+    Field("above_ground_m", *_HEIGHT, "the ground below the vehicle",
+          "heightagl altitudeagl altagl agl heightaboveground altitudeaboveground heightabovegroundatdronelocation "
+          "radaraltitude radaralt grounddistance distbottom cheight"),
+    Field("above_sea_m", *_HEIGHT, "the sea",
+          "absalt absolutealtitude altitudeabsolute altitudeabovesealevel altitudeabovesea altitudeabovemeansealevel "
+          "heightabovesealevel abovesealevel abovesea amsl altitudeamsl altamsl msl altitudemsl altmsl heightmsl "
+          "mslaltitude altitudeegm96amsl gpsaltitude gpsalt galt"),
+    Field("above_ellipsoid_m", *_HEIGHT, "the ellipsoid WGS 84",
+          "hae altitudehae heightaboveellipsoid altitudeaboveellipsoid ellipsoidheight ellipsoidalheight "
+          "altitudeellipsoid altitudeellipsoidal altellipsoid altitudewgs84 wgs84altitude altitudewgs84ellipsoid"),
+    Field("geoid_m", "length", -120, 100, "the ellipsoid, up to the sea",
+          "undulation geoidundulation geoidheight geoidseparation geoidsep"),
+    Field("bare_height_m", *_HEIGHT, "not said: the take-off point is assumed", "height"),
+    Field("bare_altitude_m", *_HEIGHT, "not said: the sea is assumed", "altitude alt gpsheight"),
+    Field("speed_m_s", "speed", 0, 300, "the ground",
+          "h.s speed groundspeed gndspeed gspd hspeed horizontalspeed velocity horizontalvelocity vel velh spd"),
+    Field("heading_rad", "angle", -360, 360, "true north, clockwise, of the camera",
+          "gimbalyaw gimbalheading gimbalabsoluteyaw gimbalazimuth"),
+    # A gimbal that looks straight down reports 90.2 as well as 89.8.
+    Field("pitch_rad", "angle", -100, 100, "the horizon, up, of the camera", "gimbalpitch gimbalabsolutepitch"),
+    Field("roll_rad", "angle", -360, 360, "level, clockwise, of the camera", "gimbalroll gimbalabsoluteroll"),
+    Field("vehicle_heading_rad", "angle", -360, 360, "true north, clockwise, of the vehicle's nose",
+          "heading yaw compassheading compass hdg"),
+    Field("course", "text", *_ANY, "true north; it need not be the nose's and is not read",
+          "course courseoverground cog gcrs groundcourse gpscourse gpsheading"),
+    Field("hfov_rad", "angle", 0.05, 179, "across the picture", "hfov horizontalfov picturehfov"),
+    Field("focal_mm", "number", 8, 2000, "a picture with a longer side of 36 mm", "focallen focallength35mm focal35mm"),
+    Field("f_number", "number", *_ANY, "", "fnum"),
+    Field("zoom", "number", 1, 200, "1; 179 and 17900 are 1.79", "dzoomratio dzoom zoomratio zoom"),
+    Field("filming", "text", *_ANY, "whether the camera records",
+          "isvideo istakingvideo isrecording recording gimbalisvideo gimbalrecording gimbalrecordstate recordstate"),
+    Field("fix", "number", *_ANY, "2 or more where the place is known", "fixtype"),
+    Field("frame", "number", *_ANY, "the clip's first frame", "frame framenumber framecnt framecount"),
+    Field("time", "time", *_ANY, "the first row, midnight or 1970",
+          "elapsedtime elapsed flytime flighttime offsettime timeboot time timestamp datetime date/time date ts t "
+          "epoch updatetime updatedatetime updatedatetime24 currenttime localtime utctime timeutc utc utcdatetime"),
+)  # fmt: skip
+
+_DEG = math.pi / 180
+_SCALES: dict[str, dict[float, str]] = {
+    "length": {1: "m meter meters metre metres", 0.3048: "ft feet foot", 0.01: "cm", 1e-3: "mm", 1e3: "km", -1: "-m"},
+    "speed": {1: "m/s mps ms", 1 / 3.6: "km/h kmh kph", 0.44704: "mph", 1852 / 3600: "kn kt kts knot knots",
+              0.3048: "ft/s fps", 0.01: "cm/s"},
+    "angle": {_DEG: "deg degree degrees ° º @ 360 180", 1: "rad radian radians", _DEG / 10: "ddeg", _DEG / 100: "cdeg"},
+    "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians", 1e-7: "dege7 1e7"},
+    "time": {1: "s sec secs second seconds", 1e-3: "ms msec millis millisecond milliseconds",
+             1e-6: "us µs usec micros microsecond microseconds", 1e-9: "ns", math.nan: "utc gmt local epoch"},
+}  # fmt: skip
+UNITS = {kind: {w: scale for scale, words in scales.items() for w in words.split()} for kind, scales in _SCALES.items()}
+"""Of each kind of field: unit -> factor to the record's unit, NaN where only the values tell it."""
+
+
+class Dialect(NamedTuple):
+    """A program. order: of the two numbers of a place.
+
+    marks: names that its tables have, alternatives with | between them, `osd.` for any name that begins so; of
+    subtitles an expression that their beginning has, in lower case. means: name=quantity,unit for names that are
+    ambiguous elsewhere, nothing after = for those not to be read.
+    """
+
+    program: str
+    marks: str
+    means: str = ""
+    order: str = ""
+
+
+TABLES = (
+    Dialect("AirData", "datetime heightabovetakeoff|ascent", "altitude=above_sea_m"),
+    Dialect("Litchi", "istakingvideo|gimbalpitchraw|velocityx velocityy", "altitude=above_takeoff_m "
+            "gimbalpitchraw=pitch_rad,ddeg gimbalrollraw=roll_rad,ddeg gimbalyawraw=heading_rad,ddeg"),
+    Dialect("DJI flight record (FlightReader, PhantomHelp, TXTlogToCSV)", "osd.|custom.",
+            "altitude=above_sea_m height=above_takeoff_m"),
+    Dialect("UgCS SkyHub", "elapsed date time latitude altitude", "altitude=above_takeoff_m elapsed=time,ms"),
+    Dialect("EdgeTX, OpenTX", "date time gps", "hdg=course", "lat-lon"),
+    Dialect("ulog2csv, receiver before PX4 1.14", "timestamp timeutcusec lat lon",
+            "timestamp=time,us alt=above_sea_m,mm altellipsoid=above_ellipsoid_m,mm heading="),
+    Dialect("ulog2csv", "timestamp timestampsample|timestamp altellipsoid|timestamp deltaalt|timestamp timeutcusec",
+            "timestamp=time,us timestampsample= alt=above_sea_m z=above_takeoff_m,-m heading=vehicle_heading_rad,rad"),
+    Dialect("mavlogdump, MNT", "timeus desyawe", "pitch=pitch_rad roll=roll_rad yawe=heading_rad"),
+    Dialect("mavlogdump, with a place", "timeus lat lng", "alt=above_sea_m status=fix relalt=above_takeoff_m"),
+    Dialect("mavlogdump, without a place", "timeus", "alt=above_takeoff_m"),
+    Dialect("mavlogdump of a .tlog", "timebootms lat lon alt relativealt|globalpositionint.", "alt=above_sea_m,mm "
+            "relativealt=above_takeoff_m,mm hdg=vehicle_heading_rad,cdeg vfrhud.alt=above_sea_m "
+            "attitude.yaw=vehicle_heading_rad,rad"),
+    # GPS_altitude is in metres or in tenths of them, as the firmware has it.
+    Dialect("blackbox_decode (Betaflight, INAV)", "gpscoord[0]|loopiteration",
+            "navpos[2]=above_takeoff_m,cm gpsaltitude="),
+    Dialect("Parrot", "productgpslatitude", "anglepsi=vehicle_heading_rad,rad"),
+)  # fmt: skip
+SUBTITLES = (
+    Dialect("DJI with SrtCnt (Air 2S, Mini 2)", "srtcnt", "altitude=above_takeoff_m"),
+    Dialect("DJI with FrameCnt (Mavic 2)", "framecnt", "altitude=above_sea_m"),
+    Dialect("GPS(48.1, 11.5, 52.5M)", r"gps ?\([^()]{3,60}[,;] ?-?[\d.]{1,12} ?m\)", "", "lat-lon"),
+    Dialect("GPS(48.1, 11.5, 569.8)", r"gps ?\(([^(),;]{3,20}[,;]){2} ?-?\d{1,6}\.\d{1,6}\)", "", "lat-lon"),
+    Dialect("GPS(11.5, 48.1, 16)", r"(gps|rtk) ?\([^()]{3,60}[,;] ?\d{1,3}\)", "", "lon-lat"),
+)
+
+_BY_QUANTITY = {field.quantity: field for field in (*FIELDS, Field("", "text", *_ANY, "", ""))}
+# What a name means: quantity, unit, rank. A column may have the name of its unit, `seconds`.
+_MEANT = {unit: ("time", unit, 0) for unit in UNITS["time"]}
+_MEANT |= {name: (field.quantity, "", rank) for field in FIELDS for rank, name in enumerate(field.names.split())}
+POSSIBLE = {
+    field.quantity: (field.low * scale, field.high * scale)
+    for field in FIELDS
+    for scale in [_DEG if field.kind == "angle" else 1.0]
+} | {"altitude_m": _HEIGHT[1:]}
+"""Lowest and highest possible value of each quantity, in the record's units."""
+HEIGHTS = ("above_takeoff_m", "above_ground_m", "bare_height_m", "bare_altitude_m", "geoid_m")
+"""What the record's altitude_m and above_sea_m are made of."""
+
+# The first bracket is looked for alone: an expression for all of it would try each one in a name full of them.
+_OPENING = re.compile(r"[(\[](?!\d{1,2}[)\]])")
+_BLANKS, _WORDS = re.compile(r"[\s_-]|:[cd]$"), re.compile(r"[^\s,;()\[\]]+")
+_VEHICLE = re.compile(
+    r"(?:osd|gps|custom|clock|general|aircraft|drone|uav|vehicle|flight|product(?:gps)?|location|imuatti"
+    r"|globalpositionint|gpsrawint)(?:\(\d\))?[.:]?"
+)
+_CAMERA = re.compile(r"(?:gimbal|gb|camera|cam|mount|payload)(?:\(\d\))?[.:]?")
+_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
+_UNLIKE = re.compile("batt|max|min|remain|rate|speed|veloc|dist", re.IGNORECASE)
+_ALIKE = re.compile(
+    r"lat(itude)?|lon(gitude)?|lng|alt(itude)?|height|elevation|heading|hdg|course|yaw|pitch|roll|azimuth|tilt|pan"
+    r"|[hv]?fov|zoom|focal|time|timestamp|date|position|agl|msl|hae"
+)
+_HEAD, _LONGEST_UNIT, _LAST = 20_000, 13, 99
+# Half the longer side of the picture for which focal lengths are given.
+_HALF_WIDTH_MM, _NUMBER = 18.0, re.compile(r"[-+]?\d{1,12}(?:\.\d{1,12})?")
+
+
+class Known(NamedTuple):
+    """What a name means. scale: to the record's unit and sign, NaN if only the values tell it.
+
+    rank: 0 is the best name, one that means so in this dialect alone the last. is_utc: whether it is a clock in UTC.
+    """
+
+    field: Field
+    scale: float
+    rank: int = _LAST
+    is_utc: bool = False
+
+    def in_unit(self, unit: str) -> "Known | None":
+        """The same in a unit; None if the field has no such unit."""
+        scale = UNITS.get(self.field.kind, {}).get(unit)
+        sign = -1 if self.field.quantity == "pitch_rad" else 1  # the record's pitch is counted down
+        return None if scale is None else self._replace(scale=sign * scale, is_utc=unit in ("utc", "gmt"))
+
+
+class Names:
+    """What names mean in a log that shows some dialects, of which the first counts. program: the first, or ""."""
+
+    def __init__(self, dialects: Sequence[Dialect] = ()) -> None:
+        self.program = dialects[0].program if dialects else ""
+        self.order = next((dialect.order for dialect in dialects if dialect.order), "")
+        self._meant: dict[str, tuple[str, str, int]] = dict(_MEANT)
+        for part in (part for dialect in reversed(dialects) for part in dialect.means.split()):
+            name, _, what = part.partition("=")
+            quantity, _, unit = what.partition(",")
+            self._meant[name] = quantity, unit, _LAST
+        self._known: dict[str, Known | None] = {}
+
+    def find(self, title: str) -> Known | None:
+        """What a name means, with its unit: `OSD.height [ft]`, `Speed (mph)`, `gb_yaw`, `alt_m`; None if unknown."""
+        try:
+            return self._known[title]
+        except KeyError:
+            self._known[title] = self._find(*_parted(title))
+            return self._known[title]
+
+    def _find(self, name: str, words: list[str]) -> Known | None:
+        rest = _plain("".join(word for word in words if not any(word in units for units in UNITS.values())))
+        for key in dict.fromkeys((name + rest, name)):  # altitude (m AMSL) is altitudeamsl
+            if (known := self._named(key)) is not None:
+                with_unit = next((found for word in words if (found := known.in_unit(word))), None)
+                # A unit that is not known may be any. The letter h means the height only with a unit.
+                if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
+                    return with_unit or known
+        return None
+
+    def _named(self, key: str) -> Known | None:
+        """The meaning of a name as it is, without its prefix, with that of a camera, and with a unit at its end."""
+        bare = key[vehicle.end() :] if (vehicle := _VEHICLE.match(key)) else key
+        forms = [key, key.replace(".", ""), bare, bare.replace(".", "")]
+        forms += ["gimbal" + form[camera.end() :] for form in (key, bare) if (camera := _CAMERA.match(form))]
+        for form in forms:
+            for cut in range(len(form), max(len(form) - _LONGEST_UNIT, 0), -1):
+                stem, end = form[:cut], form[cut:]
+                quantity, unit, rank = self._meant.get(stem, (None, "", 0))
+                if quantity is not None:
+                    field = _BY_QUANTITY[quantity]
+                    known = Known(field, math.nan if field.kind == "time" else 1.0, rank)
+                    found = known.in_unit(end or unit or "deg")
+                    if found or not end:
+                        return (found or known) if quantity else None
+        return None
+
+
+def _plain(name: str) -> str:
+    return _BLANKS.sub("", name.lower())
+
+
+def _parted(title: str) -> tuple[str, list[str]]:
+    """The plain name of a column, and the words in the brackets behind it."""
+    opening = _OPENING.search(title)
+    end = opening.start() if opening is not None else len(title)
+    return _plain(title[:end]), _WORDS.findall(title[end:].lower())
+
+
+def names_of_table(header: Sequence[str]) -> Names:
+    """What the columns of a table mean, by the programs that write such columns."""
+    keys = {_parted(title)[0] for title in header}
+    keys |= {key.partition(".")[0] + "." for key in keys if "." in key}
+    return Names([one for one in TABLES if any(keys.issuperset(marks.split()) for marks in one.marks.split("|"))])
+
+
+def names_of_subtitles(text: str) -> Names:
+    """What the keys of subtitles mean."""
+    head = text[:_HEAD].lower()
+    return Names([one for one in SUBTITLES if re.search(one.marks, head)])
+
+
+def looks_alike(title: str) -> bool:
+    """Whether the words of a name are those of a place, a height, an attitude, a time or a zoom."""
+    return any(_ALIKE.fullmatch(word.lower()) for word in _PARTS.findall(title)) and not _UNLIKE.search(title)
+
+
+def field_of_view(focal: Sequence[str], f_number: Sequence[str], zoom: Sequence[str]) -> tuple[np.ndarray, list[str]]:
+    """Widths of the field of view, rad, (N,), NaN where unknown; and notes. Each argument: (N,) as the log writes it.
+
+    The focal length is that of a picture with a longer side of 36 mm. Some write it and the aperture times ten and a
+    hundred: 240 beside 280 is 24 mm at f/2.8. The zoom may be 1.79, or a whole number of hundredths to ten thousandths.
+    """
+    texts = (focal, f_number, zoom)
+    mm, aperture, times = (np.array([float(t) if _NUMBER.fullmatch(t) else np.nan for t in text]) for text in texts)
+    is_tenths = np.array(["." not in text for text in focal]) & (mm >= 100) & ~(aperture < 100)
+    notes = ["the field of view is that of a focal length as for a picture with a longer side of 36 mm"]
+    if (times >= 100).any():
+        first = times[times >= 100][0]
+        scale = 10 ** math.floor(math.log10(times[times >= 100].min()))  # the smallest zoom of a log is below ten
+        times = np.where(times >= 100, times / scale, times)
+        notes.append(f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}")
+    is_wrong = (times < POSSIBLE["zoom"][0]) | (times > POSSIBLE["zoom"][1])
+    if is_wrong.any():
+        notes.append(f"a zoom of {times[is_wrong][0]:g} cannot be; {is_wrong.sum()} left out")
+    mm = np.where(is_tenths, mm / 10, mm) * np.where(np.isnan(times) | is_wrong, 1.0, times)
+    low, high = POSSIBLE["focal_mm"]
+    hfov = 2 * np.arctan(_HALF_WIDTH_MM / np.where((mm >= low) & (mm <= high), mm, np.nan))
+    return hfov, notes if np.isfinite(hfov).any() else []
