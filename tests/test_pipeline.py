@@ -11,7 +11,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator
 from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.pipeline import Pipeline
-from torchvision_dddas.types import Camera, Frame, People, Telemetry, Tracks
+from torchvision_dddas.types import Camera, Detections, Frame, People, Registration, Scene, Telemetry, Tracks
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
 DOWN = Telemetry(
@@ -65,6 +65,38 @@ def test_a_pipeline_takes_what_the_telemetry_lacks_from_the_camera(frames):
         pipeline = Pipeline("fast", telemetry=blind, camera=camera)
         assert {result.locations.fix.by for result in pipeline(frames) if result.locations is not None} == {by}
     assert any("heading_deg, pitch_deg" in note for note in pipeline.notes)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.5])
+def test_a_log_that_is_not_synchronised_with_the_clip_is_noted_after_the_last_frame(monkeypatch, late_s):
+    time_s = np.arange(120) / 10
+    heading = 0.3 * np.sin(time_s / 1.3) + 0.2 * np.sin(time_s / 0.7)
+    still, place = np.zeros(120), np.tile([5.0, 7.0], (120, 1))
+    turned = {"heading_rad": heading % (2 * np.pi), "pitch_rad": still + np.pi / 2, "roll_rad": still}
+    log = Telemetry(time_s - late_s, still + 50, still, place, False, **turned)
+
+    class Clip:
+        rate_hz, size = 10.0, CAMERA.size_px
+
+        def __iter__(self):
+            return (Frame(n, (n - 1) / 10, np.zeros((480, 640, 3), np.uint8)) for n in range(1, 121))
+
+    def scenes(source, *_, **__):
+        for frame, turn in zip(source, np.diff(heading, prepend=heading[0]), strict=True):
+            # Straight down the picture turns against the camera's heading.
+            way = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+            middle = np.array([[1, 0, 319.5], [0, 1, 239.5], [0, 0, 1]])
+            step = Registration(middle @ way @ np.linalg.inv(middle), 99, 99, 0.1, 1.0)
+            none = Detections(np.zeros((0, 4)), *np.zeros((4, 0)))
+            yield Scene(frame, np.zeros((480, 640), np.uint16), none, 1, step=step if frame.number > 1 else None)
+
+    monkeypatch.setattr("torchvision_dddas.pipeline.detect_motion", scenes)
+    pipeline = Pipeline(None, telemetry=log, camera=CAMERA)
+    results = list(pipeline(Clip()))
+    assert len(results) == 120
+    said = [note for note in pipeline.notes if "not synchronised" in note]
+    assert len(said) == bool(late_s)
+    assert all(float(note.split("clock_offset_s=")[1]) == pytest.approx(late_s, abs=0.02) for note in said)
 
 
 WRONG: Any = "flight.csv"  # where a record is wanted

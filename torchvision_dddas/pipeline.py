@@ -1,5 +1,6 @@
 """The whole path from frames to results: detection, identities, places on the ground, and commands in a closed loop."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -28,6 +29,7 @@ from torchvision_dddas.geo import (
     group_crowds,
 )
 from torchvision_dddas.geo.aerial_targets import tracked_targets
+from torchvision_dddas.geo.clock_offset import describe_clock_offset
 from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
 from torchvision_dddas.types import (
@@ -45,6 +47,10 @@ from torchvision_dddas.types import (
 
 if TYPE_CHECKING:
     from torchvision_dddas.control import Mission
+
+
+# Of a longer clip the latest motions of the camera show whether it is synchronised with its log.
+_MOST_MOTIONS = 20_000
 
 
 class Clip(Protocol):
@@ -71,7 +77,7 @@ class Pipeline:
 
     Call it with a source, or give it single frames with `update` and take the last results with `flush`. A frame's
     result is settled some frames later. Targets are located where landmarks are given, or telemetry with places.
-    notes: what the user should know of what was given.
+    notes: what the user should know of what was given, and after the last frame whether log and clip are synchronised.
     """
 
     def __init__(
@@ -208,6 +214,7 @@ class Pipeline:
         self._crowds = CrowdIdentities() if self.settings.crowds.join_m and self._watch is not None else None
         self._waiting: dict[int, WatchedScene] = {}
         self._watched: WatchedScene | None = None  # the last one
+        self._motions: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_MOTIONS)
         return self._engine or load_engine(self._backend, self.settings)
 
     def _build_watch(self, size_px: tuple[int, int], rate_hz: float) -> LandmarkWatch:
@@ -230,6 +237,8 @@ class Pipeline:
     def _take(self, scene: Scene) -> Iterator[FrameResult]:
         """Locate a scene's landmarks, give its targets identities, and finish the frames that are settled by it."""
         if self._watch is not None:
+            motion = scene.camera_motion
+            self._motions.append((scene.frame.time_s, np.full((3, 3), np.nan) if motion is None else motion))
             if self._mission is not None:
                 self._mission.take_reports(scene)
             if scene.repeats and self._watched is not None:
@@ -248,6 +257,8 @@ class Pipeline:
     def _rest(self) -> Iterator[FrameResult]:
         for tracked in self._tracker.flush():
             yield self._finish(tracked)
+        if self._watch is not None and (note := describe_clock_offset(self._watch.locator, self._motions)):
+            self.notes.append(note)
 
     def _finish(self, tracked: TrackedFrame) -> FrameResult:
         """Locate the targets of a settled frame by the picture that shows them."""
@@ -304,7 +315,9 @@ def _locate(tracked: TrackedFrame, past: Sequence[WatchedScene], locator: Aerial
         for stage, spent in watched.fixed.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + spent
     fixed, adjustments = replace(here.fixed, seconds={}), (*tracked.adjustments, *earlier)
-    grounded = locator.locate_targets(fixed, targets, adjustments, seconds)
+    is_known = all(watched.scene.camera_motion is not None for watched in past)
+    motion = tracked.now_from_before if is_known else None
+    grounded = locator.locate_targets(fixed, targets, adjustments, seconds, motion)
     origin = locator.site.origin_deg
     degrees = None if origin is None else geometry.lonlat(grounded.marks.east_north_m, origin)
     return FrameResult(tracked, grounded, here.sighted_by, degrees)

@@ -288,6 +288,11 @@ class Telemetry:
         """(N,) focal length in pixels by the field of view, NaN where unknown. size: (width, height) of pictures."""
         return (max(size) if self.is_nominal else size[0]) / 2 / np.tan(self.hfov_rad / 2)
 
+    @property
+    def hold_s(self) -> float:
+        """How long before its first and after its last sample the log still tells a place: half an interval."""
+        return min(0.5 * float(np.median(np.diff(self.time_s))) + 1e-6, 1.0) if len(self) > 1 else 1.0
+
     def at(self, time_s: float, tolerance_s: float = 1.0) -> "Flight | None":
         """The state at a time by linear interpolation, angles and longitudes the short way round.
 
@@ -328,14 +333,14 @@ class Telemetry:
             self.heading_from,
         )
 
-    def check_overlap(self, last_s: float) -> None:
-        """Raises InputError, with both spans, when no sample lies near a clip that lasts from 0 to last_s."""
+    def check_overlap(self, last_s: float, first_s: float = 0.0, what: str = "clip") -> None:
+        """Raises InputError, with both spans, where no sample lies near a clip or table from first_s to last_s."""
         if len(self) == 0:
-            raise InputError(f"the telemetry has no samples; the clip lasts from 0.0 to {last_s:.1f} s")
+            raise InputError(f"the telemetry has no samples; the {what} lasts from {first_s:.1f} to {last_s:.1f} s")
         from_s, to_s = float(self.time_s[0]), float(self.time_s[-1])
-        if self.at(0.0) is None and self.at(last_s) is None and not 0 <= from_s <= last_s:
+        if from_s - 1 > last_s or to_s + 1 < first_s:
             raise InputError(
-                f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the clip 0.0 to {last_s:.1f} s; "
+                f"the telemetry covers {from_s:.1f} to {to_s:.1f} s, the {what} {first_s:.1f} to {last_s:.1f} s; "
                 "they do not overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
             )
 

@@ -1,5 +1,7 @@
 """`dddas locate aerial`: what it writes, how near it comes to the truth, and one line for each mistake."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -128,7 +130,22 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(located, tmp_path):
     (gap,) = record(tmp_path / "out")["unreliable"]
     assert (gap["first"], gap["last"]) == (4, 4)
     assert "3 landmarks" in gap["cause"] and "1 missing" in gap["cause"]
-    assert "note: 1 frames could not be located" in said
+    assert said.splitlines()[-1].endswith("; 1 of 10 frames without a position, run.json gives the causes")
+
+
+def test_frames_that_a_log_does_not_cover_are_counted_on_the_screen_in_the_record_and_in_the_report(located, tmp_path):
+    flight = Overflight(frames=30)
+    head, *lines = flight.telemetry_csv().splitlines()
+    for first, last in ((0, 18), (12, 30), (5, 25)):
+        part = "\n".join([head, *lines[first:last]]) + "\n"
+        found, said = located(flight, "--save", "report", telemetry=part, landmarks=None)
+        assert {int(row["frame"]) for row in found} == set(range(first + 1, last + 1))
+        missing = 30 - (last - first)
+        assert f"; {missing} of 30 frames without a position" in said.splitlines()[-1]
+        assert record(tmp_path / "out")["frames_without_position"] == missing
+        page = (tmp_path / "out" / "report.html").read_text()
+        assert re.search(rf"frames without a position\W.*?>\s*{missing}\s*<", page, re.DOTALL)
+    assert "without a position" not in located(flight, landmarks=None)[1]
 
 
 def test_a_landmark_hardly_ever_at_its_place_is_reported(located):

@@ -259,3 +259,92 @@ def test_a_camera_file_that_names_the_lens_overrides_the_logs_nominal_focal_leng
     locator = AerialLocator(read_aerial_camera(tmp_path / "c.toml", None), hovering(("1.00", "2.00")), rate_hz=1)
     assert [metres_right(locator, frame) for frame in (1, 2)] == pytest.approx([5 / 0.8533, 2.5 / 0.8533], rel=1e-3)
     assert any("853 to 1707 px by its zoom" in note for note in locator.notes)
+
+
+# -- Ground ------------------------------------------------------------------------------------------------------------
+
+TIME = np.arange(0, 20, 0.5)
+RISEN = np.minimum(4.0 * TIME, 40.0)  # a start from the ground
+
+
+def over(ground_m, risen=RISEN, zero="takeoff", above_sea_m=None, raster_m=None, camera=None):
+    """The locator over ground of a height: a function of east, and the raster's, its heights in any unit."""
+    east = 5.0 * TIME
+    ground = ground_m(east)
+    start = ground[0] if zero == "takeoff" else ground
+    log = Telemetry(
+        TIME, risen, 5 + 0 * TIME, np.c_[east, 0 * TIME], False,
+        above_sea_m=start + risen if above_sea_m is None else above_sea_m,
+        heading_rad=0 * TIME, pitch_rad=1.5 + 0 * TIME, height_zero=zero,
+    )  # fmt: skip
+    k = np.arange(-50.0, 250.0, 5.0)
+    heights = np.tile((raster_m or ground_m)(k), (len(k), 1))
+    base = float(heights[0, 10])
+    camera = camera or Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
+    return AerialLocator(camera, log, None, Elevation(heights - base, (-50.0, -50.0), 5.0, base))
+
+
+def hillside(east):
+    return 1540.0 + 0.4 * east
+
+
+def about_ground(locator):
+    return [note for note in locator.notes if "the ground" in note]
+
+
+@pytest.mark.parametrize("zero", ["takeoff", "ground"])
+def test_an_elevation_that_agrees_with_the_log_on_the_ground_is_taken_without_a_word(zero):
+    locator = over(hillside, zero=zero)
+    assert about_ground(locator) == []
+    # A height above the take-off point stays the same over a hill, one above the ground below follows it.
+    ground = hillside(5.0 * 19.0) - 1540.0
+    assert locator.telemetry_at(19.0).altitude_m == pytest.approx(40.0 + ground * (zero == "ground"), abs=0.1)
+
+
+@pytest.mark.parametrize("zero", ["takeoff", "ground"])
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (1 / 0.3048, "is the elevation in feet, 3.28 to the metre"),
+        (0.3048, "is the log in feet, 3.28 to the metre"),
+        (10.0, "is the elevation in decimetres, 10 to the metre"),
+        (100.0, "is the elevation in centimetres, 100 to the metre"),
+    ],
+)
+def test_an_elevation_in_another_unit_is_refused_and_the_ratio_is_named(zero, times, said):
+    with pytest.raises(InputError, match=f"{times:.3g} times as much: {said}"):
+        over(hillside, zero=zero, raster_m=lambda east: times * hillside(east))
+    # GPS and a geoid do not hide it, and an offset as large does not look like it.
+    with pytest.raises(InputError, match=said):
+        over(hillside, zero=zero, raster_m=lambda east: times * (hillside(east) + 25.0))
+    (note,) = about_ground(over(hillside, zero=zero, raster_m=lambda east: hillside(east) + 300.0))
+    assert "1540 m above the sea by the log" in note if zero == "takeoff" else "by the elevation" in note
+    assert "300 m apart" in note
+
+
+@pytest.mark.parametrize(("offset_m", "notes"), [(8.0, 0), (-8.0, 0), (12.0, 1), (-47.0, 1)])
+def test_an_offset_of_more_than_ten_metres_is_named(offset_m, notes):
+    found = about_ground(over(hillside, raster_m=lambda east: hillside(east) + offset_m))
+    assert len(found) == notes and all(f"{abs(offset_m):.0f} m apart" in note for note in found)
+
+
+def test_without_the_take_off_point_nothing_is_compared_and_the_height_counts_from_below_the_first_place():
+    locator = over(hillside, risen=40.0 + 0 * TIME, raster_m=lambda east: 3.28 * hillside(east))
+    (note,) = [note for note in locator.notes if "begins in the air" in note]
+    assert not about_ground(locator) or about_ground(locator) == [note]
+    # The height of the take-off point in the camera's file says where the altitude counts from.
+    camera = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5), takeoff_above_sea_m=1520.0)
+    low = over(hillside, risen=40.0 + 0 * TIME, camera=camera)
+    assert low.telemetry_at(0.0).altitude_m == pytest.approx(20.0, abs=0.1)
+    assert not [note for note in low.notes if "begins in the air" in note]
+
+
+def test_a_height_whose_zero_is_not_known_is_not_compared():
+    assert about_ground(over(hillside, zero="unknown", above_sea_m=RISEN, risen=np.full(len(TIME), np.nan))) == []
+    assert about_ground(over(hillside, zero="ground", above_sea_m=np.full(len(TIME), np.nan))) == []
+
+
+def test_a_log_covers_half_an_interval_beside_its_samples_and_no_more():
+    locator = over(hillside)
+    assert locator.telemetry_at(-0.2) is not None and locator.telemetry_at(19.7) is not None
+    assert locator.telemetry_at(-0.3) is locator.telemetry_at(19.8) is None

@@ -210,8 +210,6 @@ def position_lines(record: "RunRecord") -> list[str]:
     counts: dict[str, Any] = {"positions": 0, "by": {}, **record.counts}
     by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")
     lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
-    if gaps := counts["by"].get("nothing", 0):
-        lines.append(f"note: {gaps} frames could not be located and have no positions; run.json gives the causes")
     if bridges := counts.get("bridges", 0):
         lines.append(f"note: boxes that bridge gaps between detections: {bridges}; not seen, they have no place")
     if untracked := counts.get("untracked", 0):

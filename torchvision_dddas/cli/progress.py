@@ -205,4 +205,7 @@ def closing_lines(first: str | Sequence[str], record: "RunRecord", folder: Path,
         lines.append(
             f"{count} problem{'s' * (count != 1)} while reading, the first: {record.problems[0]} (all in run.json)"
         )
-    return [*lines, *(f"note: {note}" for note in record.notes), f"{folder}: {', '.join(files)}"]
+    last = f"{folder}: {', '.join(files)}"
+    if missing := record.counts.get("frames_without_position"):
+        last += f"; {missing} of {record.frames} frames without a position, run.json gives the causes"
+    return [*lines, *(f"note: {note}" for note in record.notes), last]

@@ -168,7 +168,7 @@ def run(
         count = None if source.count is None else -(-source.count // interval)
         pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
-        record.notes += clip_notes(source, interval, ready.settings)
+        record.notes += [*pipeline.notes, *clip_notes(source, interval, ready.settings)]
     lines = _summary(record, out, site is not None, "overlay" in names)
     if given is None:
         print_lines(lines, quiet)

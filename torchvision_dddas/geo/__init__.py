@@ -13,7 +13,6 @@ from torchvision_dddas.geo.landmark_watch import (
 from torchvision_dddas.geo.site import (
     Site,
     build_site,
-    check_span,
     complete_site,
     describe_no_place,
     describe_unknown_heights,
@@ -32,7 +31,6 @@ __all__ = [
     "WatchedScene",
     "build_site",
     "check_colours",
-    "check_span",
     "check_table",
     "complete_site",
     "describe_no_place",

@@ -53,6 +53,7 @@ from torchvision_dddas.types import (
 _OUTSIDE = 0.25
 # A picture that is repeated for longer locates nothing: what it shows has moved on.
 _FROZEN_S = 0.25
+_UNKNOWN = np.full((3, 3), np.nan)
 # By telemetry alone a place whose distance has a standard deviation of a larger share of itself is none.
 _VAGUE = 0.2
 
@@ -158,12 +159,12 @@ class AerialLocator:
         """Where the targets of the next frame stand. Raises InputError for anything but Tracks or a TrackedFrame."""
         if isinstance(tracks, TrackedFrame):
             targets, frame = tracked_targets(tracks, bool(self.settings.crowds.join_m)), tracks.number
-            time_s = None if tracks.frame is None else tracks.frame.time_s
+            time_s, motion = None if tracks.frame is None else tracks.frame.time_s, tracks.now_from_before
         elif isinstance(tracks, Tracks):
-            targets, frame, time_s = seen_targets(tracks), tracks.frame, None
+            targets, frame, time_s, motion = seen_targets(tracks), tracks.frame, None, None
         else:
             raise InputError(f"locate wants Tracks or a TrackedFrame, got {type(tracks).__name__}")
-        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame), time_s), targets)
+        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame), time_s), targets, motion=motion)
 
     def locate_table(
         self, table: DetectionTable, times_s: Mapping[int, float] | None = None
@@ -204,7 +205,8 @@ class AerialLocator:
 
     def telemetry_at(self, time_s: float) -> Flight | None:
         """What the telemetry says, its altitude counted from up = 0; NaN where that is below the ground."""
-        flight = self.site.telemetry.at(time_s) if self.site.telemetry is not None else None
+        telemetry = self.site.telemetry
+        flight = telemetry.at(time_s, telemetry.hold_s) if telemetry is not None else None
         if flight is None:
             return None
         below, altitude = 0.0, flight.altitude_m
@@ -240,10 +242,13 @@ class AerialLocator:
         targets: Targets,
         adjustments: Sequence[Adjustment] = (),
         seconds: Mapping[str, float] | None = None,
+        motion: np.ndarray | None = None,
     ) -> AerialLocations:
         """Where the targets of a frame stand; those that the fix cannot place are left out.
 
-        adjustments, seconds: of the stages before, for the record.
+        adjustments, seconds: of the stages before, for the record. motion: (3, 3) pixel homography from the frame
+        located before, None if unknown. By telemetry alone velocities are relative to the ground as the pictures show
+        it: an error of the log that changes from frame to frame moves all that stands still, too.
         """
         start, fix, origin = time.perf_counter(), fixed.fix, self.site.origin_deg
         # The covariance relative to the team has a part that is each box's own, and one that all share.
@@ -258,7 +263,10 @@ class AerialLocator:
         own = (by_pixel - shared)[rows] * (point_sigma_px(targets, self.settings.aerial)[rows] ** 2)[:, None, None]
         relative = shared[rows] + own
         when, target = self.time_of(fix), targets.target[rows]
-        velocity = self._speeds.update(when, np.where(targets.lasting[rows], target, -1), place, own)
+        carried, level = motion if motion is not None and fix.by == "telemetry" else _UNKNOWN, self._ground is None
+        self._speeds.carry(carried, lambda px, up: locate_pixels(fix, self.camera, px, 0.0, up, self._ground)[0], level)
+        lasting, seen = np.where(targets.lasting[rows], target, -1), np.c_[pixels, lift][rows]
+        velocity = self._speeds.update(when, lasting, place, own, seen)
         positions = Positions(
             np.full(len(rows), fix.frame),
             target,

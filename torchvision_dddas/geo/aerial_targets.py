@@ -1,12 +1,14 @@
 """Targets seen from the air: the point in the picture that stands for each, its shadow, and its speed over time."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.projection import project
+from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Camera, CameraPose, Float, Int, TrackedFrame, Tracks
 
 # Width of a person from straight above, where no height shows.
@@ -133,13 +135,30 @@ def remove_shadow(
 class TargetSpeeds:
     """Velocities of targets over the ground: a constant-velocity Kalman filter each, driven by white acceleration.
 
-    The measurement noise is that of the pixel. The error of the camera's pose is common to a frame and changes slowly,
-    so it hardly touches a velocity.
+    The measurement noise is that of the pixel. The error of the camera's pose is common to a frame. Where it changes
+    from frame to frame, as where a log is late and the camera turns, `carry` takes it out.
     """
 
     def __init__(self) -> None:
         # By identity: time in seconds, (4,) east, north and their velocities, and their covariance (4, 4).
         self._tracks: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
+        # By identity: (3,) the pixel of the ground where it was seen and the height above it, and (2,) its place.
+        self._seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def carry(self, motion: np.ndarray, to_ground: Callable[[np.ndarray, np.ndarray], np.ndarray], level: bool) -> None:
+        """Move every target by as much as the next frame moves the ground on which it was seen last.
+
+        motion: (3, 3) pixel homography from the frame before; NaN where it is not known: then the targets stay.
+        to_ground: places (N, 2) of pixels (N, 2) at heights (N,) in the next frame. level: the ground is a plane, as it
+        is for the registration; elsewhere the places are less sure by as much.
+        """
+        before = np.array([seen for seen, _ in self._seen.values()]).reshape(-1, 3)
+        after = np.c_[transfer(motion, before[:, :2]), before[:, 2]]
+        for name, seen, place in zip(list(self._seen), after, to_ground(after[:, :2], after[:, 2]), strict=True):
+            shift = np.nan_to_num(place - self._seen[name][1])
+            self._tracks[name][1][:2] += level * shift
+            self._tracks[name][2][:2, :2] += (1 - level) * np.outer(shift, shift)
+            self._seen[name] = seen, place
 
     def update(
         self,
@@ -147,10 +166,12 @@ class TargetSpeeds:
         identity: Int[np.ndarray, " N"],
         east_north_m: Float[np.ndarray, "N 2"],
         covariance_m2: Float[np.ndarray, "N 2 2"],
+        seen: Float[np.ndarray, "N 3"] | None = None,
     ) -> Float[np.ndarray, "N 2"]:
         """Velocities of the next frame, m/s east and north; NaN while unknown, or without an identity (below 1).
 
-        covariance_m2: of the errors that are new in every frame; 1 m is taken where it is unknown.
+        covariance_m2: of the errors that are new in every frame; 1 m is taken where it is unknown. seen: pixels u, v of
+        the places and their heights above the ground, for `carry`.
         """
         covariance_m2 = np.where(np.isfinite(covariance_m2), covariance_m2, np.eye(2))
         velocity = np.full((len(identity), 2), np.nan)
@@ -170,7 +191,10 @@ class TargetSpeeds:
                 self._tracks[name] = time_s, state, spread
             if spread.diagonal()[2:].max() < _KNOWN_M_S**2:
                 velocity[row] = state[2:]
+        if seen is not None:
+            self._seen |= dict(zip(identity.tolist(), zip(seen, east_north_m, strict=True), strict=True))
         self._tracks = {name: track for name, track in self._tracks.items() if time_s - track[0] <= _FORGET_S}
+        self._seen = {name: seen for name, seen in self._seen.items() if name in self._tracks}
         return velocity
 
 

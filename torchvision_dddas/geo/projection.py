@@ -25,12 +25,15 @@ Surface = Callable[[np.ndarray], np.ndarray]
 """Height above the plane up = 0 of places (N, 2) in metres east and north; NaN where it is not known."""
 
 
-def axes_of(heading_rad: float, pitch_rad: float, roll_rad: float) -> Float[np.ndarray, "3 3"]:
-    """The camera's right, down and forward, as columns, in east, north and up."""
+def axes_of(
+    heading_rad: float | np.ndarray, pitch_rad: float | np.ndarray, roll_rad: float | np.ndarray
+) -> Float[np.ndarray, "*N 3 3"]:
+    """The camera's right, down and forward, as columns, in east, north and up, of single angles or of arrays."""
     (sh, sp, sr), (ch, cp, cr) = (f(np.array([heading_rad, pitch_rad, roll_rad])) for f in (np.sin, np.cos))
-    right, down = np.array([ch, -sh, 0.0]), np.array([-sh * sp, -ch * sp, -cp])
+    right, down = np.array([ch, -sh, 0 * ch]), np.array([-sh * sp, -ch * sp, -cp])
     forward = np.array([sh * cp, ch * cp, -sp])
-    return np.stack([cr * right + sr * down, cr * down - sr * right, forward], axis=1)
+    columns = np.array([cr * right + sr * down, cr * down - sr * right, forward])
+    return np.moveaxis(columns, (1, 0), (-2, -1))
 
 
 def project(points_m: Float[np.ndarray, "N 3"], pose: CameraPose, camera: Camera) -> Float[np.ndarray, "N 2"]:

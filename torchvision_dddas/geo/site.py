@@ -15,14 +15,19 @@ from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)
 
-# Telemetry holds this long before its first and after its last sample.
-_HOLDS_S = 1.0
 # A camera that looks higher above the horizon shows no landmarks as a rule: its angles have the other sign.
 _HIGHEST_DEG = 20.0
 # No vehicle sees landmarks from further away: then the files are of two flights.
 _FARTHEST_M = 100_000.0
 # Two focal lengths that differ by more than this share are not the same.
 _OTHER = 0.02
+
+# A log whose altitude is lower begins on the ground.
+_ON_GROUND_M = 3.0
+# Log and elevation agree on the ground within this; a geoid alone seldom puts them further apart than the second one.
+_SAME_M, _DATUMS_M = 10.0, 60.0
+# In these units an elevation has the ground so many times higher. Then it is so many times nearer in metres.
+_UNITS, _NEARER = {"feet": 1 / 0.3048, "decimetres": 10.0, "centimetres": 100.0, "millimetres": 1000.0}, 10.0
 
 
 @dataclass(frozen=True)
@@ -123,9 +128,48 @@ def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tupl
         return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
     has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
     telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, has_ground, has_landmarks)
+    if site.elevation is not None:
+        telemetry, more = _match_ground(telemetry, site.elevation, camera)
+        notes += more
     _check_altitude(telemetry, "the altitude by the camera's takeoff_above_sea_m", "correct that height")
     _check_pitch(telemetry, "camera file")
     return replace(site, telemetry=telemetry), notes
+
+
+def _match_ground(telemetry: Telemetry, elevation: Elevation, camera: Camera | None) -> tuple[Telemetry, list[str]]:
+    """Telemetry whose altitude counts from the ground below, and notes where log and elevation disagree on the ground.
+
+    Raises InputError where the heights of the elevation are those of the log in another unit.
+    """
+    notes, altitude, up_m = list[str](), telemetry.altitude_m, ground_height(elevation, telemetry.place)
+    takeoff_m = math.nan if camera is None else camera.takeoff_above_sea_m
+    by_log, where = telemetry.above_sea_m - altitude, "below the vehicle"
+    risen = altitude if np.isfinite(altitude).any() else telemetry.above_sea_m - takeoff_m
+    known = np.isfinite(up_m + risen)
+    if known.any() and (telemetry.height_zero == "takeoff" or risen is not altitude):
+        first, where = int(known.argmax()), "where it took off"
+        by_log = by_log if math.isnan(takeoff_m) else np.full(len(risen), takeoff_m)
+        start_m = float(up_m[first])
+        known &= (np.arange(len(known)) == first) & (risen <= _ON_GROUND_M)
+        if not known.any() and math.isfinite(takeoff_m):
+            start_m = takeoff_m - elevation.base_m
+        elif not known.any():
+            notes.append("the log begins in the air: its altitude is counted from the ground below its first place")
+        telemetry = replace(telemetry, altitude_m=altitude + start_m - up_m, height_zero="ground")
+    known &= np.isfinite(by_log)
+    if telemetry.height_zero == "unknown" or not known.any():
+        return telemetry, notes
+    logged, raster = float(np.median(by_log[known])), float(np.median(up_m[known])) + elevation.base_m
+    apart = abs(raster - logged)
+    found = f"the ground {where} is {logged:.0f} m above the sea by the log and {raster:.0f} m by the elevation"
+    whose, more, less = ("elevation", raster, logged) if raster > logged else ("log", logged, raster)
+    off, unit = min((abs(more / factor - less), unit) for unit, factor in _UNITS.items())
+    if _NEARER * off < apart > _DATUMS_M:
+        found += f", {raster / logged:.3g} times as much"
+        raise InputError(f"{found}: is the {whose} in {unit}, {_UNITS[unit]:.3g} to the metre? Give both in metres")
+    if apart > _SAME_M:
+        notes.append(f"{found}, {apart:.0f} m apart: does one of them count from the ellipsoid?")
+    return telemetry, notes
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
@@ -164,16 +208,6 @@ def _check_pitch(telemetry: Telemetry, whose: str) -> None:
         raise InputError(
             f"by the {whose}'s pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
             "below the horizon, 90 for straight down: turn the sign of pitch_deg"
-        )
-
-
-def check_span(telemetry: Telemetry, from_s: float, to_s: float, what: str) -> None:
-    """Raises InputError, with both spans, for telemetry that does not overlap the clip or table."""
-    first, last = float(telemetry.time_s[0]), float(telemetry.time_s[-1])
-    if last < from_s - _HOLDS_S or first > to_s + _HOLDS_S:
-        raise InputError(
-            f"the telemetry covers {first:.1f} to {last:.1f} s, the {what} {from_s:.1f} to {to_s:.1f} s; they do not "
-            "overlap: count time_s from the clip's first frame, or set aerial.clock_offset_s"
         )
 
 

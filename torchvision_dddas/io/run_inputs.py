@@ -15,7 +15,6 @@ from torchvision_dddas.geo import (
     LandmarkWatch,
     build_site,
     check_colours,
-    check_span,
     complete_site,
     describe_no_place,
     describe_unknown_heights,
@@ -180,7 +179,7 @@ def read_locator(
                 "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
             )
         if frames is not None and frames[1] > 0:
-            check_span(telemetry, (frames[0] - 1) / rate_hz, (frames[1] - 1) / rate_hz, what)
+            telemetry.check_overlap((frames[1] - 1) / rate_hz, (frames[0] - 1) / rate_hz, what)
         notes += telemetry.notes
     if rate_hz is None:
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")

@@ -118,6 +118,7 @@ class AerialMaps(Part[AerialLocations]):
         by = {name: count for name, count in record.counts["by"].items() if name != "nothing"}
         counts = {"frames": record.frames, "located": sum(by.values()), "identities located": len(targets.of)}
         counts["positions"] = record.counts["positions"]
+        counts["frames without a position"] = record.counts["frames_without_position"]
         counts |= {f"frames by {name}": count for name, count in by.items() if count}
         figures = [(name, f"{count}") for name, count in counts.items()]
         axes, _ = semi_axes(targets.covariance_m2)

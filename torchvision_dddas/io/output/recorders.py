@@ -288,7 +288,8 @@ def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
 class _LocationCounts:
     """Counts what is located from the air in a record.
 
-    positions: rows of positions.csv. unplaced: targets of located frames that have none. by: frames by what gave the
+    positions: rows of positions.csv. unplaced: targets of located frames that have none. frames_without_position: those
+    that are not located, as where a log covers only a part of a clip. by: frames by what gave the
     camera's pose, `nothing` for those not located. weak: spans of frames that were located with something amiss.
     repairs: what was changed and why. landmarks: of each, in how many frames it was seen, used, and left out of those
     located; and the spans of frames in which it was reassigned or excluded.
@@ -301,6 +302,7 @@ class _LocationCounts:
         record.counts |= {
             "positions": 0,
             "unplaced": 0,
+            "frames_without_position": 0,
             "by": dict.fromkeys(("pose", "homography", "paper", "telemetry", "nothing"), 0),
             "landmarks": {n: {"seen": 0, "used": 0, "left_out": 0, "reassigned": [], "excluded": []} for n in names},
             "weak": self._weak.rows,
@@ -314,6 +316,7 @@ class _LocationCounts:
         counts["positions"] += len(located.positions)
         counts["unplaced"] += (len(located.box_px) - len(located.positions)) * bool(fix.by)
         counts["by"][fix.by or "nothing"] += 1
+        counts["frames_without_position"] += not fix.by
         for which, state, is_used in zip(fix.landmark.tolist(), fix.state, fix.is_used, strict=True):
             landmark = counts["landmarks"][self._names[which]]
             landmark["seen"] += 1

@@ -279,9 +279,10 @@ def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
     if takeoff is None and ground is None and height is not None:
         log.note(unsaid.format("height", "take-off point"))
         takeoff = height
-    for rows, zero in ((ground, "ground"), (takeoff, "takeoff")):
-        if rows is not None:
-            samples["altitude_m"], log.height_zero = rows, zero
+    if ground is not None:
+        samples["altitude_m"], log.height_zero = ground, "ground"
+    if takeoff is not None:
+        samples["altitude_m"], log.height_zero = takeoff, "takeoff"
     ellipsoid, lower = samples.get("above_ellipsoid_m"), samples.get("altitude_m")
     if ellipsoid is not None and geoid is not None and "above_sea_m" not in samples:
         up_m = np.interp(ellipsoid[:, 0], geoid[:, 0], geoid[:, 1])
