@@ -174,6 +174,15 @@ def test_a_damaged_text_log_is_read_around_the_damage(fly):
     assert any("line 21: 2 messages are cut off or garbled" in note for note in flown.notes)
 
 
+@pytest.mark.parametrize("columns", ["TimeUS,Lat,Lng,Alt,RelHomeAlt,TimeUS", "TimeUS,Lat", "TimeUS,TimeUS"])
+def test_columns_that_are_damaged_on_the_way_spoil_no_other_row(fly, columns):
+    lines = dataflash_text(KINDS, messages()).split("\n")
+    layout, last = next(line for line in lines if line.startswith("FMT, 130, 50, POS")), lines[-1]
+    damaged = [f"FMT, 130, 50, POS, QLLfff, {columns}", f"POS, {', '.join('1' * len(columns.split(',')))}", layout]
+    flown = fly("\n".join([*lines[:40], *damaged, *lines[40:], last]), "a.log")
+    assert np.isfinite(flown.altitude_m).sum() >= 11 and np.nanmax(flown.altitude_m) == pytest.approx(9.74)
+
+
 @pytest.mark.parametrize("rows", [[], [("IMU", 1, 0, 0.1, 0.2)] * 9])
 def test_a_log_without_a_position_is_refused(refused, rows):
     for name, content in forms(KINDS, rows):

@@ -87,10 +87,11 @@ def build_flight(log: Log, topics: Topics, clock_offset_s: float, clock_s: float
 
 def add_topic(topics: Topics, name: str, sender: str, topic: Topic) -> None:
     """Add the messages of a sender, apart for each device of which it tells."""
-    device = next((topic[field] for field in _DEVICES if field in topic), np.zeros(len(topic["time_s"])))
-    for one in np.unique(device)[:_MOST_DEVICES]:
+    device = next((topic[field] for field in _DEVICES if field in topic), None)
+    for one in np.zeros(1) if device is None else np.unique(device)[:_MOST_DEVICES]:
         label = f"{sender} device {one:g}".strip() if one or not sender else sender
-        topics.setdefault(name, {})[label] = {field: values[device == one] for field, values in topic.items()}
+        mine = topic if device is None else {field: values[device == one] for field, values in topic.items()}
+        topics.setdefault(name, {})[label] = mine
 
 
 def column(topic: Topic, name: str, default: float = np.nan) -> np.ndarray:

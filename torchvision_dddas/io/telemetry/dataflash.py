@@ -83,21 +83,22 @@ def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
 
 def _written(log: Log, text: str) -> Iterator[tuple[str, Topic]]:
     """Yield the messages of a log as text that are read, by name. Its numbers are in the units of their columns."""
-    fields: dict[str, list[str]] = {}
-    rows: dict[str, list[list[float]]] = {}
+    columns: dict[str, tuple[str, ...]] = {}
+    rows: dict[tuple[str, tuple[str, ...]], list[list[float]]] = {}  # by name and columns, which damage may change
     bad: list[int] = []
     for number, line in enumerate(text.splitlines(), 1):
         name, _, rest = line.partition(",")
-        cells = [cell.strip() for cell in rest.split(",")] if name == "FMT" or name in fields else []
+        cells = [cell.strip() for cell in rest.split(",")] if name == "FMT" or name in columns else []
         if name == "FMT" and len(cells) > 4 and cells[2] in NAMES:
-            fields[cells[2]] = cells[4:]
-        elif name in fields:
+            columns[cells[2]] = tuple(cells[4:])
+        elif name in columns:
             try:
-                values = dict(zip(fields[name], map(float, cells), strict=True))
-                rows.setdefault(name, []).append([*values.values(), number])
+                values = [value for _, value in zip(columns[name], map(float, cells), strict=True)]
+                rows.setdefault((name, columns[name]), []).append([*values, number])
             except ValueError:
                 bad.append(number)
     if bad:
         log.note(f"line {bad[0]}: {len(bad)} messages are cut off or garbled and left out")
-    for name, found in rows.items():
-        yield name, dict(zip((*fields[name], "where"), np.array(found).T, strict=True))
+    # Of several kinds of columns the one with most rows comes last, and stays.
+    for (name, names), found in sorted(rows.items(), key=lambda item: len(item[1])):
+        yield name, dict(zip((*names, "where"), np.array(found).T, strict=True))

@@ -73,7 +73,8 @@ def _mavlink_topics(log: Log) -> tuple[Topics, float]:
             continue
         first = place + (13 if content[place + 8] == _V2 else 11)
         sender = content[first], content[first + 1]
-        if heard[sender, number] >= _ENOUGH:
+        is_call = number in (_HEARTBEAT, _SYSTEM_TIME)
+        if is_call and heard[sender, number] >= _ENOUGH:
             continue
         try:
             message = decoder.decode(bytearray(content[place + 8 : end]))
@@ -85,7 +86,7 @@ def _mavlink_topics(log: Log) -> tuple[Topics, float]:
         else:
             came_s = int.from_bytes(content[place : place + 8], "big") / 1e6
             rows.setdefault(sender, []).append((came_s, message, place))
-        if number in (_HEARTBEAT, _SYSTEM_TIME):
+        if is_call:
             heard[sender, number] += number == _HEARTBEAT or is_clock(message.time_unix_usec / 1e6)
     if bad:
         log.note(f"{len(bad)} of {count} messages are damaged and left out, the first at byte {bad[0]}")
@@ -134,7 +135,7 @@ def _choose_vehicle(log: Log, rows: Mapping[Sender, list[Row]], kinds: Mapping[S
         return 1 if kind in _PARTS else 3
 
     # A station may send nothing but its place, under any number and without heartbeats. A vehicle sends more.
-    talks = {sender: len({m.get_type() for _, m, _ in part}) > 1 for sender, part in rows.items()}
+    talks = {sender: len({m.get_type() for _, m, _ in part[:200]}) > 1 for sender, part in rows.items()}
     chosen = max(
         sorted(rows), key=lambda s: (trust(s) // 3, min(trust(s), places[s], 1), trust(s), talks[s], places[s])
     )
@@ -168,8 +169,9 @@ def _sending_times(log: Log, part: list[Row], is_timed: bool) -> np.ndarray:
     came[is_timed & ~is_clock(came)] = np.nan  # before the station's clock was set, or damaged
     sent = np.array([getattr(message, "time_boot_ms", np.nan) / 1e3 for _, message, _ in part])
     is_known, is_usable = np.isfinite(sent), np.isfinite(sent + came)
-    if len(set(sent[is_usable])) > 1:
-        apart, span_s = (came - sent)[is_usable], float(np.ptp(sent[is_usable]))
+    span_s = float(np.ptp(sent[is_usable])) if is_usable.any() else 0.0
+    if span_s > 0:
+        apart = (came - sent)[is_usable]
         alike = np.abs(apart - np.median(apart)) < 5 + 0.01 * span_s
         if alike.mean() >= 0.9:  # a few may be damaged: no checksum covers the times
             log.jitter_s = math.inf  # messages are sorted by time
