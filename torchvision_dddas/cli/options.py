@@ -44,12 +44,8 @@ Overrides = Annotated[
 EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes torch with a CUDA device, else onboard.")]
 StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as the study's file says]")]
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
-Telemetry = Annotated[
-    Path | None,
-    typer.Option(
-        "--telemetry", metavar="FILE", help="What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
-    ),
-]
+REPORTS = "What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
+Telemetry = Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help=REPORTS)]
 BoxFormat = Annotated[
     BoxOrder | None,
     typer.Option(help="What a box's columns are: left, top, size; corners; centre, size. [default: by the table]"),

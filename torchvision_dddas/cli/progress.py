@@ -168,6 +168,11 @@ def record_results(
     finally:
         record.problems += [str(problem) for problem in source.problems] if source is not None else []
         record.notes += getattr(source, "notes", [])
+        if concealed := getattr(source, "concealed", 0):
+            record.counts["concealed"] = concealed
+            record.notes.append(
+                f"the decoder concealed errors in {concealed} frames: what is found there may be damage"
+            )
         if levels := getattr(source, "levels", None):
             record.notes.append(str(levels))
     if repeats:

@@ -14,6 +14,7 @@ from torchvision_dddas.cli.exits import Ended
 from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines, print_located
 from torchvision_dddas.cli.options import (
     CLIP,
+    REPORTS,
     Backend,
     Config,
     EngineOption,
@@ -21,7 +22,6 @@ from torchvision_dddas.cli.options import (
     Overrides,
     Quiet,
     Rate,
-    Telemetry,
     check_interval,
     print_lines,
     report_errors,
@@ -39,12 +39,17 @@ _LOGIN = re.compile(r"([a-z][a-z0-9+.-]*://[^/?#@:]+)@(.*)", re.I | re.S)
 
 @report_errors
 def run(
-    clip: Annotated[str, typer.Argument(metavar="CLIP", help=f"sim:SCENARIO. {CLIP}")],
+    clips: Annotated[
+        list[str], typer.Argument(metavar="CLIP...", help=f"sim:SCENARIO. {CLIP} Several of one flight, in order.")
+    ],
     landmarks: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="A CSV of landmarks and their places. [default: by telemetry alone]"),
     ] = None,
-    telemetry: Telemetry = None,
+    telemetries: Annotated[
+        list[Path] | None,
+        typer.Option("--telemetry", metavar="FILE", help=f"{REPORTS} Of several clips one of each, or one of all."),
+    ] = None,
     colours: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The TOML of the landmarks' colours, by `dddas colours`.")
     ] = None,
@@ -108,7 +113,13 @@ def run(
     from torchvision_dddas.io.run_inputs import AerialInput
 
     check_interval(interval)
-    clip = _with_password(clip, password_file)
+    clip = _with_password(clips[0], password_file)
+    logs = telemetries or []
+    telemetry = logs[0] if logs else None
+    if len(clips) > 1 and (live or any(name.startswith(SIMULATED) for name in clips)):
+        raise InputError(f"{len(clips)} clips were given; wanted one with --live, and one sim:SCENARIO")
+    if len(clips) == 1 < len(logs):
+        raise InputError(f"one clip and {len(logs)} logs; give one --telemetry")
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
         _refuse(others, "is of no use with --live, which draws and steers nothing")
@@ -141,19 +152,20 @@ def run(
         raise typer.Exit(Ended(code))  # its last line says where the results are
     from torchvision_dddas import open_video
     from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.joined_clips import JoinedSource
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
     from torchvision_dddas.io.run_inputs import clip_notes, locator_facts, map_site, prepare_run
     from torchvision_dddas.pipeline import Pipeline
 
     names = parse_save(save, PipelineRecorder.saved)
-    files = given.files if given is not None else [telemetry] if telemetry is not None else []
-    refuse_own_input([Path(clip), *files], [out / name for name in PipelineRecorder.files], "folder with --out")
+    files = [*(given.files if given is not None else ()), *logs]
+    refuse_own_input([*map(Path, clips), *files], [out / name for name in PipelineRecorder.files], "folder with --out")
     with PipelineRecorder(out, names) as output:
-        source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given)
+        opened = [open_video(name, rate_hz=rate, full_scale=settings.levels.given) for name in (clip, *clips[1:])]
+        source = opened[0] if len(opened) == 1 else JoinedSource(opened, logs)
         ready = prepare_run(given, telemetry, settings, source, backend.value, clip)
         facts: dict[str, Any] = {
-            "input": clip,
-            "telemetry": telemetry,
+            "input": clip if len(clips) == 1 else clips,
             "clip": clip_facts(source),
             "interval_frames": interval,
             "backend": ready.engine.name,
@@ -162,7 +174,7 @@ def run(
         if ready.watch is not None and given is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
             site = map_site(ready.watch.locator, background)
-        facts["settings"] = ready.settings.model_dump()
+        facts |= {"telemetry": logs if len(logs) > 1 else telemetry, "settings": ready.settings.model_dump()}
         record = output.begin(facts, source.rate_hz / interval, source.size, site)
         record.notes += ready.notes
         count = None if source.count is None else -(-source.count // interval)

@@ -144,6 +144,7 @@ class TargetSpeeds:
         self._tracks: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
         # By identity: (3,) the pixel of the ground where it was seen and the height above it, and (2,) its place.
         self._seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._latest: tuple[float, dict[int, np.ndarray]] = math.nan, {}  # time and velocities, by identity
 
     def carry(self, motion: np.ndarray, to_ground: Callable[[np.ndarray, np.ndarray], np.ndarray], level: bool) -> None:
         """Move every target by as much as the next frame moves the ground on which it was seen last.
@@ -171,8 +172,11 @@ class TargetSpeeds:
         """Velocities of the next frame, m/s east and north; NaN while unknown, or without an identity (below 1).
 
         covariance_m2: of the errors that are new in every frame; 1 m is taken where it is unknown. seen: pixels u, v of
-        the places and their heights above the ground, for `carry`.
+        the places and their heights above the ground, for `carry`. A frame of the same time repeats the one before, and
+        its velocities.
         """
+        if time_s == self._latest[0]:
+            return np.array([self._latest[1].get(name, [math.nan] * 2) for name in identity.tolist()]).reshape(-1, 2)
         covariance_m2 = np.where(np.isfinite(covariance_m2), covariance_m2, np.eye(2))
         velocity = np.full((len(identity), 2), np.nan)
         for row, name in enumerate(identity.tolist()):
@@ -195,6 +199,7 @@ class TargetSpeeds:
             self._seen |= dict(zip(identity.tolist(), zip(seen, east_north_m, strict=True), strict=True))
         self._tracks = {name: track for name, track in self._tracks.items() if time_s - track[0] <= _FORGET_S}
         self._seen = {name: seen for name, seen in self._seen.items() if name in self._tracks}
+        self._latest = time_s, dict(zip(identity.tolist(), velocity, strict=True))
         return velocity
 
 

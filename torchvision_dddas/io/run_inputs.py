@@ -28,6 +28,7 @@ from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
+from torchvision_dddas.io.joined_clips import JoinedSource
 from torchvision_dddas.io.output import NONE_LOCATED, Site
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.pipeline import with_focal_length
@@ -82,14 +83,15 @@ def prepare_run(
 ) -> PreparedRun:
     """Read the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
     watch, notes, flight = None, list[str](), None
+    of = source if isinstance(source, JoinedSource) else clip
     reason = "neither --telemetry nor --landmarks were given"
     if given is not None and given.landmarks is None:
-        flight, reason = _read_flight(given, settings, clip)
+        flight, reason = _read_flight(given, settings, of)
     if given is not None and not (given.landmarks is None and reason):
         colours = read_colours(given.colours) if given.colours is not None else None
         frames = None if source.count is None else (1, source.count)
         locator, notes = read_locator(
-            given, settings, source.size, source.rate_hz, backend, frames, "clip", source.name, colours
+            given, settings, source.size, source.rate_hz, backend, frames, "clip", of, colours
         )
         landmarks = locator.site.landmarks
         if given.landmarks is not None:
@@ -103,7 +105,7 @@ def prepare_run(
         notes += more
     else:
         if flight is None and telemetry is not None:
-            flight = _read_telemetry(telemetry, settings, clip)
+            flight = _read_telemetry(telemetry, settings, of)
         if given is not None:
             _check_unused(given, source.size)
         settings, more = with_logged_focal(settings, flight, source.size)
@@ -120,7 +122,9 @@ def _check_unused(given: AerialInput, size: tuple[int, int]) -> None:
             raise InputError(f"{path} is no file; wanted a GeoTIFF")
 
 
-def _read_flight(given: AerialInput, settings: Settings, clip: str | None) -> tuple[Telemetry | None, str]:
+def _read_flight(
+    given: AerialInput, settings: Settings, clip: str | JoinedSource | None
+) -> tuple[Telemetry | None, str]:
     """The telemetry of a run without landmarks, and why it cannot locate anything; "" where it may."""
     flight = None if given.telemetry is None else _read_telemetry(given.telemetry, settings, clip)
     if not has_places(flight):
@@ -132,9 +136,13 @@ def _read_flight(given: AerialInput, settings: Settings, clip: str | None) -> tu
     return flight, ""
 
 
-def _read_telemetry(path: Path, settings: Settings, clip: str | None) -> Telemetry:
+def _read_telemetry(path: Path, settings: Settings, clip: str | JoinedSource | None) -> Telemetry:
     aerial = settings.aerial
-    return read_telemetry(path, aerial.clock_offset_s, clip, aerial.time_zone, aerial.order)
+
+    def read(path: Path, clip: str | None) -> Telemetry:
+        return read_telemetry(path, aerial.clock_offset_s, clip, aerial.time_zone, aerial.order)
+
+    return clip.read_logs(read) if isinstance(clip, JoinedSource) else read(path, clip)
 
 
 def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:
@@ -158,7 +166,7 @@ def read_locator(
     backend: str,
     frames: tuple[int, int] | None,
     what: str,
-    clip: str | None,
+    clip: str | JoinedSource | None,
     colours: Colours | None = None,
     extent: tuple[float, float] | None = None,
 ) -> tuple[AerialLocator, list[str]]:

@@ -103,6 +103,7 @@ class _Clip(ABC):
         self.name, self.last = name, 0
         self.problems: list[Problem] = []
         self.notes: list[str] = []
+        self.concealed = 0  # frames read so far in which the decoder concealed errors
         self._odd = 0  # pictures of another size in a row
 
     def __iter__(self) -> Iterator[Frame]:
@@ -322,7 +323,7 @@ class VideoSource(_Clip):
             capture.release()
 
     def _read_file(self, capture: Capture, interval: int) -> Iterator[Frame]:
-        stamps, lost = _Stamps(self._own_hz, self._given_hz), 0
+        stamps, lost, self.concealed, first = _Stamps(self._own_hz, self._given_hz), 0, 0, 0
         # As many reads in a row may fail as frames are still announced, and a few where none are.
         while lost < min(max((self.count or 0) - stamps.number, 0) + 4, _MOST_LOST):
             if not capture.grab():
@@ -335,6 +336,10 @@ class VideoSource(_Clip):
                 self._note(number, f"after frame {number} a frame came out of order and was left out")
                 continue
             self._note_lost(number - missing, number - 1)
+            self.concealed += concealed
+            if first and not concealed:
+                self._note(first, f"the decoder concealed errors in {_span(first, number - 1)}")
+            first = (first or number) if concealed else 0
             if not is_sampled(number, interval):
                 continue
             decoded, image = capture.retrieve()
@@ -345,6 +350,8 @@ class VideoSource(_Clip):
                 image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
                 yield Frame(number, stamps.time_s, image, damaged=getattr(capture, "damaged", False))
         number = self.last
+        if first:
+            self._note(first, f"the decoder concealed errors in {_span(first, number)}")
         if words := stamps.describe():
             self.notes.append(words)
         if self.exact and self.count and self.count > number:
@@ -381,10 +388,9 @@ class VideoSource(_Clip):
             raise LostInputError(f"{self.name} ended after frame {self.last} of {self._announced}")
 
     def _note_lost(self, first: int, last: int) -> None:
-        if first == last:
-            self._note(first, f"frame {first} could not be decoded and was left out")
-        elif first < last:
-            self._note(first, f"frames {first} to {last} could not be decoded and were left out")
+        if first <= last:
+            were = "was" if first == last else "were"
+            self._note(first, f"{_span(first, last)} could not be decoded and {were} left out")
 
     def _stored(self, read: Capture) -> int:
         """How many frames a file that was read to its end holds the data of, whether or not they can be decoded."""
@@ -401,6 +407,10 @@ class VideoSource(_Clip):
         if note := deep_grey_note(capture):
             self._note(1, note)
         return capture
+
+
+def _span(first: int, last: int) -> str:
+    return f"frame {first}" if first == last else f"frames {first} to {last}"
 
 
 def frame_times(source: Source) -> dict[int, float]:

@@ -152,7 +152,7 @@ class Player:
     ) -> None:
         self._recording, self._pace, self._queue, self._log = recording, pace, queue, log
         self._health, self._clock = health, clock
-        self.seeking = False
+        self.seeking, self._concealed = False, 0
         if isinstance(recording, (VideoSource, ImageSource)):
             recording.tolerant = True  # leave out single pictures of another size
         self.apart_s = 1 / (recording.rate_hz * pace) if pace else 0.0
@@ -200,6 +200,9 @@ class Player:
             queue.note(ended=True)
 
     def _report(self) -> None:
+        concealed = getattr(self._recording, "concealed", 0)
+        self._health.count("concealed", concealed - self._concealed)
+        self._concealed = concealed
         for problem in self._recording.problems:
             self._log.damaged(problem.what, problem.frame)
         self._recording.problems.clear()

@@ -146,8 +146,10 @@ class RunRecord:
 
     @property
     def input_name(self) -> str:
-        """The name of the clip or table, without its folder; empty where there is none."""
-        return readable(Path(str(self.facts.get("input", ""))).name)
+        """The name of the clips or the table, without folders; empty where there is none."""
+        given = self.facts.get("input", "")
+        names = given if isinstance(given, list) else [given]
+        return readable(", ".join(Path(str(name)).name for name in names))
 
     def note(
         self,
@@ -195,6 +197,7 @@ class RunRecord:
             "targets": self.targets,
             **self.counts,
             "notes": self.notes,
+            "ok": not self.problems,
             "problems": self.problems,
             "unreliable": self.unreliable.rows,
             "adjustments": self.adjustments.rows,
