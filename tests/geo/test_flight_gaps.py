@@ -80,6 +80,20 @@ def test_heights_above_the_sea_are_counted_from_the_take_off_of_the_cameras_file
     assert np.isnan(fill_gaps(above_sea, started, PARAMETERS, has_ground=True)[0].altitude_m[0])
 
 
+@pytest.mark.parametrize("has_ground", [False, True])
+@pytest.mark.parametrize(
+    ("height_m", "takeoff_m", "altitude_m"), [(1350.0, 1300.0, 50.0), (35.0, 1300.0, 35.0), (35.0, 0.0, 35.0)]
+)
+def test_heights_of_unknown_zero_count_from_the_take_off_where_they_would_lie_below_it(
+    height_m, takeoff_m, altitude_m, has_ground
+):
+    unknown = replace(log(altitude_m=np.nan, above_sea_m=height_m), height_zero="unknown")
+    started = replace(CAMERA, takeoff_above_sea_m=takeoff_m, given=frozenset({"takeoff_above_sea_m"}))
+    filled, notes = fill_gaps(unknown, started, PARAMETERS, has_ground)
+    assert filled.altitude_m[0] == altitude_m
+    assert bool([note for note in notes if "count from the take-off point" in note]) == (height_m == altitude_m)
+
+
 @pytest.mark.parametrize(
     ("heights", "unused"),
     [

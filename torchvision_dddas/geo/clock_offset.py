@@ -47,8 +47,8 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
     offset_s, sigma_s = found
     return (
         f"log and clip are not synchronised: the camera turns {abs(offset_s):.3f} s "
-        f"{'later' if offset_s > 0 else 'earlier'} in the pictures than in the log (sigma {max(sigma_s, 0.001):.3f} s), "
-        f"so set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
+        f"{'later' if offset_s > 0 else 'earlier'} in the pictures than in the log, sigma {max(sigma_s, 0.001):.3f} s; "
+        f"set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
     )
 
 

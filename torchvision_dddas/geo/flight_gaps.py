@@ -37,7 +37,8 @@ def fill_gaps(
         if used:
             words = "it is taken" if len(used) == 1 else "they are taken"
             notes.append(f"the log does not say {', '.join(used)}: {words} from camera {camera.name}")
-        if np.array_equal(telemetry.altitude_m, telemetry.above_sea_m):
+        is_alike = np.array_equal(telemetry.altitude_m, telemetry.above_sea_m, equal_nan=True)
+        if "takeoff_above_sea_m" in used and telemetry.height_zero == "unknown" and is_alike:
             notes.append("the heights of the log count from the take-off point: above the sea they would lie below it")
         reasons: dict[str, list[str]] = {}
         for key in (key for key in known_keys(camera) if key not in used):

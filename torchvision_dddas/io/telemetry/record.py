@@ -286,7 +286,7 @@ def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
     ellipsoid, lower = samples.get("above_ellipsoid_m"), samples.get("altitude_m")
     if ellipsoid is not None and geoid is not None and "above_sea_m" not in samples:
         up_m = np.interp(ellipsoid[:, 0], geoid[:, 0], geoid[:, 1])
-        samples["above_sea_m"] = ellipsoid - up_m[:, None] * [0, 1, 0]
+        samples["above_sea_m"] = np.column_stack([ellipsoid[:, 0], ellipsoid[:, 1] - up_m, ellipsoid[:, 2]])
         log.note("the heights above the sea are those above the ellipsoid less the log's own height of the geoid")
     if bare is None or "above_sea_m" in samples:
         return

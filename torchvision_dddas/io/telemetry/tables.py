@@ -240,6 +240,7 @@ class _Table:
         is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, self.names.order, order, "a cell")
         return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
 
+    @np.errstate(over="ignore", invalid="ignore")  # numbers may be any
     def _times(self, values: dict[str, np.ndarray], zone: tzinfo | None) -> tuple[np.ndarray, float]:
         """Seconds since the first row, (N,), and when that was since 1970."""
         columns = self.columns["time"][:_CLOCKS]
