@@ -10,7 +10,18 @@ import numpy as np
 
 from tests.evaluation.datasets.layouts import MAKE
 from tests.io.clips import write_by_av, write_video
-from tests.io.flights import attitude, eastward, packet, sentence, spread, tlog, transport_stream, ulog
+from tests.io.flights import (
+    attitude,
+    dataflash,
+    dataflash_text,
+    eastward,
+    packet,
+    sentence,
+    spread,
+    tlog,
+    transport_stream,
+    ulog,
+)
 
 FEATURES = 3780
 """Of the descriptor that the classifiers here fit."""
@@ -103,7 +114,7 @@ TEXT: dict[str, tuple[str, ...]] = {
         "# by a program\n"
         + _rows("Date,Time,GPS,Alt(m),Yaw(rad),fix_type", "8/26/2022,15:41:0{i}.9,48.1{i}N 11.5W,5{i},1.5,3"),
         "time\tlat\tlon\talt_ellipsoid\tundulation\tzoom\tfocal_len\ns\tdeg\tdeg\tft\tm\t\t\n"
-        + _rows("0\t481\t115\t1\t1\t179\t24", "{i}00\t4810000{i}\t115000000\t{even}\t47\t1790\t240").replace("time", "t"),
+        + _rows("0\t481\t115\t1\t1\t179\t24", "{i}00\t4810000{i}\t115000000\t{even}\t47\t1790\t240").replace("time", "t"),  # noqa: E501
     ),
     "subtitles": (
         _subtitles(
@@ -125,6 +136,7 @@ TEXT: dict[str, tuple[str, ...]] = {
     "nmea": (
         "\r\n".join(sentence(line.format(i=i)) for i in range(8) for line in _NMEA),
         "\n".join(line.format(i=i) for i in range(8) for line in (*_UNCHECKED, "$HETHS,274.0,A")),
+        "\n".join(f"NMEA,{sentence(line.format(i=i))},149900000{i}" for i in range(8) for line in _NMEA),
     ),
     "classifier text": ("# weights\n" + "0.25 " * FEATURES + "\n-1.5\n", ",".join(["1e-3"] * FEATURES)),
     "seqinfo": ("[Sequence]\nname=x\nimDir=img1\nframeRate=30\nseqLength=5\nimWidth=640\nimHeight=480\nimExt=.jpg\n",),
@@ -166,7 +178,8 @@ def mavlink() -> list[bytes]:
     said = eastward(10)
     angles = {"roll": 0, "pitch": -30, "yaw": 5}
     turns = [(row[0], "MOUNT_ORIENTATION", {"time_boot_ms": 5000 + 125 * k, **angles}) for k, row in enumerate(said)]
-    return [tlog(said, version=1), tlog(sorted(said + turns, key=lambda row: row[0]), version=2)]
+    others = tlog(said[:6], system=255, component=190) + tlog(turns[:6], component=154)
+    return [tlog(said, version=1), tlog(sorted(said + turns, key=lambda row: row[0]), version=2) + others]
 
 
 @cache
@@ -178,7 +191,27 @@ def px4() -> list[bytes]:
         "vehicle_local_position": (local, [(100_000 * i, i, 0, -50, 1, 0, 1, 1) for i in range(12)]),
         "vehicle_attitude": (["float[4] q"], [(100_000 * i, 1, 0, 0, 0) for i in range(12)]),
     }
-    return [ulog(topics)]
+    receiver = ["double latitude_deg", "double longitude_deg", "double altitude_msl_m", "uint8_t fix_type"]
+    fixes = {f"sensor_gps {k}": (receiver, [(100_000 * i, 32.2, -110.9, 800, 3 * k) for i in range(6)]) for k in (0, 1)}
+    return [ulog(topics), ulog(fixes)]
+
+
+_KINDS = {
+    "GPS": ("QBBIHBcLLffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,U"),
+    "POS": ("QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
+    "ATT": ("QcC", "TimeUS,Roll,Yaw"),
+    "MNT": ("QBfffff", "TimeUS,I,Roll,Pitch,YawB,YawE,Dist"),
+}
+
+
+@cache
+def ardupilot(as_text: bool) -> list[bytes]:
+    rows: list[tuple] = []
+    for i in range(8):
+        us, clock, place = 1_000_000 + 200_000 * i, (200 * i, 2300, 9, 0.9), (32.2, -110.9 + 1e-5 * i, 800.0)
+        rows += [("GPS", us, k, 3 * k, *clock, *place, 5.0, 90.0, 0.0, 1) for k in (0, 1)]
+        rows += [("POS", us, *place, 50.0, 51.0), ("ATT", us, 0, 90), ("MNT", us, 0, 0.0, -30.0, 5.0, 95.0, 0.0)]
+    return [dataflash_text(_KINDS, rows).encode()] if as_text else [dataflash(_KINDS, rows)]
 
 
 @cache
@@ -186,7 +219,10 @@ def klv(in_stream: bool) -> list[bytes]:
     view = {16: spread(60, 0, 180, 2), 25: spread(300, -900, 19000, 2)}
     packets = [packet(i, {**attitude(159.97, -0.43, 3.4, 100, -30, 0), **view}) for i in range(6)]
     times = [3600 * i for i in range(6)]
-    return [transport_stream(times, list(zip(times, packets, strict=True))) if in_stream else b"".join(packets)]
+    others = [one[:-2] + b"\0\0" for one in packets]
+    if in_stream:
+        return [transport_stream(times, list(zip(times, some, strict=True))) for some in (packets, others)]
+    return [b"".join(packets), b"\0lead" + b"".join(others)]
 
 
 @cache

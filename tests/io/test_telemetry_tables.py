@@ -66,7 +66,7 @@ PROGRAMS = {
         },
     ),
     "AirData with ascent and altitude alone": (
-        table("time(millisecond),datetime(utc),latitude,longitude,altitude(m),ascent(m)", "{i}00,2022-08-26 12:00:00,41,-91,250,50"),
+        table("time(millisecond),datetime(utc),latitude,longitude,altitude(m),ascent(m)", "{i}00,2022-08-26 12:00:00,41,-91,250,50"),  # noqa: E501
         {"altitude": 50, "sea": 250, "start": NOON_UTC_S},
     ),
     "Litchi": (
@@ -102,7 +102,7 @@ PROGRAMS = {
             "time_s,lat,lng,alt_m,height_m,vps_height_m,altitude_m,speed_ms,pitch,roll,yaw,gimbal_pitch,gimbal_yaw",
             "{i},35.1,-110.4,40,40,39.5,1540,3,-5,0,90,-60,95",
         ),
-        {"altitude": 40, "zero": "takeoff", "sea": 1540, "speed": 3, "nose": 90, "heading": 95, "pitch": 60, "roll": None},
+        {"altitude": 40, "zero": "takeoff", "sea": 1540, "speed": 3, "nose": 90, "heading": 95, "pitch": 60, "roll": None},  # noqa: E501
     ),
     "QGroundControl": (
         table(
@@ -121,18 +121,18 @@ PROGRAMS = {
             "08/26/2022 12:00:00\t0.{i}69\tx\t1\t37.7\t-122.4\t10\t164.042\t33.1\t37\t-60\t33.9",
         )
         + "#Session End\nDate/Time (UTC)\t08/26/2022 12:01:00\n",
-        {"times": [0, 0.1], "altitude": 50, "latitude": 37.7, "nose": 33.1, "heading": 33.9, "start": NOON_UTC_S - 0.069},
+        {"times": [0, 0.1], "altitude": 50, "latitude": 37.7, "nose": 33.1, "heading": 33.9, "start": NOON_UTC_S - 0.069},  # noqa: E501
     ),
     "SkyHub": (
         table(
-            "Elapsed,Date,Time,Pitch,Roll,Yaw,Latitude,Longitude,Altitude,Velocity,RTK Status,Latitude RTK,Altitude RTK",
+            "Elapsed,Date,Time,Pitch,Roll,Yaw,Latitude,Longitude,Altitude,Velocity,RTK Status,Latitude RTK,Altitude RTK",  # noqa: E501
             "{i}00,2022/08/26,12:00:00.{i}00,1,2,90,56.9,24.1,20,3,OFF,0,0",
         ),
         {"times": [0, 0.1], "altitude": 20, "zero": "takeoff", "nose": 90, "speed": 3, "latitude": 56.9},
     ),
     "EdgeTX": (
         table("Date,Time,GPS,Alt(m),Yaw(rad),Hdg(@),GSpd(kts)", "2022-08-26,12:00:0{i}.000,48.1 11.5,50,1.5708,10,10"),
-        {"latitude": 48.1, "longitude": 11.5, "altitude": None, "zero": "unknown", "sea": 50, "nose": 90, "speed": 5.144},
+        {"latitude": 48.1, "longitude": 11.5, "altitude": None, "zero": "unknown", "sea": 50, "nose": 90, "speed": 5.144},  # noqa: E501
     ),
     "ulog2csv, long after the start": (
         table(
@@ -146,7 +146,7 @@ PROGRAMS = {
             "timestamp,time_utc_usec,lat,lon,alt,alt_ellipsoid,s_variance_m_s,fix_type,vel_m_s",
             "7{i}00000,16615152000{i}0000,473977420,85455950,488080,535000,0.5,3,1.5",
         ),
-        {"latitude": 47.397742, "longitude": 8.545595, "sea": 488.08, "ellipsoid": 535, "speed": 1.5, "start": NOON_UTC_S},
+        {"latitude": 47.397742, "longitude": 8.545595, "sea": 488.08, "ellipsoid": 535, "speed": 1.5, "start": NOON_UTC_S},  # noqa: E501
     ),
     "ulog2csv of a new receiver": (
         table(
@@ -160,7 +160,7 @@ PROGRAMS = {
         {"altitude": 30, "zero": "takeoff", "nose": 90, "times": [0, 0.1]},
     ),
     "mavlogdump POS": (
-        table("timestamp,TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt", "1661515200.{i},8{i}00000,-35.36,149.16,584.4,-0.26,-1.2"),
+        table("timestamp,TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt", "1661515200.{i},8{i}00000,-35.36,149.16,584.4,-0.26,-1.2"),  # noqa: E501
         {"altitude": -0.26, "zero": "takeoff", "sea": 584.4, "times": [0, 0.1], "start": NOON_UTC_S},
     ),
     "mavlogdump GPS": (
@@ -168,7 +168,7 @@ PROGRAMS = {
         {"speed": 0.2, "sea": 588.8, "nose": None, "latitude": -35.36},
     ),
     "mavlogdump MNT": (
-        table("timestamp,TimeUS,I,DesRoll,Roll,DesPitch,Pitch,DesYawE,YawE", "1661515200.{i},8{i}00000,0,0,1,-45,-44,0,95"),
+        table("timestamp,TimeUS,I,DesRoll,Roll,DesPitch,Pitch,DesYawE,YawE", "1661515200.{i},8{i}00000,0,0,1,-45,-44,0,95"),  # noqa: E501
         {"pitch": 44, "roll": 1, "heading": 95, "nose": None},
     ),
     "mavlogdump BARO": (
@@ -214,7 +214,7 @@ PROGRAMS = {
         {"altitude": 50, "ellipsoid": 120, "sea": None, "pitch": 45, "nose": 90, "start": NOON_UTC_S},
     ),
     "UgCS": (
-        table("Time,Latitude,Longitude,Altitude RAW,Altitude AMSL (m),Altitude [AGL]", "2022-08-26T12:00:0{i}Z,37,-122,50,150,45"),
+        table("Time,Latitude,Longitude,Altitude RAW,Altitude AMSL (m),Altitude [AGL]", "2022-08-26T12:00:0{i}Z,37,-122,50,150,45"),  # noqa: E501
         {"altitude": 45, "zero": "ground", "sea": 150},
     ),
     "the fields of a subtitle": (
@@ -420,7 +420,7 @@ def test_flights_one_after_the_other_whose_times_run_back_are_told_apart_by_date
     rows = ["".join(f"{k}00,2022-08-26 1{h}:00:0{k},48.1,11.5,50\n" for k in range(9)) for h in (2, 3)]
     flown = fly("time(ms),datetime(utc),lat,lon,relative_altitude\n" + "".join(rows))
     assert math.isnan(flown.at(1800.0).altitude_m) and flown.time_s[-1] == 3608
-    with pytest.raises(InputError, match="time runs back from 8.000 to 0.000 s; are these two recordings"):
+    with pytest.raises(InputError, match=r"time runs back from 8\.000 to 0\.000 s; are these two recordings"):
         fly(f"{PLACE}\n" + "".join(f"{k % 9},48.1,11.5,50\n" for k in range(18)))
 
 
