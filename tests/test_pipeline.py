@@ -72,7 +72,7 @@ def test_a_log_that_is_not_synchronised_with_the_clip_is_noted_after_the_last_fr
     time_s = np.arange(120) / 10
     heading = 0.3 * np.sin(time_s / 1.3) + 0.2 * np.sin(time_s / 0.7)
     still, place = np.zeros(120), np.tile([5.0, 7.0], (120, 1))
-    turned = {"heading_rad": heading % (2 * np.pi), "pitch_rad": still + np.pi / 2, "roll_rad": still}
+    turned: Any = {"heading_rad": heading % (2 * np.pi), "pitch_rad": still + np.pi / 2, "roll_rad": still}
     log = Telemetry(time_s - late_s, still + 50, still, place, False, **turned)
 
     class Clip:

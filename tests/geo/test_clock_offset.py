@@ -122,7 +122,7 @@ def fly(length_s=12.0, rate_hz=10.0, late_s=0.0):
         ground = before.place_m + np.c_[corners @ np.array([[0.5, 0], [0, 0.5]]), np.zeros(5)]
         ground[:, 2] = 0.0
         seen = [project(ground, pose, CAMERA) for pose in (before, now)]
-        motions.append(cv2.findHomography(*seen)[0])
+        motions.append(cv2.findHomography(seen[0], seen[1])[0])
     return telemetry, list(zip(time_s.tolist(), motions, strict=True))
 
 
@@ -133,7 +133,8 @@ def test_the_turns_of_a_log_are_those_of_the_registrations_of_level_ground():
     for turn, (_, motion) in list(zip(turns, seen, strict=True))[1:]:
         middle = motion @ [u, v, 1]
         assert middle[:2] / middle[2] == pytest.approx([u - turn[1] * fu, v + turn[0] * fv], abs=0.05)
-        flat = np.linalg.inv([[fu, 0, u], [0, fv, v], [0, 0, 1]]) @ motion @ [[fu, 0, u], [0, fv, v], [0, 0, 1]]
+        pixels = np.array([[fu, 0, u], [0, fv, v], [0, 0, 1]], float)
+        flat = np.linalg.inv(pixels) @ motion @ pixels
         flat /= flat[2, 2]
         assert (flat[0, 1] - flat[1, 0]) / 2 == pytest.approx(turn[2], abs=1e-4)
     # Of ground at an unknown depth the camera's own turn remains.

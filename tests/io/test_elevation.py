@@ -233,3 +233,31 @@ def test_a_white_band_of_a_photo_is_no_hole(tmp_path):
     found = read_ortho(write(tmp_path / "a.tif", photo, nodata=255), HERE, ORIGIN, 20)
     middle = found.image.shape[0] // 2
     assert found.image[middle, middle].tolist() == [90, 90, 255]
+
+
+@pytest.mark.parametrize("of", ["strip", "tile", "overview"])
+def test_a_raster_whose_strips_or_tiles_take_too_much_memory_is_refused(tmp_path, monkeypatch, of):
+    path, side = tmp_path / "a.tif", 64 if of == "overview" else 512
+    blocks = {"tiled": of != "strip", "blockysize": side, "compress": "deflate"}
+    write(path, slope(cells=1024), **blocks, **({"blockxsize": side} if of != "strip" else {}))
+    if of == "overview":
+        with rasterio.Env(GDAL_TIFF_OVR_BLOCKSIZE=512), rasterio.open(path, "r+") as file:
+            file.build_overviews([2])
+    assert read_elevation(path, HERE, ORIGIN, 60).base_m == pytest.approx(1300, abs=0.2)
+    monkeypatch.setenv("DDDAS_MEMORY_MB", "1")
+    with pytest.raises(InputError, match=r"a\.tif has strips or tiles of (512|1024)x512 cells; that takes [12] MB of"):
+        read_elevation(path, HERE, ORIGIN, 60)
+
+
+@pytest.mark.parametrize("side", [30_000, 29_999])
+def test_a_raster_of_one_huge_strip_in_a_file_of_bytes_is_refused(tmp_path, side):
+    path = tmp_path / "a.tif"
+    shape = {"height": side, "width": side, "count": 1, "dtype": "float32", "blockysize": side, "sparse_ok": True}
+    shape["compress"] = "deflate"  # libtiff reads a strip that is not compressed in parts
+    corner = rasterio.transform.from_origin(*centre("EPSG:32612"), 1, 1)
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32612", transform=corner, **shape):
+        pass
+    assert path.stat().st_size < 1000
+    for read_it in (read_elevation, read_ortho):
+        with pytest.raises(InputError, match=f"has strips or tiles of {side}x{side} cells; that takes 3,600 MB of"):
+            read_it(path, HERE, ORIGIN)

@@ -22,11 +22,12 @@ from torchvision_dddas.evaluation.evaluate import Result, load_result
 from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.io import detection_tables
 from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
-from torchvision_dddas.io.images import read_image, size_in_header
-from torchvision_dddas.io.sources import ImageSource
+from torchvision_dddas.io.images import decode_image, read_image, size_in_header
+from torchvision_dddas.io.sources import ImageSource, VideoSource
 from torchvision_dddas.io.tables import read_csv
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import KEY, local_sets
+from torchvision_dddas.memory import check_memory
 from torchvision_dddas.people.classifiers import read_classifier
 
 SECONDS = 15.0
@@ -237,28 +238,122 @@ def announced(suffix, width, height):
     return data.replace(b"64 48", f"{width} {height}".encode(), 1)
 
 
+def chunk(kind, data, length=None):
+    """A chunk of a PNG, which says another length than it has."""
+    size = struct.pack(">I", len(data) if length is None else length)
+    return size + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def jpeg2000(width, height, boxes=True):
+    """A blank JPEG 2000 of some hundred bytes; without boxes its bare codestream."""
+    data = cv2.imencode(".jp2", np.zeros((height, width), np.uint8))[1].tobytes()
+    return data if boxes else data[data.index(b"\xff\x4f\xff\x51") :]
+
+
+def tiff_of_one_tile(width, height, side):
+    """A picture's directory alone, whose tile is larger than the picture. Tags of 2 bytes each."""
+    tags = {256: width, 257: height, 258: 8, 259: 1, 262: 1, 277: 1, 322: side, 323: side, 324: 8, 325: 1}
+    entries = b"".join(struct.pack("<HHIHH", tag, 3, 1, value, 0) for tag, value in tags.items())
+    return b"II*\0\x08\0\0\0" + struct.pack("<H", len(tags)) + entries + bytes(4)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg", ".tif", ".pgm"])
 def test_a_picture_of_too_many_pixels_is_refused_by_its_header(tmp_path, monkeypatch, suffix):
     path = tmp_path / f"1{suffix}"
     path.write_bytes(announced(suffix, 20_000, 20_000))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     for read_it in (read_image, read_mask, lambda p: ImageSource([p], "clip")):
-        with pytest.raises(InputError, match=r"1.* is 20000x20000 pixels; wanted at most 100,000,000"):
+        with pytest.raises(InputError, match=r"1.* is 20000x20000 pixels; that takes .* MB of memory, wanted at most"):
             read_it(path)
 
 
-def test_the_limit_of_pixels_can_be_set(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("content", "width"),
+    [
+        (jpeg2000(4200, 4200, boxes=False), 4200),
+        (jpeg2000(4200, 4200).replace(struct.pack(">II", 4200, 4200), struct.pack(">II", 99, 99), 1), 4200),
+        (jpeg2000(99, 99).replace(struct.pack(">II", 99, 99), struct.pack(">II", 4200, 4200), 1), 4200),
+        (tiff_of_one_tile(9, 9, 30_000), 30_000),
+        (announced(".jpg", 20_000, 20_000).replace(b"\xff\xdb", b"rubbish\xff\xff\xff\xdb", 1), 20_000),
+        (announced(".pgm", 20_000, 20_000).replace(b"P5", b"P5" + b" " * 5000 + b"#" * 5000, 1), 20_000),
+        (announced(".bmp", 20_000, -20_000), 20_000),
+    ],
+    ids=[
+        "bare codestream",
+        "small box",
+        "large box",
+        "tile",
+        "rubbish between segments",
+        "long comment",
+        "upside down",
+    ],
+)
+def test_the_size_that_counts_is_the_one_that_the_decoder_makes_room_for(monkeypatch, content, width):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InputError, match=f"a picture is {width}x{width} pixels; that takes"):
+        decode_image(content, cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"P7\nWIDTH 40000\nHEIGHT 40000\nDEPTH 3\nMAXVAL 255\nTUPLTYPE RGB\nENDHDR\n",
+        b"PF\n40000 40000\n-1.0\n",
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 40000 +X 40000\n",
+        struct.pack(">8I", 0x59A66A95, 40_000, 40_000, 24, 0, 1, 0, 0),
+        b"\x76\x2f\x31\x01\x02\0\0\0channels",
+        b"P5" + b" " * 200_000 + b"x",
+        b"\xff\xd8" + b"\xff" * 200_000,
+        b"II*\0",
+    ],
+    ids=["PAM", "PFM", "HDR", "Sun raster", "EXR", "endless blanks", "endless fill bytes", "cut short"],
+)
+def test_a_picture_whose_size_is_not_known_is_not_decoded(monkeypatch, content):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    assert decode_image(content + bytes(50), cv2.IMREAD_UNCHANGED) is None
+
+
+@pytest.mark.parametrize("length", [0xFFFFFFF0, 0x7FFFFFF0, 1])
+def test_a_png_whose_end_says_a_length_is_not_decoded(monkeypatch, length):
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 2, 0, 0, 0)) + chunk(b"acTL", struct.pack(">II", 2, 0))
+    content = b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(4))) + chunk(b"IEND", b"", length)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    assert decode_image(content, cv2.IMREAD_UNCHANGED) is None
+
+
+def test_a_large_file_may_take_more_memory_than_a_small_one():
+    check_memory(5e9, "a.png is large", 5_000_000)
+    with pytest.raises(InputError, match=r"a\.png is large; that takes 5,000 MB of memory, wanted at most 1,000 MB"):
+        check_memory(5e9, "a.png is large", 4_999_999)
+    with pytest.raises(InputError, match="that takes 7,000 MB of memory, wanted at most 6,000 MB: make it smaller"):
+        check_memory(7e9, "a camera is large")
+
+
+def test_the_budget_of_memory_can_be_set(tmp_path, monkeypatch):
     path = tmp_path / "1.png"
-    path.write_bytes(announced(".png", 64, 48))
-    monkeypatch.setenv("DDDAS_MOST_PIXELS", "3072")
-    assert np.asarray(read_image(path)).shape == (48, 64)
-    monkeypatch.setenv("DDDAS_MOST_PIXELS", "3071")
-    with pytest.raises(InputError, match="64x48 pixels; wanted at most 3,071"):
+    path.write_bytes(announced(".png", 200, 100))
+    monkeypatch.setenv("DDDAS_MEMORY_MB", "1")
+    with pytest.raises(InputError, match="200x100 pixels; that takes 1 MB of memory, wanted at most 1 MB: make it"):
         read_image(path)
-    for words in ("many", "9" * 5000):
-        monkeypatch.setenv("DDDAS_MOST_PIXELS", words)
-        with pytest.raises(InputError, match=f"DDDAS_MOST_PIXELS is '{words[:4]}"):
+    monkeypatch.setenv("DDDAS_MEMORY_MB", "2")
+    assert read_image(path) is None  # its header told a lie
+    for words in ("many", "0", "9" * 5000):
+        monkeypatch.setenv("DDDAS_MEMORY_MB", words)
+        with pytest.raises(InputError, match=f"DDDAS_MEMORY_MB is '{words[:4]}"):
             read_image(path)
+
+
+@pytest.mark.parametrize("suffix", [".avi", ".mp4"])
+def test_a_video_of_too_many_pixels_is_refused_before_a_frame_is_read(tmp_path, monkeypatch, suffix):
+    path = str(tmp_path / f"a{suffix}")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*("MJPG" if suffix == ".avi" else "mp4v")), 10, (640, 480))
+    for _ in range(3):
+        writer.write(np.zeros((480, 640, 3), np.uint8))
+    writer.release()
+    assert VideoSource(path, "a").size == (640, 480)
+    monkeypatch.setenv("DDDAS_MEMORY_MB", "30")
+    with pytest.raises(InputError, match="a has frames of 640x480 pixels; that takes 31 MB of memory, wanted at most"):
+        VideoSource(path, "a")
 
 
 @pytest.mark.parametrize("suffix", [".webp", ".jp2", ".gif", ".png", ".bmp", ".jpg", ".tif", ".ppm"])
@@ -311,30 +406,64 @@ def test_a_classifier_of_too_many_numbers_is_refused_by_their_count(tmp_path, pa
         read_classifier(path, 3780)
 
 
+def array(shape, kind="<f8", numbers=b""):
+    """An array in NumPy's format, whose header may announce more than follows."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": kind, "fortran_order": False, "shape": shape})
+    return file.getvalue() + numbers
+
+
+def archive(path, **members):
+    """An .npz of members by name."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    return path
+
+
+LONG_HEADER = b"\x93NUMPY\2\0\xf0\xff\xff\x7f" + bytes(1000)
+ANNOUNCED = "announces 400000 x 1000 numbers; wanted at most 1,000,000"
+
+
 @pytest.mark.parametrize("kind", [".npy", ".npz"])
-def test_an_array_of_too_many_numbers_is_refused_by_its_header(tmp_path, monkeypatch, kind):
-    path, file = tmp_path / f"a{kind}", io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (400_000, 1000)})
+@pytest.mark.parametrize(
+    ("content", "words"), [(array((400_000, 1000)), ANNOUNCED), (LONG_HEADER, "a header of 2,147,483,632 bytes")]
+)
+def test_an_array_of_too_many_numbers_is_refused_by_its_header(tmp_path, monkeypatch, kind, content, words):
+    path = tmp_path / f"a{kind}"
     if kind == ".npy":
-        path.write_bytes(file.getvalue())
+        path.write_bytes(content)
     else:
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("weights.npy", file.getvalue())
-    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was loaded"))
-    with pytest.raises(InputError, match="announces 400000 x 1000 numbers; wanted at most 1,000,000"):
+        archive(path, **{"weights.npy": content})
+    monkeypatch.setattr(np.lib.format, "read_array", lambda *_, **__: pytest.fail("it was loaded"))
+    with pytest.raises(InputError, match=words):
         read_classifier(path, 3780)
+
+
+def test_of_an_archive_only_the_arrays_of_a_classifier_are_read(tmp_path):
+    others = {f"a{k}.npy": array((900_000,), numbers=bytes(7_200_000)) for k in range(5)}
+    others |= {"weights": array((50_000_000,)), "rubbish": bytes(50_000_000)}
+    weights = {"weights.npy": array((3,), numbers=np.arange(3.0).tobytes())}
+    path = archive(tmp_path / "a.npz", **others, **weights)
+    tracemalloc.start()
+    assert read_classifier(path, 3).weights.tolist() == [0, 1, 2]
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 5_000_000
+    with pytest.raises(InputError, match="holds a0, a1, a2, a3, a4; wanted weights, and a bias"):
+        read_classifier(archive(tmp_path / "b.npz", **others), 3)
 
 
 def test_a_table_of_too_many_boxes_in_a_frame_is_refused(tmp_path):
     path = tmp_path / "a.txt"
-    path.write_text("".join(f"{frame},{k + 1},{k},1,1,1,1\n" for frame in (1, 2, 3) for k in range(3001)))
+    path.write_text("".join(f"{frame},{k + 1},{k},1,1,1,1\n" for frame in (1, 2, 3) for k in range(1001)))
     for read_it in (detection_tables.read_detections, load_truth, load_result):
-        with pytest.raises(InputError, match="has 3001 boxes in frame 1; wanted at most 3000 in a frame"):
+        with pytest.raises(InputError, match="has 1001 boxes in frame 1; wanted at most 1000 in a frame"):
             read_it(path)
     for read_places, kind in ((read_positions, "target"), (read_landmarks, "landmark")):
-        rows = "".join(f"7,{k + 1},{k},1\n" for k in range(3001))
+        rows = "".join(f"7,{k + 1},{k},1\n" for k in range(1001))
         (tmp_path / "a.csv").write_text(f"frame,{kind},east_m,north_m\n{rows}")
-        with pytest.raises(InputError, match=r"has 3001 (places|landmarks) in frame 7; wanted at most 3000 in a frame"):
+        with pytest.raises(InputError, match=r"has 1001 (places|landmarks) in frame 7; wanted at most 1000 in a frame"):
             read_places(tmp_path / "a.csv")
     result = CliRunner().invoke(app, ["track", "--detections", str(path), "--out", str(tmp_path / "out")])
-    assert result.exit_code == 2 and "3001 boxes" in result.output and "Traceback" not in result.output
+    assert result.exit_code == 2 and "1001 boxes" in result.output and "Traceback" not in result.output

@@ -35,12 +35,17 @@ def scored(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "sizes", [(16, 200_000, 5000, 20_000), (40, 1, 5000, 1), (72, 30_000, 1, 3000), (1000, 10**6, 10**6, 10**6)]
+    "sizes",
+    [
+        *((16, 200_000, 5000, 20_000, 10**7, 1), (40, 1, 5000, 1, 10**7, 10**7)),
+        *((72, 30_000, 1, 3000, 40_000, 1), (1000, 10**6, 10**6, 10**6, 1, 10**7)),
+    ],
 )
-def test_the_sizes_of_tiles_bands_and_batches_do_not_change_the_scores(monkeypatch, sizes):
+def test_the_sizes_of_tiles_bands_strips_and_batches_do_not_change_the_scores(monkeypatch, sizes):
     image = picture()
     wanted = scored(image)
-    for name, size in zip(("_TILE_PX", "_GRADIENT_PX", "_BLOCKS", "_BAND_PX"), sizes, strict=True):
+    names = ("_TILE_PX", "_GRADIENT_PX", "_BLOCKS", "_BAND_PX", "_STRIP_PX", "_FEW_VALUES")
+    for name, size in zip(names, sizes, strict=True):
         monkeypatch.setattr(onnx_scorer, name, size)
     np.testing.assert_allclose(scored(image), wanted, atol=5e-6, rtol=0)
 

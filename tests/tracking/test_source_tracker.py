@@ -250,3 +250,19 @@ def test_without_something_to_link_nothing_is_decided(rule):
     none = Detections(np.zeros((0, 4)), np.zeros(0))
     fed = [tracker.feed(n, given, None, None) for n, given in enumerate((none, none, one, none, none, none, one), 1)]
     assert [settled[0].appearance for settled in fed] == [None] * 7
+
+
+@pytest.mark.parametrize(("window", "is_refused"), [(3, True), (2, False)])
+def test_more_targets_than_the_memory_of_a_window_allows_are_refused_before_they_are_compared(window, is_refused):
+    tracker = source_tracker.SourceTracker(with_parameters(Settings(), {"paper.window": window}), 1)
+    box_px = np.stack([*np.divmod(np.arange(300), 20), np.full(300, 0.5), np.full(300, 0.5)], axis=1) * 20.0
+    detections = Detections(box_px, *np.ones((4, 300)))
+    for frame in (1, 2):
+        tracker.feed(frame, detections)
+    if is_refused:
+        with pytest.raises(
+            InputError, match=r"paper.window = 3 with 300 targets in a frame has 27,270,901 combinations"
+        ):
+            tracker.feed(3, detections)
+    else:
+        assert len(tracker.feed(3, detections)[0].identity) == 300

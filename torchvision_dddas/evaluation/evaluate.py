@@ -25,6 +25,7 @@ from torchvision_dddas.evaluation.metrics.truth import (
     read_rows,
 )
 from torchvision_dddas.io.images import decode_image
+from torchvision_dddas.memory import MASK
 
 DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
 
@@ -118,7 +119,7 @@ class Result:
     def mask_at(self, frame: int) -> np.ndarray:
         """(H, W) mask of a frame. Raises InputError if it is not there."""
         path = self.place / "masks" / f"{frame:06d}.png"
-        mask = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path) if path.is_file() else None
+        mask = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK) if path.is_file() else None
         if mask is None:
             raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
         return mask if mask.ndim == 2 else mask.max(axis=2)

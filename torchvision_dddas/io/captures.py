@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
+from pathlib import Path
 from typing import Any, Protocol, cast
 
 # FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
@@ -16,6 +17,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import utf8_name
 from torchvision_dddas.io.images import quiet_opencv
+from torchvision_dddas.memory import VIDEO, check_memory
 
 # FFmpeg draws any text file as an old terminal would, which is never wanted.
 _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
@@ -72,6 +74,9 @@ def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
     if code.decode("latin-1") in _TEXT_AS_VIDEO:
         capture.release()
         raise InputError(f"{name} is a text file, not a video")
+    _check_size(
+        target, name, *(int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    )
     if _grey_form(capture) == _GREY16 and not is_live(target):
         capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     return capture
@@ -130,6 +135,7 @@ class AvCapture:
         if not films or films[0].codec_context.name in _TEXT_AS_VIDEO:
             self._container.close()
             raise InputError(f"{name} is {'a text file, not' if films else 'no'} video")
+        _check_size(target, name, films[0].width, films[0].height)
         self._video, self._reformatter = films[0], cast(Any, VideoReformatter())
         self._tick_s = float(self._video.time_base or 0)
         # H.264 conceals errors, and says so, only if its slices are not decoded in parallel. Frames in parallel come
@@ -252,6 +258,11 @@ def announced_hz(capture: Capture) -> float | None:
     """The rate that a video or stream announces; None where nothing credible is."""
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
     return rate_hz if 0 < rate_hz <= 1000 else None
+
+
+def _check_size(target: str | int, name: str, width: int, height: int) -> None:
+    size = None if isinstance(target, int) or is_live(target) else Path(target).stat().st_size
+    check_memory(VIDEO * width * height, f"{name} has frames of {width}x{height} pixels", size)
 
 
 def _is_cover(video: Any) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import DEGREE_M
+from torchvision_dddas.memory import check_memory
 from torchvision_dddas.types import Elevation, Ortho
 
 LOWEST_M, HIGHEST_M = -500.0, 9000.0
@@ -25,8 +26,11 @@ MOST_PX = 1600
 Degrees = tuple[float, float] | None
 """Longitude and latitude of the origin of local metres; None where these are a raster's own coordinates."""
 
-_ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO"}
-"""GDAL's settings under which it opens nothing beside a raster: such files may name others, also in the network."""
+_ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO", "GDAL_CACHEMAX": 64}
+"""GDAL's settings under which it opens nothing beside a raster: such files may name others, also in the network.
+
+Its cache of blocks holds 64 MB; by default it is 5 % of the machine's memory.
+"""
 
 Grid = tuple[np.ndarray, np.ndarray, float]
 """Values (R, C) or (B, R, C), rows to the north, NaN where a raster has none; place of the first; metres a cell."""
@@ -118,6 +122,7 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
                 raise InputError(f"{what} {path} does not say where it lies; wanted a georeferenced GeoTIFF")
             if not (np.isfinite([*t]).all() and 0 < abs(t.a * t.e - t.b * t.d) < math.inf):
                 raise InputError(f"{what} {path} is damaged: its cells have no size")
+            _check_blocks(raster, f"{what} {path}")
             if origin_deg is not None and raster.crs is None:
                 raise InputError(
                     f"{what} {path} has no CRS: where it lies is not known; wanted a georeferenced GeoTIFF"
@@ -130,6 +135,20 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
             yield raster
     except (RasterioError, OSError) as error:
         raise InputError(f"{what} {path} cannot be read as a raster: {' '.join(str(error).split())}") from None
+
+
+def _check_blocks(raster: Any, name: str) -> None:
+    """Raise InputError if a strip or tile of a raster, which is read as a whole, takes more memory than it may."""
+    import rasterio
+
+    copies = raster.count if raster.count == 1 else 2 * raster.count  # as stored, and by bands
+    levels = [{}, *({"overview_level": level} for level in range(len(raster.overviews(1))))]
+    for level in levels:
+        with rasterio.open(raster.name, driver="GTiff", **level) as opened:
+            rows, columns = opened.block_shapes[0]
+        bytes_a_cell = copies * np.dtype(raster.dtypes[0]).itemsize
+        what = f"{name} has strips or tiles of {columns}x{rows} cells"
+        check_memory(rows * columns * bytes_a_cell, what, Path(raster.name).stat().st_size)
 
 
 def _resample(

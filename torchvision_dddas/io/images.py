@@ -1,28 +1,24 @@
 """Pictures in files: reading and decoding them, finding them in folders, and one PNG a frame for masks."""
 
 import math
-import os
 import re
-from collections.abc import Iterator, Sequence
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from glob import glob
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import Part, write_whole
+from torchvision_dddas.memory import PICTURE, check_memory
 from torchvision_dddas.types import Scene
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2", ".gif"}
 )
-MOST_PIXELS = 100_000_000
-"""A picture with more is refused: a file of kilobytes may say that it has billions."""
-
-MOST_PIXELS_VARIABLE = "DDDAS_MOST_PIXELS"
 NUMBERED = re.compile(r"\d{6,}\.(png|jpg)")
 """Names of the pictures of a run, one a frame."""
 
@@ -49,20 +45,16 @@ def read_colour_image(file: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, :3])
 
 
-def decode_image(data: bytes, flags: int, name: object = "a picture") -> np.ndarray | None:
+def decode_image(data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE) -> np.ndarray | None:
     """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_...
 
-    Raises InputError, before anything is decoded, where its header says more pixels than `most_pixels`. name: of the
-    file, for the message.
+    name: of the file, for the message. cost: bytes of memory a pixel. A picture whose size its header does not say is
+    not decoded. Raises InputError, before anything is decoded, for more pixels than a file of this length may have.
     """
-    if not data or not _is_whole(data):
-        return None
     size = size_in_header(data)
-    if size is not None and size[0] * size[1] > most_pixels():
-        raise InputError(
-            f"{name} is {size[0]}x{size[1]} pixels; wanted at most {most_pixels():,} in all: make it smaller, or set "
-            f"{MOST_PIXELS_VARIABLE} in the environment"
-        )
+    if size is None or not _is_whole(data):
+        return None
+    check_memory(cost * size[0] * size[1], f"{name} is {size[0]}x{size[1]} pixels", len(data))
     with quiet_opencv():
         try:
             image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -71,70 +63,95 @@ def decode_image(data: bytes, flags: int, name: object = "a picture") -> np.ndar
     return image
 
 
-def most_pixels() -> int:
-    """The most pixels that a picture may have: MOST_PIXELS, or what the environment says. Raises InputError."""
-    given = os.environ.get(MOST_PIXELS_VARIABLE, "")
-    if given and not (given.isascii() and given.isdigit() and len(given) < 20 and int(given)):
-        raise InputError(f"{MOST_PIXELS_VARIABLE} is '{given}'; wanted a whole number of pixels")
-    return int(given or MOST_PIXELS)
-
-
 def size_in_header(data: bytes) -> tuple[int, int] | None:
-    """(width, height), px, as the beginning of a picture's file says them before any turn; None where it does not."""
-
-    def number(place: int, size: int, order: Literal["big", "little"] = "little") -> int:
-        return int.from_bytes(data[place : place + size], order)
-
-    if data[:8] == _PNG and data[12:16] == b"IHDR" and len(data) >= 24:
-        return number(16, 4, "big"), number(20, 4, "big")
-    if data[:2] == b"BM" and len(data) >= 26:
-        return number(18, 4), abs(int.from_bytes(data[22:26], "little", signed=True))
-    if pnm := re.match(rb"P[1-6](?:\s+|#[^\n]*\n)+([0-9]{1,9})\s+([0-9]{1,9})\s", data[:1000]):
-        return int(pnm[1]), int(pnm[2])
-    if data[:4] == b"GIF8":
-        return number(6, 2), number(8, 2)
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        if data[12:16] == b"VP8X":
-            return 1 + number(24, 3), 1 + number(27, 3)
-        if data[12:16] == b"VP8L":
-            return 1 + (number(21, 4) & 0x3FFF), 1 + (number(21, 4) >> 14 & 0x3FFF)
-        return number(26, 2) & 0x3FFF, number(28, 2) & 0x3FFF
-    if data[:2] in (b"II", b"MM"):
-        return _size_in_tiff(data, "little" if data[:1] == b"I" else "big")
-    if data[4:8] == b"jP  " and (place := data.find(b"ihdr", 0, 4096)) >= 0:
-        return number(place + 8, 4, "big"), number(place + 4, 4, "big")
-    return _size_in_jpeg(data) if data[:2] == b"\xff\xd8" else None
+    """(width, height), px, as a picture's file says them before any turn; None where it does not, or is no picture."""
+    try:
+        return next((find(data) for magic, find in _SIZES if data.startswith(magic)), None)
+    except (struct.error, IndexError):  # too short
+        return None
 
 
-def _size_in_tiff(data: bytes, order: Literal["big", "little"]) -> tuple[int, int] | None:
-    """Of its first page: two of the entries of a directory, classic or of 8 bytes an offset."""
-    is_big = int.from_bytes(data[2:4], order) == 43
-    start, width, step, at = (8, 8, 20, 12) if is_big else (4, 4, 12, 8)
-    place = int.from_bytes(data[start : start + width], order)
-    count = int.from_bytes(data[place : place + (8 if is_big else 2)], order)
-    place += 8 if is_big else 2
-    found = {}
-    for entry in range(place, min(place + min(count, 4096) * step, len(data)), step):
-        tag, kind = (int.from_bytes(data[entry + k : entry + k + 2], order) for k in (0, 2))
-        if tag in (256, 257):  # in 2, 4 or 8 bytes
-            length = {3: 2, 16: 8}.get(kind, 4)
-            found[tag] = int.from_bytes(data[entry + at : entry + at + length], order)
-    return (found[256], found[257]) if len(found) == 2 else None
+def _at(form: str, place: int) -> Callable[[bytes], tuple[int, int]]:
+    """The reader of a size that is stored at a place, as `struct` names its form."""
+    return lambda data: struct.unpack_from(form, data, place)
+
+
+def _size_in_bmp(data: bytes) -> tuple[int, int]:
+    is_old = data[14:18] == b"\x0c\0\0\0"
+    width, height = struct.unpack_from("<HH" if is_old else "<ii", data, 18)
+    return abs(width), abs(height)
+
+
+def _size_in_pnm(data: bytes) -> tuple[int, int] | None:
+    found = _PNM.match(data, 0, 65536)
+    return (int(found[1]), int(found[2])) if found else None
+
+
+def _size_in_webp(data: bytes) -> tuple[int, int] | None:
+    if data[8:16] == b"WEBPVP8X":
+        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
+    if data[8:16] == b"WEBPVP8L":
+        (bits,) = struct.unpack_from("<I", data, 21)
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    width, height = struct.unpack_from("<HH", data, 26)
+    return (width & 0x3FFF, height & 0x3FFF) if data[8:12] == b"WEBP" else None
+
+
+def _size_in_tiff(data: bytes) -> tuple[int, int] | None:
+    """Of its first page, or of that page's tiles if they are larger: the decoder makes room for a whole tile."""
+    order = "<" if data[:1] == b"I" else ">"
+    is_big = data[2:4] in (b"\x2b\0", b"\0\x2b")
+    (place,) = struct.unpack_from(order + ("Q" if is_big else "I"), data, 8 if is_big else 4)
+    (count,) = struct.unpack_from(order + ("Q" if is_big else "H"), data, place)
+    place, step, at = (place + 8, 20, 12) if is_big else (place + 2, 12, 8)
+    found = dict[int, int]()
+    for entry in range(place, min(place + min(count, 4096) * step, len(data) - step + 1), step):
+        tag, kind = struct.unpack_from(order + "HH", data, entry)
+        if tag in (256, 257, 322, 323):  # width and height of the page, and of a tile
+            (value,) = struct.unpack_from(order + {3: "H", 16: "Q"}.get(kind, "I"), data, entry + at)
+            found[tag] = max(value, found.get(tag, 0))
+    page, tile = ((found.get(tag, 0), found.get(tag + 1, 0)) for tag in (256, 322))
+    return max(page, tile, key=math.prod) if math.prod(page) else None
+
+
+def _size_in_jpeg2000(data: bytes) -> tuple[int, int] | None:
+    """Of the codestream, or of the header around it if that says more."""
+    place = data.find(b"\xff\x4f\xff\x51")
+    right, bottom, left, top = struct.unpack_from(">4I", data, place + 8) if place >= 0 else (0, 0, 0, 0)
+    box = data.find(b"ihdr", 0, 4096)
+    height, width = struct.unpack_from(">II", data, box + 4) if box >= 0 else (0, 0)
+    return max((right - left, bottom - top), (width, height), key=math.prod) if place >= 0 else None
 
 
 def _size_in_jpeg(data: bytes) -> tuple[int, int] | None:
     place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
+    while (place := data.find(b"\xff", place)) >= 0:
         marker = data[place + 1]
-        if marker == 0xFF:  # a fill byte
+        if marker in (0x00, 0xFF):  # a stray byte, a fill byte
             place += 1
-            continue
-        # Start of frame, baseline to progressive lossless; C4, C8 and CC are tables.
-        if 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = data[place + 5 : place + 7], data[place + 7 : place + 9]
-            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
-        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        elif 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame; the others are tables
+            height, width = struct.unpack_from(">HH", data, place + 5)
+            return width, height
+        else:
+            place += 2 if 0xD0 <= marker < 0xDA or marker == 0x01 else 2 + int.from_bytes(data[place + 2 : place + 4])
     return None
+
+
+_PNM = re.compile(rb"P[1-6](?:\s|#[^\n]*\n)+([0-9]{1,9})(?:\s|#[^\n]*\n)+([0-9]{1,9})\s")
+
+_SIZES: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
+    (_PNG, _at(">II", 16)),
+    (b"\xff\xd8", _size_in_jpeg),
+    (b"BM", _size_in_bmp),
+    (b"P", _size_in_pnm),
+    (b"GIF8", _at("<HH", 6)),
+    (b"RIFF", _size_in_webp),
+    (b"II", _size_in_tiff),
+    (b"MM", _size_in_tiff),
+    (b"\xff\x4f\xff\x51", _size_in_jpeg2000),
+    (b"\0\0\0\x0cjP  ", _size_in_jpeg2000),
+)
+"""How each kind of picture begins, and what finds its size."""
 
 
 def _is_whole(data: bytes) -> bool:
@@ -147,9 +164,10 @@ def _is_whole(data: bytes) -> bool:
     # OpenCV 4.14 asks for as much memory as a chunk says it is long, and may then never return.
     place = len(_PNG)
     while place + 12 <= len(data):
+        length = int.from_bytes(data[place : place + 4])
         if data[place + 4 : place + 8] == b"IEND":
-            return True
-        place += 12 + int.from_bytes(data[place : place + 4], "big")
+            return length == 0
+        place += 12 + length
     return False
 
 

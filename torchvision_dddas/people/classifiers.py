@@ -4,7 +4,6 @@ import math
 import re
 import zipfile
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from pathlib import Path
 from typing import IO
 
@@ -42,6 +41,7 @@ _HOG_KEYS = {
 }
 """Of a HOGDescriptor that OpenCV saved."""
 _MOST_NUMBERS = 1_000_000  # of an array; descriptors have thousands
+_LONGEST_HEADER = 10_000  # of an array, bytes; NumPy reads no longer ones, after it has made room
 _MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # begins a part of what OpenCV saves: a key, a list, an item, a tag
 _MOST_MARKS = 10_000  # OpenCV crashes on parts that lie deeper in each other than twice that
 _DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
@@ -131,23 +131,24 @@ def _read_text(path: Path, features: int) -> tuple[np.ndarray, Layout]:
 
 def _read_numpy(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     try:
-        _check_array_sizes(path)
-        with path.open("rb") as file:  # NumPy leaves one that it opened itself open where an archive is broken
-            held = np.load(file, allow_pickle=False)
-            if isinstance(held, np.ndarray):
-                return held, {}
-            with held:
-                content = {name: held[name] for name in held.files}
-    except InputError:
+        with path.open("rb") as file:
+            if file.read(2) != b"PK":
+                return _read_array(file, path), {}
+            with zipfile.ZipFile(file) as archive:
+                held = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+                content = {}
+                for name in ("weights", "bias", *_PARAMETERS):
+                    if name in held:
+                        with archive.open(f"{name}.npy") as member:
+                            content[name] = _read_array(member, path)
+    except (InputError, OSError):
         raise
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(f"classifier {path} is not an array of numbers in NumPy's format: {error}") from None
     except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
-        if isinstance(error, OSError):
-            raise
         raise InputError(f"classifier {path} is a broken file: {error}") from None
     if "weights" not in content:
-        raise InputError(f"classifier {path} holds {', '.join(content) or 'nothing'}; wanted weights, and a bias")
+        raise InputError(f"classifier {path} holds {', '.join(held[:9]) or 'no array'}; wanted weights, and a bias")
     parts = [np.ravel(content[name]) for name in ("weights", "bias") if name in content]
     if len(parts) == 2 and parts[1].size != 1:
         raise InputError(f"classifier {path} has a bias of {parts[1].size} numbers; wanted one")
@@ -157,24 +158,23 @@ def _read_numpy(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     return np.concatenate(parts), stated
 
 
-def _check_array_sizes(path: Path) -> None:
-    """Raises InputError where a header announces more than _MOST_NUMBERS, for which NumPy would make room."""
-    with ExitStack() as stack:
-        with path.open("rb") as start:
-            is_archive = start.read(2) == b"PK"
-        if is_archive:
-            archive = stack.enter_context(zipfile.ZipFile(path))
-            names = [name for name in archive.namelist() if name.endswith(".npy")]
-            files: list[IO[bytes]] = [stack.enter_context(archive.open(name)) for name in names]
-        else:
-            files = [stack.enter_context(path.open("rb"))]
-        for file in files:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, _, kind = read(file)
-            if math.prod(shape) * max(kind.itemsize // 16, 1) > _MOST_NUMBERS:
-                sides = " x ".join(map(str, shape))
-                raise InputError(f"classifier {path} announces {sides} numbers; wanted at most {_MOST_NUMBERS:,}")
+def _read_array(file: IO[bytes], path: Path) -> np.ndarray:
+    """An array, if its header announces at most _MOST_NUMBERS. NumPy would make room for all, and for the header."""
+    file.seek(0)
+    start = file.read(12)
+    length = int.from_bytes(start[8 : 10 if start[6:7] == b"\1" else 12], "little")
+    if start.startswith(np.lib.format.MAGIC_PREFIX) and length > _LONGEST_HEADER:
+        raise InputError(f"classifier {path} has a header of {length:,} bytes; wanted at most {_LONGEST_HEADER:,}")
+    file.seek(0)
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = read(file)
+    if math.prod(shape) * max(kind.itemsize // 16, 1) > _MOST_NUMBERS:
+        sides = " x ".join(map(str, shape))
+        raise InputError(f"classifier {path} announces {sides} numbers; wanted at most {_MOST_NUMBERS:,}")
+    file.seek(0)
+    found: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
+    return found
 
 
 def _read_opencv(path: Path, features: int) -> tuple[np.ndarray, Layout]:

@@ -36,6 +36,10 @@ _BAND_PX = 20_000
 # Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
 _GRADIENT_PX = 160_000
 _BLOCKS = 2_500
+# Pixels of a level whose histograms are held at once, 2.3 bytes a pixel; strips overlap by a window's height.
+_STRIP_PX = 16_000_000
+# Pictures with more values are resized as they are, which takes longer and less memory.
+_FEW_VALUES = 25_000_000
 
 
 class OnnxScorer:
@@ -73,7 +77,10 @@ class OnnxScorer:
             for index, part in enumerate(wanted):
                 jobs[picture, part.level].append(index)
         # With an unused fourth channel: OpenCV resizes four channels quicker than three.
-        sources = [cv2.cvtColor(image, cv2.COLOR_BGR2BGRA) if image.ndim == 3 else image for image in images]
+        sources = [
+            cv2.cvtColor(image, cv2.COLOR_BGR2BGRA) if image.ndim == 3 and image.size <= _FEW_VALUES else image
+            for image in images
+        ]
         maps: list[list[np.ndarray]] = [[np.empty(0)] * len(wanted) for wanted in parts]
 
         def score(job: tuple[int, tuple[int, int]]) -> None:
@@ -91,11 +98,17 @@ class OnnxScorer:
         return maps
 
     def _score_part(self, level: np.ndarray, part: Part) -> np.ndarray:
-        """A part's scores, every window stride. level: uint8 (H, W) or (H, W, 4) BGRA."""
+        """A part's scores, every window stride. level: uint8 (H, W), or (H, W, 3) or (H, W, 4) in the order BGRA."""
         stride, block_stride = self.parameters.window_stride_px, self.parameters.block_stride_px
         width, height = count_windows(part, self.parameters)
         scores = np.empty((height, width), np.float32)
         if not scores.size:
+            return scores
+        rows = max(1, (_STRIP_PX // part.width - self.parameters.window_height_px) // stride)
+        if height > rows:
+            for top, bottom in split_evenly(height, rows):
+                high = (bottom - top - 1) * stride + self.parameters.window_height_px
+                scores[top:bottom] = self._score_part(level, replace(part, y=part.y + top * stride, height=high))
             return scores
         # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
         common = math.gcd(stride, block_stride)

@@ -8,6 +8,7 @@ windows go from the newest frame to the oldest. `functional.affinity` holds the 
 `torch_source_tracker` computes those of many windows at once.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,11 +20,13 @@ import numpy as np
 from torchvision_dddas.config import PaperParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import best_pairs
+from torchvision_dddas.memory import check_memory
 from torchvision_dddas.tracking.dual_ascent import add_lone_targets, assign_triplets
 from torchvision_dddas.types import AppearanceUse, Detections, Float, Int, Tracks
 
 Feature = Literal["location", "appearance"]
 
+_COMBINATION = 45  # bytes of memory for a combination of targets of a window
 _STEPS = 2.0**40  # that the share of a level in a histogram is rounded to
 
 # -- features ----------------------------------------------------------------------------------------------------------
@@ -369,6 +372,13 @@ class Association:
     appearance_dispersion: float | None
 
 
+def check_window(window: Sequence[Features]) -> None:
+    """Raise InputError if a window has more combinations of targets than memory may be taken for."""
+    count, most = math.prod(len(frame) + 1 for frame in window), max(map(len, window))
+    what = f"paper.window = {len(window)} with {most} targets in a frame has {count:,} combinations"
+    check_memory(_COMBINATION * count, what, 0, "take paper.window=2, or another --config")
+
+
 def associate(
     window: Sequence[Features], parameters: PaperParameters, affinities: Mapping[Feature, np.ndarray] | None = None
 ) -> Association:
@@ -445,6 +455,7 @@ class SourceTracker:
         once, where the dispersion of the locations requires it, maybe while one of the next frames is fed.
         """
         self.window.appendleft(Features(detections.box_px, appearance))
+        check_window(self.window)
         return [self.identify(frame, detections, list(self.window))]
 
     def identify(

@@ -20,6 +20,7 @@ from torchvision_dddas.tracking.source_tracker import (
     Features,
     PicturedBoxes,
     SourceTracker,
+    check_window,
     crops,
     frames_considered,
     needs_appearance,
@@ -58,6 +59,7 @@ class TorchSourceTracker(SourceTracker):
     ) -> list[Tracks]:
         """Add the detections of a frame. appearance: `PicturedBoxes`, or what gives (N, 768) histograms."""
         self.window.appendleft(Features(detections.box_px, appearance))
+        check_window(self.window)
         self._waiting.append((frame, detections, list(self.window)))
         affinities = sum(prod(len(targets) + 1 for targets in window) for _, _, window in self._waiting)
         return self.end() if len(self._waiting) == FRAMES or affinities > _AFFINITIES else []

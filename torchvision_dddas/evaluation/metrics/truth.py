@@ -12,6 +12,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.io.tables import check_crowding
+from torchvision_dddas.memory import MASK
 
 UNNAMED = 1 << 24
 """The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
@@ -147,7 +148,7 @@ def load_truth(place: Path, first_frame: int | None = None) -> Truth:
 def read_mask(path: Path) -> np.ndarray:
     """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
     try:
-        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path)
+        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK)
     except OSError:
         image = None
     if image is None:
