@@ -44,11 +44,11 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
     # When within a frame's interval its picture was taken is not known.
     if found is None or abs(found[0]) <= max(3 * found[1], float(np.median(np.diff(time_s))) / 2):
         return ""
-    offset_s, sigma_s = found
+    offset_s, sigma_s = found[0], max(found[1], 0.001)
+    when = f"{abs(offset_s):.3f} s {'later' if offset_s > 0 else 'earlier'} in the pictures than in the log"
     return (
-        f"log and clip are not synchronised: the camera turns {abs(offset_s):.3f} s "
-        f"{'later' if offset_s > 0 else 'earlier'} in the pictures than in the log, sigma {max(sigma_s, 0.001):.3f} s; "
-        f"set aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
+        f"log and clip are not synchronised: the camera turns {when} (sigma {sigma_s:.3f} s); set "
+        f"aerial.clock_offset_s={locator.settings.aerial.clock_offset_s + offset_s:.3f}"
     )
 
 
