@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -65,6 +66,65 @@ def test_a_pipeline_takes_what_the_telemetry_lacks_from_the_camera(frames):
         pipeline = Pipeline("fast", telemetry=blind, camera=camera)
         assert {result.locations.fix.by for result in pipeline(frames) if result.locations is not None} == {by}
     assert any("heading_deg, pitch_deg" in note for note in pipeline.notes)
+
+
+def car_seen_from_above(times_s):
+    """Pictures of a car at 5 m/s, 12 px a metre, 50 m below a camera that hovers."""
+    rng = np.random.default_rng(0)
+    ground = cv2.GaussianBlur(rng.integers(0, 255, (240, 480, 3)).astype(np.uint8), (0, 0), 1.5)
+    paint = cv2.resize(rng.integers(0, 2, (6, 11, 3)).astype(np.uint8) * 200 + 30, (44, 24))
+    for number, time_s in enumerate(times_s.tolist(), 1):
+        image, left = ground.copy(), round(20 + 5 * 12 * time_s)
+        image[104:128, left : left + 44] = paint
+        yield Frame(number, time_s, image)
+
+
+class Clip:
+    """Frames in memory, whose rate is announced as their mean rate."""
+
+    def __init__(self, frames):
+        self.frames, self.size, self.last = list(frames), (480, 240), 0
+        self.rate_hz = (len(self.frames) - 1) / self.frames[-1].time_s
+
+    def __iter__(self):
+        return iter(self.frames)
+
+
+GAP = np.arange(60) / 20 + 3.0 * (np.arange(60) >= 30)
+VARYING = np.cumsum(np.tile([0.05, 0.05, 0.15, 0.09], 18))
+
+
+@pytest.mark.parametrize("times_s", [GAP, VARYING - VARYING[0]], ids=["a gap of 3 s", "a varying rate"])
+def test_positions_and_speeds_follow_the_time_stamps(times_s):
+    camera = Camera("uav", (480, 240), (600.0, 600.0), (239.5, 119.5))
+    pipeline = Pipeline("fast", telemetry=DOWN, camera=camera)
+    results = list(pipeline(Clip(car_seen_from_above(times_s))))
+    located = [result.locations for result in results if result.locations is not None]
+    assert [found.time_s for found in located] == pytest.approx(times_s.tolist())
+    speeds = np.concatenate([np.linalg.norm(found.velocity_m_s, axis=1) for found in located])
+    known = speeds[np.isfinite(speeds)]
+    assert len(known) > 20 and np.median(known) == pytest.approx(5.0, abs=0.4)
+    way = np.array([found.positions.east_north_m[0] for found in located if len(found.positions)])
+    when = np.array([found.time_s for found in located if len(found.positions)])
+    assert np.linalg.norm(way[-1] - way[0]) / (when[-1] - when[0]) == pytest.approx(5.0, abs=0.2)
+
+
+def test_a_repeated_picture_has_the_place_and_speed_of_its_moment_until_it_is_too_old():
+    camera = Camera("uav", (480, 240), (600.0, 600.0), (239.5, 119.5))
+    flying = replace(DOWN, place=np.array([[0.0, 0.0], [40.0, 0.0]]))
+    shown = [*range(20), *[19] * 10, *range(30, 44)]  # the camera is frozen for half a second
+    images = [frame.image for frame in car_seen_from_above(np.arange(50) / 20)]
+    frames = [Frame(n, (n - 1) / 20, images[k].copy()) for n, k in enumerate(shown, 1)]
+    results = [r.locations for r in Pipeline("fast", telemetry=flying, camera=camera)(Clip(frames))]
+    last, *frozen = results[19:30]
+    assert len(last.positions)
+    for n, found in enumerate(frozen, 1):
+        assert found.frame == 20 + n and found.time_s == pytest.approx((19 + n) / 20)
+        if n <= 5:
+            np.testing.assert_allclose(found.positions.east_north_m, last.positions.east_north_m)
+            np.testing.assert_allclose(found.velocity_m_s, last.velocity_m_s)
+        else:
+            assert not len(found.positions) and "frozen" in found.fix.cause
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.5])

@@ -1,5 +1,6 @@
 """`dddas detect`, `people`, `track` and `run` on clips: what they write, valid clips that are odd, and faulty ones."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import bad, names, record, rows
+from tests.io.clips import textured, write_by_av
 from tests.synthetic_clip import render
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.detection_tables import read_detections
@@ -409,3 +411,104 @@ def test_a_frame_of_another_size_late_in_a_clip_leaves_nothing_that_looks_whole(
     assert "200x150" in line and "240x180" in line
     assert record(tmp_path / "out")["state"] == "failed"
     assert not set(names(tmp_path / "out")) - {"run.json", "masks"}
+
+
+# Clips as they come.
+
+
+def textured_frames(count, size=(96, 72)):
+    ground = np.random.default_rng(0).integers(0, 255, (size[1] + 40, size[0] + 100, 3)).astype(np.uint8)
+    return [ground[k : k + size[1], 2 * k : 2 * k + size[0]].copy() for k in range(count)]
+
+
+def film_of(path, shots, rate_hz=10.0):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate_hz, shots[0].shape[1::-1])
+    for shot in shots:
+        writer.write(shot)
+    writer.release()
+    return path
+
+
+def test_repeated_pictures_are_noted(dddas, tmp_path):
+    film = film_of(tmp_path / "twice.mp4", [shot for shot in textured_frames(8) for _ in (1, 2)], 20.0)
+    result = dddas("detect", film, "--config", "fast", "--out", tmp_path / "out", "--save", "none")
+    assert result.exit_code == 0, result.output
+    assert "8 of 16 frames repeat the picture before, and have its result" in result.stdout
+
+
+def test_a_varying_frame_rate_is_noted(dddas, engine, tmp_path):
+    stamps = (np.arange(30) * 50 + 3000 * (np.arange(30) >= 15)).tolist()
+    film = write_by_av(tmp_path / "gap.mkv", "mjpeg", stamps)
+    result = dddas("track", film, "--out", tmp_path / "out", "--save", "none")
+    assert "the frame rate varies: pictures are 50 ms apart, but 1 times 50 to 3050 ms" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["detect", "track", "people", "run"])
+def test_a_clip_with_a_colon_in_its_name_and_that_of_its_folder_is_read(
+    dddas, engine, scorer, tmp_path, monkeypatch, command
+):
+    monkeypatch.chdir(tmp_path)
+    film_of(tmp_path / "clip.mp4", textured_frames(5)).rename(tmp_path / "cam1:2024-05-01.mp4")
+    result = dddas(command, "cam1:2024-05-01.mp4", *COMMANDS[command], "--out", "out:1", "--save", "overlay")
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out:1" / "overlay.mp4").stat().st_size > 100
+
+
+@pytest.mark.parametrize("command", ["detect", "track", "people", "run"])
+def test_a_clip_that_changes_its_size_is_one_line(dddas, engine, scorer, tmp_path, command):
+    parts = [cv2.imencode(".jpg", shot)[1].tobytes() for n in (96, 64) for shot in textured_frames(6, (n, 72))]
+    (tmp_path / "clip.mjpeg").write_bytes(b"".join(parts))
+    result = dddas(command, tmp_path / "clip.mjpeg", *COMMANDS[command], "--out", tmp_path / "out", "--save", "none")
+    assert result.exit_code == 2 and "is 64x72 but the first is 96x72" in bad(result)
+
+
+def test_a_damaged_clip_is_counted_and_not_ok(dddas, engine, tmp_path):
+    film = write_by_av(
+        tmp_path / "clip.mp4", "libx264", list(range(0, 4000, 100)), (320, 240), textured, g="10", bf="0"
+    )
+    data = bytearray(film.read_bytes())
+    for place in np.random.default_rng(0).integers(len(data) // 4, len(data) * 3 // 4, 12).tolist():
+        data[place] ^= 255
+    for content, ok in ((film.read_bytes(), True), (bytes(data), False)):
+        film.write_bytes(content)
+        result = dddas("run", film, "--out", tmp_path / "out", "--save", "none")
+        found = record(tmp_path / "out")
+        assert result.exit_code == 0 and found["ok"] is ok and (found.get("concealed", 0) == 0) is ok
+    assert "the decoder concealed errors in" in result.stdout
+
+
+def test_clips_of_one_flight_are_one_run_and_clips_to_detect_in_are_several(dddas, engine, tmp_path):
+    shots = textured_frames(20)
+    films = [film_of(tmp_path / f"part{k}.mp4", shots[10 * k : 10 * k + 10]) for k in (0, 1)]
+    logs = []
+    for k in (0, 1):
+        rows = [f"{n / 10},{50},{11.5 + (10 * k + n) / 1e5:.5f},48.1,0,90,60" for n in range(10)]
+        logs.append(tmp_path / f"part{k}.csv")
+        header = "time_s,altitude_m,longitude_deg,latitude_deg,heading_deg,pitch_deg,hfov_deg"
+        logs[k].write_text("\n".join([header, *rows, ""]))
+    told = [word for log in logs for word in ("--telemetry", log)]
+    result = dddas("run", *films, *told, "--out", tmp_path / "run", "--save", "none")
+    assert result.exit_code == 0 and result.stdout.startswith("20 frames, 20 detections"), result.output
+    with (tmp_path / "run" / "fixes.csv").open() as file:
+        fixes = list(csv.DictReader(file))
+    assert [int(row["frame"]) for row in fixes] == list(range(1, 21))
+    assert [float(row["time_s"]) for row in fixes] == pytest.approx(np.arange(20) / 10)
+    assert record(tmp_path / "run")["input"] == [str(film) for film in films]
+    result = dddas("detect", *films, "--out", tmp_path / "found", "--save", "none")
+    assert result.exit_code == 0 and sorted(path.name for path in (tmp_path / "found").iterdir()) == ["part0", "part1"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["clip.mp4", "clip.mp4", "--live"], "2 clips were given; wanted one with --live"),
+        (["clip.mp4", "sim:four"], "one sim:SCENARIO"),
+        (["clip.mp4", "--telemetry", "a.csv", "--telemetry", "b.csv"], "one clip and 2 logs"),
+        (["clip.mp4", "clip.mp4", *["--telemetry", "a.csv"] * 3], "2 clips and 3 logs"),
+    ],
+)
+def test_clips_and_logs_that_do_not_go_together_are_one_line(dddas, engine, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    film_of(tmp_path / "clip.mp4", textured_frames(5))
+    result = dddas("run", *words, "--out", "out")
+    assert result.exit_code == 2 and message in bad(result)

@@ -13,7 +13,7 @@ def picture(number: int, width: int = 64, height: int = 48) -> np.ndarray:
     """(H, W, 3) uint8; the top left block is as bright as six times the number."""
     image = np.full((height, width, 3), 90, np.uint8)
     image[:, (2 * number) % width :][:, :6] = (200, 160, 120)
-    image[:16, :16] = 6 * number
+    image[:16, :16] = min(6 * number, 255)
     return image
 
 
@@ -32,7 +32,15 @@ def write_video(
     return path
 
 
-def write_by_av(path: Path, codec: str, stamps_ms: list[int], size: tuple[int, int] = (64, 48), **options: str) -> Path:
+def textured(number: int, width: int, height: int) -> np.ndarray:
+    """(H, W, 3) uint8, a texture that moves: each picture takes some kilobytes."""
+    ground = np.random.default_rng(0).integers(0, 255, (height + 200, width + 200, 3)).astype(np.uint8)
+    return cv2.GaussianBlur(ground, (0, 0), 1.5)[number : number + height, 2 * number : 2 * number + width].copy()
+
+
+def write_by_av(
+    path: Path, codec: str, stamps_ms: list[int], size: tuple[int, int] = (64, 48), shot=picture, **options: str
+) -> Path:
     """A clip with time stamps of its own; needs PyAV, which writes what OpenCV cannot."""
     av = pytest.importorskip("av")
     tick = Fraction(1, 1000)
@@ -42,7 +50,7 @@ def write_by_av(path: Path, codec: str, stamps_ms: list[int], size: tuple[int, i
         stream.pix_fmt = {"mjpeg": "yuvj420p", "ffv1": "bgr0"}.get(codec, "yuv420p")
         stream.time_base = stream.codec_context.time_base = tick
         for number, stamp in enumerate(stamps_ms, start=1):
-            frame = av.VideoFrame.from_ndarray(picture(number, *size), format="bgr24")
+            frame = av.VideoFrame.from_ndarray(shot(number, *size), format="bgr24")
             frame.pts, frame.time_base = stamp, tick
             file.mux(stream.encode(frame))
         file.mux(stream.encode())

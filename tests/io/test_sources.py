@@ -1,5 +1,6 @@
 """Videos, folders and globs: what is whole is read, what is damaged is reported, and every frame keeps its number."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.io.clips import mark_rotated, number_of, picture, spoil_avi_frame, write_by_av, write_images, write_video
+from tests.io.clips import (
+    mark_rotated,
+    number_of,
+    picture,
+    spoil_avi_frame,
+    textured,
+    write_by_av,
+    write_images,
+    write_video,
+)
 from torchvision_dddas import open_video
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.sources import frame_times, open_source
 
 
 @pytest.fixture
@@ -213,6 +223,15 @@ def test_a_film_that_changes_its_size_is_refused_and_never_squeezed(tmp_path, ki
     assert 18 <= len(seen) <= 20 and set(seen) == {(48, 64, 3)}
 
 
+def test_without_pyav_a_film_whose_size_may_change_is_noted(tmp_path, monkeypatch):
+    film, whole = write_changing(tmp_path, "mpg2.ts", [(64, 48)]), write_video(tmp_path / "clip.mp4", "mp4v")
+    monkeypatch.setitem(sys.modules, "av", None)
+    for path, count in ((film, 1), (whole, 0)):
+        source = open_source(path)
+        assert len(list(source)) >= 19
+        assert sum("without PyAV" in note for note in source.notes) == count  # type: ignore[attr-defined]
+
+
 def test_a_tolerant_reader_goes_on_with_a_size_that_lasts(tmp_path):
     source = open_source(write_changing(tmp_path, "mjpeg", [(64, 48), (96, 72), (64, 48)], each=30))
     source.tolerant = True  # type: ignore[attr-defined]
@@ -239,6 +258,35 @@ def test_time_stamps_that_begin_anew_in_the_middle_go_on(tmp_path):
 def test_a_rate_that_the_time_stamps_contradict_is_measured(tmp_path, rate, stamps, hz):
     source = open_source(write_by_av(tmp_path / "clip.mkv", "mjpeg", stamps.astype(int).tolist()))
     assert source.rate_hz == pytest.approx(hz, rel=0.005)
+
+
+@pytest.mark.parametrize(("codec", "ending"), [("libx264", "mp4"), ("mpeg4", "avi"), ("libx264", "ts")])
+def test_frames_in_which_errors_were_concealed_are_counted_and_what_builds_on_them_is_damaged(tmp_path, codec, ending):
+    stamps, size = list(range(0, 4000, 100)), (320, 240)
+    path = write_by_av(tmp_path / f"clip.{ending}", codec, stamps, size, textured, g="10", bf="0")
+    assert open_source(path).concealed == 0  # type: ignore[attr-defined]
+    data, rng = bytearray(path.read_bytes()), np.random.default_rng(0)
+    if ending == "ts":
+        packets = [data[k : k + 188] for k in range(0, len(data), 188)]
+        lost = rng.integers(len(packets) // 3, len(packets) * 2 // 3, 4).tolist()
+        data = bytearray(b"".join(packet for k, packet in enumerate(packets) if k not in lost))
+    else:
+        for place in rng.integers(len(data) // 4, len(data) * 3 // 4, 12).tolist():
+            data[place] ^= 255
+    path.write_bytes(bytes(data))
+    source = open_source(path)
+    frames = list(source)
+    damaged = [frame.number for frame in frames if frame.damaged]
+    assert 0 < source.concealed <= len(damaged) < len(frames)  # type: ignore[attr-defined]
+    assert any("the decoder concealed errors in frame" in str(problem) for problem in source.problems)
+    assert not frames[0].damaged
+
+
+def test_the_times_of_frames_are_known_without_reading_pictures(tmp_path):
+    stamps = np.cumsum(np.random.default_rng(0).integers(60, 180, 30))
+    source = open_source(write_by_av(tmp_path / "clip.mkv", "libx264", stamps.tolist(), bf="2"))
+    assert frame_times(source) == pytest.approx({frame.number: frame.time_s for frame in source})
+    assert frame_times(open_source(write_images(tmp_path / "images"))) == {}
 
 
 class ScriptedCapture:

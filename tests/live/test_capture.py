@@ -513,3 +513,14 @@ def test_a_network_stream_that_is_cut_is_read_on_by_a_new_connection(tmp_path: P
     source.close()
     server.join()
     assert [event.kind for event in health.snapshot().events[:2]] == ["stream", "stream"]
+
+
+def test_a_recording_whose_size_changes_goes_on_with_the_new_size(tmp_path: Path) -> None:
+    shots = [picture(n, *size) for size in ((64, 48), (96, 48)) for n in range(1, 31)]
+    (tmp_path / "film.mjpeg").write_bytes(b"".join(cv2.imencode(".jpg", shot)[1].tobytes() for shot in shots))
+    health = Health()
+    source = LiveSource(str(tmp_path / "film.mjpeg"), LiveParameters(pace=0), health)
+    assert source.size == (64, 48)
+    widths = [frame.image.shape[1] for frame in source]
+    assert widths == [64] * 30 + [96] * 21 and source.size == (96, 48)
+    assert any("left out" in event.text for event in health.snapshot().events)

@@ -1,6 +1,7 @@
 """Identities along a clip, a clip with a table, a table alone, and in the public class."""
 
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -295,3 +296,93 @@ def test_classes_stay_with_their_identities_also_where_a_detection_is_missing():
 def test_arrays_of_boxes_that_would_be_misread_are_refused(boxes, scores, words):
     with pytest.raises(InputError, match=words):
         Tracker(size=(640, 480)).update((np.array(boxes, float), np.array(scores)))
+
+
+# Time stamps, repeated pictures, damaged pictures.
+
+
+def car_at(time_s, speed=60.0):
+    """The box of a car, 60 px a second."""
+    return np.array([[20.0 + speed * time_s, 100.0, 30.0, 20.0]])
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 1.0, 3.0])
+def test_targets_are_predicted_over_the_true_time_between_two_frames(gap_s):
+    """Frames 21 and on come later than their numbers say. Beside the car another one waits where the car was."""
+    times = np.arange(40) / 20 + gap_s * (np.arange(40) >= 20)
+    tracker, found = Tracker(motion=True, rate_hz=20.0, size=(1000, 400)), []
+    for number, time_s in enumerate(times, 1):
+        boxes = car_at(time_s)
+        if number > 20:
+            boxes = np.concatenate([boxes, car_at(times[19] + 1 / 20) + np.array([0, 30, 0, 0])])
+        found += tracker.update(boxes, frame=number, time_s=time_s)
+    found += tracker.flush()
+    car = [tracks.identity[tracks.row == 0].tolist() for tracks in found]
+    assert car == [[1]] * 40
+
+
+def test_time_stamps_that_are_rounded_change_nothing():
+    rows = [walkers([number]) for number in range(1, 40)]
+    for places in (9, 3):
+        tracker, found = Tracker(motion=True, rate_hz=30.0), []
+        for number, given in enumerate(rows, 1):
+            boxes = np.array([box for _, box in given])
+            found += tracker.update(boxes, frame=number, time_s=round((number - 1) / 30, places))
+        found += tracker.flush()
+        kept = found if places == 9 else kept
+    plain = Tracker(motion=True)
+    bare = [t for given in rows for t in plain.update(np.array([box for _, box in given]))] + plain.flush()
+    for one, other, third in zip(kept, found, bare, strict=True):
+        assert one.identity.tolist() == other.identity.tolist() == third.identity.tolist()
+        assert np.array_equal(one.box_px, other.box_px) and np.array_equal(one.box_px, third.box_px)
+
+
+def scenes_of(numbers, repeats=None, damaged=()):
+    """Scenes of a walker. repeats: number of a frame -> the one that it repeats."""
+    still = Registration(np.eye(3), 9, 9, 0.1, 0.0)
+    for number in numbers:
+        shown = (repeats or {}).get(number, number)
+        boxes = np.array([box for _, box in walkers([shown])])
+        unknown = np.full(len(boxes), np.nan)
+        found = Detections(boxes, np.ones(len(boxes)), unknown, unknown, unknown)
+        frame = Frame(number, number / 10, np.zeros((240, 320), np.uint8), damaged=number in damaged)
+        yield Scene(frame, np.zeros((0, 0), np.uint16), found, 1, step=still, repeats=0 if shown == number else shown)
+
+
+@pytest.mark.parametrize("mode", ["scores", "paper"])
+@pytest.mark.parametrize("interval", [1, 2, 3])
+def test_a_frame_that_repeats_another_has_its_tracks(mode, interval):
+    settings = load_config("paper" if mode == "paper" else None)
+    repeats = {number: number - 1 for number in range(2, 41, 2)}
+    frames = list(track_scenes(scenes_of(range(1, 41), repeats), settings, interval, SIZE))
+    assert [frame.number for frame in frames] == list(range(1, 41, interval))
+    assert [frame.tracks.frame for frame in frames] == [frame.number for frame in frames]
+    for before, frame in pairwise(frames):
+        if frame.repeats == before.number:
+            assert np.array_equal(frame.tracks.box_px, before.tracks.box_px)
+            assert frame.tracks.identity.tolist() == before.tracks.identity.tolist()
+    assert {n for frame in frames for n in frame.tracks.identity.tolist()} == {1, 2}
+
+
+def test_damage_that_looks_like_targets_for_a_few_frames_begins_no_identities():
+    rng = np.random.default_rng(0)
+    for damaged, most in ((True, 0), (False, 40)):
+        tracker, found = Tracker(motion=True, size=(640, 480)), []
+        for number in range(1, 80):
+            boxes = car_at(number / 20)
+            if number % 4 < 2 and number > 10:  # what lasts for two frames
+                blocks = np.random.default_rng(number // 4).uniform(0, 440, (4, 2))
+                boxes = np.concatenate([boxes, np.c_[blocks + rng.normal(0, 1, (4, 2)), np.full((4, 2), 24.0)]])
+            found += tracker.update(boxes, frame=number, damaged=damaged and number > 10)
+        found += tracker.flush()
+        identities = {n for tracks in found for n in tracks.identity.tolist()}
+        assert 1 in identities and (len(identities) == 1 if damaged else len(identities) > most)
+
+
+def test_a_target_that_comes_in_a_damaged_stretch_gets_its_identity_after_five_looks():
+    tracker, found = Tracker(motion=True), []
+    for number in range(1, 30):
+        boxes = np.zeros((0, 4)) if number < 10 else car_at(number / 20)
+        found += tracker.update(boxes, frame=number, damaged=True)
+    found += tracker.flush()
+    assert [len(tracks) for tracks in found][13:] == [1] * 16

@@ -249,10 +249,12 @@ class MotionDetector:
 
     def _settle_rest(self, last_number: int = 0) -> Iterator[Scene]:
         """As `flush`, one scene at a time."""
-        repeats = self._slots[-1].repeats if self._slots else []
-        while repeats and self._total < _MIN_FRAMES:  # a clip in which nothing ever changes
-            self._passed = 0
-            self._add(repeats.pop(0), self._slots[-1].view, (), 0.0)
+        if self._slots and self._total < _MIN_FRAMES:  # nothing changes: its copies are looks all the same
+            few, repeats = _MIN_FRAMES - self._total, self._slots[-1].repeats
+            self._slots[-1].repeats, self._passed = [], 0
+            for frame in repeats[:few]:
+                self._add(frame, self._slots[-1].view, (), 0.0)
+            self._slots[-1].repeats += repeats[few:]
         check_length(self._total)
         self._ended = True
         yield from self._advance()

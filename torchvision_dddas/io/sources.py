@@ -350,10 +350,14 @@ class VideoSource(_Clip):
                 image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
                 yield Frame(number, stamps.time_s, image, damaged=getattr(capture, "damaged", False))
         number = self.last
-        if first:
+        if 0 < first < number:  # the last frame alone is that of a clip which is cut short
             self._note(first, f"the decoder concealed errors in {_span(first, number)}")
         if words := stamps.describe():
             self.notes.append(words)
+        if not isinstance(capture, AvCapture) and not self.exact:
+            self.notes.append(
+                "without PyAV a change of the pictures' size is not seen: pip install 'torchvision-dddas[video]'"
+            )
         if self.exact and self.count and self.count > number:
             # Of the frames announced, those whose data are in the file belong to the clip.
             self.last = max(number, min(self.count, self._stored(capture)))

@@ -1,0 +1,99 @@
+"""Clips of one flight are one clip: numbers and times go on, each log belongs to its clip, a pause stays a pause."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.io.clips import number_of, write_video
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.joined_clips import JoinedSource
+from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.types import Telemetry
+
+FRAMES, RATE_HZ = (20, 12, 8), 10.0
+ENDS = np.cumsum(FRAMES)
+
+
+def clips(folder, sizes=((64, 48),) * 3, rates=(RATE_HZ,) * 3):
+    return [
+        open_source(write_video(folder / f"{k}.mp4", "mp4v", n, size, rate))
+        for k, (n, size, rate) in enumerate(zip(FRAMES, sizes, rates, strict=True))
+    ]
+
+
+def log(k, start_utc_s=np.nan, frames=None):
+    """The log of a clip, a sample a picture: from one to the next the vehicle flies 1 m to the east."""
+    time_s = np.arange(frames or FRAMES[k]) / RATE_HZ
+    east = time_s * RATE_HZ + (0 if k == 0 else ENDS[k - 1])
+    place = np.stack([east, 0 * east], axis=1)
+    return Telemetry(time_s, 50 + 0 * east, 10 + 0 * east, place, False, start_utc_s=start_utc_s, notes=("a", f"b{k}"))
+
+
+def test_numbers_and_times_go_on_from_clip_to_clip(tmp_path):
+    joined = JoinedSource(clips(tmp_path))
+    assert (joined.count, joined.size, joined.rate_hz, joined.exact) == (40, (64, 48), RATE_HZ, True)
+    for interval in (1, 3):
+        frames = list(joined.every(interval))
+        assert [frame.number for frame in frames] == list(range(1, 41, interval)) and joined.last == 40
+        assert [frame.time_s for frame in frames] == pytest.approx([(f.number - 1) / RATE_HZ for f in frames])
+    firsts = [frame for frame in joined if frame.number in (1, 21, 33)]
+    assert [number_of(frame.image) for frame in firsts] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("clock", [False, True])
+def test_each_log_belongs_to_its_clip(tmp_path, clock):
+    joined = JoinedSource(clips(tmp_path), ["0.srt", "1.srt", "2.srt"])
+    starts = (0.0, *ENDS[:-1] / RATE_HZ)
+    flight = joined.read_logs(lambda path, _: log(int(path[0]), 1000 + starts[int(path[0])] if clock else np.nan))
+    for frame in joined:
+        state = flight.at(frame.time_s)
+        assert state is not None and state.place[0] == pytest.approx(frame.number - 1, abs=1e-6)
+    assert flight.notes[0] == "a" and sorted(note[-2:] for note in flight.notes[1:]) == ["b0", "b1", "b2"]
+
+
+def test_samples_beyond_the_end_of_a_clip_do_not_count_for_the_next(tmp_path):
+    joined = JoinedSource(clips(tmp_path), ["0", "1", "2"])
+    flight = joined.read_logs(lambda path, _: log(int(path), frames=60))
+    east = [flight.at(frame.time_s).place[0] for frame in joined]
+    assert east == pytest.approx(np.arange(40), abs=1e-6)
+
+
+def test_a_pause_between_two_clips_stays_one_and_nothing_is_known_in_it(tmp_path):
+    joined, pause_s = JoinedSource(clips(tmp_path), ["0", "1", "2"]), np.array([0.0, 30.0, 30.0])
+    starts = np.array([0.0, *ENDS[:-1] / RATE_HZ]) + pause_s
+    flight = joined.read_logs(lambda path, _: log(int(path), 1000 + starts[int(path)]))
+    times = [frame.time_s for frame in joined]
+    assert np.diff(times).max() == pytest.approx(30.1) and times[-1] == pytest.approx(33.9)
+    assert [flight.at(at).place[0] for at in times] == pytest.approx(np.arange(40), abs=1e-6)
+    assert not np.isfinite(flight.at(15.0).place).any()
+
+
+def test_one_log_for_all_clips_goes_through(tmp_path):
+    joined = JoinedSource(clips(tmp_path), ["all"])
+    flight = joined.read_logs(lambda *_: log(0, frames=40))
+    assert [flight.at(frame.time_s).place[0] for frame in joined] == pytest.approx(np.arange(40), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda f: JoinedSource(clips(f, sizes=((64, 48), (64, 48), (48, 64)))), "48x64 at 10 Hz, .*64x48 at 10 Hz"),
+        (lambda f: JoinedSource(clips(f, rates=(10, 10, 25))), "at 25 Hz, .* at 10 Hz; clips of one run"),
+        (lambda f: JoinedSource(clips(f), ["a", "b"]), "3 clips and 2 logs"),
+        (
+            lambda f: JoinedSource(clips(f), ["0", "1", "2"]).read_logs(lambda p, _: log(int(p), 1000 - 9 * int(p))),
+            r"1.mp4 begins 11.0 s before .*0.mp4 ends",
+        ),
+        (
+            lambda f: JoinedSource(clips(f), ["0", "1", "2"]).read_logs(
+                lambda p, _: replace(log(int(p)), geographic=p == "1")
+            ),
+            "one kind",
+        ),
+    ],
+)
+def test_what_does_not_belong_together_is_one_line(tmp_path, make, words):
+    with pytest.raises(InputError, match=words) as error:
+        make(tmp_path)
+    assert "\n" not in str(error.value)
