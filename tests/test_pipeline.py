@@ -115,7 +115,7 @@ def test_a_repeated_picture_has_the_place_and_speed_of_its_moment_until_it_is_to
     shown = [*range(20), *[19] * 10, *range(30, 44)]  # the camera is frozen for half a second
     images = [frame.image for frame in car_seen_from_above(np.arange(50) / 20)]
     frames = [Frame(n, (n - 1) / 20, images[k].copy()) for n, k in enumerate(shown, 1)]
-    results = [r.locations for r in Pipeline("fast", telemetry=flying, camera=camera)(Clip(frames))]
+    results: list[Any] = [r.locations for r in Pipeline("fast", telemetry=flying, camera=camera)(Clip(frames))]
     last, *frozen = results[19:30]
     assert len(last.positions)
     for n, found in enumerate(frozen, 1):

@@ -76,8 +76,7 @@ def test_a_slow_mover_before_a_standing_camera_is_seen_at_least_each_time_that_i
 
 
 def test_a_clip_in_which_nothing_changes_has_a_reliable_scene_for_each_frame():
-    image = np.random.default_rng(0).integers(0, 255, (*SIZE[::-1], 3)).astype(np.uint8)
-    image = cv2.GaussianBlur(image, (0, 0), 2)
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (*SIZE[::-1], 3)).astype(np.uint8), (0, 0), 2)
     scenes = detect([image] * 12, load_config("fast"))
     assert [scene.frame.number for scene in scenes] == list(range(1, 13))
     assert all(scene.reliable and not len(scene.detections) for scene in scenes)

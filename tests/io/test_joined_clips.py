@@ -1,6 +1,7 @@
 """Clips of one flight are one clip: numbers and times go on, each log belongs to its clip, a pause stays a pause."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,11 @@ def clips(folder, sizes=((64, 48),) * 3, rates=(RATE_HZ,) * 3):
         open_source(write_video(folder / f"{k}.mp4", "mp4v", n, size, rate))
         for k, (n, size, rate) in enumerate(zip(FRAMES, sizes, rates, strict=True))
     ]
+
+
+def joining(*given: Any, **options: Any) -> Any:
+    """A joined source whose logs have any names."""
+    return JoinedSource(*given, **options)
 
 
 def log(k, start_utc_s=np.nan, frames=None):
@@ -43,7 +49,7 @@ def test_numbers_and_times_go_on_from_clip_to_clip(tmp_path):
 
 @pytest.mark.parametrize("clock", [False, True])
 def test_each_log_belongs_to_its_clip(tmp_path, clock):
-    joined = JoinedSource(clips(tmp_path), ["0.srt", "1.srt", "2.srt"])
+    joined = joining(clips(tmp_path), ["0.srt", "1.srt", "2.srt"])
     starts = (0.0, *ENDS[:-1] / RATE_HZ)
     flight = joined.read_logs(lambda path, _: log(int(path[0]), 1000 + starts[int(path[0])] if clock else np.nan))
     for frame in joined:
@@ -53,14 +59,14 @@ def test_each_log_belongs_to_its_clip(tmp_path, clock):
 
 
 def test_samples_beyond_the_end_of_a_clip_do_not_count_for_the_next(tmp_path):
-    joined = JoinedSource(clips(tmp_path), ["0", "1", "2"])
+    joined = joining(clips(tmp_path), ["0", "1", "2"])
     flight = joined.read_logs(lambda path, _: log(int(path), frames=60))
     east = [flight.at(frame.time_s).place[0] for frame in joined]
     assert east == pytest.approx(np.arange(40), abs=1e-6)
 
 
 def test_a_pause_between_two_clips_stays_one_and_nothing_is_known_in_it(tmp_path):
-    joined, pause_s = JoinedSource(clips(tmp_path), ["0", "1", "2"]), np.array([0.0, 30.0, 30.0])
+    joined, pause_s = joining(clips(tmp_path), ["0", "1", "2"]), np.array([0.0, 30.0, 30.0])
     starts = np.array([0.0, *ENDS[:-1] / RATE_HZ]) + pause_s
     flight = joined.read_logs(lambda path, _: log(int(path), 1000 + starts[int(path)]))
     times = [frame.time_s for frame in joined]
@@ -70,7 +76,7 @@ def test_a_pause_between_two_clips_stays_one_and_nothing_is_known_in_it(tmp_path
 
 
 def test_one_log_for_all_clips_goes_through(tmp_path):
-    joined = JoinedSource(clips(tmp_path), ["all"])
+    joined = joining(clips(tmp_path), ["all"])
     flight = joined.read_logs(lambda *_: log(0, frames=40))
     assert [flight.at(frame.time_s).place[0] for frame in joined] == pytest.approx(np.arange(40), abs=1e-6)
 
@@ -80,13 +86,13 @@ def test_one_log_for_all_clips_goes_through(tmp_path):
     [
         (lambda f: JoinedSource(clips(f, sizes=((64, 48), (64, 48), (48, 64)))), "48x64 at 10 Hz, .*64x48 at 10 Hz"),
         (lambda f: JoinedSource(clips(f, rates=(10, 10, 25))), "at 25 Hz, .* at 10 Hz; clips of one run"),
-        (lambda f: JoinedSource(clips(f), ["a", "b"]), "3 clips and 2 logs"),
+        (lambda f: joining(clips(f), ["a", "b"]), "3 clips and 2 logs"),
         (
-            lambda f: JoinedSource(clips(f), ["0", "1", "2"]).read_logs(lambda p, _: log(int(p), 1000 - 9 * int(p))),
+            lambda f: joining(clips(f), ["0", "1", "2"]).read_logs(lambda p, _: log(int(p), 1000 - 9 * int(p))),
             r"1.mp4 begins 11.0 s before .*0.mp4 ends",
         ),
         (
-            lambda f: JoinedSource(clips(f), ["0", "1", "2"]).read_logs(
+            lambda f: joining(clips(f), ["0", "1", "2"]).read_logs(
                 lambda p, _: replace(log(int(p)), geographic=p == "1")
             ),
             "one kind",

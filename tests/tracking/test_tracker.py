@@ -329,7 +329,8 @@ def test_time_stamps_that_are_rounded_change_nothing():
             boxes = np.array([box for _, box in given])
             found += tracker.update(boxes, frame=number, time_s=round((number - 1) / 30, places))
         found += tracker.flush()
-        kept = found if places == 9 else kept
+        if places == 9:
+            kept = found
     plain = Tracker(motion=True)
     bare = [t for given in rows for t in plain.update(np.array([box for _, box in given]))] + plain.flush()
     for one, other, third in zip(kept, found, bare, strict=True):
