@@ -372,10 +372,11 @@ def answers_of(address: tuple[str, int]) -> list[bytes]:
 def test_the_processes_of_a_study_talk_to_nobody_without_their_key_and_serve_no_http(by_name, tmp_path) -> None:
     psutil = pytest.importorskip("psutil")
     pytest.importorskip("distributed")
+    here = psutil.Process()
+    before = here.children(recursive=True)  # the open scheduler of other tests
     with Workers(2) as team:
         assert run_jobs([by_name["table"]], team, Cache(tmp_path / "cache"))
-        here = psutil.Process()
-        for one in (here, *here.children(recursive=True)):
+        for one in {here, *here.children(recursive=True)}.difference(before):
             for port in [c.laddr for c in one.net_connections() if c.status == psutil.CONN_LISTEN]:
                 assert port.ip == "127.0.0.1"
                 for answer in answers_of(port):  # at most TLS's refusal, in a few bytes
