@@ -21,6 +21,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.evaluate import Result, load_result
 from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.io import detection_tables
+from torchvision_dddas.io.camera_files import read_poses
 from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
 from torchvision_dddas.io.images import decode_image, read_image, size_in_header
 from torchvision_dddas.io.sources import ImageSource, VideoSource
@@ -165,6 +166,17 @@ def test_a_key_of_endless_parts_is_refused(tmp_path, key):
         read_toml(path)
     path.write_text("about = '" + "." * 300 + "'\nway = [" + "1.5, " * 300 + "2.5]\n")
     assert len(read_toml(path)["way"]) == 301
+
+
+@pytest.mark.parametrize(
+    ("read_places", "text"),
+    [(read_positions, "frame,target,east_m,north_m\n1,1,{},2\n"), (read_poses, "frame,east_m,north_m\n1,{},2\n")],
+)
+def test_a_cell_of_endless_digits_that_is_no_number_is_refused(tmp_path, read_places, text):
+    path = tmp_path / "a.csv"
+    path.write_text(text.format("1" * 60_000 + "-1"))
+    with pytest.raises(InputError, match="line 2: east_m is '111"):
+        read_places(path)
 
 
 def test_blank_lines_of_a_table_take_no_memory(tmp_path):

@@ -195,7 +195,8 @@ class CsvText(NamedTuple):
 # The beginning of a file tells how it is written.
 _HEAD_BYTES, _HEAD_LINES = 65_536, 50
 _QUOTED, _SEP_LINE = re.compile(r'"[^"]*"'), re.compile(r'"?sep=([,;|\t])"?')
-_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*(?:[eE][-+]?\d+)?")
+# Digits after a mark only: two runs of digits side by side would try each way to part a long one, its length squared.
+_NUMBER = re.compile(r"[-+]?\d*(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d+)?")
 
 
