@@ -270,6 +270,12 @@ def test_names_that_come_again_are_no_rows_and_other_rows_without_a_time_are_not
     assert [note for note in flown.notes if "line 11: 'the end' is no time; 1 rows" in note]
 
 
+def test_a_number_that_no_clock_counts_to_is_no_time(fly):
+    flown = fly("time_s,lat,lon,x\n-1e308,48.1,11.5,\n" + table("0,48.1,11.5,", "{i},48.1,11.5,"))
+    assert flown.time_s.tolist() == [0, 1, 2, 3]
+    assert [note for note in flown.notes if "line 2: '-1e308' is no time; 1 rows" in note]
+
+
 # -- Times -------------------------------------------------------------------------------------------------------------
 
 
@@ -449,10 +455,12 @@ def test_four_heights_are_told_apart_and_what_is_assumed_is_noted(fly, names, ce
     assert [note for note in flown.notes if words in note], flown.notes
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
         ("gimbal_pitch", "-120", "pitch_deg is 120, which cannot be"),
+        ("gimbal_yaw(rad)", "1e308", "heading_deg is inf, which cannot be"),
         ("hfov", "180", "hfov_deg is 180, which cannot be"),
         ("hfov", "0", "hfov_deg is 0, which cannot be"),
         ("speed", "900", "speed_m_s is 900, which cannot be"),

@@ -32,6 +32,8 @@ _SPAN = re.compile(
 )
 # From 2001 to 2100: an earlier clock was never set.
 _SINCE_1970 = (1e9, 4.1e9)
+# A larger number is no time of a log, since its start or since 1970.
+_LONGEST_S = 1e10
 # How far the rows of a flight log may be apart.
 _STEP_S = (0.002, 10.0)
 _SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
@@ -224,7 +226,8 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
         elif len(names) > 1 or (name != "seconds" and name not in since):
             one = one._replace(remark=f"'{one.title}' is taken to be in {name}, by its steps of {step:g}")
     is_date = bool(_SINCE_1970[0] < middle * scale < _SINCE_1970[1])
-    return one._replace(values=one.values * scale, kind="date" if is_date else "number", is_utc=is_date)
+    values = np.where(np.abs(one.values * scale) < _LONGEST_S, one.values * scale, math.nan)
+    return one._replace(values=values, kind="date" if is_date else "number", is_utc=is_date)
 
 
 def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | None) -> float:

@@ -1,5 +1,6 @@
 """One record of a flight from the samples of any log: checked, and resampled at common times."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -249,7 +250,7 @@ def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
         for wrong in (is_infinite, is_beyond):
             if wrong.any():
                 _, value, where = rows[wrong.argmax()]
-                what = "infinite" if np.isinf(value) else f"{np.degrees(value) if name.endswith('_rad') else value:g}"
+                what = "infinite" if np.isinf(value) else f"{math.degrees(value) if name.endswith('_rad') else value:g}"
                 title = name.replace("_rad", "_deg")
                 log.note(f"{log.where} {where:.0f}: {title} is {what}, which cannot be; {wrong.sum()} left out")
                 rows[wrong, 1] = np.nan
