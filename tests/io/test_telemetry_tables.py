@@ -276,6 +276,13 @@ def test_a_number_that_no_clock_counts_to_is_no_time(fly):
     assert [note for note in flown.notes if "line 2: '-1e308' is no time; 1 rows" in note]
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_of_rows_within_a_microsecond_the_last_counts(fly):
+    flown = fly("time_s,lat,lon,x\n0,48.1,11.5,\n5e-324,40.1,1.5,\n1,40.1,1.5,\n2,40.1,1.5,\n")
+    np.testing.assert_allclose(flown.time_s, [0, 1, 2], atol=1e-9)
+    np.testing.assert_array_equal(flown.place, [[1.5, 40.1]] * 3)
+
+
 # -- Times -------------------------------------------------------------------------------------------------------------
 
 

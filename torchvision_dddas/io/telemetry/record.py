@@ -23,6 +23,8 @@ OWN = "table"
 _FIRST_CLOCK_S, _DAY_S = 1_230_768_000.0, 86_400.0  # 2009-01-01
 # A barometer's zero drifts by metres in a flight; an altitude below this has another origin than the ground.
 _DEEP_M = -5.0
+# Samples this near are of the same time: between them a split would have the time of one of them.
+_SAME_S = 1e-6
 # A vehicle does not go further between two samples, unless they are of two flights.
 _JUMP_M, _SPLIT_S, _STRAY = 200.0, 1e-3, 2
 # Two heights that differ by less everywhere are the same.
@@ -224,7 +226,7 @@ def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
             f"time runs back from {before[0]:.3f} to {after[0]:.3f} s; are these two recordings in one file?", after[2]
         )
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return rows[np.append(np.diff(rows[:, 0]) > 0, True)] if len(rows) else rows
+    return rows[np.append(np.diff(rows[:, 0]) > _SAME_S, True)] if len(rows) else rows
 
 
 def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
