@@ -12,7 +12,7 @@ import numpy as np
 from torchvision_dddas.errors import InputError, printable
 from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.telemetry.fields import HEIGHTS, POSSIBLE
-from torchvision_dddas.types import Telemetry
+from torchvision_dddas.types import COLUMNS_OF_TELEMETRY, Telemetry
 
 KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, ArduPilot .bin or .log, MPEG-TS with MISB ST 0601, or NMEA 0183"
 
@@ -152,17 +152,12 @@ def build_record(
         date = np.datetime64(int(np.clip(clock_s, -1e11, 1e11)), "s")
         log.note(f"the log's clock says {date}, which cannot be: the time of day is unknown")
         clock_s = np.nan
-    others: dict[str, Any] = {
-        name: columns.get(name, unknown)
-        for name in (*_TURNING, "above_sea_m", "above_ellipsoid_m", "pitch_rad", "hfov_rad")
-    }
+    columns = {"altitude_m": unknown, "speed_m_s": unknown, **columns, "place": place}
+    known: dict[str, Any] = {name: columns[name] for name in COLUMNS_OF_TELEMETRY if name in columns}
     return Telemetry(
         times + clock_offset_s,
-        columns.get("altitude_m", unknown),
-        columns.get("speed_m_s", unknown),
-        place,
-        geographic,
-        **others,
+        **known,
+        geographic=geographic,
         height_zero=log.height_zero,
         is_nominal=log.is_nominal,
         start_utc_s=float(clock_s - clock_offset_s),
