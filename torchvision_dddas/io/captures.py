@@ -24,8 +24,6 @@ _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
 # A stream is the cover of the file if it is marked so (attached picture, thumbnails, still image), or if it holds one
 # picture in one of these codecs.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
-# FFmpeg's tag of grey pictures of 16 bits, lowest byte first: of the deeper ones OpenCV (4.14) gives these alone.
-_GREY16 = b"Y1\x00\x10"
 # FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
@@ -77,35 +75,15 @@ def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
     _check_size(
         target, name, *(int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     )
-    if _grey_form(capture) == _GREY16 and not is_live(target):
-        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     return capture
 
 
-def _grey_form(capture: cv2.VideoCapture) -> bytes:
-    """The tag of grey pictures of more than 8 bits; nothing for others."""
+def is_cut_to_8_bits(capture: Capture) -> bool:
+    """Whether pictures are grey and lose their lower bits, as OpenCV (4.14) gives them."""
+    if isinstance(capture, AvCapture):
+        return False
     tag = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).to_bytes(4, "little", signed=True)
-    return tag if b"Y1\x00" in (tag[:3], tag[:0:-1]) else b""
-
-
-def deep_grey_note(capture: Capture) -> str:
-    """What to tell the user of grey pictures whose lower bits are lost without PyAV; nothing for others."""
-    if not isinstance(capture, cv2.VideoCapture) or _grey_form(capture) in (b"", _GREY16):
-        return ""
-    return "the greys have more than 8 bits, of which the upper 8 are read: install PyAV, or store them as gray16le"
-
-
-def sample_pictures(capture: Capture, count: int) -> list[np.ndarray]:
-    """Up to `count` - 1 pictures spread over the rest of a file. The capture is of no use for reading in order then."""
-    found = []
-    for share in np.linspace(0, 1, count)[1:]:
-        if isinstance(capture, AvCapture):
-            capture.seek(float(share))
-        elif isinstance(capture, cv2.VideoCapture):
-            capture.set(cv2.CAP_PROP_POS_FRAMES, int(share * max(capture.get(cv2.CAP_PROP_FRAME_COUNT) - 1, 0)))
-        decoded, image = capture.read()
-        found += [image] * decoded
-    return found
+    return b"Y1\x00" in (tag[:3], tag[:0:-1])  # FFmpeg's tag of deep greys, with the lowest byte first or last
 
 
 class AvCapture:
@@ -218,11 +196,16 @@ class AvCapture:
         stamp = None if frame is None else frame.dts if frame.pts is None else frame.pts
         return 0.0 if stamp is None else 1000 * self._tick_s * stamp
 
-    def seek(self, share: float) -> None:
-        """Go to the picture that can be decoded alone before a share of the file's length."""
-        with suppress(*self._failures):
-            self._container.seek(int(share * (self._container.duration or 0)))
-        self._packets, self._waiting = self._container.demux(self._video), []
+    def sample(self, count: int) -> list[np.ndarray]:
+        """Up to `count` - 1 pictures spread over the rest of a file, which can then not be read in order."""
+        found = []
+        for share in np.linspace(0, 1, count)[1:].tolist():
+            with suppress(*self._failures):  # to the picture before that can be decoded alone
+                self._container.seek(int(share * (self._container.duration or 0)))
+            self._packets, self._waiting = self._container.demux(self._video), []
+            decoded, image = self.read()
+            found += [image] if decoded and image is not None else []
+        return found
 
     def stamps_s(self, most: int | None = None) -> list[float]:
         """Time stamps of the next pictures, at most so many, as they are stored. The pictures are not read."""

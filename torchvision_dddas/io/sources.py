@@ -11,15 +11,13 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError, LostInputError, without_secrets
-from torchvision_dddas.io.atomic_files import utf8_name
 from torchvision_dddas.io.captures import (
     AvCapture,
     Capture,
     announced_hz,
-    deep_grey_note,
+    is_cut_to_8_bits,
     is_live,
     open_capture,
-    sample_pictures,
 )
 from torchvision_dddas.io.images import (
     IMAGE_SUFFIXES,
@@ -292,9 +290,11 @@ class VideoSource(_Clip):
             own_hz, count = announced_hz(capture), capture.get(cv2.CAP_PROP_FRAME_COUNT)
             is_counted = Path(urlsplit(str(target)).path if self._live else str(target)).suffix.lower() in _EXACT_COUNT
             decoded, first = capture.read()
-            true_hz = None if self._live or not isinstance(capture, AvCapture) else capture.measure_hz()
-            if decoded and first.dtype == np.uint16:
-                self.levels = Levels([first, *sample_pictures(capture, _SAMPLES if scale is None else 1)], scale)
+            true_hz = None
+            if isinstance(capture, AvCapture) and not self._live:
+                true_hz = capture.measure_hz()
+                if decoded and first.dtype == np.uint16:
+                    self.levels = Levels([first, *capture.sample(_SAMPLES if scale is None else 1)], scale)
         finally:
             capture.release()
         if not decoded:
@@ -360,7 +360,7 @@ class VideoSource(_Clip):
             )
         if self.exact and self.count and self.count > number:
             # Of the frames announced, those whose data are in the file belong to the clip.
-            self.last = max(number, min(self.count, self._stored(capture)))
+            self.last = max(number, min(self.count, getattr(capture, "stored", 0)))
             self._note_lost(number + 1, self.last)
         # A count guessed from the duration means something only where the rate is constant.
         allowed = 0 if self.exact else max(2, number // 50) if stamps.regular else number
@@ -396,20 +396,10 @@ class VideoSource(_Clip):
             were = "was" if first == last else "were"
             self._note(first, f"{_span(first, last)} could not be decoded and {were} left out")
 
-    def _stored(self, read: Capture) -> int:
-        """How many frames a file that was read to its end holds the data of, whether or not they can be decoded."""
-        if isinstance(read, AvCapture):
-            return read.stored
-        capture = cv2.VideoCapture(utf8_name(str(self._target)), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-        try:
-            return sum(1 for _ in iter(capture.grab, False))
-        finally:
-            capture.release()
-
     def _open(self) -> Capture:
         capture = open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
-        if note := deep_grey_note(capture):
-            self._note(1, note)
+        if is_cut_to_8_bits(capture):
+            self._note(1, "of deeper greys the upper 8 bits are read: pip install 'torchvision-dddas[video]'")
         return capture
 
 
