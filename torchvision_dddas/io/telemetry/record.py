@@ -242,15 +242,13 @@ def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
     """Set impossible values to NaN, but for places, see `_check_globe`."""
     for name, rows in samples.items():
         low, high = (-np.inf, np.inf) if "itude_deg" in name else POSSIBLE.get(name, (-np.inf, np.inf))
-        is_infinite = np.isinf(rows[:, 1])
-        is_beyond = ((rows[:, 1] < low) | (rows[:, 1] > high)) & ~is_infinite
-        for wrong in (is_infinite, is_beyond):
-            if wrong.any():
-                _, value, where = rows[wrong.argmax()]
-                what = "infinite" if np.isinf(value) else f"{math.degrees(value) if name.endswith('_rad') else value:g}"
-                title = name.replace("_rad", "_deg")
-                log.note(f"{log.where} {where:.0f}: {title} is {what}, which cannot be; {wrong.sum()} left out")
-                rows[wrong, 1] = np.nan
+        wrong = np.isinf(rows[:, 1]) | (rows[:, 1] < low) | (rows[:, 1] > high)
+        if wrong.any():
+            _, value, where = rows[wrong.argmax()]
+            value = math.degrees(value) if name.endswith("_rad") else value
+            title = name.replace("_rad", "_deg")
+            log.note(f"{log.where} {where:.0f}: {title} is {value:g}, which cannot be; {wrong.sum()} left out")
+            rows[wrong, 1] = np.nan
 
 
 def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:

@@ -55,11 +55,9 @@ _ANGLE = re.compile(rf"([NSEW-])? ?{_PART} ?[°d:]? ?(?:{_PART} ?['′m:]? ?)?(?
 def read_telemetry_table(
     path: Path, clock_offset_s: float, clip: Path | None, zone: tzinfo | None = None, order: str = "auto"
 ) -> Telemetry:
-    """Read an own table, whose columns are all in SCHEMA, or that of another program.
+    """Read an own table, whose columns are all in SCHEMA, or that of another program; arguments as `read_telemetry`.
 
-    zone, order: of dates that say no zone, and of a cell with two coordinates; see `read_telemetry`.
-    Raises InputError with file and line: unreadable, no time, no rows, nothing of use; and of an own table as
-    read_table, half a place, a time before the one above it.
+    Raises InputError as that does; and of an own table as read_table, half a place, a time before the one above it.
     """
     _, lines, rows = read_csv(path, "telemetry", has_header=False)
     names = Names()
@@ -233,10 +231,8 @@ class _Table:
             [two for sign in signs if len(two := cell.strip("()[]").split(sign)) == 2] for cell in self.texts("place")
         ]
         angles = [[_angle(part) for part in (two[0] if two else ("", ""))] for two in parts]
-        pairs, sides = (
-            np.array([[value for value, _ in two] for two in angles]),
-            {side for (_, side), _ in angles if side},
-        )
+        pairs = np.array([[value for value, _ in two] for two in angles])
+        sides = {side for (_, side), _ in angles if side}
         is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, self.names.order, order, "a cell")
         return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
 

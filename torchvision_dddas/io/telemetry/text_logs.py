@@ -40,10 +40,7 @@ _WORST = 1000
 def read_subtitles(
     path: Path, text: str, clock_offset_s: float, zone: tzinfo | None = None, order: str = "auto"
 ) -> Telemetry:
-    """zone, order: of dates that say no zone, and of two coordinates; see `read_telemetry`.
-
-    Raises InputError without any position, height or attitude, or if times decrease.
-    """
+    """The record of subtitles; arguments and errors as `read_telemetry`."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     names = names_of_subtitles(text)
     subtitles = _subtitles(_GROUP.sub(_with_group, text))
