@@ -124,8 +124,8 @@ class AvCapture:
             self._video.codec_context.thread_count = 1
         # Until a larger block was freed, glibc maps the memory of each picture anew, which takes 2 ms at 1080p.
         np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
-        form = self._video.format
-        self._is_deep = limits_s is None and form is not None and form.name.startswith("gray") and _bits_of(form) > 8
+        form = self._video.format if limits_s is None else None
+        self._is_deep = form is not None and form.name.startswith("gray") and form.bits_per_pixel > 8
         self._packets: Iterator[Any] = self._container.demux(self._video)
         self._waiting: list[Any] = []  # frames of the packet read last
         self._spoiled: set[int | None] = set()  # time stamps of damaged packets
@@ -226,10 +226,6 @@ class AvCapture:
     def release(self) -> None:
         """Let go of the file or the connection."""
         self._container.close()
-
-
-def _bits_of(form: Any) -> int:
-    return max((component.bits for component in form.components), default=0)
 
 
 def is_live(target: str | int) -> bool:

@@ -22,9 +22,6 @@ from torchvision_dddas.types import Telemetry
 __all__ = ["read_telemetry"]
 
 _STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 4)}
-_OTHERS = {
-    b"ftyp": "is a video; give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt",
-}
 
 
 def read_telemetry(
@@ -76,8 +73,10 @@ def read_telemetry(
         return read_telemetry_table(path, clock_offset_s, clip, zone, order)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
-    known = (words for mark, words in _OTHERS.items() if mark in head[:12])
-    raise InputError(f"telemetry {path} {next(known, f'is none of the kinds that can be read; wanted {KINDS}')}")
+    if b"ftyp" in head[:12]:
+        hint = "give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt"
+        raise InputError(f"telemetry {path} is a video; {hint}")
+    raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
 
 
 def _text(content: bytes) -> str | None:

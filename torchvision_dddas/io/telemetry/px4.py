@@ -38,16 +38,18 @@ class _Onwards(io.BytesIO):
 
     pyulog 1.3 seeks back from a damaged message to the byte behind its first, which takes seconds a megabyte; and at
     the end of the file by its announced length, though it read less, which would loop forever.
+    is_cut: whether the message read last ends behind the file.
     """
 
     def __init__(self, content: bytes) -> None:
         super().__init__(content)
-        self._content, self._asked, self._short = content, 0, 0
+        self._content, self._asked, self._short, self.is_cut = content, 0, 0, False
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
         self._asked = size or 0
         self._short = max(self._asked - len(data), 0)
+        self.is_cut = self._short > 0 and (self._asked > 3 or len(data) > 0)  # else no message begins there
         return data
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
@@ -67,17 +69,17 @@ def _px4_topics(log: Log) -> Topics:
         raise InputError(
             f"telemetry {log.path} is a PX4 log, which needs pyulog: pip install 'torchvision-dddas[telemetry]'"
         ) from None
-    content = log.path.read_bytes()
+    content = _Onwards(log.path.read_bytes())
     try:
         # It prints what it finds damaged.
         with contextlib.redirect_stdout(io.StringIO()):
-            read = ULog(_Onwards(content), [*NAMES, "home_position"])
+            read = ULog(content, [*NAMES, "home_position"])
     except Exception as error:
         raise log.refuse(f"the PX4 log is damaged from its beginning and cannot be read ({error})") from None
     if read.file_corruption:
         log.note("the log is damaged: what could not be read is left out")
-    elif (byte := _cut(content)) is not None:
-        log.note(f"byte {byte}: the file ends within a message; it was cut off")
+    elif content.is_cut:
+        log.note(f"byte {log.path.stat().st_size}: the file ends within a message; it was cut off")
     if read.dropouts:
         lost_s = sum(part.duration for part in read.dropouts) / 1000
         log.note(f"the logger fell behind {len(read.dropouts)} times and lost {lost_s:.3g} s in all")
@@ -90,17 +92,6 @@ def _px4_topics(log: Log) -> Topics:
     if not topics:
         raise log.refuse("the PX4 log has no position, height or attitude")
     return topics
-
-
-def _cut(content: bytes) -> int | None:
-    """Start of an incomplete last message, or None; messages follow a header of 16 bytes, length first."""
-    place = 16
-    while place < len(content):
-        end = place + 3 + int.from_bytes(content[place : place + 2], "little")
-        if end > len(content) or place + 3 > len(content):
-            return place
-        place = end
-    return None
 
 
 def px4_lonlat(
