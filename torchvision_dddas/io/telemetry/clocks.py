@@ -49,21 +49,21 @@ def parse_date(text: str, day_first: bool = False) -> tuple[float, bool] | None:
     if found is None:
         return None
     *parts, zone = found.groups(default="")
-    seconds = _midnight_s(*parts[:3], day_first or "." in found[0][:3]) + _clock_s(*parts[3:])
+    seconds = midnight_s(*parts[:3], day_first or "." in found[0][:3]) + _clock_s(*parts[3:])
     if zone[:1] in ("+", "-"):
         away = timedelta(hours=int(zone[1:3]), minutes=int(zone[-2:])).total_seconds()
         seconds -= math.copysign(away, float(zone[0] + "1"))
     return (seconds, bool(zone)) if math.isfinite(seconds) else None
 
 
-@lru_cache(maxsize=64)
-def _midnight_s(first: str, second: str, third: str, day_first: bool) -> float:
-    """NaN for no date."""
+@lru_cache(maxsize=100)
+def midnight_s(first: str, second: str, third: str, day_first: bool = False) -> float:
+    """Seconds from 1970 to a date, of which the year has four digits; NaN if it is none."""
     last = (third, second, first) if day_first else (third, first, second)
     year, month, day = (first, second, third) if len(first) == 4 else last
     try:
         return datetime(int(year), int(month), int(day), tzinfo=UTC).timestamp() if len(year) == 4 else math.nan
-    except ValueError:
+    except (ValueError, OverflowError):
         return math.nan
 
 
@@ -137,7 +137,7 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
                 values[place], is_utc = date[0], is_utc or date[1]
         elif cell and (found := forms[kind](cell)) is not None:
             if kind == "day":
-                values[place] = _midnight_s(*found.groups(), day_first or "." in cell)
+                values[place] = midnight_s(*found.groups(), day_first or "." in cell)
             elif kind == "clock":
                 values[place] = _clock_s(*found.groups(default="")[:6])
             else:

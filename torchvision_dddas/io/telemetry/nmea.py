@@ -6,9 +6,9 @@ import operator
 import re
 from collections import Counter
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
+from torchvision_dddas.io.telemetry.clocks import midnight_s
 from torchvision_dddas.io.telemetry.record import Log, build_record, is_clock
 from torchvision_dddas.types import Telemetry
 
@@ -48,11 +48,11 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         except (ValueError, LookupError) as error:
             faults.append((number, "too short" if isinstance(error, IndexError) else "with a garbled field"))
             continue
-        now_s, midnight_s, separation = (values.pop(name) for name in ("time", "date", "separation"))
+        now_s, date_s, separation = (values.pop(name) for name in ("time", "date", "separation"))
         if math.isfinite(now_s):
             days += now_s < last_s - _DAY_S / 2  # time goes on over midnight
             first_s, last_s = now_s if math.isnan(first_s) else first_s, now_s
-            clocks += [midnight_s + first_s - days * _DAY_S] if math.isfinite(midnight_s) else []
+            clocks += [date_s + first_s - days * _DAY_S] if math.isfinite(date_s) else []
         if math.isfinite(first_s):
             separations.add(separation)
             for name, value in values.items():
@@ -148,12 +148,8 @@ def _degrees(text: str, letter: str) -> float:
     return -degrees if letter in "SW" else degrees
 
 
-@functools.lru_cache(maxsize=100)
 def _midnight_s(day: str, month: str, year: str) -> float:
     """Seconds from 1970 to a date, of which RMC has all in the first text: 230394; NaN if it is none."""
     if len(day) == 6:
         day, month, year = day[:2], day[2:4], f"{'19' if day[4] >= '8' else '20'}{day[4:]}"
-    try:
-        return datetime(int(year), int(month), int(day), tzinfo=UTC).timestamp()
-    except (ValueError, OverflowError):
-        return math.nan
+    return midnight_s(year, month, day)
