@@ -99,10 +99,8 @@ def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
         row = int(np.argmax(is_back)) + 1
         raise table.error(f"time_s runs back from {time_s[row - 1]:g} to {time_s[row]:g}; sort it by time", row)
     log = Log(path, OWN, moments=np.column_stack([time_s, time_s, table.line]))
-    for name in SCHEMA.names[1:]:
-        if name in table:
-            values = {_OWN[name]: table[name] * _KNOWN[_OWN[name]].scale}
-            log.add_all(time_s, table.line, values, known=True)
+    values = {known: table[name] * _KNOWN[known].scale for name, known in _OWN.items() if name in table}
+    log.add_all(time_s, table.line, values, known=True)
     return build_record(log, clock_offset_s)
 
 
@@ -187,8 +185,8 @@ class _Table:
                 raise log.refuse(f"{text}; wanted a date with a time, or seconds", where[row])
             log.note(f"line {where[row]:.0f}: {text}; {(~is_known).sum()} rows without a time are left out")
         log.moments = np.column_stack([time_s, time_s, where])[is_known]
-        for quantity, column in values.items():
-            log.add_all(time_s[is_known], where[is_known], {quantity: column[is_known]}, known=True)
+        values = {quantity: column[is_known] for quantity, column in values.items()}
+        log.add_all(time_s[is_known], where[is_known], values, known=True)
         if "filming" in self.columns and not clock_offset_s:
             self._note_film(time_s)
         # Columns that look like what a record holds, those of unknown meaning first.
