@@ -17,6 +17,7 @@ OWN = "torchvision_dddas"
 # From the bottom to the top; rooms of one line do not import each other, except on the first line.
 ORDER = (
     ("errors", "types", "config", "geometry", "memory", "runtime"),
+    ("chain",),
     ("functional",),
     ("nn",),
     ("detection", "tracking", "people", "geo"),

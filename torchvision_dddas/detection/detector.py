@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from torchvision_dddas.chain import View, Window
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.detection.blob_motion import DenseFlow
-from torchvision_dddas.detection.engine import Engine, View, Window
+from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.detection.interval import (
     DistanceSettings,
     adjust_interval,

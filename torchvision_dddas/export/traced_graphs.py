@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.chain import Window
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.export.graph_files import Check, ExportedGraph, open_session, trace_graph
@@ -31,10 +32,7 @@ class RawPlaneHomography(nn.Module):
 
 
 class WarpDifference(nn.Module):
-    """`nn.MotionSegmenter` on one picture and two neighbours, but for the correction of exposures.
-
-    What the controller moves is an input; sizes and budgets are baked in.
-    """
+    """The detection chain on a picture and two neighbours; the threshold is an input, sizes are baked in."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
@@ -48,11 +46,10 @@ class WarpDifference(nn.Module):
         reference: uint8 (H, W). neighbours: uint8 (2, H, W). neighbour_from_reference: float64 (2, 3, 3), px.
         threshold: uint8 (), grey levels; a larger difference is foreground.
         """
-        pictures, matrices = neighbours.float()[:, None, None], neighbour_from_reference[None]
-        views = self.segmenter.warp(reference.float()[None, None], pictures.unbind(0), matrices)
-        least, both = views.least((0, 1)), views.both((0, 1))
-        found = self.segmenter.pair_evidence(least, both, views.texture, None)
-        return found[0, 0], self.segmenter.core(found, {"difference.threshold": threshold})[0, 0]
+        pictures = neighbours.float()[:, None, None].unbind(0)
+        window = Window(reference.float()[None, None], pictures, neighbour_from_reference[None], (-1, 1), ((0, 1),))
+        found = self.segmenter.chain({"difference.threshold": threshold}).find_foreground(window)
+        return found.evidence[0, 0], found.core[0, 0]
 
 
 class Step(nn.Module):

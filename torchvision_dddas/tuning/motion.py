@@ -18,17 +18,16 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import (
     Foreground,
     MotionDetector,
-    View,
     Window,
     fill_hull,
 )
-from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine, OpenCVView
 from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.records import Task
 from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values
+from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values, differences_of
 from torchvision_dddas.nn.motion_segmenter import check_softness
 from torchvision_dddas.tuning.examples import check_masks, labels_at
 from torchvision_dddas.tuning.family import Example, Family
@@ -122,7 +121,7 @@ class MotionFamily(Family):
         pitch = max((clip.frames or len(clip.pictures)) // _STILL_FRAMES, 1)
         wanted = set(truth.masks) if truth else set(range(1, _STILL_FRAMES * pitch + 1, pitch))
         freer = with_parameters(settings, {"difference.threshold": max(_FREER * settings.difference.threshold, 0.1)})
-        freer_frames: Iterable[tuple[int, Window | None, np.ndarray | None]] = repeat((0, None, None))
+        freer_frames: Iterable[tuple[int, Window[OpenCVView] | None, np.ndarray | None]] = repeat((0, None, None))
         if self.with_later_steps:
             freer_frames = record_frames(clip, freer, wanted)
         recorded = zip(record_frames(clip, settings, wanted), freer_frames, strict=False)
@@ -134,7 +133,7 @@ class MotionFamily(Family):
             pictures = labels > 0, labels >= 0, mask, mask if freer_mask is None else freer_mask
             moves, known, final, freer_final = (torch.from_numpy(picture)[None, None] for picture in pictures)
             none = torch.zeros_like(moves)
-            frame = LabelledFrames(differences_of(window, settings), moves, known, none, none)
+            frame = LabelledFrames(prepare_differences(window, settings), moves, known, none, none)
             if freer_mask is not None:
                 batch = stack_frames([frame], torch.device("cpu"))
                 with torch.no_grad():
@@ -228,22 +227,23 @@ class _RecordingEngine(OpenCVEngine):
 
     def __init__(self, settings: Settings, wanted: Set[int]) -> None:
         super().__init__(settings)
-        self.number, self.wanted, self.windows = 0, wanted, dict[int, Window]()
+        self.number, self.numbers, self.wanted = 0, dict[int, int](), wanted
+        self.windows = dict[int, Window[OpenCVView]]()
 
-    def prepare(self, image: np.ndarray) -> View:
+    def prepare(self, image: np.ndarray) -> OpenCVView:
         view = super().prepare(image)
-        view.kept["number"] = self.number
+        self.numbers[id(view)] = self.number
         return view
 
-    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
-        by_number = {window.reference.kept["number"]: window for window in windows}
+    def foreground(self, windows: Sequence[Window[OpenCVView]]) -> list[Foreground]:
+        by_number = {self.numbers[id(window.reference)]: window for window in windows}
         self.windows |= {number: window for number, window in by_number.items() if number in self.wanted}
         return super().foreground(windows)
 
 
 def record_frames(
     clip: Clip, settings: Settings, wanted: Set[int]
-) -> Iterator[tuple[int, Window | None, Bool[np.ndarray, "H W"]]]:
+) -> Iterator[tuple[int, Window[OpenCVView] | None, Bool[np.ndarray, "H W"]]]:
     """The wanted frames of a clip, in order: number, window if it had one, and mask by the hard pipeline.
 
     Raises InputError as `dddas detect` does.
@@ -264,8 +264,10 @@ def record_frames(
 
 
 @torch.inference_mode()
-def differences_of(window: Window, settings: Settings) -> Differences:
+def prepare_differences(window: Window[Any], settings: Settings) -> Differences:
     """The part of a window that depends on no tunable parameter, on the CPU; a batch of one."""
-    views = TorchEngine(settings, "cpu").warp_neighbours([window])
-    found = views.differences(window.near)
+    engine = TorchEngine(settings, "cpu")
+    views = [engine.prepare(view.grey) for view in (window.reference, *window.neighbours)]
+    batch = engine.batch_of([replace(window, reference=views[0], neighbours=tuple(views[1:]))])
+    found = differences_of(engine.segmenter.chain(), batch)
     return Differences(found.least.clone(), found.both, found.texture.to(torch.uint8))

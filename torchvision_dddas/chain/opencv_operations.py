@@ -1,127 +1,116 @@
-"""The foreground of a window on OpenCV, in as few passes over 8-bit memory as possible."""
+"""The operations of the detection chain on OpenCV: 8-bit arrays, in as few passes over memory as possible."""
 
 from itertools import pairwise
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import EVIDENCE_CAP, EVIDENCE_SCALE, WHITE, DifferenceParameters, Settings, exposure_step
-from torchvision_dddas.detection.blobs import clean_silhouette, close_mask
-from torchvision_dddas.detection.engine import (
-    Foreground,
-    Window,
-    evidence_scale,
-    exposure_between,
-)
-from torchvision_dddas.geometry import transfer
+from torchvision_dddas.chain.exposure import View, exposure_between
+from torchvision_dddas.chain.operations import Operations
+from torchvision_dddas.config import WHITE, exposure_step
+from torchvision_dddas.geometry import occupied, transfer
 
 # An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
 # round places to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
 _MOST_TILES = 8
 _STRIP_ROWS = 64
-# An exposure is found when no grey level moves by more than this.
+# An exposure is found when no grey level moves by more than this, and not judged by fewer pixels.
 _SETTLED_LEVELS = 0.1
+_LEAST_PIXELS = 100
 _LEVELS = np.arange(256)
 
+Light = tuple[float, float]
 
-def find_foreground(window: Window, settings: Settings) -> Foreground:
-    """What moves in the window's reference frame: differences to the warped neighbours, threshold, morphology."""
-    parameters, grey = settings.difference, window.reference.grey
-    if min(grey.shape) < 2:  # OpenCV takes a single column for a number
-        zero = np.zeros_like(grey)
-        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
-    normalized = parameters.kind == "normalized"
-    texture = measure_texture(grey) if normalized or settings.refine.on else no_texture(grey.shape)
-    if normalized:
-        noise = np.sqrt((_LEVELS * parameters.gradient_share / 4) ** 2 + parameters.noise_levels**2)
-        weight = cv2.LUT(texture, (EVIDENCE_SCALE / noise).astype(np.float32))
-        textured = cv2.threshold(texture, 16, 255, cv2.THRESH_BINARY)[1]
-    neighbours = _Neighbours(window, parameters)
-    blur_px, smooth_px = parameters.blur_px, 1
-    if parameters.blur_of == "silhouette":
-        blur_px, smooth_px = smooth_px, blur_px
 
-    def evidence(pair: tuple[int, int]) -> np.ndarray:
-        both = neighbours.both(pair)
-        z = neighbours.apart(pair) if parameters.kind == "between_later" else neighbours.least(pair)
-        if not normalized:
-            z = cv2.GaussianBlur(z, (blur_px,) * 2, 0)
-            return cv2.bitwise_and(z, both, dst=z)
-        z = cv2.multiply(cv2.bitwise_and(z, both), weight, dtype=cv2.CV_8U)
-        z = cv2.threshold(z, EVIDENCE_CAP, EVIDENCE_CAP, cv2.THRESH_TRUNC)[1]
-        z = cv2.GaussianBlur(z, (blur_px,) * 2, 0)
-        unit = median_above(z, cv2.bitwise_and(both, textured, dst=both), EVIDENCE_SCALE) / EVIDENCE_SCALE
-        return z if unit == 1.0 else cv2.convertScaleAbs(z, alpha=1 / unit)
+class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
+    """Implements `Operations` on one picture at a time; masks are 0 and 255."""
 
-    near = evidence(window.near[0])
-    for pair in window.near[1:]:
-        near = cv2.max(near, evidence(pair), dst=near)
-    a, b = window.near[-1]
-    warped, offsets = (neighbours[a][0], neighbours[b][0]), (window.offsets[a], window.offsets[b])
-    neighbours.keep_for(window.wide, window.small)
-    wide = near if window.wide is None else evidence(window.wide)
-    neighbours.keep_for(window.small)
-    core = cv2.threshold(near, int(parameters.threshold * evidence_scale(settings)), 255, cv2.THRESH_BINARY)[1]
-    core, small = clean_silhouette(core, settings.morphology, smooth_px, window.close_px), None
-    if window.small is not None:
-        small = cv2.GaussianBlur(neighbours.least(window.small), (5, 5), 0)
-        small = cv2.bitwise_and(small, neighbours.both(window.small), dst=small)
-        level = max(settings.small.threshold, settings.small.noise_ratio * cv2.mean(small)[0])
-        small = close_mask(cv2.threshold(small, int(level), 255, cv2.THRESH_BINARY)[1], settings.small.close_px)
-    return Foreground(core, near, wide, texture, small, warped, offsets)
+    def grey(self, view: View) -> np.ndarray:
+        """See `Operations`, as of every other method."""
+        return view.grey
+
+    def texture(self, view: View) -> np.ndarray:  # noqa: D102
+        return measure_texture(view.grey)
+
+    def no_texture(self, view: View) -> np.ndarray:  # noqa: D102
+        return no_texture(view.grey.shape)
+
+    def warp(self, view: View, reference: View, view_from_reference: np.ndarray) -> np.ndarray:  # noqa: D102
+        return warp(view.grey, view_from_reference)
+
+    def seen(  # noqa: D102
+        self, view: View, reference: View, view_from_reference: np.ndarray, border_px: int
+    ) -> np.ndarray:
+        return find_seen(view_from_reference, reference.size, border_px)
+
+    def seen_by_both(self, one: np.ndarray, other: np.ndarray, reference: View) -> np.ndarray:  # noqa: D102
+        return cv2.bitwise_and(one, other)
+
+    def fit_light(self, reference: View, warped: np.ndarray, seen: np.ndarray) -> Light:  # noqa: D102
+        return fit_light(reference.grey, warped, seen)
+
+    def fit_level_shares(self, reference: View, other: View) -> Light:  # noqa: D102
+        return exposure_between(reference, other)
+
+    def apply_light(self, reference: View, warped: np.ndarray, light: Light) -> np.ndarray:  # noqa: D102
+        return apply_light(reference.grey, warped, *light)
+
+    def difference(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+        return cv2.absdiff(one, other)
+
+    def smaller(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+        return cv2.min(one, other)
+
+    def larger(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+        return cv2.max(one, other)
+
+    def inside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # noqa: D102
+        return cv2.bitwise_and(picture, mask)
+
+    def exceeds(self, picture: np.ndarray, level: float) -> np.ndarray:  # noqa: D102
+        return cv2.threshold(picture, int(level), 255, cv2.THRESH_BINARY)[1]
+
+    def stands_out(self, picture: np.ndarray, least: float, ratio: float) -> np.ndarray:  # noqa: D102
+        return self.exceeds(picture, max(least, ratio * cv2.mean(picture)[0]))
+
+    def noise_weight(  # noqa: D102
+        self, texture: np.ndarray, noise_levels: float, gradient_share: float, scale: float
+    ) -> np.ndarray:
+        noise = np.sqrt((_LEVELS * gradient_share / 4) ** 2 + noise_levels**2)
+        return cv2.LUT(texture, (scale / noise).astype(np.float32))
+
+    def weigh(self, picture: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:  # noqa: D102
+        z = cv2.multiply(picture, weight, dtype=cv2.CV_8U)
+        return cv2.threshold(z, most, most, cv2.THRESH_TRUNC)[1]
+
+    def blur(self, picture: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+        return picture if side == 1 else cv2.GaussianBlur(picture, (side, side), 0)
+
+    def in_units_of_median(self, picture: np.ndarray, mask: np.ndarray, least: float) -> np.ndarray:  # noqa: D102
+        unit = median_above(picture, mask, least) / least
+        return picture if unit == 1.0 else cv2.convertScaleAbs(picture, alpha=1 / unit)
+
+    def above(self, evidence: np.ndarray, limit: float) -> np.ndarray:  # noqa: D102
+        return self.exceeds(evidence, limit)
+
+    def erode(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+        return cv2.erode(mask, ellipse(side))
+
+    def dilate(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+        return mask if side == 1 else cv2.dilate(mask, ellipse(side))
+
+    def close(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+        return close_mask(mask, side)
+
+    def halve(self, picture: np.ndarray) -> np.ndarray:  # noqa: D102
+        height, width = (side // 2 for side in picture.shape)
+        return cv2.resize(picture[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
 
 
 def no_texture(shape: tuple[int, ...]) -> np.ndarray:
     """A texture map that is not needed: it takes no memory."""
     return np.broadcast_to(np.uint8(0), shape)
-
-
-class _Neighbours:
-    """The neighbours as the reference sees them, each warped when it is first needed.
-
-    All neighbours of a window at once, with where each is seen, would take 15 MB at 1280x720.
-    """
-
-    def __init__(self, window: Window, parameters: DifferenceParameters) -> None:
-        self.window, self.parameters = window, parameters
-        self.made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self.known: dict[tuple[int, int], np.ndarray] = {}
-
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """A neighbour warped, and 255 where it may be compared."""
-        if index not in self.made:
-            reference, neighbour_from_reference = self.window.reference, self.window.neighbour_from_reference[index]
-            neighbour = self.window.neighbours[index]
-            warped = warp(neighbour.grey, neighbour_from_reference)
-            seen = find_seen(neighbour_from_reference, reference.size, self.parameters.border_px)
-            if self.parameters.kind == "normalized":
-                warped = match_light(reference.grey, warped, seen)
-            elif self.parameters.kind == "to_reference":
-                warped = apply_light(reference.grey, warped, *exposure_between(reference, neighbour))
-            self.made[index] = warped, seen
-        return self.made[index]
-
-    def both(self, pair: tuple[int, int]) -> np.ndarray:
-        """255 where both of a pair are seen."""
-        return cv2.bitwise_and(self[pair[0]][1], self[pair[1]][1])
-
-    def apart(self, pair: tuple[int, int]) -> np.ndarray:
-        """The difference between the two of a pair."""
-        return cv2.absdiff(self[pair[0]][0], self[pair[1]][0])
-
-    def least(self, pair: tuple[int, int]) -> np.ndarray:
-        """The smaller difference of the reference to the two of a pair, computed once."""
-        if pair not in self.known:
-            a, b = (cv2.absdiff(self.window.reference.grey, self[i][0]) for i in pair)
-            self.known[pair] = cv2.min(a, b, dst=a)
-        return self.known[pair]
-
-    def keep_for(self, *pairs: tuple[int, int] | None) -> None:
-        """Drop what none of these pairs uses."""
-        wanted = {i for pair in pairs if pair for i in pair}
-        self.made = {i: kept for i, kept in self.made.items() if i in wanted}
-        self.known = {pair: kept for pair, kept in self.known.items() if pair in pairs}
 
 
 def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
@@ -226,16 +215,16 @@ def measure_texture(grey: np.ndarray) -> np.ndarray:
     return cv2.blur(steep, (5, 5))
 
 
-def match_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The warped picture in the reference's exposure: gain and offset by trimmed least squares on a sparse grid.
+def fit_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
+    """Gain and offset that give the warped picture the reference's exposure, by trimmed least squares on a sparse grid.
 
     seen: 255 where the warped picture may be compared. All are (H, W) uint8.
     """
     step = exposure_step(reference.shape)
     inside = seen[::step, ::step] > 0
     x, y = (picture[::step, ::step][inside].astype(np.float32) for picture in (warped, reference))
-    if len(x) < 100:
-        return warped
+    if len(x) < _LEAST_PIXELS:
+        return 1.0, 0.0
     gain, offset = 1.0, _lower_median(y - x)
     for _ in range(4):
         before = gain, offset
@@ -249,7 +238,7 @@ def match_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> 
         offset = float(wanted.mean()) - gain * mean
         if 255 * abs(gain - before[0]) + abs(offset - before[1]) < _SETTLED_LEVELS:
             break
-    return apply_light(reference, warped, gain, offset)
+    return gain, offset
 
 
 def _lower_median(values: np.ndarray) -> float:
@@ -281,3 +270,21 @@ def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int
     so_far = np.cumsum(cv2.calcHist([values], [0], mask, [256], [0, 256]).ravel())
     low, high = np.searchsorted(so_far, [(count + 1) // 2, count // 2 + 1])
     return max(least, (int(low) + int(high)) / 2)
+
+
+def ellipse(side: int) -> np.ndarray:
+    """The morphological element."""
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+
+
+def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
+    """Close a mask with an ellipse: the result of OpenCV bit for bit, computed only around set pixels."""
+    if side <= 1:
+        return mask
+    out = np.zeros_like(mask)
+    # Dilation does not reach the edge of these boxes, nor what is set in another one.
+    for box in occupied(mask, side + 2):
+        x, y, width, height = box
+        part = np.s_[y : y + height, x : x + width]
+        cv2.morphologyEx(mask[part], cv2.MORPH_CLOSE, ellipse(side), dst=out[part])
+    return out
