@@ -15,8 +15,8 @@ _STEADY, _UNLIKE = 0.5, 0.25
 _RING_NEAR_PX, _RING_FAR_PX = 5, 15
 # Flow is searched so far around all blobs, px of the half picture: coarse levels of the search need surroundings.
 _SEARCH_PX = 64
-# OpenCV's search works at a quarter of the resolution it is given. In smaller pictures than this it takes a finer scale,
-# and then keeps that scale for all later pictures, at five times the time.
+# OpenCV's search works at a quarter of the resolution it is given. In pictures smaller than this it takes a finer
+# scale, and keeps that scale for all later pictures, at five times the time.
 _FINEST_SCALE, _LEAST_SIDE_PX = 2, 96
 # An affine motion is fitted to so many pixels; it has converged when no term changes by more than this.
 _SAMPLES, _CONVERGED_PX = 300, 0.01
