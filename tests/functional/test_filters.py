@@ -14,7 +14,9 @@ from torchvision_dddas.functional.filters import in_strips, is_above, to_bytes
 
 
 @pytest.mark.parametrize(("size", "sigma"), [(1, None), (3, None), (7, None), (9, None), (5, 1.3), (31, 4.0)])
-def test_smoothing_agrees_with_opencv_closely_where_a_sigma_is_given_and_to_a_level_and_a_half_without(texture, tensor, size, sigma):
+def test_smoothing_agrees_with_opencv_closely_where_a_sigma_is_given_and_to_a_level_and_a_half_without(
+    texture, tensor, size, sigma
+):
     picture = tensor(texture(0, 37, 53))
     wanted = cv2.GaussianBlur(picture[0, 0].numpy(), (size, size), sigma or 0)
     found = F.gaussian_blur2d(picture, size, sigma and (sigma, sigma))[0, 0]

@@ -10,10 +10,12 @@ from torchvision_dddas.chain.foreground import (
     evidence_scale,
     halve_side,
 )
+from torchvision_dddas.chain.implementations import IMPLEMENTATIONS, uses_kornia
 from torchvision_dddas.chain.opencv_operations import OpenCVOperations, close_mask, ellipse, no_texture
 from torchvision_dddas.chain.operations import Number, Operations
 
 __all__ = [
+    "IMPLEMENTATIONS",
     "DetectionChain",
     "Maps",
     "Neighbours",
@@ -31,4 +33,5 @@ __all__ = [
     "halve_side",
     "match_exposure",
     "no_texture",
+    "uses_kornia",
 ]

@@ -14,6 +14,7 @@ from kornia import filters
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.chain import uses_kornia
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.soft import is_traced
 
@@ -78,6 +79,9 @@ def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], block: int = 5) -> Shaped[T
     255 before and after the mean, as OpenCV's 8-bit pictures are. Kornia's `sobel` repeats the edge pixel: the rim
     differs. No gradient passes.
     """
+    if uses_kornia("gradient", levels.device.type) and not is_traced():
+        slope = filters.sobel(levels.detach(), normalized=False, eps=0.0).mul(0.5).round_().clamp_(max=255.0)
+        return filters.box_blur(slope, block).round_()
     padded = pad_reflect(levels.detach(), 1, 1, 1, 1)
     steep = padded[..., 2:, :] - padded[..., :-2, :]
     smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)
