@@ -118,7 +118,8 @@ def tensor_given(numbers: list[int], dtype: Any = torch.float32, strided: bool =
     frames = [stack([view.grey for view in views]).to(dtype) for views in zip(*(p[:2] for p in parts), strict=True)]
     maps = [stack(list(of)) for of in zip(*(p[3:6] for p in parts), strict=True)]
     motion = torch.from_numpy(np.stack([part.motion for part in parts]))
-    return Given(*frames, motion, *maps, stack([part.weight for part in parts]).to(dtype))
+    (reference, view), (one, other, mask) = frames, maps
+    return Given(reference, view, motion, one, other, mask, stack([part.weight for part in parts]).to(dtype))
 
 
 def as_bytes(found: Any) -> np.ndarray:

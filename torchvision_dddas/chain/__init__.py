@@ -10,6 +10,7 @@ from torchvision_dddas.chain.foreground import (
     evidence_scale,
     halve_side,
 )
+from torchvision_dddas.chain.frame_pairs import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.chain.implementations import IMPLEMENTATIONS, uses_kornia
 from torchvision_dddas.chain.opencv_operations import OpenCVOperations, close_mask, ellipse, no_texture
 from torchvision_dddas.chain.operations import Number, Operations
@@ -31,7 +32,12 @@ __all__ = [
     "exposure_between",
     "fit_exposure",
     "halve_side",
+    "later_pair",
     "match_exposure",
+    "near_gaps",
+    "near_pairs",
+    "next_pair",
     "no_texture",
+    "pair_about",
     "uses_kornia",
 ]

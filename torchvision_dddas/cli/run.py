@@ -110,7 +110,7 @@ def run(
     them).
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.run_inputs import AerialInput
+    from torchvision_dddas.pipeline import AerialInput
 
     check_interval(interval)
     clip = _with_password(clips[0], password_file)
@@ -154,8 +154,7 @@ def run(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.joined_clips import JoinedSource
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
-    from torchvision_dddas.io.run_inputs import clip_notes, locator_facts, map_site, prepare_run
-    from torchvision_dddas.pipeline import Pipeline
+    from torchvision_dddas.pipeline import Pipeline, assemble_files, clip_notes, locator_facts, map_site
 
     names = parse_save(save, PipelineRecorder.saved)
     files = [*(given.files if given is not None else ()), *logs]
@@ -163,7 +162,7 @@ def run(
     with PipelineRecorder(out, names) as output:
         opened = [open_video(name, rate_hz=rate, full_scale=settings.levels.given) for name in (clip, *clips[1:])]
         source = opened[0] if len(opened) == 1 else JoinedSource(opened, logs)
-        ready = prepare_run(given, telemetry, settings, source, backend.value, clip)
+        ready = assemble_files(given, telemetry, settings, source, backend.value, clip)
         facts: dict[str, Any] = {
             "input": clip if len(clips) == 1 else clips,
             "clip": clip_facts(source),
@@ -178,7 +177,7 @@ def run(
         record = output.begin(facts, source.rate_hz / interval, source.size, site)
         record.notes += ready.notes
         count = None if source.count is None else -(-source.count // interval)
-        pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
+        pipeline = Pipeline.from_assembly(ready, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
         record.notes += [*pipeline.notes, *clip_notes(source, interval, ready.settings)]
     lines = _summary(record, out, site is not None, "overlay" in names)

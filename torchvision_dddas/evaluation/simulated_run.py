@@ -8,13 +8,11 @@ from typing import Any
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
-from torchvision_dddas.control import Mission, StartedSource, build_mission
-from torchvision_dddas.detection import load_engine
+from torchvision_dddas.control import Mission, StartedSource
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.metrics.crowds import CrowdScore, CrowdScorer
 from torchvision_dddas.io.output import NOTICED, RunRecord, clip_facts
-from torchvision_dddas.io.run_inputs import map_site
-from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.pipeline import Pipeline, assemble_mission, map_site
 from torchvision_dddas.simulation import (
     SimulatedRunRecorder,
     SimulatorSource,
@@ -55,14 +53,15 @@ def run_scenario(
         with name_scenario_in_errors(scenario):
             simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = StartedSource(simulated)
-        mission = build_mission(source, settings, backend, chosen.clip.located_by == "landmarks")
-        engine = load_engine(backend, mission.settings)
+        ready = assemble_mission(source, settings, backend, chosen.clip.located_by == "landmarks")
+        mission = ready.mission
+        assert mission is not None
         locator = mission.watch.locator
         facts: dict[str, Any] = {
             "input": f"sim:{simulated.name}",
             "clip": clip_facts(simulated),
             "scenario": chosen.model_dump(),
-            "backend": engine.name,
+            "backend": ready.engine.name,
             "origin_deg": locator.site.origin_deg,
             "settings": mission.settings.model_dump(),
         }
@@ -72,7 +71,7 @@ def run_scenario(
         try:
             with (progress or _no_progress)(simulated.name, simulated.count) as tick:
                 done = 0
-                for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(source):
+                for result in Pipeline.from_assembly(ready)(source):
                     for truth in simulated.truths():
                         scorer.feed(truth)
                         output.add_truth(truth)

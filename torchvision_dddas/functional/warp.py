@@ -52,10 +52,10 @@ def warp_perspective(
 
     def sample(y: Tensor) -> Tensor:
         along_u, along_v, depth = (start[:, k, None] + y * slope[:, k, None] for k in range(3))
-        places = along_u / depth, along_v / depth
+        places = [along_u / depth, along_v / depth]
         if subpixels:
-            places = (place.mul(subpixels).round_().div_(subpixels) for place in places)
-        found = remap(src, *places, mode=mode, padding_mode=padding_mode, align_corners=True)
+            places = [place.mul(subpixels).round_().div_(subpixels) for place in places]
+        found = remap(src, places[0], places[1], mode=mode, padding_mode=padding_mode, align_corners=True)
         return to_bytes(found.add_(0.5)) if whole else found
 
     step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)

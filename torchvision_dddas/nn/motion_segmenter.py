@@ -15,10 +15,18 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
-from torchvision_dddas.chain import DetectionChain, Pair, Window, evidence_scale
+from torchvision_dddas.chain import (
+    DetectionChain,
+    Pair,
+    Window,
+    evidence_scale,
+    later_pair,
+    near_gaps,
+    near_pairs,
+    next_pair,
+)
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
 Values = Mapping[str, float | Tensor]

@@ -35,10 +35,9 @@ from torchvision_dddas.geo.pose_estimation import (
     linearize_pose,
     pose_prior,
 )
-from torchvision_dddas.geo.projection import Surface, ground_with_slopes, surface_of
+from torchvision_dddas.geometry.projection import Surface, ground_with_slopes, surface_of
 from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
-from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tuning.parameters import value_of
 from torchvision_dddas.types import AerialLocations, Camera, CameraPose, Flight, LandmarkObservations
 
@@ -334,9 +333,9 @@ def _located_view(
 
 def _locate_pictures(clip: Clip, settings: Settings) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
     source = open_clip(clip)
-    ready = prepare_run(_input(clip), clip.telemetry, settings, source, "auto", str(clip.pictures[0]))
+    ready = assemble_files(_input(clip), clip.telemetry, settings, source, "auto", str(clip.pictures[0]))
     assert ready.watch is not None
-    pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, pictures=False)
+    pipeline = Pipeline.from_assembly(ready, pictures=False)
     for result in pipeline(source):
         if result.locations is not None:
             yield ready.watch.locator, result.locations, _targets(result.locations.box_px, None, bodies=True)

@@ -22,10 +22,9 @@ from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.detection_tables import check_table, read_detections
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
-from torchvision_dddas.io.run_inputs import AerialInput, prepare_run, read_locator
 from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.people.detector import detect_in_clip, load_scorer
-from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
     Detections,
@@ -305,9 +304,8 @@ def _find_locations(run: _Run) -> None:
 
 def _locate_clip(run: _Run, files: AerialInput) -> None:
     source = open_clip(run.clip)
-    ready = prepare_run(files, run.clip.telemetry, run.settings, source, run.backend, str(run.clip.pictures[0]))
-    parts = ready.engine, ready.settings, ready.flight, ready.watch
-    for result in Pipeline.from_parts(*parts, run.interval, pictures=False)(source):
+    ready = assemble_files(files, run.clip.telemetry, run.settings, source, run.backend, str(run.clip.pictures[0]))
+    for result in Pipeline.from_assembly(ready, run.interval, pictures=False)(source):
         tracks, located = result.tracked.tracks, result.locations
         seen = tracks.row >= 0
         columns = {"box_px": round_as_written(tracks.box_px[seen]), "identity": tracks.identity[seen]}

@@ -1,13 +1,19 @@
-"""The files that `dddas run` and `dddas locate` take beside the pictures, read and checked before the first picture."""
+"""Puts a run together: settings, engine, telemetry, camera, landmarks, elevation and colours, before the first picture.
+
+`assemble` takes records, as `Pipeline` is given them. `assemble_files` reads the files that `dddas run` takes beside
+the pictures; `read_locator` those of `dddas locate`. `assemble_mission` closes the loop around a source that can be
+steered. Commands, live runs, studies, the simulator and tuning all use these.
+"""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, is_set, with_parameters
+from torchvision_dddas.control import Instrument, Mission, build_mission
 from torchvision_dddas.detection import Engine, load_engine, with_logged_focal
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
@@ -22,7 +28,6 @@ from torchvision_dddas.geo import (
     resolve_camera,
     without_pixels,
 )
-from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
@@ -31,8 +36,7 @@ from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.joined_clips import JoinedSource
 from torchvision_dddas.io.output import NONE_LOCATED, Site
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.pipeline import with_focal_length
-from torchvision_dddas.types import Colours, Source, Telemetry
+from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Source, Telemetry
 
 
 @dataclass(frozen=True)
@@ -59,31 +63,70 @@ class AerialInput:
 
 
 @dataclass(frozen=True)
-class PreparedRun:
-    """What a run needs beside the pictures.
+class Assembly:
+    """The parts of a run beside its pictures.
 
-    settings: with the camera's focal length, where that is known. watch: None if nothing is located; notes say why.
-    flight: None without telemetry. notes: what the user should know.
+    settings: with the camera's focal length, where that is known. telemetry: None without a log. watch: None if nothing
+    is located; notes say why. mission: steers a source that can be steered. notes: what the user should know.
     """
 
     settings: Settings
     engine: Engine
-    watch: LandmarkWatch | None
-    flight: Telemetry | None
-    notes: list[str]
+    telemetry: Telemetry | None = None
+    watch: LandmarkWatch | None = None
+    mission: Mission | None = None
+    notes: list[str] = field(default_factory=list)
 
 
-def prepare_run(
+def assemble(
+    settings: Settings,
+    backend: str,
+    size_px: tuple[int, int],
+    rate_hz: float,
+    telemetry: Telemetry | None = None,
+    landmarks: Landmarks | None = None,
+    camera: Camera | None = None,
+    colours: Colours | None = None,
+    elevation: Elevation | None = None,
+) -> Assembly:
+    """A run of records; nothing is located without landmarks or telemetry with places.
+
+    Raises InputError as AerialLocator, and for landmarks that cannot be found.
+    """
+    if landmarks is None and not has_places(telemetry):
+        return Assembly(settings, load_engine(backend, settings), telemetry)
+    locator = AerialLocator(
+        camera, telemetry, landmarks, elevation, settings, rate_hz=rate_hz, backend=backend, size_px=size_px
+    )
+    if landmarks is not None:
+        check_colours(landmarks, colours, telemetry is not None and settings.aerial.mode == "pose")
+    return _with_locator(locator, colours, settings, backend, list(locator.notes))
+
+
+def _with_locator(
+    locator: AerialLocator, colours: Colours | None, settings: Settings, backend: str, notes: list[str]
+) -> Assembly:
+    settings, more = with_focal_length(settings, locator)
+    watch, engine = LandmarkWatch(locator, colours, backend), load_engine(backend, settings)
+    return Assembly(settings, engine, locator.site.telemetry, watch, notes=[*notes, *more])
+
+
+def assemble_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool) -> Assembly:
+    """The closed loop around a source whose first frame has been read. Raises InputError as `build_mission`."""
+    mission = build_mission(source, settings, backend, by_landmarks)
+    return Assembly(mission.settings, load_engine(backend, mission.settings), None, mission.watch, mission)
+
+
+def assemble_files(
     given: AerialInput | None,
     telemetry: Path | None,
     settings: Settings,
     source: Source,
     backend: str,
     clip: str,
-) -> PreparedRun:
-    """Read the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
-    watch, notes, flight = None, list[str](), None
-    of = source if isinstance(source, JoinedSource) else clip
+) -> Assembly:
+    """A run of the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
+    flight, of = None, source if isinstance(source, JoinedSource) else clip
     reason = "neither --telemetry nor --landmarks were given"
     if given is not None and given.landmarks is None:
         flight, reason = _read_flight(given, settings, of)
@@ -98,19 +141,30 @@ def prepare_run(
             check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
         if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
             notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
-        watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
-    if watch is not None:
-        flight = watch.locator.site.telemetry
-        settings, more = with_focal_length(settings, watch.locator)
-        notes += more
-    else:
-        if flight is None and telemetry is not None:
-            flight = _read_telemetry(telemetry, settings, of)
-        if given is not None:
-            _check_unused(given, source.size)
-        settings, more = with_logged_focal(settings, flight, source.size)
-        notes += [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
-    return PreparedRun(settings, load_engine(backend, settings), watch, flight, notes)
+        return _with_locator(locator, colours, settings, backend, notes)
+    if flight is None and telemetry is not None:
+        flight = _read_telemetry(telemetry, settings, of)
+    if given is not None:
+        _check_unused(given, source.size)
+    settings, more = with_logged_focal(settings, flight, source.size)
+    notes = [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
+    return Assembly(settings, load_engine(backend, settings), flight, notes=notes)
+
+
+def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
+    """Set gates.focal_px from telemetry, else from the camera, given telemetry, unless it is set.
+
+    Returns settings and notes.
+    """
+    telemetry, camera = locator.site.telemetry, locator.camera
+    settings, notes = with_logged_focal(settings, telemetry, camera.size_px)
+    if notes or telemetry is None or is_set(settings, "gates.focal_px"):
+        return settings, notes
+    focal = camera.focal_px[0]
+    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    if not locator.focal_known:
+        note = f"gates.focal_px is {focal:.0f} px by a guess: sizes in metres may be off by as much as the lens is"
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
 def _check_unused(given: AerialInput, size: tuple[int, int]) -> None:

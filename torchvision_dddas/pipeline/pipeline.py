@@ -3,34 +3,32 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, is_set, load_config, with_parameters
+from torchvision_dddas.config import Settings, load_config
+from torchvision_dddas.control import Mission
 from torchvision_dddas.detection import (
     Engine,
     MotionDetector,
     Retune,
     detect_motion,
-    load_engine,
-    with_logged_focal,
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import (
     AerialLocator,
     LandmarkWatch,
     WatchedScene,
-    check_colours,
     describe_no_place,
     group_crowds,
+    has_places,
 )
 from torchvision_dddas.geo.aerial_targets import tracked_targets
 from torchvision_dddas.geo.clock_offset import describe_clock_offset
-from torchvision_dddas.geo.colours import load_colours
+from torchvision_dddas.pipeline.assembly import Assembly, assemble
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
 from torchvision_dddas.types import (
     Camera,
@@ -44,10 +42,6 @@ from torchvision_dddas.types import (
     TrackedFrame,
     as_picture,
 )
-
-if TYPE_CHECKING:
-    from torchvision_dddas.control import Mission
-
 
 # Of a longer clip the latest motions of the camera show whether it is synchronised with its log.
 _MOST_MOTIONS = 20_000
@@ -115,22 +109,24 @@ class Pipeline:
             if value is not None and not isinstance(value, kind):
                 read = "; td.read_telemetry(path) makes one of a log" if kind is Telemetry else ""
                 raise InputError(f"{name} must be of type {kind.__name__}, got {type(value).__name__}{read}")
-        self.settings, self.telemetry, self.interval, self.rate_hz = (
-            settings or Settings(),
-            telemetry,
-            interval,
-            rate_hz,
-        )
+        self._assembly: Assembly | None = None
+        self._given: dict[str, Any] = {
+            "telemetry": telemetry,
+            "landmarks": landmarks,
+            "camera": camera,
+            "colours": colours,
+            "elevation": elevation,
+        }
+        self._backend, self.interval, self.rate_hz = backend, interval, rate_hz
+        self.settings, self.telemetry = settings or Settings(), telemetry
         self.notes: list[str] = []
-        self._engine: Engine | None = None
-        self._backend, self._landmarks, self._camera = backend, landmarks, camera
-        self._flown, self._colours, self._elevation = telemetry, colours, elevation
-        has_places = telemetry is not None and bool(np.isfinite(telemetry.place).all(axis=1).any())
-        self._locates = landmarks is not None or has_places
-        if not self._locates and (colours or camera or elevation):
-            raise InputError("camera, colours and elevation are of no use without landmarks, or telemetry with places")
-        if telemetry is not None and not self._locates:
-            self.notes.append(f"nothing is located: {describe_no_place(telemetry)}")
+        if landmarks is None and not has_places(telemetry):
+            if colours or camera or elevation:
+                raise InputError(
+                    "camera, colours and elevation are of no use without landmarks, or telemetry with places"
+                )
+            if telemetry is not None:
+                self.notes.append(f"nothing is located: {describe_no_place(telemetry)}")
         self._watch: LandmarkWatch | None = None
         self._mission: Mission | None = None
         self._seen: Callable[[Scene], object] | None = None
@@ -139,25 +135,21 @@ class Pipeline:
         self._detector: MotionDetector | None = None
 
     @classmethod
-    def from_parts(
+    def from_assembly(
         cls,
-        engine: Engine,
-        settings: Settings,
-        telemetry: Telemetry | None = None,
-        watch: LandmarkWatch | None = None,
+        assembly: Assembly,
         interval: int = 1,
-        mission: "Mission | None" = None,
         seen: Callable[[Scene], object] | None = None,
         retune: Retune | None = None,
         pictures: bool = True,
     ) -> "Pipeline":
-        """A pipeline of prepared parts. watch: locates its frames; None: nothing is located.
+        """A pipeline of assembled parts, for one clip.
 
-        mission: closes the loop with a source that can be steered. seen: called with each scene, without its landmarks.
-        retune: as for `detect_motion`. pictures: whether results keep their pictures, most of a long run's memory.
+        seen: called with each scene, without its landmarks. retune: as for `detect_motion`. pictures: whether results
+        keep their pictures, most of a long run's memory.
         """
-        pipeline = cls(settings, interval=interval)
-        pipeline.telemetry, pipeline._engine, pipeline._watch, pipeline._mission = telemetry, engine, watch, mission
+        pipeline = cls(assembly.settings, interval=interval)
+        pipeline._assembly = assembly
         pipeline._seen, pipeline._retune, pipeline._pictures = seen, retune, pictures
         return pipeline
 
@@ -168,8 +160,9 @@ class Pipeline:
         Raises InputError for another source, for frames of a wrong shape or type, and for fewer than three frames.
         """
         if isinstance(source, str | Path):
-            # The front door lies above this module; it is asked for only here.
-            source = import_module("torchvision_dddas").open_video(str(source), full_scale=self.settings.levels.given)
+            import torchvision_dddas  # the front door, which also opens sim:
+
+            source = torchvision_dddas.open_video(str(source), full_scale=self.settings.levels.given)
         if not hasattr(source, "__iter__"):
             raise InputError(f"a pipeline wants a path or frames, got {type(source).__name__}")
         self._detector = None
@@ -204,35 +197,19 @@ class Pipeline:
 
     def _begin(self, size_px: tuple[int, int], rate_hz: float) -> Engine:
         """Start a clip: a tracker, and what locates its frames."""
-        if self._locates:
-            self._watch = self._build_watch(size_px, rate_hz)
-            self.settings, more = with_focal_length(self.settings, self._watch.locator)
-            self.telemetry = self._watch.locator.site.telemetry
-            self.notes += more
+        assembly = self._assembly
+        if assembly is None:
+            assembly = assemble(self.settings, self._backend, size_px, rate_hz, **self._given)
+            self.notes = [*assembly.notes] if assembly.watch is not None else self.notes
+        self.settings, self.telemetry = assembly.settings, assembly.telemetry
+        self._watch, self._mission = assembly.watch, assembly.mission
         self._clip_rate_hz = rate_hz
         self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures, rate_hz=rate_hz)
         self._crowds = CrowdIdentities() if self.settings.crowds.join_m and self._watch is not None else None
         self._waiting: dict[int, WatchedScene] = {}
         self._watched: WatchedScene | None = None  # the last one
         self._motions: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_MOTIONS)
-        return self._engine or load_engine(self._backend, self.settings)
-
-    def _build_watch(self, size_px: tuple[int, int], rate_hz: float) -> LandmarkWatch:
-        landmarks, colours = self._landmarks, self._colours
-        locator = AerialLocator(
-            self._camera,
-            self._flown,
-            landmarks,
-            self._elevation,
-            self.settings,
-            rate_hz=rate_hz,
-            backend=self._backend,
-            size_px=size_px,
-        )
-        self.notes = list(locator.notes)
-        if landmarks is not None:
-            check_colours(landmarks, colours, self._flown is not None and self.settings.aerial.mode == "pose")
-        return LandmarkWatch(locator, colours, load_colours(self._backend) if colours is not None else None)
+        return assembly.engine
 
     def _take(self, scene: Scene) -> Iterator[FrameResult]:
         """Locate a scene's landmarks, give its targets identities, and finish the frames that are settled by it."""
@@ -269,22 +246,6 @@ class Pipeline:
             tracked = _with_crowd_identities(tracked, past[-1], self._watch.locator, self._crowds)
         result = _locate(tracked, past, self._watch.locator)
         return result if self._mission is None else self._mission.steer(result, past[-1].scene.step)
-
-
-def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """Set gates.focal_px from telemetry, else from the camera, given telemetry, unless it is set.
-
-    Returns settings and notes.
-    """
-    telemetry, camera = locator.site.telemetry, locator.camera
-    settings, notes = with_logged_focal(settings, telemetry, camera.size_px)
-    if notes or telemetry is None or is_set(settings, "gates.focal_px"):
-        return settings, notes
-    focal = camera.focal_px[0]
-    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
-    if not locator.focal_known:
-        note = f"gates.focal_px is {focal:.0f} px by a guess: sizes in metres may be off by as much as the lens is"
-    return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
 def _repeated(watched: WatchedScene, scene: Scene) -> WatchedScene:
