@@ -16,7 +16,7 @@ from tests.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.tuning import family, time_cost
+from torchvision_dddas.tuning import family
 
 THRESHOLD = "difference.threshold"
 STEPS = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
@@ -96,23 +96,6 @@ def test_a_resumed_run_does_no_step_twice_and_says_the_same(clips, tuned) -> Non
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
-def test_a_cost_is_measured_once_and_kept_for_a_resumed_run(one, tmp_path, monkeypatch) -> None:
-    calls = list[float]()
-
-    def timed(settings) -> float:
-        calls.append(settings.difference.threshold)
-        return settings.difference.threshold
-
-    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: timed)
-    assert one("--cost", "0.5").exit_code == 0
-    count = len(calls)
-    kept = record(tmp_path)["cost"]
-    assert kept["weight"] == 0.5 and [curve["knob"] for curve in kept["curves"]] == [THRESHOLD]
-    assert one("--cost", "0.5", "--resume").exit_code == 0
-    assert len(calls) == count > 0
-    assert "What time costs" in (tmp_path / "report.html").read_text()
-
-
 @dataclass
 class Choosy(Bowl):
     """A bowl of two losses."""
@@ -129,7 +112,6 @@ def test_a_checkpoint_of_another_plan_is_refused_and_the_run_before_stays(one, t
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     for words, said in (
         (("--patience", "3", "--loss", "square"), "with other patience"),
-        (("--cost", "2", "--loss", "square"), "with other cost"),
         ((), "with other loss, square and not round"),
     ):
         assert said in bad(one(*words, "--resume", "--quiet", bowl=bowl))
@@ -220,7 +202,6 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         ("--pull -1", "pull must be 0 or more, got -1"),
         ("--holdout none*", "fits no clip"),
         ("--holdout *", "leaves no clip"),
-        ("--cost -1", "--cost must be 0 or more"),
         ("--device nowhere", "--device nowhere"),
         ("--device meta", "--device meta"),
         ("--minutes 0", "--minutes must be more than 0"),

@@ -46,10 +46,6 @@ def tune(
         typer.Option(metavar="PATTERN,...", help="Clips that nothing is learned from, measured before and after."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed of the order of examples.")] = 0,
-    cost: Annotated[
-        float | None,
-        typer.Option(metavar="WEIGHT", help="The loss that a frame of twice the time is worth. [default: none]"),
-    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -109,8 +105,6 @@ def tune(
     check_jobs(jobs)
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes must be more than 0, got {minutes:g}")
-    if cost is not None and not 0 <= cost < float("inf"):
-        raise InputError(f"--cost must be 0 or more, the loss that a frame of twice the time is worth, got {cost:g}")
     longest_s = float("inf") if minutes is None else 60 * minutes
     plan = Plan(
         steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull, watched=watched
@@ -123,9 +117,7 @@ def tune(
     display = Display(study=partial(show_progress, quiet), progress=partial(progress, quiet=quiet))
     if not quiet:
         display = replace(display, message=_print, step=_StepLines(steps))
-    tuner = Tuner(
-        out, plan, time_weight=cost, resume=resume, device=_device(device), jobs=jobs, cache=cache, display=display
-    )
+    tuner = Tuner(out, plan, resume=resume, device=_device(device), jobs=jobs, cache=cache, display=display)
     tuned = tuner.run(spec, study.parent, names, held, split_patterns(clips, "--clips"), measure, loss)
     if not quiet:
         _show(tuned, out)
