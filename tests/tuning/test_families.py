@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.overflight import Overflight
-from tests.tuning.worlds import filmed_clip, flown, seen, spotted_clip, walk
-from torchvision_dddas.config import Settings, load_config, with_parameters
+from tests.tuning.worlds import filmed_clip, flown, seen, walk
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.family import Example, Family, load_family
@@ -19,7 +19,6 @@ SETTINGS = Settings()
 MOTION = with_parameters(
     SETTINGS, {"gates.min_area_px": 30, "morphology.close_px": 7, "registration.keypoints": 200, "small.on": False}
 )
-PAPER = with_parameters(load_config("paper"), {"paper.window": 2})
 
 
 @dataclass(frozen=True)
@@ -60,20 +59,6 @@ CASES = {
         idle=IDLE,
         change=lambda family: family.at(5, "tracking"),
     ),
-    **{
-        f"paper {loss}": Case(
-            "paper",
-            lambda place, _: walk(people=6, frames=80),
-            [6, 56],
-            "no true identities",
-            PAPER,
-            0.05,
-            frozenset(f"paper.{name}" for name in ("weight", "lowest_dispersion", "location_cut", "appearance_cut")),
-            lambda family, loss=loss: family.at(5, "association").with_loss(loss),  # type: ignore[misc]
-        )
-        for loss in ("wrong", "likelihood")
-    },
-    "people": Case("people", spotted_clip, [1, 3], "no boxes of people", idle=frozenset({"people.feet_share"})),
     "location": Case(
         "location",
         lambda place, _: flown(place, Overflight(frames=3, gps_m=0.5), sigma=False),

@@ -25,8 +25,6 @@ Tick = Callable[[], object]
 FAMILIES = {
     "motion": "motion.MotionFamily",
     "tracking": "tracking.TrackingFamily",
-    "paper": "source_association.SourceFamily",
-    "people": "people.PeopleFamily",
     "location": "location.LocationFamily",
 }
 """Family -> its module and class in this package; a module is loaded when its family is used."""
