@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.tuning import family
 
 THRESHOLD = "difference.threshold"
-STEPS = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
+STEPS = ("--parameters", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
 BOTTOM = math.log(6)
 
 
@@ -96,27 +95,10 @@ def test_a_resumed_run_does_no_step_twice_and_says_the_same(clips, tuned) -> Non
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
-@dataclass
-class Choosy(Bowl):
-    """A bowl of two losses."""
-
-    losses: tuple[str, ...] = ("round", "square")
-    loss_name: str = "round"
-
-
 def test_a_checkpoint_of_another_plan_is_refused_and_the_run_before_stays(one, tmp_path) -> None:
-    bowl = Choosy(place=BOTTOM)
-    assert one("--loss", "square", bowl=bowl).exit_code == 0
-    assert record(tmp_path)["loss"] == "square"
-    assert "motion, loss square, on" in (tmp_path / "report.html").read_text()
+    assert one().exit_code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    for words, said in (
-        (("--patience", "3", "--loss", "square"), "with other patience"),
-        ((), "with other loss, square and not round"),
-    ):
-        assert said in bad(one(*words, "--resume", "--quiet", bowl=bowl))
-    unknown = one("--loss", "oval", bowl=bowl)
-    assert "'oval' is no loss of the family motion; wanted one of round, square" in bad(unknown)
+    assert "with other patience" in bad(one("--patience", "3", "--resume", "--quiet"))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -194,10 +176,10 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--knobs difference.absent", "difference.threshold (0.1 to"),
-        ("--knobs registration.keypoints", "is no parameter that can be tuned"),
-        ("--knobs=", "names no parameter"),
-        (f"--knobs {THRESHOLD},track.wander", "several families"),
+        ("--parameters difference.absent", "difference.threshold (0.1 to"),
+        ("--parameters registration.keypoints", "is no parameter that can be tuned"),
+        ("--parameters=", "names no parameter"),
+        (f"--parameters {THRESHOLD},track.wander", "several families"),
         ("--steps 0", "steps must be 1 or more, got 0"),
         ("--pull -1", "pull must be 0 or more, got -1"),
         ("--holdout none*", "fits no clip"),
@@ -205,7 +187,6 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         ("--device nowhere", "--device nowhere"),
         ("--device meta", "--device meta"),
         ("--minutes 0", "--minutes must be more than 0"),
-        ("--loss f", "is no loss of the family motion; it has one only"),
         ("--measure motion.pixels", "is no measure"),
         ("--measure motion.pixels.iou", "no measure of motion.pixels; wanted accuracy, "),
         ("--measure motion.target.hit", "no clip has truth for motion.target.hit"),

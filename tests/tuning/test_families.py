@@ -117,13 +117,6 @@ def test_a_clip_without_truth_is_refused_by_name(made: Made) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_another_loss_is_refused_with_those_there_are(made: Made) -> None:
-    _, family, *_ = made
-    wanted = f"wanted one of {', '.join(family.losses)}" if family.losses else "it has one only"
-    with pytest.raises(InputError, match=f"'iou' is no loss of the family {family.name}; {wanted}"):
-        family.with_loss("iou")
-
-
 def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
     with pytest.raises(InputError, match="wanted one of motion"):
         load_family("weather")

@@ -175,7 +175,6 @@ class _Run:
             "family": family.name,
             "task": family.task,
             "interval": family.interval,
-            "loss": family.loss_name,
             "knobs": ", ".join(parameters.names),
             "settings": json.dumps(changes(parameters.base), default=str),
             **{name: value for name, value in asdict(plan).items() if name != "most_s"},

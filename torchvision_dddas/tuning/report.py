@@ -22,7 +22,7 @@ def tuning_report(run: Mapping[str, Any]) -> str:
     return render_page(
         "tuning.html",
         title=f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient",
-        run={"loss": None, **run},
+        run=run,
         measure=describe(name),
         group=title_of_group(group),
         sides=[_side(side, heading, verdict[side], group, name) for side, heading in SIDES.items() if verdict],

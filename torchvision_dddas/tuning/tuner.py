@@ -94,7 +94,6 @@ class Tuner:
         holdout: Sequence[str] = (),
         clips: Sequence[str] = (),
         measure: str | None = None,
-        loss: str | None = None,
     ) -> Tuned:
         """Prepare, descend, measure before and after, and record it. The arguments are those of `prepare`.
 
@@ -104,7 +103,7 @@ class Tuner:
         with claimed(self._folder):
             try:
                 with self._timed("examples"), self._display.progress("examples", None) as tick:
-                    ready = prepare(study, base, names, holdout, clips, measure, loss, tick)
+                    ready = prepare(study, base, names, holdout, clips, measure, tick)
                 return self._run(ready)
             except BaseException as error:
                 if self._state:  # otherwise the record of an earlier run in this folder is still there
@@ -172,7 +171,6 @@ class Tuner:
             "versions": versions(),
             "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
             "family": ready.family.name,
-            "loss": ready.family.loss_name or None,
             "plan": asdict(self._plan),
             "examples": len(ready.examples),
             "knobs": {
