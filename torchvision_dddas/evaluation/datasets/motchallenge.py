@@ -103,13 +103,6 @@ def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) ->
     return Clip(name, place, pictures, info.rate_hz, last, truth, shows=("people",), given=public)
 
 
-def single_pictures(place: Path) -> dict[int, Path]:
-    """The pictures of a sequence by frame, where not all of them need be there: those of its folders img1*."""
-    folders = [place / name for name in files.folders_in(place) if name.startswith("img1")]
-    paths = [path for folder in folders for path in files.images_in(folder)]
-    return {number: path for path in paths if (number := files.number_of(path)) is not None}
-
-
 def _of_2015(path: Path, has_ground: bool) -> Truth:
     truth = load_truth(path)
     if truth.tracks is None:
