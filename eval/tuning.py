@@ -4,7 +4,7 @@ python eval/tuning.py recovery           perturbed parameters of motion, on simu
 python eval/tuning.py default            the shipped parameters of the difference beside those before they were tuned
 python eval/tuning.py identities DATA    the tracker's parameters, each sequence left out in turn
 
-Gradient descent beside random search or Optuna at equal time: `dddas tune` and `dddas sweep --search` on one study.
+Gradient descent beside random search or Optuna at equal time: `dddas tune` and `dddas sweep --optuna` on one study.
 """
 
 import tempfile
