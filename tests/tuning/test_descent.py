@@ -16,7 +16,6 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, clip_shares, descend, draw_batch, split_examples
 from torchvision_dddas.tuning.family import Example
 from torchvision_dddas.tuning.parameters import Parameters
-from torchvision_dddas.tuning.time_cost import TimeCost
 
 THRESHOLD, NOISE, ERODE = "difference.threshold", "difference.noise_levels", "morphology.erode_px"
 QUICK = Plan(steps=12, batch=4, rate=0.1, look_every=3)
@@ -200,19 +199,9 @@ def test_examples_on_which_no_parameter_has_an_effect_stop_nothing() -> None:
     assert found.failed == "" and found.history[-1].step == 12 and found.idle == ()
 
 
-class Dear(TimeCost):
-    """A threshold that costs time."""
-
-    def term(self, parameters: Mapping[str, Tensor]) -> Tensor:
-        """The higher the dearer."""
-        return parameters[THRESHOLD].log()
-
-
-@pytest.mark.parametrize(("cost", "least"), [(None, 3.0), (Dear(1.0, 1.0, ()), 2.5)])
-def test_it_gets_to_the_bottom_of_the_loss_and_the_cost(cost: TimeCost | None, least: float) -> None:
-    """Of (x - 3)² + x the bottom is at 2.5."""
-    found = descend(Bowl(), parameters(), pieces(spread=0.0), Plan(steps=100, rate=0.15), cost)
-    assert found.settings.difference.threshold == pytest.approx(math.exp(least), rel=0.02)
+def test_it_gets_to_the_bottom_of_the_loss() -> None:
+    found = descend(Bowl(), parameters(), pieces(spread=0.0), Plan(steps=100, rate=0.15))
+    assert found.settings.difference.threshold == pytest.approx(math.exp(3.0), rel=0.02)
     assert found.settings.difference.noise_levels == pytest.approx(1, rel=0.05)
     assert found.failed == "" and found.idle == ()
 

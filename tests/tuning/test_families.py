@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from tests.overflight import Overflight
-from tests.tuning.worlds import filmed_clip, flown, seen, spotted_clip, walk
-from torchvision_dddas.config import Settings, load_config, with_parameters
+from tests.tuning.worlds import filmed_clip, flown, seen, walk
+from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.tuning.family import Example, Family, load_family
@@ -19,7 +19,6 @@ SETTINGS = Settings()
 MOTION = with_parameters(
     SETTINGS, {"gates.min_area_px": 30, "morphology.close_px": 7, "registration.keypoints": 200, "small.on": False}
 )
-PAPER = with_parameters(load_config("paper"), {"paper.window": 2})
 
 
 @dataclass(frozen=True)
@@ -60,20 +59,6 @@ CASES = {
         idle=IDLE,
         change=lambda family: family.at(5, "tracking"),
     ),
-    **{
-        f"paper {loss}": Case(
-            "paper",
-            lambda place, _: walk(people=6, frames=80),
-            [6, 56],
-            "no true identities",
-            PAPER,
-            0.05,
-            frozenset(f"paper.{name}" for name in ("weight", "lowest_dispersion", "location_cut", "appearance_cut")),
-            lambda family, loss=loss: family.at(5, "association").with_loss(loss),  # type: ignore[misc]
-        )
-        for loss in ("wrong", "likelihood")
-    },
-    "people": Case("people", spotted_clip, [1, 3], "no boxes of people", idle=frozenset({"people.feet_share"})),
     "location": Case(
         "location",
         lambda place, _: flown(place, Overflight(frames=3, gps_m=0.5), sigma=False),
@@ -130,13 +115,6 @@ def test_a_clip_without_truth_is_refused_by_name(made: Made) -> None:
     with pytest.raises(InputError, match=f"bare has {case.lacks}") as caught:
         family.examples([replace(clip, name="bare", truth=None)], case.settings)
     assert "\n" not in str(caught.value)
-
-
-def test_another_loss_is_refused_with_those_there_are(made: Made) -> None:
-    _, family, *_ = made
-    wanted = f"wanted one of {', '.join(family.losses)}" if family.losses else "it has one only"
-    with pytest.raises(InputError, match=f"'iou' is no loss of the family {family.name}; {wanted}"):
-        family.with_loss("iou")
 
 
 def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:

@@ -1,31 +1,25 @@
-"""What a tuning run says: figures before and after, its page, and the time that parameters cost."""
+"""What a tuning run says: figures before and after, and its page."""
 
-import json
 import math
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
-import torch
 
 from tests.browser import evaluate, needs_browser
 from tests.evaluation.studies.test_comparison import CLIPS, comparison
 from tests.evaluation.studies.world import filmed, study
 from tests.pages import Page
-from tests.tuning.worlds import filmed_clip
-from torchvision_dddas.config import Settings, load_config, with_parameters
-from torchvision_dddas.errors import InputError
+from torchvision_dddas.config import load_config
 from torchvision_dddas.evaluation.metrics import bootstrap
 from torchvision_dddas.evaluation.studies.runner import read_spec, run_study
 from torchvision_dddas.evaluation.studies.summary import goal_value, parse_goal
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.tuning.report import tuning_report
-from torchvision_dddas.tuning.time_cost import Curve, TimeCost, frame_timer, measure_cost, read_cost, timed_points
 from torchvision_dddas.tuning.verdict import Verdict, _say_change, judge
 
 THRESHOLD, NOISE = "difference.threshold", "difference.noise_levels"
-CLOSE, BLUR = "morphology.close_px", "difference.blur_px"
 GOAL = parse_goal("motion.pixels.f")
 
 
@@ -110,7 +104,6 @@ def record(**changed):
         "ended": "all 4 steps were taken",
         "failed": "",
         "history": history,
-        "cost": None,
         "verdict": {
             "measure": "motion.pixels.f",
             "better": "more",
@@ -123,8 +116,6 @@ def record(**changed):
 
 
 NOTHING = side(["one"], None, None, "") | {"changes": None}
-TIMED = {"weight": 0.1, "seconds": 0.02, "expected": 0.015}
-TIMES = [{"knob": THRESHOLD, "values": [2.0, 4.0], "times": [1.3, 1.0]}]
 FAILED = "the loss of motion is no number for one, frame 3, with difference.threshold = 12, at step 2"
 
 
@@ -137,8 +128,6 @@ FAILED = "the loss of motion is no number for one, frame 3, with difference.thre
         ({"taken": 2}, "4.00 s a step"),
         ({"verdict": record()["verdict"] | {"held_out": None}}, "none; give --holdout"),
         ({"failed": FAILED}, f"Stopped: {FAILED}. The parameters are the last good ones."),
-        ({"cost": TIMED | {"curves": TIMES}}, "a loss of 0.1. Expected: 20.0 → 15.0 ms a frame.|1.3, 1"),
-        ({"cost": TIMED | {"curves": []}}, "No parameter changed the time by more than repeats differ."),
         (
             {"verdict": {"measure": "motion.pixels.f", "tuned": NOTHING, "held_out": None}},
             "no F before and after|Nothing to compare",
@@ -165,60 +154,3 @@ def test_each_parameter_has_its_plot_and_row_and_words_of_the_user_are_no_markup
 @needs_browser
 def test_on_a_phone_nothing_hangs_over_the_edge(tmp_path):
     assert evaluate(tuning_report(record()), "return page.documentElement.scrollWidth;", tmp_path, 390) <= 390
-
-
-def scalar(value: float) -> torch.Tensor:
-    return torch.tensor(value, dtype=torch.float64, requires_grad=True)
-
-
-def test_a_factor_is_measured_at_what_was_measured_and_lies_between_elsewhere() -> None:
-    curve = Curve(THRESHOLD, (2.0, 4.0, 8.0), (2.0, 1.0, 0.8))
-    # The knob's scale is that of factors: the middle of 2 and 4 is their geometric mean.
-    at = {2.0: 2.0, 4.0: 1.0, 8.0: 0.8, 8**0.5: 1.5, 0.5: 2.0, 90.0: 0.8}
-    assert [float(curve.factor(scalar(value)).detach()) for value in at] == pytest.approx(list(at.values()))
-
-
-def test_the_term_is_nothing_at_the_settings_and_twice_the_time_costs_the_weight() -> None:
-    cost = TimeCost(0.5, 0.02, (Curve(THRESHOLD, (2.0, 4.0), (2.0, 1.0)), Curve(CLOSE, (5.0, 10.0), (1.0, 1.5))))
-    assert float(cost.term({THRESHOLD: scalar(4.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0)
-    assert float(cost.term({THRESHOLD: scalar(2.0), CLOSE: scalar(5.0)}).detach()) == pytest.approx(0.5)
-    assert float(cost.expected({THRESHOLD: scalar(2.0), CLOSE: scalar(10.0)}).detach()) == pytest.approx(0.06)
-    value = scalar(3.0)
-    cost.term({THRESHOLD: value}).backward()
-    assert value.grad is not None and float(value.grad) < 0
-    assert torch.autograd.gradcheck(lambda v: cost.term({THRESHOLD: v}), scalar(3.0))
-
-
-def test_the_points_are_allowed_values_on_either_side_of_the_parameters_own() -> None:
-    settings = with_parameters(Settings(), {THRESHOLD: 200.0, BLUR: 5})
-    points = [("", 0.0), (THRESHOLD, 100.0), (THRESHOLD, 255.0), (BLUR, 3.0), (BLUR, 11.0)]
-    assert list(timed_points(settings, [THRESHOLD, BLUR])) == points
-
-
-def test_what_depends_on_a_parameter_is_found_and_what_does_not_costs_nothing(tmp_path: Path) -> None:
-    settings = with_parameters(Settings(), {THRESHOLD: 8.0})
-    noise = iter(1 + 0.01 * k for k in (0, 1, -1, 2, 0, 1, -2, 0, 1, 0, 2, -1, 1, 0, -1, 0, 1, 2, 0, 0))
-    cost = measure_cost(
-        lambda changed: 0.1 * 8 / changed.difference.threshold * next(noise), settings, [THRESHOLD, CLOSE], 1.0
-    )
-    (curve,) = cost.curves
-    assert curve.parameter == THRESHOLD and curve.values == (4.0, 8.0, 16.0)
-    assert curve.times == pytest.approx((2, 1, 0.5), rel=0.05) and cost.seconds == pytest.approx(0.1, rel=0.05)
-    assert 0 < frame_timer(filmed_clip(tmp_path, 5), "motion", load_config("fast"), "onboard")(load_config("fast")) < 10
-
-
-CURVE = '{"knob": "difference.threshold", "values": [1, 2], "times": [1]}'
-
-
-@pytest.mark.parametrize("curves", [None, "1", CURVE, CURVE.replace("1, 2", '"a"'), CURVE.replace("threshold", "no")])
-def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, curves: str | None) -> None:
-    text = f'{{"weight": 1, "seconds": 1, "curves": [{curves}]}}' if curves else ""
-    (tmp_path / "cost.json").write_text(text)
-    with pytest.raises(InputError, match="does not hold the cost"):
-        read_cost(tmp_path / "cost.json")
-
-
-def test_what_was_measured_is_kept_to_the_last_digit(tmp_path: Path) -> None:
-    cost = TimeCost(0.1, 1 / 3, (Curve(THRESHOLD, (2.0, 4.0), (1.1, 1.0)),))
-    (tmp_path / "cost.json").write_text(json.dumps(cost.as_json()))
-    assert read_cost(tmp_path / "cost.json") == cost

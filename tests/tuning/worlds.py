@@ -3,19 +3,15 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pytest
 
 from tests.overflight import ORIGIN, Overflight
 from tests.synthetic_clip import film_into
-from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.evaluation.datasets.kinds import read
 from torchvision_dddas.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.evaluation.metrics import truth as truths
 from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, Truth
 from torchvision_dddas.geometry import lonlat
-from torchvision_dddas.people.suppression import body_boxes
 from torchvision_dddas.types import Camera
 
 PERSON = np.array([20.0, 50.0])
@@ -120,43 +116,3 @@ def ground_clip(folder: Path) -> Clip:
     where = Positions(*numbers, np.concatenate([ground_people(frame, 5, 0, 0, 0)[1] for frame in (1, 2)]))
     truth = replace(truths.load_truth(folder / "gt.txt"), positions=where)
     return Clip("ground", folder, truth=truth, given=folder / "det.txt", camera=folder / "camera.toml")
-
-
-class Spots:
-    """A recognizer for which the window about a white spot is a person, the more the whiter."""
-
-    name = "stub"
-
-    def scores(self, images, parts):
-        return [[self._map(image, part) for part in wanted] for image, wanted in zip(images, parts, strict=True)]
-
-    def _map(self, image, part):
-        level = cv2.resize(image, part.level).astype(np.float32)
-        rows, columns = ((side - length) // 8 + 1 for side, length in ((part.height, 128), (part.width, 64)))
-        found = np.full((rows, columns), -5.0, np.float32)
-        for j in range(rows):
-            for i in range(columns):
-                v, u = part.y + 8 * j + 64, part.x + 8 * i + 32
-                inside = 0 <= v < level.shape[0] and 0 <= u < level.shape[1]
-                if part.level == (image.shape[1], image.shape[0]) and inside and level[v, u] > 0:
-                    found[j, i] = level[v, u] / 100 - 1
-        return found
-
-
-def spotted() -> tuple[np.ndarray, np.ndarray]:
-    """A picture of 256 x 160 with spots of which windows score 1.5, 0.5 and -0.5, and the first one's body."""
-    image = np.zeros((160, 256), np.uint8)
-    for u, level in ((40, 250), (136, 150), (216, 50)):
-        image[80 - 3 : 80 + 4, u - 3 : u + 4] = level
-    return image, body_boxes(np.array([[8.0, 16.0, 64.0, 128.0]]), PeopleParameters())
-
-
-def spotted_clip(place: Path, monkeypatch: pytest.MonkeyPatch) -> Clip:
-    """Three pictures of spots that are scored by `Spots`; the second is not labelled, the third shows nobody."""
-    image, true = spotted()
-    files = [place / f"{number}.png" for number in (1, 2, 3)]
-    for file in files:
-        cv2.imwrite(str(file), image)
-    truth = Truth("boxes", place, {}, {1: true, 3: np.zeros((0, 4))})
-    monkeypatch.setattr("torchvision_dddas.tuning.people.load_scorer", lambda parameters: Spots())
-    return Clip("spots", place, tuple(files), truth=truth, shows=("people",))

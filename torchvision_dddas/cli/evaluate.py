@@ -24,6 +24,7 @@ from torchvision_dddas.cli.options import (
     check_jobs,
     echo,
     print_lines,
+    refuse_options,
     report_errors,
     split_patterns,
 )
@@ -102,7 +103,7 @@ def evaluate(
         study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
         study |= {"--worker-silent": worker_silent}
         study |= {"--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
-        _refuse(study, "is for a study; give --dataset FILE too")
+        refuse_options(study, "is for a study; give --dataset FILE too")
         if truth is None or result is None:
             raise InputError(
                 "evaluate needs TRUTH and RESULT, or --dataset FILE, the TOML of a study; see dddas evaluate --help"
@@ -118,7 +119,7 @@ def evaluate(
     from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
     from torchvision_dddas.evaluation.studies.runner import write_study
 
-    _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
+    refuse_options({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
     check_jobs(jobs, scheduler)
     check_interval(interval, 1000)
     folder, base, used = out or Path("dddas-study"), dataset.parent, split_patterns(clips, "--clips")
@@ -135,13 +136,6 @@ def evaluate(
     if all(case.cause for case in results.cases):
         case = results.cases[0]
         raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")
-
-
-def _refuse(options: dict[str, object], why: str) -> None:
-    """Raise InputError for the first option that was given."""
-    for option, given in options.items():
-        if given is not None:
-            raise InputError(f"{option} {why}")
 
 
 def change_spec(

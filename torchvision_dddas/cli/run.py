@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +23,7 @@ from torchvision_dddas.cli.options import (
     Rate,
     check_interval,
     print_lines,
+    refuse_options,
     report_errors,
 )
 from torchvision_dddas.cli.progress import closing_lines, progress, record_results
@@ -122,23 +122,23 @@ def run(
         raise InputError(f"one clip and {len(logs)} logs; give one --telemetry")
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
-        _refuse(others, "is of no use with --live, which draws and steers nothing")
+        refuse_options(others, "is of no use with --live, which draws and steers nothing")
     else:
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
-        _refuse(others, "is for a run that keeps up with a camera; give --live too")
+        refuse_options(others, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, **beside}
         inputs["--interval"] = None if interval == 1 else interval
-        _refuse(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
+        refuse_options(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
         _fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, quiet)
         return
     if scene or seed is not None:
         raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
     if landmarks is None:
-        _refuse({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
+        refuse_options({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
     if landmarks is None and telemetry is None:
-        _refuse(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
+        refuse_options(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
     given = None
     if landmarks is not None or telemetry is not None:
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
@@ -203,13 +203,6 @@ def _with_password(clip: str, path: Path | None) -> str:
         if not password:
             raise InputError(f"--password-file {path} begins with an empty line; wanted the password")
     return f"{login[1]}:{quote(password, safe='')}@{login[2]}" if login is not None and password else clip
-
-
-def _refuse(options: Mapping[str, object], why: str) -> None:
-    """Raise InputError for the first option that was given."""
-    for option, given in options.items():
-        if given is not None and given != []:
-            raise InputError(f"{option} {why}")
 
 
 def _fly(

@@ -22,8 +22,8 @@ from torchvision_dddas.config import AerialParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.studies.scoring import whose_places
-from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.geo import AerialLocator, Targets, check_table
+from torchvision_dddas.evaluation.studies.stages import open_pipeline, open_table
+from torchvision_dddas.geo import AerialLocator, Targets
 from torchvision_dddas.geo.landmark_faults import passes
 from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
 from torchvision_dddas.geo.pose_estimation import (
@@ -36,8 +36,6 @@ from torchvision_dddas.geo.pose_estimation import (
     pose_prior,
 )
 from torchvision_dddas.geometry.projection import Surface, ground_with_slopes, surface_of
-from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tuning.parameters import value_of
 from torchvision_dddas.types import AerialLocations, Camera, CameraPose, Flight, LandmarkObservations
 
@@ -332,32 +330,18 @@ def _located_view(
 
 
 def _locate_pictures(clip: Clip, settings: Settings) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
-    source = open_clip(clip)
-    ready = assemble_files(_input(clip), clip.telemetry, settings, source, "auto", str(clip.pictures[0]))
+    source, ready, pipeline = open_pipeline(clip, settings)
     assert ready.watch is not None
-    pipeline = Pipeline.from_assembly(ready, pictures=False)
     for result in pipeline(source):
         if result.locations is not None:
             yield ready.watch.locator, result.locations, _targets(result.locations.box_px, None, bodies=True)
 
 
 def _locate_detections(clip: Clip, settings: Settings) -> Iterator[tuple[AerialLocator, AerialLocations, Targets]]:
-    if clip.given is None:
-        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
-    table = read_detections(clip.given)
-    span = (table.first, table.last)
-    locator, _ = read_locator(
-        _input(clip), settings, None, clip.rate_hz, "auto", span, "table", None, extent=table.extent
-    )
-    check_table(table, locator)
+    table, locator, _ = open_table(clip, settings)
     for located in locator.locate_table(table):
         feet_px = None if table.feet_px is None else table.feet_px[table.rows(located.frame)]
         yield locator, located, _targets(located.box_px, feet_px, table.ours)
-
-
-def _input(clip: Clip) -> AerialInput:
-    assert clip.landmarks is not None
-    return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
 def _targets(box_px: np.ndarray, feet_px: np.ndarray | None, bodies: bool) -> Targets:

@@ -10,7 +10,7 @@ import torch
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, save_file
 
-FORMAT = 3
+FORMAT = 4
 
 
 def write_checkpoint(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
@@ -43,21 +43,18 @@ def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
     return state
 
 
-def set_aside(place: Path, aside: Path, more: Mapping[Path, Path]) -> int:
+def set_aside(place: Path, aside: Path) -> int:
     """Keep an unfinished checkpoint that a new descent would overwrite; return its steps, 0 if none was kept.
 
-    One of more steps that lies at `aside` already is left there. more: files that belong to it, and where they go.
-    Raises InputError where the disk refuses.
+    One of more steps that lies at `aside` already is left there. Raises InputError where the disk refuses.
     """
     steps = _unfinished_steps(place)
     if steps == 0 or steps < _unfinished_steps(aside):
         return 0
-    for here, there in {**more, place: aside}.items():
-        try:
-            if here.is_file():
-                here.replace(there)
-        except OSError as error:
-            raise cannot_write(there, error) from error
+    try:
+        place.replace(aside)
+    except OSError as error:
+        raise cannot_write(aside, error) from error
     return steps
 
 

@@ -17,7 +17,6 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.tuning.checkpoint import read_checkpoint, write_checkpoint
 from torchvision_dddas.tuning.family import Example, Family
 from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.time_cost import TimeCost
 
 FINAL_RATE = 0.1
 """The rate at the last step, as a share of the first."""
@@ -65,7 +64,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Step:
-    """The parameters after a step, where step 0 is the start, and the losses with the cost.
+    """The parameters after a step, where step 0 is the start, and the losses.
 
     loss: of the step's batch, NaN at step 0. watched: mean of the watched examples at the final softness; None where
     they were not measured.
@@ -106,7 +105,6 @@ def descend(
     parameters: Parameters,
     examples: Sequence[Example],
     plan: Plan | None = None,
-    cost: TimeCost | None = None,
     tell: Callable[[Step], object] = lambda step: None,
     place: Path | None = None,
     resume: bool = False,
@@ -120,7 +118,7 @@ def descend(
     plan = plan or Plan()
     if not examples:
         raise InputError(f"there is nothing to tune {family.name} on; give clips with the truth that it needs")
-    run = _Run(family, parameters, examples, plan, cost)
+    run = _Run(family, parameters, examples, plan)
     began = time.perf_counter()
     if resume and place is not None and place.is_file():
         run.load(place)
@@ -161,10 +159,8 @@ class _Run:
 
     _SAVED = ("best", "least", "best_step", "since", "ended", "failed")
 
-    def __init__(
-        self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan, cost: TimeCost | None
-    ) -> None:
-        self._family, self._parameters, self._plan, self._cost = family, parameters, plan, cost
+    def __init__(self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan) -> None:
+        self._family, self._parameters, self._plan = family, parameters, plan
         self._learned, self._watched = split_examples(examples, plan.watched, plan.most_watched)
         self._adam = torch.optim.Adam(parameters.parameters(), lr=plan.rate, betas=(0.9, 0.99))
         self._hardest = family.softness[1]
@@ -179,12 +175,10 @@ class _Run:
             "family": family.name,
             "task": family.task,
             "interval": family.interval,
-            "loss": family.loss_name,
             "knobs": ", ".join(parameters.names),
             "settings": json.dumps(changes(parameters.base), default=str),
             **{name: value for name, value in asdict(plan).items() if name != "most_s"},
             "examples": hashlib.sha256(used.encode()).hexdigest()[:16],
-            "cost": "" if cost is None else repr(cost),
         }
 
     def begin(self) -> Step:
@@ -207,13 +201,13 @@ class _Run:
         for value in values.values():
             if value.requires_grad:
                 value.retain_grad()
-        charged = self._family.loss(values, batch, softness).mean() + self._time_term(values)
-        loss = charged + self._pull_term(whole)
+        wrong = self._family.loss(values, batch, softness).mean()
+        loss = wrong + self._pull_term(whole)
         if not bool(torch.isfinite(loss)):
             self._fail(number, batch, values, softness)
             return None
         # The examples of one batch may depend on no parameter; all together must.
-        if not charged.requires_grad and not self.moved:
+        if not wrong.requires_grad and not self.moved:
             parts = self._parts(self._learned)
             if not any(self._family.loss(values, part, softness).requires_grad for part in parts):
                 raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(values)}")
@@ -286,15 +280,12 @@ class _Run:
         return step
 
     def _watched_mean(self, values: Mapping[str, Tensor]) -> float:
-        """The mean loss of the watched examples at the final softness, every clip with the same weight, charged."""
+        """The pull, and the mean loss of the watched examples at the final softness, each clip with the same weight."""
         shares = iter(clip_shares([example.clip for example in self._watched]))
         losses = (self._family.loss(values, part, self._hardest).tolist() for part in self._parts(self._watched))
         # Each part is summed exactly, so that the result does not depend on the order within it.
         total = sum(math.fsum(loss * next(shares) for loss in part) for part in losses)
-        return total + float(self._time_term(values) + self._pull_term())
-
-    def _time_term(self, values: Mapping[str, Tensor]) -> Tensor:
-        return torch.zeros((), dtype=torch.float64) if self._cost is None else self._cost.term(values)
+        return total + float(self._pull_term())
 
     def _pull_term(self, whole: bool = False) -> Tensor:
         pull = self._plan.pull
@@ -309,7 +300,7 @@ class _Run:
         return first ** (1 - share) * last**share if first > 0 and last > 0 else first + (last - first) * share
 
     def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
-        self.failed = f"{self._explain(batch, values, softness) or 'the cost is not finite'}, at step {number}"
+        self.failed = f"{self._explain(batch, values, softness) or 'the pull is not finite'}, at step {number}"
 
     def _explain(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
         """Name the first example whose loss or gradient is not finite, and the parameter; empty where all are finite.

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
-import torch
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, load_config
@@ -25,8 +24,6 @@ Tick = Callable[[], object]
 FAMILIES = {
     "motion": "motion.MotionFamily",
     "tracking": "tracking.TrackingFamily",
-    "paper": "source_association.SourceFamily",
-    "people": "people.PeopleFamily",
     "location": "location.LocationFamily",
 }
 """Family -> its module and class in this package; a module is loaded when its family is used."""
@@ -48,19 +45,15 @@ class Example:
 class Family(ABC):
     """A stage of the pipeline whose parameters can be tuned: examples of what is true, and a loss on them.
 
-    A family defines `clip_examples`, and `loss` or `_losses`. name: a key of FAMILIES. task: of a study, whose clips
-    are used. measure: judged before and after, such as motion.pixels.f. softness: of the loss at the first and at the
-    last step. losses: names to choose from, the first is the default; empty where there is one loss only. loss_name:
-    the chosen one. interval: frames between examples. empty: why a clip may give no example; a clip without any is an
-    error where this is set.
+    name: a key of FAMILIES. task: of a study, whose clips are used. measure: judged before and after, such as
+    motion.pixels.f. softness: of the loss at the first and at the last step. interval: frames between examples. empty:
+    why a clip may give no example; a clip without any is an error where this is set.
     """
 
     name: str
     task: Task
     measure: str
     softness: tuple[float, float]
-    losses: tuple[str, ...] = ()
-    loss_name: str = ""
     interval: int = 1
     empty = ""
 
@@ -81,13 +74,6 @@ class Family(ABC):
         """The family for a study's interval and for the task of the measure."""
         return self
 
-    def with_loss(self, name: str) -> Self:
-        """The family with another of its losses. Raises InputError where it has no such loss."""
-        if name not in self.losses:
-            wanted = f"wanted one of {', '.join(self.losses)}" if self.losses else "it has one only; leave --loss out"
-            raise InputError(f"'{name}' is no loss of the family {self.name}; {wanted}")
-        return cast(Self, replace(cast(Any, self), loss_name=name))
-
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
         """The examples of all clips. tick is called once an example. Raises InputError for a clip without any."""
         self.check_clips(clips, settings)
@@ -101,18 +87,13 @@ class Family(ABC):
                 raise InputError(f"{clip.name}: {self.empty}")
         return found
 
+    @abstractmethod
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
         """(B,) how wrong each example is, with a gradient in the parameters, on their device.
 
         parameters: the tuned values by name, in the units of the settings; all others are as the examples were prepared
-        with. The result depends on nothing else. Unless a family overrides this, `_losses` computes it on the CPU.
+        with. The result depends on nothing else.
         """
-        device = next(iter(parameters.values())).device if parameters else torch.device("cpu")
-        values = {name: value.cpu() for name, value in parameters.items()}
-        return torch.stack(self._losses(batch, values, softness)).to(device)
-
-    def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:
-        raise NotImplementedError
 
 
 def load_family(name: str) -> Family:
@@ -149,14 +130,13 @@ def prepare(
     holdout: Sequence[str] = (),
     clips: Sequence[str] = (),
     measure: str | None = None,
-    loss: str | None = None,
     tick: Tick = lambda: None,
 ) -> Prepared:
     """Read a study's clips and prepare the examples of those that are not held out.
 
-    names: of parameters, as `expand_names` takes them. holdout, clips: patterns of clips' names. measure, loss: in
-    place of the family's. tick: called once an example. Raises InputError for a parameter that cannot be tuned or has
-    no effect under the settings, parameters of several families, an unknown loss, clips without the needed truth, and
+    names: of parameters, as `expand_names` takes them. holdout, clips: patterns of clips' names. measure: in place of
+    the family's. tick: called once an example. Raises InputError for a parameter that cannot be tuned or has
+    no effect under the settings, parameters of several families, clips without the needed truth, and
     as `plan_study` does.
     """
     settings = load_config(spec.config, spec.overrides)
@@ -174,8 +154,6 @@ def prepare(
     family.check(parameters.names, settings)
     goal = parse_goal(measure or family.measure)
     family = family.at(spec.interval, goal.task)
-    if loss is not None:
-        family = family.with_loss(loss)
     spec = replace(spec, tasks=(goal.task,))
     tuned, held = split_clips(spec, base, clips, holdout)
     used = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)

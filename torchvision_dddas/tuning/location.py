@@ -60,8 +60,10 @@ class LocationFamily(Family):
             raise InputError(f"{clip.name} has no true positions, which tuning of ellipses needs; leave it out")
         yield from ground_examples(clip, settings) if clip.landmarks is None else aerial_examples(clip, settings)
 
-    def _losses(self, batch: Sequence[Example], values: dict[str, Tensor], softness: float) -> list[Tensor]:
-        """Nats a target; views from the air of equal shapes are computed together."""
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,) nats a target, on the CPU; views from the air of equal shapes are computed together."""
+        device = next((value.device for value in parameters.values()), torch.device("cpu"))
+        values = {name: value.cpu() for name, value in parameters.items()}
         losses: list[Tensor] = [torch.zeros(0)] * len(batch)
         groups = defaultdict(list)
         for row, example in enumerate(batch):
@@ -78,7 +80,7 @@ class LocationFamily(Family):
             rows, views, fits = zip(*members, strict=True)
             for row, loss in zip(rows, aerial_losses(views, known, fits), strict=True):
                 losses[row] = loss
-        return losses
+        return torch.stack(losses).to(device)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
 """The family of motion segmentation: masks of labelled frames against soft masks."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import repeat
 from typing import Any
 
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from kornia.losses import binary_focal_loss_with_logits
 from torch import Tensor
 
 from torchvision_dddas.config import Settings, with_parameters
@@ -48,30 +46,11 @@ Masks = Float[Tensor, "B 1 H W"]
 Labels = Bool[Tensor, "B 1 H W"]
 
 
-def overlap_loss(mask: Masks, truth: Labels, known: Labels, power: int = 1) -> Float[Tensor, "B"]:
-    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11). known: where the truth is known.
-
-    power: of the found mask; with squares doubtful pixels cost less (Milletari et al. 2016).
-    """
+def overlap_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"]:
+    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11). known: where the truth is known."""
     seen, axes = mask * known, (1, 2, 3)
-    found, true = (seen**power).sum(axes), (truth & known).sum(axes).to(mask.dtype)
+    found, true = seen.sum(axes), (truth & known).sum(axes).to(mask.dtype)
     return 1 - (2 * (seen * truth).sum(axes) + _SPARE_PX) / (found + true + _SPARE_PX)
-
-
-def focal_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"]:
-    """Mean of -(1 - p)² ln p, where p is the mask's value for the truth, movers weighed 3 : 1 (Lin et al. 2017)."""
-    logits = torch.logit(mask, eps=1e-6)
-    loss = binary_focal_loss_with_logits(logits, truth.to(mask.dtype), alpha=0.75, gamma=2.0, reduction="none")
-    weight = torch.where(truth, 0.75, 0.25) * known
-    return (loss * known).sum((1, 2, 3)) / weight.sum((1, 2, 3)).clamp(min=1e-6)
-
-
-LOSSES: Mapping[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
-    "f": overlap_loss,
-    "dice": partial(overlap_loss, power=2),
-    "focal": focal_loss,
-}
-"""By the names that `dddas tune --loss` takes; the first is the default."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +78,11 @@ class MotionFamily(Family):
     below the threshold adds up, and the least loss lies at a higher threshold than with hard masks.
     """
 
-    loss_name: str = "f"
     with_later_steps: bool = True
     name: str = "motion"
     task: Task = "motion"
     measure: str = "motion.pixels.f"
     softness: tuple[float, float] = (0.1, 0.02)
-    losses: tuple[str, ...] = tuple(LOSSES)
     empty = "no labelled frame was compared with its neighbours; nothing to tune on"
 
     def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:
@@ -153,7 +130,7 @@ class MotionFamily(Family):
         for places in groups.values():
             frames = stack_frames([batch[place].content for place in places], device)
             mask = soft_masks(frames, batch[0].settings, parameters, softness)
-            for place, loss in zip(places, LOSSES[self.loss_name](mask, frames.truth, frames.known), strict=True):
+            for place, loss in zip(places, overlap_loss(mask, frames.truth, frames.known), strict=True):
                 losses[place] = loss
         return torch.stack(losses)
 

@@ -19,24 +19,15 @@ def tuning_report(run: Mapping[str, Any]) -> str:
     """The HTML. run: the content of run.json of `dddas tune`, NaN as None."""
     parameters, verdict = run["knobs"], run.get("verdict")
     _, group, name = verdict["measure"].split(".", 2) if verdict else ("", "", "f")
-    times = ""
-    if run.get("cost"):
-        columns = [Column(name, text=True) for name in ("parameter", "values", "times as long")]
-        rows = [
-            [curve["knob"], *(", ".join(f"{v:.3g}" for v in curve[part]) for part in ("values", "times"))]
-            for curve in run["cost"]["curves"]
-        ]
-        times = table("time by parameter", columns, [[text_cell(text) for text in row] for row in rows])
     return render_page(
         "tuning.html",
         title=f"Tuning of {len(parameters)} parameter{'s' * (len(parameters) != 1)} by gradient",
-        run={"loss": None, **run},
+        run=run,
         measure=describe(name),
         group=title_of_group(group),
         sides=[_side(side, heading, verdict[side], group, name) for side, heading in SIDES.items() if verdict],
         charts=_charts(run),
         parameters=_parameter_table(parameters),
-        times=times,
         meaning=MEANING,
     )
 

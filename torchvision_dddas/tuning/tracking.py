@@ -70,7 +70,7 @@ class TrackingFamily(Family):
         """See `Family.check`."""
         if settings.track.mode != "default":
             mine = f"{', '.join(names)}: no effect under track.mode={settings.track.mode}"
-            raise InputError(f"{mine}; add --set track.mode=default, or tune paper.threshold and its like")
+            raise InputError(f"{mine}; add --set track.mode=default")
 
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         """Stretches of the clip's true tracks, each a row of `Stretches`; the last may be shorter, with two frames."""

@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from torchvision_dddas.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.io.atomic_files import claimed, save_file
 from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.io.output.run_record import finite, versions
-from torchvision_dddas.tuning import time_cost
 from torchvision_dddas.tuning.checkpoint import set_aside
 from torchvision_dddas.tuning.descent import Descended, Plan, Step, descend
 from torchvision_dddas.tuning.family import Prepared, prepare
@@ -25,9 +24,9 @@ from torchvision_dddas.tuning.parameters import TUNABLE
 from torchvision_dddas.tuning.report import tuning_report
 from torchvision_dddas.tuning.verdict import Shown, Verdict, count_clips, judge
 
-CHECKPOINT, COST, TUNED, REPORT, RUN = "checkpoint.pt", "cost.json", "tuned.toml", "report.html", "run.json"
-OLD, OLD_COST = "checkpoint.old.pt", "cost.old.json"
-FILES = (CHECKPOINT, OLD, COST, OLD_COST, TUNED, REPORT, RUN)
+CHECKPOINT, OLD = "checkpoint.pt", "checkpoint.old.pt"
+TUNED, REPORT, RUN = "tuned.toml", "report.html", "run.json"
+FILES = (CHECKPOINT, OLD, TUNED, REPORT, RUN)
 
 
 @dataclass(frozen=True)
@@ -71,19 +70,18 @@ class Tuner:
         folder: Path,
         plan: Plan | None = None,
         *,
-        time_weight: float | None = None,
         resume: bool = False,
         device: torch.device | str = "cpu",
         jobs: int | None = None,
         cache: Path | None = None,
         display: Display | None = None,
     ) -> None:
-        """time_weight: the loss that a frame of twice the time costs; None leaves time out. device: of the descent.
+        """resume: go on from the folder's checkpoint where there is one. device: of the descent.
 
-        resume: go on from the folder's checkpoint where there is one. jobs, cache: as `judge` takes them.
+        jobs, cache: as `judge` takes them.
         """
         self._folder, self._plan, self._resume, self._device = folder, plan or Plan(), resume, device
-        self._time_weight, self._jobs, self._cache = time_weight, jobs, cache
+        self._jobs, self._cache = jobs, cache
         self._display = display or Display()
         self._seconds: dict[str, float] = {}
         self._state: dict[str, str] = {}
@@ -96,7 +94,6 @@ class Tuner:
         holdout: Sequence[str] = (),
         clips: Sequence[str] = (),
         measure: str | None = None,
-        loss: str | None = None,
     ) -> Tuned:
         """Prepare, descend, measure before and after, and record it. The arguments are those of `prepare`.
 
@@ -106,7 +103,7 @@ class Tuner:
         with claimed(self._folder):
             try:
                 with self._timed("examples"), self._display.progress("examples", None) as tick:
-                    ready = prepare(study, base, names, holdout, clips, measure, loss, tick)
+                    ready = prepare(study, base, names, holdout, clips, measure, tick)
                 return self._run(ready)
             except BaseException as error:
                 if self._state:  # otherwise the record of an earlier run in this folder is still there
@@ -122,18 +119,17 @@ class Tuner:
         self._display.message(
             f"{ready.family.name}: {len(ready.examples)} examples of {count_clips(ready.tuned)}{held}"
         )
-        cost = None if self._time_weight is None else self._measure_cost(ready, self._time_weight)
         before, place = _values(ready), self._folder / CHECKPOINT
         if self._resume and not place.is_file():
             self._display.message(f"there is no checkpoint at {place}: it begins anew")
 
         def tell(step: Step) -> None:
             if not self._state:
-                self._begin_record(ready, cost)
+                self._begin_record(ready)
             self._display.step(step)
 
         with self._timed("descent"):
-            found = descend(ready.family, ready.parameters, ready.examples, self._plan, cost, tell, place, self._resume)
+            found = descend(ready.family, ready.parameters, ready.examples, self._plan, tell, place, self._resume)
         after = _values(ready)
         about = f"dddas tune: {', '.join(after)} on {', '.join(ready.tuned)}, step {found.best}."
         self._write(TUNED, settings_toml(found.settings, [about]))
@@ -143,33 +139,18 @@ class Tuner:
                 self._display.study,
             )  # fmt: skip
         self._write(TUNED, settings_toml(found.settings, [about, *(f"{line}." for line in verdict.lines())]))
-        record = self._record(ready, found, cost, before, after, verdict)
+        record = self._record(ready, found, before, after, verdict)
         self._write(REPORT, tuning_report(finite(record)))
         self._write_json(RUN, record)
         last_good = f"{self._folder / TUNED} holds the last good state, of step {found.best}"
         return Tuned(found, verdict, before, after, f"{found.failed}; {last_good}" if found.failed else "")
 
-    def _measure_cost(self, ready: Prepared, weight: float) -> time_cost.TimeCost:
-        """The time that the parameters cost on the shortest clip; a resumed descent keeps what was measured for it."""
-        place = self._folder / COST
-        if self._resume and place.is_file() and (self._folder / CHECKPOINT).is_file():
-            # Another weight is another descent, which the checkpoint refuses.
-            return replace(time_cost.read_cost(place), weight=weight)
-        clip = min(ready.clips, key=lambda clip: clip.frames or len(clip.pictures) or 10**9)
-        names, settings = ready.parameters.names, ready.parameters.base
-        count = time_cost.REPEATS * len(time_cost.timed_points(settings, names))
-        with self._timed("cost"), self._display.progress("what time costs", count) as tick:
-            timed = time_cost.frame_timer(clip, ready.goal.task, settings, ready.spec.backend)
-            return time_cost.measure_cost(timed, settings, names, weight, tick)
-
-    def _begin_record(self, ready: Prepared, cost: time_cost.TimeCost | None) -> None:
+    def _begin_record(self, ready: Prepared) -> None:
         """Called with the first step, so that a refused run leaves the files of an earlier one alone."""
         if not self._resume:
             place, aside = self._folder / CHECKPOINT, self._folder / OLD
-            if steps := set_aside(place, aside, {self._folder / COST: self._folder / OLD_COST}):
+            if steps := set_aside(place, aside):
                 self._display.message(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
-        if cost is not None:
-            self._write_json(COST, cost.as_json())
         state = {"state": "running", "study": ready.spec.name}
         self._write_json(RUN, state)
         self._state = state
@@ -178,7 +159,6 @@ class Tuner:
         self,
         ready: Prepared,
         found: Descended,
-        cost: time_cost.TimeCost | None,
         before: Mapping[str, Any],
         after: Mapping[str, Any],
         verdict: Verdict,
@@ -186,16 +166,11 @@ class Tuner:
         """The content of run.json and of the report."""
         spec = ready.spec
         meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
-        charged = None
-        if cost is not None:
-            values = {name: value.detach() for name, value in ready.parameters.values().items()}
-            charged = {**cost.as_json(), "expected": float(cost.expected(values))}
         return {
             "state": "failed" if found.failed else "complete",
             "versions": versions(),
             "study": {"name": spec.name, "config": spec.config, "set": spec.overrides, "backend": spec.backend},
             "family": ready.family.name,
-            "loss": ready.family.loss_name or None,
             "plan": asdict(self._plan),
             "examples": len(ready.examples),
             "knobs": {
@@ -214,7 +189,6 @@ class Tuner:
                 {"knobs" if name == "parameters" else name: value for name, value in asdict(step).items()}
                 for step in found.history
             ],
-            "cost": charged,
             "verdict": verdict.as_json(),
             "seconds": {name: round(spent, 3) for name, spent in self._seconds.items()},
         }

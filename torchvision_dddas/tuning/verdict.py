@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchvision_dddas.evaluation.studies.comparison import LEVEL, compare_studies
+from torchvision_dddas.evaluation.studies.comparison import compare_studies, verdict
 from torchvision_dddas.evaluation.studies.jobs import Event, Workers
 from torchvision_dddas.evaluation.studies.records import Case, ScoredCase, ScoredStudy, Spec
 from torchvision_dddas.evaluation.studies.runner import Plan, run_study
@@ -141,14 +141,7 @@ def _say_change(goal: Goal, changes: Mapping[str, Any] | None) -> str:
     """As `compare_studies` says it, but not corrected for measures that nobody asked about."""
     entry = (changes or {"tasks": {}})["tasks"].get(goal.task, {"pooled": {}})["pooled"].get(goal.group, {})
     entry = entry.get(goal.measure)
-    if entry is None or not entry["change"]:
-        return "the same" if entry else ""
-    word = "better" if (entry["change"] < 0) == goal.minimize else "worse"
-    ways = [(over, way) for over in ("over_clips", "over_frames") if (way := entry.get(over)) is not None]
-    for over, way in ways:
-        if way["p"] < LEVEL:
-            return word if over == "over_clips" else f"{word} on these clips"
-    return "within noise" if any(way["enough"] for _, way in ways) else "too little to tell"
+    return "" if entry is None else verdict(entry, goal.measure, "p")
 
 
 def count_clips(clips: Sequence[str]) -> str:

@@ -8,9 +8,9 @@ import pytest
 
 from tests.evaluation.datasets.layouts import pictures, text
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets import annotations
-from torchvision_dddas.evaluation.datasets.annotations import read_rows
 from torchvision_dddas.evaluation.datasets.files import size_of
+from torchvision_dddas.evaluation.metrics import text_rows
+from torchvision_dddas.evaluation.metrics.text_rows import read_columns
 
 COLUMNS = ("frame", "identity", "x", "kind")
 WHOLE = '1 2 3.5 "Person_sitting" 9\n\n2 2 -1e2 Car\n'
@@ -21,9 +21,9 @@ def test_the_fast_and_the_careful_way_read_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str
 ) -> None:
     path = text(tmp_path / "a.txt", content)
-    fast = read_rows(path, COLUMNS, "kind")
-    monkeypatch.setattr(annotations, "_read_fast", lambda *_: None)
-    slow = read_rows(path, COLUMNS, "kind")
+    fast = read_columns(path, COLUMNS, "kind")
+    monkeypatch.setattr(text_rows, "_read_fast", lambda *_: None)
+    slow = read_columns(path, COLUMNS, "kind")
     assert all(np.array_equal(fast[name], slow[name]) for name in COLUMNS)
     assert fast["kind"].tolist() == slow["kind"].tolist() == ["Person_sitting", "Car"]
     assert fast.line.tolist() == slow.line.tolist() == [1, 3]
@@ -41,9 +41,9 @@ def test_the_fast_and_the_careful_way_read_the_same(
 )
 def test_an_error_names_the_line(tmp_path: Path, content: str, line: str) -> None:
     with pytest.raises(InputError, match=line.replace("+", r"\+")):
-        read_rows(text(tmp_path / "a.txt", content), COLUMNS, "kind")
+        read_columns(text(tmp_path / "a.txt", content), COLUMNS, "kind")
     with pytest.raises(InputError, match=r"none\.txt cannot be read: No such file"):
-        read_rows(tmp_path / "none.txt", COLUMNS)
+        read_columns(tmp_path / "none.txt", COLUMNS)
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".ppm", ".pgm", ".webp", ".tif"])

@@ -10,7 +10,8 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets.files import images_in, size_of
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
-from torchvision_dddas.evaluation.metrics.truth import Truth, read_text
+from torchvision_dddas.evaluation.metrics.text_rows import read_text
+from torchvision_dddas.evaluation.metrics.truth import Truth
 
 WIDTH_SHARE = 0.41
 """A standing body's width by its height (Dollár et al., 2012)."""

@@ -8,10 +8,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.annotations import boxes_of_corners, read_rows, table_of, truth_of
+from torchvision_dddas.evaluation.datasets.annotations import boxes_of_corners, table_of, truth_of
 from torchvision_dddas.evaluation.datasets.files import check_numbering, folders_in, images_in
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
-from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable, read_text
+from torchvision_dddas.evaluation.metrics.text_rows import read_columns, read_text
+from torchvision_dddas.evaluation.metrics.truth import Positions, TrackTable
 
 EARTH_RADIUS_M = 6378137.0
 MOST_LATITUDE_DEG = 85.0
@@ -54,7 +55,7 @@ class Kitti(Reader):
         absent = [str(path) for path in pose if not path.is_file()]
         corners = ("left", "top", "right", "bottom")
         columns = ("frame", "identity", "type", "truncated", "occluded", "alpha", *corners)
-        rows = read_rows(place, (*columns, "height", "width", "length", "x", "y", "z"), "type", first=0)
+        rows = read_columns(place, (*columns, "height", "width", "length", "x", "y", "z"), "type", first=0)
         rows.check_known("type", (*self.types, "DontCare"), ", ".join(self.types))
         is_region = rows["type"] == "DontCare"
         other, rows = rows.at(is_region), rows.at(~is_region)
@@ -107,7 +108,7 @@ def camera_from_imu(path: Path) -> np.ndarray:
 def poses(path: Path) -> np.ndarray:
     """(F, 4, 4) east, north, up from the unit's forward, left, up, of each line. Raises InputError with the line."""
     columns = ("latitude", "longitude", "altitude", "roll", "pitch", "yaw")
-    rows = read_rows(path, columns)
+    rows = read_columns(path, columns)
     latitude, longitude, altitude, roll, pitch, yaw = rows.stack(*columns).T
     if not len(rows):
         raise InputError(f"{path} is empty; wanted {','.join(columns)} a line")

@@ -9,15 +9,10 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import files
-from torchvision_dddas.evaluation.datasets.annotations import (
-    LAST,
-    boxes_of_corners,
-    read_rows,
-    table_of,
-    truth_of,
-)
+from torchvision_dddas.evaluation.datasets.annotations import boxes_of_corners, table_of, truth_of
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
-from torchvision_dddas.evaluation.metrics.truth import FARTHEST, TrackTable, read_text, to_number
+from torchvision_dddas.evaluation.metrics.text_rows import FARTHEST, LAST, read_columns, read_text, to_number
+from torchvision_dddas.evaluation.metrics.truth import TrackTable
 
 _CORNER_AND_SIZE = ("left", "top", "width", "height")
 
@@ -56,7 +51,7 @@ class VisDrone(Reader):
     def _clip(self, name: str, place: Path) -> Clip:
         home = place.parents[1] / "sequences" / name
         pictures = files.check_numbering(files.images_in(home), 1)
-        rows = read_rows(place, ("frame", "identity", *_CORNER_AND_SIZE, "counts", "category"))
+        rows = read_columns(place, ("frame", "identity", *_CORNER_AND_SIZE, "counts", "category"))
         rows.check_known("category", range(12), "0 to 11")
         is_region = np.isin(rows["category"], (0, 11))
         other, rows = rows.at(is_region), rows.at(~is_region)
@@ -127,13 +122,13 @@ class Uavdt(Reader):
         homes = [self.folder / home / name for home in ("UAV-benchmark-M", "UAVDT_Benchmark_M", ".", "..")]
         pictures = files.check_numbering(next((found for home in homes if (found := files.images_in(home))), ()), 1)
         columns = ("frame", "identity", *_CORNER_AND_SIZE)
-        rows = read_rows(place, (*columns, "out-of-view", "occlusion", "category"))
+        rows = read_columns(place, (*columns, "out-of-view", "occlusion", "category"))
         rows.check_known("category", range(1, len(self.categories) + 1), f"1 to {len(self.categories)}")
         table = table_of(place, rows["frame"], rows["identity"], rows.stack(*_CORNER_AND_SIZE), rows.line)
         counts = np.isin(np.array(self.categories)[rows["category"].astype(int) - 1], self.options["classes"])
         beside, regions = place.with_name(f"{name}_gt_ignore.txt"), None
         if beside.is_file():
-            ignored = read_rows(beside, columns)
+            ignored = read_columns(beside, columns)
             regions = TrackTable.of(ignored["frame"], ignored["identity"], ignored.stack(*_CORNER_AND_SIZE))
         truth = truth_of(place, table, counts, len(pictures), regions)
         return self._boxes_clip(name, place, pictures, truth, homes[0], rate_hz=30.0)
@@ -174,7 +169,7 @@ class StanfordDrone(Reader):
         video = (files.videos_in(place) or files.videos_in(published))[:1]
         corners, path = ("xmin", "ymin", "xmax", "ymax"), place / self.file
         columns = ("identity", *corners, "frame", "lost", "occluded", "generated", "label")
-        rows = read_rows(path, columns, "label", first=0)
+        rows = read_columns(path, columns, "label", first=0)
         rows = rows.at(rows["lost"] == 0)
         boxes = boxes_of_corners(rows.stack(*corners))
         table = table_of(path, rows["frame"] + 1, rows["identity"], boxes, rows.line)

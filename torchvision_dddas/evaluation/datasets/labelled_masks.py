@@ -10,7 +10,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import files
 from torchvision_dddas.evaluation.datasets.folder import clip_at, is_clip
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
-from torchvision_dddas.evaluation.metrics.truth import Labels, Truth, read_text
+from torchvision_dddas.evaluation.metrics.text_rows import read_text
+from torchvision_dddas.evaluation.metrics.truth import Labels, Truth
 
 _PHOTOS = frozenset({".jpg", ".jpeg", ".png"})
 _LONGEST_NAME = 250  # bytes of a file's name; another suffix may be tried, and 255 is what most systems take

@@ -9,16 +9,15 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import files
-from torchvision_dddas.evaluation.datasets.annotations import boxes_by_frame, read_rows, table_of
+from torchvision_dddas.evaluation.datasets.annotations import boxes_by_frame, table_of
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
+from torchvision_dddas.evaluation.metrics.text_rows import read_columns, read_text, split_cells
 from torchvision_dddas.evaluation.metrics.truth import (
     Positions,
     SeqInfo,
     Truth,
     load_truth,
     read_seqinfo,
-    read_text,
-    split_cells,
 )
 
 BENCHMARKS = ("MOT15", "MOT16", "MOT17", "MOT20")
@@ -103,20 +102,13 @@ def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) ->
     return Clip(name, place, pictures, info.rate_hz, last, truth, shows=("people",), given=public)
 
 
-def single_pictures(place: Path) -> dict[int, Path]:
-    """The pictures of a sequence by frame, where not all of them need be there: those of its folders img1*."""
-    folders = [place / name for name in files.folders_in(place) if name.startswith("img1")]
-    paths = [path for folder in folders for path in files.images_in(folder)]
-    return {number: path for path in paths if (number := files.number_of(path)) is not None}
-
-
 def _of_2015(path: Path, has_ground: bool) -> Truth:
     truth = load_truth(path)
     if truth.tracks is None:
         raise InputError(f"{path} has no identities; wanted MOTChallenge's frame,id,x,y,w,h,counts")
     if not has_ground:
         return truth
-    rows = read_rows(path, _GROUND)
+    rows = read_columns(path, _GROUND)
     ground = rows.stack(*_GROUND[7:])
     known = ~(ground == -1).all(axis=1) & (ground[:, 2] != -1) & (rows["counts"] != 0)
     if not ground.any() or not known.any():  # zeros alone: nobody measured
@@ -126,7 +118,7 @@ def _of_2015(path: Path, has_ground: bool) -> Truth:
 
 
 def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: float, length: int) -> Truth:
-    rows = read_rows(path, _COLUMNS)
+    rows = read_columns(path, _COLUMNS)
     table = table_of(path, rows["frame"], rows["identity"], rows.stack(*_COLUMNS[2:6]), rows.line)
     is_pedestrian = rows["class"] == PEDESTRIAN
     hidden = is_pedestrian & (rows["visibility"] < least_visibility)

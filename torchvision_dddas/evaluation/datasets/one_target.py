@@ -13,7 +13,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.evaluation.datasets import files
 from torchvision_dddas.evaluation.datasets.annotations import boxes_by_frame, table_of
 from torchvision_dddas.evaluation.datasets.record import Clip, Reader
-from torchvision_dddas.evaluation.metrics.truth import FARTHEST, TrackTable, Truth, load_truth, read_mask, read_text
+from torchvision_dddas.evaluation.metrics.text_rows import FARTHEST, read_text
+from torchvision_dddas.evaluation.metrics.truth import TrackTable, Truth, load_truth, read_mask
 from torchvision_dddas.io.tables import read_csv
 
 

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,10 +40,10 @@ def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
     return np.array(boxes, float).reshape(-1, 4)
 
 
-def areas(box_px: Any, other_px: Any) -> tuple[Any, Any]:
+def areas(box_px: np.ndarray, other_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(...) what two boxes (..., 4) share and what they cover together, px²; broadcast against each other.
 
-    Arrays, or tensors, whose gradients it keeps. The pipeline has its own formula: measures share no code with it.
+    The pipeline has its own formula: measures share no code with it.
     """
     low = box_px[..., :2].clip(min=other_px[..., :2])
     high = (box_px[..., :2] + box_px[..., 2:]).clip(max=other_px[..., :2] + other_px[..., 2:])

@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.evaluation.metrics.text_rows import FARTHEST, read_columns, read_text
 from torchvision_dddas.io.images import decode_image
-from torchvision_dddas.io.tables import check_crowding
+from torchvision_dddas.io.tables import LAST_FRAME, check_crowding
 from torchvision_dddas.memory import MASK
 
 UNNAMED = 1 << 24
@@ -212,10 +213,7 @@ def _load_boxes(path: Path) -> Truth:
     return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
 
 
-FARTHEST = 1e9
-"""No place, size or mark is larger."""
-
-_COLUMNS = ("frame", "id", "x", "y", "width", "height", "the seventh column")
+_COLUMNS = ("frame", "identity", "x", "y", "width", "height", "counts")
 
 
 class MotRows(NamedTuple):
@@ -234,59 +232,21 @@ class MotRows(NamedTuple):
 def read_rows(path: Path, what: str) -> MotRows:
     """Read a file; `what` names it in errors.
 
-    Raises InputError with file and line: unreadable, too few columns, not a finite number, a frame that is not whole
-    or below 1, an identity that is not whole, a size that is not positive.
+    Raises InputError as `read_columns`, for a size that is not positive, and for too many boxes in a frame.
     """
-    lines = [(n, line) for n, line in enumerate(read_text(path, what=f"{what} ").splitlines(), 1) if line.strip()]
-    table = _read_fast([line for _, line in lines])
-    if table is None:
-        table = _read_slowly(lines, f"{what} {path}")
-    check_crowding(table[:, 0], f"{what} {path}")
-    boxes = TrackTable.of(table[:, 0], table[:, 1], table[:, 2:6])
-    return MotRows(boxes, table[:, 6], np.array([number for number, _ in lines], np.int64))
+    rows = read_columns(path, _COLUMNS, what=what, last=LAST_FRAME, may_end_early=True)
+    check_crowding(rows["frame"], f"{what} {path}")
+    boxes = TrackTable.of(rows["frame"], rows["identity"], rows.stack(*_COLUMNS[2:6]))
+    check_sizes(boxes.box_px, rows.line, f"{what} {path}")
+    return MotRows(boxes, rows["counts"], rows.line)
 
 
-def _read_fast(lines: list[str]) -> np.ndarray | None:
-    """The seven columns (N, 7) by NumPy's own reader, ten times as fast; None where anything may be wrong with them."""
-    first = split_cells(lines[0]) if lines else []
-    if len(first) < 6 or (len(first) == 6 and not all(line.count(",") == 5 for line in lines)):
-        return None
-    count, separator = min(len(first), 7), "," if "," in lines[0] else None
-    try:
-        values = np.loadtxt(lines, delimiter=separator, comments=None, usecols=range(count), ndmin=2)
-    except ValueError:
-        return None
-    table = np.column_stack([values, np.ones((len(values), 7 - count))])
-    whole, box = table[:, :2], table[:, 2:6]
-    is_right = (whole == np.floor(whole)).all(axis=1) & (np.abs(whole) <= 2**53).all(axis=1) & (whole[:, 0] >= 1)
-    is_right &= (np.abs(table[:, 2:]) <= FARTHEST).all(axis=1) & (box[:, 2:] > 0).all(axis=1)
-    return table if len(table) == len(lines) and is_right.all() else None
-
-
-def _read_slowly(lines: list[tuple[int, str]], name: str) -> np.ndarray:
-    """The seven columns (N, 7), checked cell by cell."""
-    rows = []
-    for number, line in lines:
-        where, cells = f"{name}, line {number}", split_cells(line)
-        if len(cells) < 6:
-            count = f"{len(cells)} column{'s' * (len(cells) != 1)}"
-            raise InputError(f"{where}: {count}; wanted frame,id,x,y,w,h[,score]")
-        values = []
-        for cell, column in zip(cells, _COLUMNS, strict=False):
-            value, is_whole = to_number(cell), column in ("frame", "id")
-            if not math.isfinite(value):
-                raise InputError(f"{where}: {column} is '{cell}'; wanted a finite number")
-            if is_whole and (value != int(value) or abs(value) > 2**53):
-                raise InputError(f"{where}: {column} is '{cell}'; wanted a whole number")
-            if not is_whole and abs(value) > FARTHEST:
-                raise InputError(f"{where}: {column} is '{cell}'; wanted {-FARTHEST:g} to {FARTHEST:g}")
-            values.append(value)
-        if values[0] < 1:
-            raise InputError(f"{where}: frame is '{cells[0]}'; frames count from 1")
-        if min(values[4:6]) <= 0:
-            raise InputError(f"{where}: the box is {cells[4]}×{cells[5]} pixels; wanted more than 0")
-        rows.append([*values, 1.0][:7])
-    return np.array(rows, float).reshape(-1, 7)
+def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
+    """Raises InputError with the line where a box has no size. line: (N,) of the file. name: of the file."""
+    if (flat := ~(box_px[:, 2:] > 0).all(axis=1)).any():
+        i = int(flat.argmax())
+        size = f"{box_px[i, 2]:g}×{box_px[i, 3]:g}"
+        raise InputError(f"{name}, line {line[i]}: the box is {size} pixels; wanted more than 0")
 
 
 def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
@@ -306,28 +266,6 @@ def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
             f"{path}, lines {line[k]} and {line[k + 1]}: identity {identity[k]} twice in frame {frame[k]}; "
             "an identity has one box a frame"
         )
-
-
-def read_text(path: Path, encoding: str = "utf-8-sig", what: str = "") -> str:
-    """A file's text. Raises InputError where it cannot be read or is none."""
-    try:
-        return path.read_text(encoding=encoding)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
-        raise InputError(f"{what}{path} cannot be read: {reason}") from None
-
-
-def split_cells(line: str) -> list[str]:
-    """The cells of a line, separated by commas, or by blanks where there are none."""
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
-
-
-def to_number(cell: str) -> float:
-    """A cell's number, NaN for none."""
-    try:
-        return float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
-    except ValueError:
-        return math.nan
 
 
 _LONGEST_INI = 16_384

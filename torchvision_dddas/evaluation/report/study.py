@@ -4,19 +4,15 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from markupsafe import Markup
 
-from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.datasets.record import Clip
 from torchvision_dddas.evaluation.metrics.registry import GROUPS, HEADLINES, describe, title_of_group
 from torchvision_dddas.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
 from torchvision_dddas.evaluation.report.worst_frames import draw_pictures, find_worst_frames
 from torchvision_dddas.evaluation.studies.records import TASKS, Case, Results, Task
 from torchvision_dddas.evaluation.studies.summary import sum_costs
-from torchvision_dddas.io.images import IMAGE_SUFFIXES, read_image
 from torchvision_dddas.io.output.run_record import finite, versions
 from torchvision_dddas.io.report import (
     Cell,
@@ -28,8 +24,7 @@ from torchvision_dddas.io.report import (
     table,
     text_cell,
 )
-from torchvision_dddas.io.report.charts import MOST_ROWS, Axis, Dots, Interval, chart, interval_chart
-from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
 
 MAX_STAGES = 8
 """Columns of the table of costs."""
@@ -49,8 +44,6 @@ def study_report(metrics: Mapping[str, Any], results: Results) -> str:
         if case.cause and not any(case.cause in line for line in left_out):
             left_out.append(f"{case.clip.name}, {case.task}: {case.cause}")
     timed = [case for case in results.cases if case.found is not None and case.found.seconds]
-    sizes = {number: _megapixels(clip) for number, clip in {id(case.clip): case.clip for case in timed}.items()}
-    costs = [_Cost(case, sum_costs([case]), sizes[id(case.clip)]) for case in timed]
     return render_page(
         "study.html",
         title=f"{results.spec.name}: study",
@@ -59,8 +52,7 @@ def study_report(metrics: Mapping[str, Any], results: Results) -> str:
         tasks=tasks,
         left_out=left_out,
         notes=_unique(results.facts.get("notes", ())),
-        costs=_cost_table(costs) if costs else "",
-        cost_plots=_cost_plots(costs),
+        costs=_cost_table(timed) if timed else "",
         facts=_fact_table(results),
         settings=json.dumps(finite(results.settings.model_dump(mode="json")), indent=2),
     )
@@ -178,28 +170,6 @@ def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> 
     }
 
 
-class _Cost(NamedTuple):
-    """A case that has times, its cost, and the megapixels of its pictures (NaN: unknown)."""
-
-    case: Case
-    cost: dict[str, Any]
-    megapixels: float
-
-
-def _megapixels(clip: Clip) -> float:
-    """The size of a clip's first picture; NaN if it cannot be read."""
-    files = clip.pictures
-    try:
-        if not files:
-            return math.nan
-        if files[0].suffix.lower() in IMAGE_SUFFIXES:
-            picture = read_image(files[0])
-            return math.nan if picture is None else picture.shape[0] * picture.shape[1] / 1e6
-        return math.prod(open_source(files[0]).size) / 1e6
-    except InputError:
-        return math.nan
-
-
 def _format_cost(cases: Sequence[Case]) -> str:
     """The images a second, seconds and memory of all cases together; empty if unknown."""
     cost = sum_costs([case for case in cases if case.found is not None and case.found.seconds])
@@ -209,17 +179,17 @@ def _format_cost(cases: Sequence[Case]) -> str:
     return f"{_format_rate(cost['frames_per_s'])} frames/s ({format_number(cost['seconds'], 1)} s){memory}"
 
 
-def _cost_table(costs: Sequence[_Cost]) -> Markup:
+def _cost_table(cases: Sequence[Case]) -> Markup:
     """A row a case: time, rate, memory, and the time a frame of the longest stages."""
+    costs = [(case, sum_costs([case])) for case in cases]
     total: Counter[str] = Counter()
-    for _, cost, _ in costs:
+    for _, cost in costs:
         total.update({stage: ms * cost["frames"] for stage, ms in cost["ms_per_frame"].items()})
     stages = [stage for stage, _ in total.most_common(MAX_STAGES)]
     columns = [
         Column("clip", text=True),
         Column("task", text=True),
         Column("frames", "processed pictures"),
-        Column("Mpx", "millions of pixels of a picture"),
         Column("s", "seconds in all"),
         Column("frames/s", "processed pictures a second"),
         Column("MB", "the most memory that the process held"),
@@ -230,32 +200,14 @@ def _cost_table(costs: Sequence[_Cost]) -> Markup:
             text_cell(case.clip.name),
             text_cell(case.task.capitalize()),
             number_cell(cost["frames"]),
-            number_cell(megapixels, 2),
             number_cell(cost["seconds"], 2),
             Cell(_format_rate(cost["frames_per_s"]), cost["frames_per_s"]) if cost["seconds"] else Cell("–"),
             number_cell(cost["peak_mb"], 0),
             *(number_cell(cost["ms_per_frame"].get(stage), 2) for stage in stages),
         ]
-        for case, cost, megapixels in costs
+        for case, cost in costs
     ]
     return table("what each clip cost", columns, rows)
-
-
-def _cost_plots(costs: Sequence[_Cost]) -> list[Markup]:
-    """Milliseconds a frame against the size of the pictures, of each task that reads pictures."""
-    dots = []
-    for k, task in enumerate(TASKS):
-        drawn = [one for one in costs if one.case.task == task and math.isfinite(one.megapixels) and one.cost["frames"]]
-        if drawn:
-            sizes = np.array([one.megapixels for one in drawn])
-            times = np.array([1000 * one.cost["seconds"] / one.cost["frames"] for one in drawn])
-            hints = [
-                f"{one.case.clip.name}: {format_number(size, 2)} Mpx, {format_number(ms, 1)} ms"
-                for one, size, ms in zip(drawn, sizes.tolist(), times.tolist(), strict=True)
-            ]
-            dots.append(Dots(task.capitalize(), sizes, times, k % 6 + 1, hints))
-    axes = Axis("megapixels of a picture", 0), Axis("ms a frame", log=True)
-    return [chart("Time and resolution", *axes, dots=dots)] if dots else []
 
 
 def _format_rate(per_s: float) -> str:

@@ -89,8 +89,8 @@ def _compare_task(pairs: Pairs) -> dict[str, Any]:
     clips = {clip: _changes([pair], 1, {}) for clip, pair in pairs.items() if clip not in same}
     every = [scored for side in zip(*pairs.values(), strict=True) for scored in side]
     pooled = _changes(list(pairs.values()), None, {"over_clips": over_clips(every) if len(pairs) >= FEWEST else {}})
-    of_clips = [entry for clip in clips.values() for _, _, entry in _rows(clip)]
-    of_pooled = [entry for _, _, entry in _rows(pooled)]
+    of_clips = [entry for clip in clips.values() for _, _, entry in entries_of(clip)]
+    of_pooled = [entry for _, _, entry in entries_of(pooled)]
     for entries, way in ((of_clips, "over_frames"), (of_pooled, "over_clips"), (of_pooled, "over_frames")):
         # All entries that are tested together are corrected together.
         effects = [entry[way] for entry in entries if entry[way] is not None]
@@ -99,7 +99,7 @@ def _compare_task(pairs: Pairs) -> dict[str, Any]:
             one["p_holm"] = adjusted[str(i)]
             one["enough"] = one.pop("least") * len(effects) < LEVEL
     for groups in (pooled, *clips.values()):
-        for _, name, entry in _rows(groups):
+        for _, name, entry in entries_of(groups):
             entry["says"] = verdict(entry, name)
     return {"same": same, "pooled": pooled, "clips": clips}
 
@@ -144,15 +144,15 @@ def _effects(estimate: Estimate) -> dict[str, Effect]:
     return bootstrap.effects(estimate.statistic, tuple(strata), estimate.seed)
 
 
-def verdict(entry: Mapping[str, Any], name: str) -> str:
-    """What a change of a measure amounts to, in words."""
+def verdict(entry: Mapping[str, Any], name: str, p: str = "p_holm") -> str:
+    """What a change of a measure amounts to, in words. p: the entry's own, `p`, or the one corrected for all."""
     change = entry["change"]
     if not change:
         return "the same"
     word = "better" if (change < 0) == is_lower_better(name) else "worse"
     ways = [way for over in WAYS if (way := entry.get(over)) is not None]
     for way in ways:
-        if way["p_holm"] < LEVEL:
+        if way[p] < LEVEL:
             return f"{word} on these clips" if "over_clips" in entry and way is not entry["over_clips"] else word
     return "within noise" if any(way["enough"] for way in ways) else "too little to tell"
 
@@ -183,7 +183,7 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
     first, second = str(comparison["first"]), str(comparison["second"])
     tasks = []
     for task, changes in comparison["tasks"].items():
-        verdicts = [rows[0][2]["says"] for groups in changes["clips"].values() if (rows := _rows(groups))]
+        verdicts = [rows[0][2]["says"] for groups in changes["clips"].values() if (rows := entries_of(groups))]
         n_better, n_worse = (sum(text.startswith(word) for text in verdicts) for word in ("better", "worse"))
         card = {
             "id": task,
@@ -195,7 +195,7 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
             "n_same": len(changes["same"]),
             "section": comparison_section(task, task.capitalize(), changes, first, second),
         }
-        if pooled := _rows(changes["pooled"]):
+        if pooled := entries_of(changes["pooled"]):
             group, name, entry = pooled[0]
             before, after = (number_cell(entry[end], describe(name).digits).text for end in ("first", "second"))
             card |= {"change": _signed(entry, name), "metric": _title(group, name), "before": before, "after": after}
@@ -218,11 +218,11 @@ def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], firs
 
     anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
-    pooled = [_cells(group, name, entry, WAYS) for group, name, entry in _rows(changes["pooled"])]
+    pooled = [_cells(group, name, entry, WAYS) for group, name, entry in entries_of(changes["pooled"])]
     by_clip = [
         [text_cell(clip), *_cells(group, name, entry, WAYS[1:])]
         for clip, groups in changes["clips"].items()
-        for group, name, entry in _rows(groups)
+        for group, name, entry in entries_of(groups)
     ]
     columns = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
     says = Column("verdict", text=True)
@@ -263,7 +263,8 @@ def _cells(group: str, name: str, entry: Mapping[str, Any], ways: Sequence[str])
     return [text_cell(_title(group, name)), *cells, text_cell(str(entry["says"]))]
 
 
-def _rows(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
+def entries_of(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
+    """Group, measure and entry of each change."""
     return [(group, name, entry) for group, names in groups.items() for name, entry in names.items()]
 
 

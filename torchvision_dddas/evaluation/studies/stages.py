@@ -24,7 +24,7 @@ from torchvision_dddas.io.detection_tables import check_table, read_detections
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.people.detector import detect_in_clip, load_scorer
-from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
+from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
     Detections,
@@ -295,17 +295,45 @@ def _find_locations(run: _Run) -> None:
     if clip.landmarks is None:
         _locate_from_ground(run)
         return
-    files = AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
     if clip.pictures:
-        _locate_clip(run, files)
+        _locate_clip(run)
     else:
-        _locate_table(run, files)
+        _locate_table(run)
 
 
-def _locate_clip(run: _Run, files: AerialInput) -> None:
-    source = open_clip(run.clip)
-    ready = assemble_files(files, run.clip.telemetry, run.settings, source, run.backend, str(run.clip.pictures[0]))
-    for result in Pipeline.from_assembly(ready, run.interval, pictures=False)(source):
+def aerial_input(clip: Clip) -> AerialInput:
+    """The files that locating from the air takes."""
+    assert clip.landmarks is not None
+    return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
+
+
+def open_pipeline(
+    clip: Clip, settings: Settings, backend: str = "auto", interval: int = 1
+) -> tuple[Source, Assembly, Pipeline]:
+    """The pictures of a clip with landmarks, and what `dddas run` does with them."""
+    source = open_clip(clip)
+    ready = assemble_files(aerial_input(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
+    return source, ready, Pipeline.from_assembly(ready, interval, pictures=False)
+
+
+def open_table(
+    clip: Clip, settings: Settings, backend: str = "auto"
+) -> tuple[DetectionTable, geo.AerialLocator, list[str]]:
+    """The detections of a clip with landmarks and without pictures, what locates them, and notes."""
+    if clip.given is None:
+        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
+    table = read_detections(clip.given)
+    span = (table.first, table.last)
+    locator, notes = read_locator(
+        aerial_input(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
+    )
+    geo.check_table(table, locator)
+    return table, locator, notes
+
+
+def _locate_clip(run: _Run) -> None:
+    source, ready, pipeline = open_pipeline(run.clip, run.settings, run.backend, run.interval)
+    for result in pipeline(source):
         tracks, located = result.tracked.tracks, result.locations
         seen = tracks.row >= 0
         columns = {"box_px": round_as_written(tracks.box_px[seen]), "identity": tracks.identity[seen]}
@@ -316,16 +344,8 @@ def _locate_clip(run: _Run, files: AerialInput) -> None:
     run.notes += [*ready.notes, *map(str, source.problems)]
 
 
-def _locate_table(run: _Run, files: AerialInput) -> None:
-    clip = run.clip
-    if clip.given is None:
-        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
-    table = read_detections(clip.given)
-    span = (table.first, table.last)
-    locator, notes = read_locator(
-        files, run.settings, None, clip.rate_hz, run.backend, span, "table", None, extent=table.extent
-    )
-    geo.check_table(table, locator)
+def _locate_table(run: _Run) -> None:
+    table, locator, notes = open_table(run.clip, run.settings, run.backend)
     for located in locator.locate_table(table):
         places = _place_columns(len(located.box_px), located.row, located.positions, located.relative_m2)
         score = table.score[table.rows(located.frame)]
