@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.evaluation.datasets import motchallenge
-from torchvision_dddas.evaluation.datasets.files import folders_in, images_in, number_of
-from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.studies.records import Task
-from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.stages import find
-from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.io.images import read_image
 from torchvision_dddas.io.sources import ImageSource, open_source
+from torchvision_dddas.lab.evaluation.datasets import motchallenge
+from torchvision_dddas.lab.evaluation.datasets.files import folders_in, images_in, number_of
+from torchvision_dddas.lab.evaluation.datasets.kinds import read
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.studies.records import Task
+from torchvision_dddas.lab.evaluation.studies.scoring import score
+from torchvision_dddas.lab.evaluation.studies.stages import find
+from torchvision_dddas.lab.evaluation.studies.summary import measures
 
 sys.path.insert(0, str(bench.ROOT))
 from tests.synthetic_clip import RATE_HZ, film_into, flight, render

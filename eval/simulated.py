@@ -29,9 +29,9 @@ from simulated_clips import CONFIG, GROUND_WAYS, Case, Way, locate_clip, locate_
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.control import StartedSource
-from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.lab.simulation import SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.pipeline import Pipeline, assemble_mission
-from torchvision_dddas.simulation import SimulatorSource, load_scenario, scenario_settings
 from torchvision_dddas.types import Command, Frame
 
 # -- altitude and landmarks ------------------------------------------------------------------------------------------
@@ -302,7 +302,7 @@ def measure_whole(options: bench.Options) -> tuple[str, Any]:
 
 def fly_whole(case: Case) -> Case:
     """The score of one run, by name."""
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
         _, score = run_scenario(Path(out), case["scenario"], seed=case["seed"])
@@ -344,7 +344,7 @@ def measure_ground(options: bench.Options) -> tuple[str, Any]:
 
 def fly_ground(case: Case) -> list[list[float]]:
     """Of each row of crowds.csv the errors of centre and course, and whether it steers."""
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
         words = [f"steering.follow={str(case['follow']).lower()}"]

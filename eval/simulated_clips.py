@@ -14,7 +14,6 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control import StartedSource, fit_settings
 from torchvision_dddas.control.rules import every_least
 from torchvision_dddas.detection import detect_motion, pixels_per_metre
-from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer, TrueFrame
 from torchvision_dddas.geo import (
     AerialLocator,
     GroundLocator,
@@ -27,10 +26,11 @@ from torchvision_dddas.geo import (
 )
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.geometry.projection import shift_origin
+from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScorer, TrueFrame
+from torchvision_dddas.lab.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
+from torchvision_dddas.lab.simulation.cameras import view_from_pose
+from torchvision_dddas.lab.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.people import PersonDetector
-from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
-from torchvision_dddas.simulation.cameras import view_from_pose
-from torchvision_dddas.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.types import Command, FrameResult, Landmarks, Order, Scene, TrackedFrame, Tracks, Truth
 
 CONFIG = "patrol"

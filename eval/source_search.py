@@ -25,11 +25,11 @@ from torchvision_dddas.chain import DetectionChain, OpenCVOperations, Window
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import load_engine
 from torchvision_dddas.detection.blobs import find_blobs
-from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.lab.evaluation.metrics import truth as truths
+from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts
 
 GRID: dict[str, tuple[int, ...]] = {
     "interval.frames": (1, 2, 3),

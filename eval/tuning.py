@@ -20,17 +20,17 @@ import torch
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.evaluation.metrics import pixels as segmentation
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.records import Task
-from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.motion import MotionFamily
-from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.tracking import TrackingFamily
+from torchvision_dddas.lab.evaluation.datasets.kinds import read
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.evaluation.metrics.truth import labels_of
+from torchvision_dddas.lab.evaluation.studies.records import Task
+from torchvision_dddas.lab.evaluation.studies.stages import open_clip
+from torchvision_dddas.lab.tuning.descent import Plan, descend
+from torchvision_dddas.lab.tuning.motion import MotionFamily
+from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters
+from torchvision_dddas.lab.tuning.tracking import TrackingFamily
 
 MOTION = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9

@@ -151,7 +151,7 @@ def test_a_batch_is_its_members_one_by_one(name) -> None:
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.exports])
 def test_the_exported_graph_gives_what_torch_gives(name) -> None:
     pytest.importorskip("onnx")
-    from torchvision_dddas.export.graph_files import open_session, trace_graph
+    from torchvision_dddas.lab.export.graph_files import open_session, trace_graph
 
     class Module(torch.nn.Module):
         def forward(self, *given: Any) -> Any:

@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.cli.conftest import bad, record
-from tests.evaluation.studies.world import filmed, study
-from tests.tuning.toys import Bowl
+from tests.lab.evaluation.studies.world import filmed, study
+from tests.lab.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.tuning import family
+from torchvision_dddas.lab.evaluation.metrics import bootstrap
+from torchvision_dddas.lab.tuning import family
 
 THRESHOLD = "difference.threshold"
 STEPS = ("--parameters", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")

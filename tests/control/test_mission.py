@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.simulation.small import small
+from tests.lab.simulation.small import small
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control import StartedSource
 from torchvision_dddas.geometry import east_north, lonlat
+from torchvision_dddas.lab.simulation import SimulatorSource
 from torchvision_dddas.pipeline import Pipeline, assemble_mission
-from torchvision_dddas.simulation import SimulatorSource
 
 FAULTS = (
     {"what": "frozen", "time_s": 2.0, "seconds": 0.5},

@@ -28,8 +28,10 @@ def compare(
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.evaluation.studies.cache import read_scores
-    from torchvision_dddas.evaluation.studies.comparison import (
+    from torchvision_dddas.io.atomic_files import refuse_folder, save_file
+    from torchvision_dddas.io.output.run_record import finite, read_run_record
+    from torchvision_dddas.lab.evaluation.studies.cache import read_scores
+    from torchvision_dddas.lab.evaluation.studies.comparison import (
         MEANING,
         compare_studies,
         comparison_report,
@@ -37,8 +39,6 @@ def compare(
         entries_of,
         settings_lines,
     )
-    from torchvision_dddas.io.atomic_files import refuse_folder, save_file
-    from torchvision_dddas.io.output.run_record import finite, read_run_record
 
     named = [(read_scores(folder), folder) for folder in (first, second)]
     studies = [replace(study, name=f"{study.name} ({folder})") for study, folder in named]

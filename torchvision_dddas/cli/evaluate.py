@@ -34,7 +34,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.studies.records import Results, Spec
+    from torchvision_dddas.lab.evaluation.studies.records import Results, Spec
 
 MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
 
@@ -115,9 +115,9 @@ def evaluate(
             show(report)
             echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
-    from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
-    from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
-    from torchvision_dddas.evaluation.studies.runner import write_study
+    from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
+    from torchvision_dddas.lab.evaluation.studies.jobs import SILENT_S, Workers
+    from torchvision_dddas.lab.evaluation.studies.runner import write_study
 
     refuse_options({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
     check_jobs(jobs, scheduler)
@@ -142,7 +142,7 @@ def change_spec(
     file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
 ) -> "Spec":
     """Read a study's file and change it by what the command line says. Raises InputError for bad input."""
-    from torchvision_dddas.evaluation.studies.runner import read_spec
+    from torchvision_dddas.lab.evaluation.studies.runner import read_spec
 
     spec = read_spec(file)
     spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
@@ -158,9 +158,9 @@ def score(
     ignored: Literal["dropped", "removed"] = "dropped",
 ) -> dict[str, Any]:
     """Evaluate, and write metrics.json into a folder. Raises InputError."""
-    from torchvision_dddas.evaluation.evaluate import evaluate
     from torchvision_dddas.io.atomic_files import save_file
     from torchvision_dddas.io.output import finite
+    from torchvision_dddas.lab.evaluation.evaluate import evaluate
 
     report = evaluate(truth, result, first_frame, interval, ignored)
     save_file(out / "metrics.json", (json.dumps(finite(report), indent=2) + "\n").encode())
@@ -172,7 +172,7 @@ def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None)
 
     prefix: of titles. most: clips in a table, the worst of them if there are more. Without it, the notes follow.
     """
-    from torchvision_dddas.evaluation.metrics.registry import GROUPS
+    from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 
     console = open_console()
     for group in GROUPS:
@@ -183,7 +183,7 @@ def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None)
 
 def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -> None:
     """Print the main measures of each task, what was left out, and where the rest is."""
-    from torchvision_dddas.evaluation.studies.runner import FILES
+    from torchvision_dddas.lab.evaluation.studies.runner import FILES
 
     for task, found in measures["tasks"].items():
         show(found, f"{task}: ", MOST_CLIPS)
@@ -202,7 +202,7 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
     from rich.markup import escape
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.metrics.registry import GROUPS, describe, is_lower_better
+    from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS, describe, is_lower_better
 
     columns, title = GROUPS[group].columns, GROUPS[group].title
 

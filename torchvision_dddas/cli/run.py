@@ -216,9 +216,9 @@ def _fly(
     save: str | None,
     quiet: bool,
 ) -> None:
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
     from torchvision_dddas.io.output import parse_save
-    from torchvision_dddas.simulation import SimulatedRunRecorder
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.simulation import SimulatedRunRecorder
 
     names = parse_save(save, SimulatedRunRecorder.saved)
     show = partial(progress, quiet=quiet)

@@ -42,7 +42,7 @@ def settings(
     table = Table("parameter", "default", "unit", "range", "meaning")
     rows = [row for row in all_parameters() if group is None or row.name.startswith(f"{group}.")]
     if group == _SCENARIO:
-        from torchvision_dddas.simulation import scenario_parameters
+        from torchvision_dddas.lab.simulation import scenario_parameters
 
         rows = scenario_parameters()
     for parameter in rows:
