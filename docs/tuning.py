@@ -7,9 +7,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from torchvision_dddas.evaluation.studies.runner import read_spec
-from torchvision_dddas.simulation import film_clip
-from torchvision_dddas.tuning import Plan, Step, descend, judge, prepare
+from torchvision_dddas.lab.evaluation.studies.runner import read_spec
+from torchvision_dddas.lab.simulation import film_clip
+from torchvision_dddas.lab.tuning import Plan, Step, descend, judge, prepare
 
 
 def show_step(step: Step) -> None:

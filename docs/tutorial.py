@@ -12,8 +12,8 @@ from kornia.losses import dice_loss
 from torch import Tensor, nn
 
 import torchvision_dddas.functional as F
+from torchvision_dddas.lab.simulation import film, load_scenario
 from torchvision_dddas.nn import MotionSegmenter
-from torchvision_dddas.simulation import film, load_scenario
 
 Clip = tuple[Tensor, Tensor]
 """Pictures (T, 3, H, W), RGB in [0, 1], and their true masks (T, 1, H, W)."""

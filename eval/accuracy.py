@@ -24,13 +24,13 @@ from clips import clips_in
 
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics import boxes as box_metrics
-from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.boxes import Boxes, OneTarget
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.evaluation.metrics import boxes as box_metrics
+from torchvision_dddas.lab.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.lab.evaluation.metrics import truth as truths
+from torchvision_dddas.lab.evaluation.metrics.boxes import Boxes, OneTarget
+from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.types import Scene
 
 Found = tuple[np.ndarray, np.ndarray]

@@ -38,12 +38,12 @@ from scipy.cluster import hierarchy
 
 from torchvision_dddas.config import PaperParameters, Settings, load_config
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.matching import pair
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.evaluation.metrics import tracking
+from torchvision_dddas.lab.evaluation.metrics.matching import pair
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.tracking import CameraMotion, FrameTracker
 from torchvision_dddas.tracking.source_tracker import (
     centres,

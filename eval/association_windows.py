@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from torchvision_dddas.config import PaperParameters
-from torchvision_dddas.evaluation.metrics import tracking
+from torchvision_dddas.lab.evaluation.metrics import tracking
 from torchvision_dddas.nn import HistogramAffinity
 from torchvision_dddas.tracking import rgb_histograms
 from torchvision_dddas.tracking.source_tracker import (

@@ -9,16 +9,17 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.config import Settings
-from torchvision_dddas.evaluation.datasets import motchallenge
-from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.evaluation.metrics.truth import Truth
-from torchvision_dddas.evaluation.studies.records import Task
-from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.stages import find
-from torchvision_dddas.evaluation.studies.summary import measures
 from torchvision_dddas.io.images import read_image
 from torchvision_dddas.io.sources import ImageSource, open_source
+from torchvision_dddas.lab.evaluation.datasets import motchallenge
+from torchvision_dddas.lab.evaluation.datasets.files import folders_in, images_in, number_of
+from torchvision_dddas.lab.evaluation.datasets.kinds import read
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.studies.records import Task
+from torchvision_dddas.lab.evaluation.studies.scoring import score
+from torchvision_dddas.lab.evaluation.studies.stages import find
+from torchvision_dddas.lab.evaluation.studies.summary import measures
 
 sys.path.insert(0, str(bench.ROOT))
 from tests.synthetic_clip import RATE_HZ, film_into, flight, render
@@ -102,16 +103,23 @@ def film_of(place: Path) -> Path | None:
     return pictures[0] if len(pictures) == 1 else None
 
 
+def single_pictures(place: Path) -> dict[int, Path]:
+    """The pictures of a sequence by frame, where not all of them need be there: those of its folders img1*."""
+    folders = [place / name for name in folders_in(place) if name.startswith("img1")]
+    paths = [path for folder in folders for path in images_in(folder)]
+    return {number: path for path in paths if (number := number_of(path)) is not None}
+
+
 def has_pictures(place: Path, pictures: str) -> bool:
     """Whether there is a video of all frames ("video"), or single pictures in folders img1* ("images")."""
     single = pictures != "video"
-    return bool(motchallenge.single_pictures(place) if single else motchallenge.sequence(place).pictures)
+    return bool(single_pictures(place) if single else motchallenge.sequence(place).pictures)
 
 
 def frames_of(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
     """Number and picture of each frame."""
     if pictures != "video":
-        for number, path in sorted(motchallenge.single_pictures(place).items()):
+        for number, path in sorted(single_pictures(place).items()):
             image = read_image(path)
             assert image is not None, path
             yield number, image

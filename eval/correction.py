@@ -20,7 +20,7 @@ from clips import clips_in
 from torch import Tensor
 
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics.truth import load_truth, read_mask
+from torchvision_dddas.lab.evaluation.metrics.truth import load_truth, read_mask
 from torchvision_dddas.nn import MotionSegmenter
 
 sys.path.insert(0, str(bench.ROOT / "docs"))

@@ -20,10 +20,10 @@ from simulated_clips import Case, walking
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.control import fit_settings
 from torchvision_dddas.detection import MotionDetector
-from torchvision_dddas.evaluation.metrics import boxes as box_metrics
-from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.simulation import SimulatorSource
+from torchvision_dddas.lab.evaluation.metrics import boxes as box_metrics
+from torchvision_dddas.lab.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.simulation import SimulatorSource
 from torchvision_dddas.types import Scene, Truth
 
 FLIGHTS = tuple(product((50.0, 100.0, 200.0), (2.0, 5.0, 10.0)))

@@ -24,8 +24,8 @@ from clips import film_of, frames_of, has_pictures, read_frames, truth_of
 
 from torchvision_dddas.config import PeopleParameters, Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 from torchvision_dddas.people import pyramid
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.detector import detect_in_clip, detect_people, load_scorer

@@ -36,12 +36,12 @@ from geo_scene import (
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from torchvision_dddas.config import AerialParameters, GroundParameters, Settings, load_config, with_parameters
-from torchvision_dddas.evaluation.metrics.boxes import iou
 from torchvision_dddas.geo import AerialLocator
 from torchvision_dddas.geo.georeferencer import Georeferencer
 from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.io.detection_tables import read_detections
+from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 from torchvision_dddas.types import Camera, Flight, LandmarkObservations, Poses, Sightings, Telemetry, Tracks
 
 SIZES = {"PETS09-S2L1": (768, 576), "TUD-Stadtmitte": (640, 480)}

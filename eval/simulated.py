@@ -28,11 +28,10 @@ from simulated_clips import CONFIG, GROUND_WAYS, Case, Way, locate_clip, locate_
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config, with_parameters
-from torchvision_dddas.control import StartedSource, build_mission
-from torchvision_dddas.detection import load_engine
-from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer
-from torchvision_dddas.pipeline import Pipeline
-from torchvision_dddas.simulation import SimulatorSource, load_scenario, scenario_settings
+from torchvision_dddas.control import StartedSource
+from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScorer
+from torchvision_dddas.lab.simulation import SimulatorSource, load_scenario, scenario_settings
+from torchvision_dddas.pipeline import Pipeline, assemble_mission
 from torchvision_dddas.types import Command, Frame
 
 # -- altitude and landmarks ------------------------------------------------------------------------------------------
@@ -267,11 +266,10 @@ def fly(source: SimulatorSource, changed: Case) -> Case:
     settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
     timed: Any = TimedSource(source, changed.get("every", 1))
     started = StartedSource(timed)
-    mission = build_mission(started, settings, "onboard")
-    engine = load_engine("onboard", mission.settings)
+    ready = assemble_mission(started, settings, "onboard", by_landmarks=True)
     scorer = CrowdScorer(partial(geometry.east_north, origin_deg=source.origin_deg))
     stages, judging, timed.spent_s, start = Counter[str](), 0.0, 0.0, bench.now()[1]
-    for result in Pipeline.from_parts(engine, mission.settings, None, mission.watch, 1, mission)(started):
+    for result in Pipeline.from_assembly(ready)(started):
         stages.update(result.locations.seconds if result.locations is not None else result.tracked.seconds)
         before = bench.now()[1]
         for truth in source.truths():
@@ -304,7 +302,7 @@ def measure_whole(options: bench.Options) -> tuple[str, Any]:
 
 def fly_whole(case: Case) -> Case:
     """The score of one run, by name."""
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
         _, score = run_scenario(Path(out), case["scenario"], seed=case["seed"])
@@ -346,7 +344,7 @@ def measure_ground(options: bench.Options) -> tuple[str, Any]:
 
 def fly_ground(case: Case) -> list[list[float]]:
     """Of each row of crowds.csv the errors of centre and course, and whether it steers."""
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
         words = [f"steering.follow={str(case['follow']).lower()}"]

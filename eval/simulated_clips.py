@@ -14,7 +14,6 @@ from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.control import StartedSource, fit_settings
 from torchvision_dddas.control.rules import every_least
 from torchvision_dddas.detection import detect_motion, pixels_per_metre
-from torchvision_dddas.evaluation.metrics.crowds import CrowdScorer, TrueFrame
 from torchvision_dddas.geo import (
     AerialLocator,
     GroundLocator,
@@ -25,13 +24,13 @@ from torchvision_dddas.geo import (
     group_crowds,
     to_local,
 )
-from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.geo.projection import shift_origin
+from torchvision_dddas.geometry.projection import shift_origin
+from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScorer, TrueFrame
+from torchvision_dddas.lab.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
+from torchvision_dddas.lab.simulation.cameras import view_from_pose
+from torchvision_dddas.lab.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.people import PersonDetector
-from torchvision_dddas.simulation import CarPlan, CrowdPlan, Scenario, SimulatorSource, scenario_settings
-from torchvision_dddas.simulation.cameras import view_from_pose
-from torchvision_dddas.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.types import Command, FrameResult, Landmarks, Order, Scene, TrackedFrame, Tracks, Truth
 
 CONFIG = "patrol"
@@ -88,7 +87,7 @@ class ClipLocator:
                 site, self._source.camera, self._settings, load_solver("onboard"), self._source.rate_hz,
                 focal_known=True,
             )  # fmt: skip
-            self._watch = LandmarkWatch(locator, self._source.colours, load_colours("onboard"))
+            self._watch = LandmarkWatch(locator, self._source.colours, "onboard")
         else:
             self._watch.locator.set_site(site)
         locator = self._watch.locator

@@ -21,15 +21,15 @@ import cv2
 import numpy as np
 from clips import clips_in
 
+from torchvision_dddas.chain import DetectionChain, OpenCVOperations, Window
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import load_engine
-from torchvision_dddas.detection.blobs import clean_silhouette, find_blobs
-from torchvision_dddas.detection.engine import Window
-from torchvision_dddas.evaluation.metrics import pixels as pixel_metrics
-from torchvision_dddas.evaluation.metrics import truth as truths
-from torchvision_dddas.evaluation.metrics.pixels import Pixels, add_counts
+from torchvision_dddas.detection.blobs import find_blobs
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.evaluation.metrics import pixels as pixel_metrics
+from torchvision_dddas.lab.evaluation.metrics import truth as truths
+from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts
 
 GRID: dict[str, tuple[int, ...]] = {
     "interval.frames": (1, 2, 3),
@@ -120,10 +120,9 @@ def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
 def score(frames: Sequence[Labelled], settings: Settings) -> dict[str, dict[str, float]]:
     """Measures of a clip by frame of the truth, pixel counts pooled."""
     counts = {"reference": Pixels(), "middle": Pixels()}
-    difference, morphology = settings.difference, settings.morphology
+    difference = settings.difference
     for frame in frames:
-        above = cv2.threshold(frame.difference, int(difference.threshold), 255, cv2.THRESH_BINARY)[1]
-        core = clean_silhouette(above, morphology, difference.blur_px)
+        core = DetectionChain(settings, OpenCVOperations()).find_core(frame.difference)
         mask = np.zeros(core.shape, bool)
         for blob in find_blobs(core, frame.difference, difference.threshold, settings.gates.min_area_px, 0, False):
             x, y, width, height = blob.box

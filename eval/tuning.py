@@ -3,13 +3,12 @@
 python eval/tuning.py recovery           perturbed parameters of motion, on simulated scenes
 python eval/tuning.py default            the shipped parameters of the difference beside those before they were tuned
 python eval/tuning.py identities DATA    the tracker's parameters, each sequence left out in turn
-python eval/tuning.py affinities DATA    the source's association, the same
 
-Gradient descent beside random search or Optuna at equal time: `dddas tune` and `dddas sweep --search` on one study.
+Gradient descent beside random search or Optuna at equal time: `dddas tune` and `dddas sweep --optuna` on one study.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,18 +20,17 @@ import torch
 
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
-from torchvision_dddas.evaluation.datasets.kinds import read
-from torchvision_dddas.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.evaluation.metrics import pixels as segmentation
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.evaluation.metrics.truth import labels_of
-from torchvision_dddas.evaluation.studies.records import Task
-from torchvision_dddas.evaluation.studies.stages import open_clip
-from torchvision_dddas.tuning.descent import Plan, descend
-from torchvision_dddas.tuning.motion import MotionFamily
-from torchvision_dddas.tuning.parameters import TUNABLE, Parameters
-from torchvision_dddas.tuning.source_association import SourceFamily
-from torchvision_dddas.tuning.tracking import TrackingFamily
+from torchvision_dddas.lab.evaluation.datasets.kinds import read
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.metrics import pixels as segmentation
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.evaluation.metrics.truth import labels_of
+from torchvision_dddas.lab.evaluation.studies.records import Task
+from torchvision_dddas.lab.evaluation.studies.stages import open_clip
+from torchvision_dddas.lab.tuning.descent import Plan, descend
+from torchvision_dddas.lab.tuning.motion import MotionFamily
+from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters
+from torchvision_dddas.lab.tuning.tracking import TrackingFamily
 
 MOTION = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
@@ -129,7 +127,6 @@ TRACKING = tuple(
         "rest_price",
     )
 )
-PAPER = tuple(f"paper.{name}" for name in ("threshold", "lowest_dispersion", "location_cut", "appearance_cut"))
 
 
 def measure_identities(options: bench.Options) -> tuple[str, Any]:
@@ -141,31 +138,16 @@ def measure_identities(options: bench.Options) -> tuple[str, Any]:
     found = clips.identified_clips(options.data, ("motchallenge", "cvml", "sdd"))
     found = [replace(c, pictures=()) for c in found if c.given is not None or not options.detections]
     plan = Plan(options.steps, 4, 0.2, look_every=8, pull=0.1)
-    return leave_out(options, TrackingFamily().at(options.interval, task), Settings(), TRACKING, found, task, plan)
-
-
-def measure_affinities(options: bench.Options) -> tuple[str, Any]:
-    """IDF1 of the source's association (two frames at once) with thresholds and cuts tuned on other sequences."""
-    shipped = with_parameters(load_config("paper"), {"paper.window": 2, "paper.rule": "dispersion"})
-    found = clips.identified_clips(options.data, ("motchallenge", "cvml"))
-    plan = Plan(options.steps, 8, 0.4, look_every=5, most_watched=16)
-    return leave_out(options, SourceFamily(interval=options.interval), shipped, PAPER, found, "association", plan)
-
-
-def leave_out(
-    options: bench.Options, family: Any, shipped: Settings, names: Sequence[str], found: Sequence[Clip], task: Task,
-    plan: Plan,
-) -> tuple[str, Any]:  # fmt: skip
-    """IDF1 of each clip with the shipped parameters and with those tuned on all others."""
+    family, shipped = TrackingFamily().at(options.interval, task), Settings()
     torch.set_num_threads(1)
     wanted = [clip for clip in found if not options.only or clip.name in options.only]
     examples = {clip.name: family.examples([clip], shipped) for clip in wanted}
     rows = []
     for clip in wanted:
         others = [example for name, mine in examples.items() if name != clip.name for example in mine]
-        tuned = descend(family, Parameters(shipped, names), others, plan).settings
+        tuned = descend(family, Parameters(shipped, TRACKING), others, plan).settings
         rows.append([100 * clips.measure_idf1(clip, task, s, options.interval) for s in (shipped, tuned)])
-        bench.log(clip.name, np.round(rows[-1], 1), {name: value_of(tuned, name) for name in names})
+        bench.log(clip.name, np.round(rows[-1], 1), {name: value_of(tuned, name) for name in TRACKING})
     cells = [[clip.name, *(f"{value:.1f}" for value in row)] for clip, row in zip(wanted, rows, strict=True)]
     gains = [after - before for before, after in rows]
     cells.append(["mean gain, and 95 % of draws of the sequences", "", bench.format_gain(gains)])
@@ -179,6 +161,5 @@ if __name__ == "__main__":
         "recovery": (measure_recovery, seeds),
         "default": (measure_default, {"--seeds": 20}),
         "identities": (measure_identities, left_out | {"--detections": False}),
-        "affinities": (measure_affinities, left_out),
     }
     bench.main(__doc__, studies)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from torchvision_dddas.config import AerialParameters, Settings
-from torchvision_dddas.geo.projection import axes_of, project
 from torchvision_dddas.geometry import turned
+from torchvision_dddas.geometry.projection import axes_of, project
 from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 
 FOCAL_PX = 960 / np.tan(np.radians(35))

@@ -150,7 +150,7 @@ def test_a_log_that_is_not_synchronised_with_the_clip_is_noted_after_the_last_fr
             none = Detections(np.zeros((0, 4)), *np.zeros((4, 0)))
             yield Scene(frame, np.zeros((480, 640), np.uint16), none, 1, step=step if frame.number > 1 else None)
 
-    monkeypatch.setattr("torchvision_dddas.pipeline.detect_motion", scenes)
+    monkeypatch.setattr("torchvision_dddas.pipeline.pipeline.detect_motion", scenes)
     pipeline = Pipeline(None, telemetry=log, camera=CAMERA)
     results = list(pipeline(Clip()))
     assert len(results) == 120

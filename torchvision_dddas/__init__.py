@@ -53,7 +53,7 @@ def open_video(spec: "str | Path", **options: Any) -> "Source":
     if not text.startswith("sim:") or names_file(text):
         return open_source(spec, **options)
     from torchvision_dddas.errors import InputError
-    from torchvision_dddas.simulation import open_scenario  # takes 0.4 s to import
+    from torchvision_dddas.lab.simulation import open_scenario  # takes 0.4 s to import
 
     if options.get("rate_hz") is not None:
         raise InputError(f"the scenario of {text} sets the frame rate (clip.rate_hz): leave --rate out")

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 from jobs import PYTHON, Table, check_environments, run_peer
 
-from torchvision_dddas.evaluation.datasets.record import Clip
-from torchvision_dddas.evaluation.evaluate import evaluate
-from torchvision_dddas.evaluation.metrics import truth as true_boxes
-from torchvision_dddas.evaluation.studies.records import Found, round_as_written
-from torchvision_dddas.evaluation.studies.scoring import score
-from torchvision_dddas.evaluation.studies.summary import measures
+from torchvision_dddas.lab.evaluation.datasets.record import Clip
+from torchvision_dddas.lab.evaluation.evaluate import evaluate
+from torchvision_dddas.lab.evaluation.metrics import truth as true_boxes
+from torchvision_dddas.lab.evaluation.studies.records import Found, round_as_written
+from torchvision_dddas.lab.evaluation.studies.scoring import score
+from torchvision_dddas.lab.evaluation.studies.summary import measures
 
 HERE = Path(__file__).resolve().parent
 MOST = 1e-6

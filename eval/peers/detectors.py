@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 
 TRUE_SCORES, FALSE_SCORES = (9.0, 1.5), (2.0, 3.0)
 FALSE = -1

@@ -35,7 +35,7 @@ from kept_peers import KeptPeers, Run, checksum
 from row_scores import Score, bounds_of_mean, score_rows
 
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.tracking import track_table
 from torchvision_dddas.types import DetectionTable
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 
 HERE = Path(__file__).resolve().parent
 PYTHON, NORFAIR_PYTHON = (HERE.parents[1] / f"{name}/bin/python" for name in (".venv-peers", ".venv-norfair"))

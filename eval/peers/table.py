@@ -20,12 +20,12 @@ import bench
 from clips import sequences
 from jobs import Table, check_environments, grid, job, run_jobs, run_peer
 
-from torchvision_dddas.evaluation.datasets import motchallenge
-from torchvision_dddas.evaluation.metrics import tracking, truth
-from torchvision_dddas.evaluation.metrics.matching import pair
-from torchvision_dddas.evaluation.metrics.pixels import add_counts
-from torchvision_dddas.evaluation.metrics.tracking import TrackCounts
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.lab.evaluation.datasets import motchallenge
+from torchvision_dddas.lab.evaluation.metrics import tracking, truth
+from torchvision_dddas.lab.evaluation.metrics.matching import pair
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.evaluation.metrics.tracking import TrackCounts
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 
 # Around each tracker's defaults and towards looser gates, shorter confirmation and longer memory.
 DETECTIONS: dict[str, dict[str, list]] = {

@@ -10,7 +10,6 @@ import pytest
 from typer.testing import CliRunner
 
 from torchvision_dddas import detection, pipeline
-from torchvision_dddas.io import run_inputs
 from torchvision_dddas.types import Detections, Scene
 
 
@@ -40,7 +39,7 @@ def stub_engine(found=True, after=None):
 def engine(monkeypatch):
     def install(**how):
         for name, stub in stub_engine(**how).items():
-            for module in (detection, pipeline, run_inputs):
+            for module in (detection, pipeline.assembly, pipeline.pipeline):
                 monkeypatch.setattr(module, name, stub, raising=False)
 
     install()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.evaluation.studies import world
+from tests.lab.evaluation.studies import world
 from torchvision_dddas.cli import app
 
 # In a new network namespace only the loopback device is there, and it is down.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import bad
+from tests.lab.simulation.small import as_file, small
 from tests.overflight import COLOURS_TOML
-from tests.simulation.small import as_file, small
 
 CAMERA = "focal_px = 1000\nwidth_px = 1280\nheight_px = 960\n"
 PLACED = CAMERA + "height_m = 1.2\nheading_deg = 0\neast_m = 0\nnorth_m = 0\n"

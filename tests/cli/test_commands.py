@@ -89,7 +89,7 @@ def test_a_terminal_of_ascii_alone_is_written_to(dddas, engine, clip, tmp_path):
 
 def test_demo_films_detects_and_scores_twice_into_the_same_folder(dddas, engine, tmp_path, monkeypatch):
     small = partial(film_into, frames=3, size=(160, 120))
-    monkeypatch.setattr("torchvision_dddas.simulation.film_clip", lambda folder, tick: small(folder))
+    monkeypatch.setattr("torchvision_dddas.lab.simulation.film_clip", lambda folder, tick: small(folder))
     for _ in range(2):
         result = dddas("demo", "--out", tmp_path / "demo")
         assert result.exit_code == 0, result.output

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from tests.cli.conftest import bad, record
-from tests.evaluation.studies import world
-from torchvision_dddas.evaluation.studies.cache import SCORES
+from tests.lab.evaluation.studies import world
+from torchvision_dddas.lab.evaluation.studies.cache import SCORES
 
 TRUTH = "1,1,0,0,10,20,1,-1,-1\n1,2,100,0,10,20,0,-1,-1\n2,1,0,0,10,20,1,-1,-1\n"
 FOUND = "1,7,0,0,10,20,1,-1,-1,-1\n1,8,100,0,10,20,1,-1,-1,-1\n2,8,0,0,10,20,1,-1,-1,-1\n"

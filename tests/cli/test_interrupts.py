@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import bad, record
-from tests.evaluation.studies import world
+from tests.lab.evaluation.studies import world
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.interrupts import Stopped, is_stop, raising_signals, uninterrupted
 

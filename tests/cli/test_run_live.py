@@ -30,8 +30,8 @@ from tests.live.streams import FakeStream
 from tests.synthetic_clip import render
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.errors import InputError, without_secrets
-from torchvision_dddas.io.run_inputs import prepare_run
 from torchvision_dddas.io.streams.stream import Stream
+from torchvision_dddas.pipeline import assemble_files
 
 FRAMES = 14
 # A machine that is busy with other things is no hung run.
@@ -100,9 +100,9 @@ def test_the_cost_of_a_look_is_measured_where_frames_do_not_wait_unless_it_is_se
 
 def test_notes_on_the_files_are_said_at_the_start(dddas, frames, tmp_path, monkeypatch):
     def noting(*given):
-        return replace(prepare_run(*given), notes=["bravo has no colour"])
+        return replace(assemble_files(*given), notes=["bravo has no colour"])
 
-    monkeypatch.setattr("torchvision_dddas.live.session.prepare_run", noting)
+    monkeypatch.setattr("torchvision_dddas.live.session.assemble_files", noting)
     done = dddas("run", frames, *FAST, "--out", tmp_path)
     assert done.exit_code == 0, done.output
     assert "dddas: note: bravo has no colour\n" in done.stderr

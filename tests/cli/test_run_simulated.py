@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import record, rows
-from tests.simulation.small import as_file, small
+from tests.lab.simulation.small import as_file, small
 from torchvision_dddas import geometry
 from torchvision_dddas.io.ground_tables import read_positions
 
@@ -69,7 +69,7 @@ def test_log_and_record_tell_what_the_run_noticed_and_how_good_it_was(made):
 
 @pytest.mark.slow
 def test_an_interrupt_leaves_results_and_truth_up_to_the_same_frame(tmp_path, dddas, monkeypatch):
-    from torchvision_dddas.simulation import SimulatedRunRecorder
+    from torchvision_dddas.lab.simulation import SimulatedRunRecorder
 
     survey = SimulatedRunRecorder.write
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from tests.cli.conftest import record, rows
-from tests.simulation.small import as_file, small
+from tests.lab.simulation.small import as_file, small
 from torchvision_dddas import geometry, open_video
-from torchvision_dddas.evaluation.metrics import truth as judges
 from torchvision_dddas.io.camera_files import read_camera, read_poses
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.simulation import load_scenario, scenario_names
+from torchvision_dddas.lab.evaluation.metrics import truth as judges
+from torchvision_dddas.lab.simulation import load_scenario, scenario_names
 
 FAULTS = ({"what": "dropped", "time_s": 0.5, "seconds": 0.15}, {"what": "gps_dropout", "time_s": 1.0, "seconds": 0.55})
 
@@ -82,8 +82,8 @@ def test_reports_are_read_and_true(folder):
 def test_the_elevation_is_that_of_the_world(folder):
     pytest.importorskip("rasterio")
     from torchvision_dddas.io.elevation import read_elevation
-    from torchvision_dddas.simulation import open_simulator
-    from torchvision_dddas.simulation.world import height_at
+    from torchvision_dddas.lab.simulation import open_simulator
+    from torchvision_dddas.lab.simulation.world import height_at
 
     scenario = load_scenario(folder / "scenario.toml")
     places = np.random.default_rng(0).uniform(-25, 25, (50, 2))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.conftest import bad
-from tests.evaluation.studies import world
+from tests.lab.evaluation.studies import world
 from torchvision_dddas.config import load_config
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
@@ -61,7 +61,9 @@ def test_the_default_is_shown_and_marked(swept) -> None:
 
 
 def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(run, swept, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.jobs.do_job", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(
+        "torchvision_dddas.lab.evaluation.studies.jobs.do_job", lambda *_: pytest.fail("computed again")
+    )
     assert run(*GRID, *HOLD, "--out", tmp_path, "--quiet").exit_code == 0
     for name in ("sweep.json", "best.toml"):
         assert (tmp_path / name).read_bytes() == (swept[0] / name).read_bytes()
@@ -95,13 +97,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, words, message)
 
 
 def test_without_optuna_the_line_says_how_to_get_it(run, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("torchvision_dddas.evaluation.studies.sweep.find_spec", lambda name: None)
+    monkeypatch.setattr("torchvision_dddas.lab.evaluation.studies.sweep.find_spec", lambda name: None)
     words = ("--optuna", 2, "--range", "difference.threshold=5:40", "--out", tmp_path / "out")
     assert "torchvision-dddas[tune]" in bad(run(*words))
 
 
 def test_an_interrupt_before_the_first_trial_says_that_finished_stages_are_kept(study, run, tmp_path, monkeypatch):
-    from torchvision_dddas.evaluation.studies.sweep import StudyMeasure
+    from torchvision_dddas.lab.evaluation.studies.sweep import StudyMeasure
 
     whole = StudyMeasure.prepare
 

@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -11,15 +10,15 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.cli.conftest import bad, record
-from tests.evaluation.studies.world import filmed, study
-from tests.tuning.toys import Bowl
+from tests.lab.evaluation.studies.world import filmed, study
+from tests.lab.tuning.toys import Bowl
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import load_config
-from torchvision_dddas.evaluation.metrics import bootstrap
-from torchvision_dddas.tuning import family, time_cost
+from torchvision_dddas.lab.evaluation.metrics import bootstrap
+from torchvision_dddas.lab.tuning import family
 
 THRESHOLD = "difference.threshold"
-STEPS = ("--knobs", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
+STEPS = ("--parameters", THRESHOLD, "--steps", "10", "--rate", "0.2", "--jobs", "1")
 BOTTOM = math.log(6)
 
 
@@ -96,45 +95,10 @@ def test_a_resumed_run_does_no_step_twice_and_says_the_same(clips, tuned) -> Non
     assert after["history"] == before["history"] and after["verdict"] == before["verdict"]
 
 
-def test_a_cost_is_measured_once_and_kept_for_a_resumed_run(one, tmp_path, monkeypatch) -> None:
-    calls = list[float]()
-
-    def timed(settings) -> float:
-        calls.append(settings.difference.threshold)
-        return settings.difference.threshold
-
-    monkeypatch.setattr(time_cost, "frame_timer", lambda *_: timed)
-    assert one("--cost", "0.5").exit_code == 0
-    count = len(calls)
-    kept = record(tmp_path)["cost"]
-    assert kept["weight"] == 0.5 and [curve["knob"] for curve in kept["curves"]] == [THRESHOLD]
-    assert one("--cost", "0.5", "--resume").exit_code == 0
-    assert len(calls) == count > 0
-    assert "What time costs" in (tmp_path / "report.html").read_text()
-
-
-@dataclass
-class Choosy(Bowl):
-    """A bowl of two losses."""
-
-    losses: tuple[str, ...] = ("round", "square")
-    loss_name: str = "round"
-
-
 def test_a_checkpoint_of_another_plan_is_refused_and_the_run_before_stays(one, tmp_path) -> None:
-    bowl = Choosy(place=BOTTOM)
-    assert one("--loss", "square", bowl=bowl).exit_code == 0
-    assert record(tmp_path)["loss"] == "square"
-    assert "motion, loss square, on" in (tmp_path / "report.html").read_text()
+    assert one().exit_code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    for words, said in (
-        (("--patience", "3", "--loss", "square"), "with other patience"),
-        (("--cost", "2", "--loss", "square"), "with other cost"),
-        ((), "with other loss, square and not round"),
-    ):
-        assert said in bad(one(*words, "--resume", "--quiet", bowl=bowl))
-    unknown = one("--loss", "oval", bowl=bowl)
-    assert "'oval' is no loss of the family motion; wanted one of round, square" in bad(unknown)
+    assert "with other patience" in bad(one("--patience", "3", "--resume", "--quiet"))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -212,19 +176,17 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--knobs difference.absent", "difference.threshold (0.1 to"),
-        ("--knobs registration.keypoints", "is no parameter that can be tuned"),
-        ("--knobs=", "names no parameter"),
-        (f"--knobs {THRESHOLD},track.wander", "several families"),
+        ("--parameters difference.absent", "difference.threshold (0.1 to"),
+        ("--parameters registration.keypoints", "is no parameter that can be tuned"),
+        ("--parameters=", "names no parameter"),
+        (f"--parameters {THRESHOLD},track.wander", "several families"),
         ("--steps 0", "steps must be 1 or more, got 0"),
         ("--pull -1", "pull must be 0 or more, got -1"),
         ("--holdout none*", "fits no clip"),
         ("--holdout *", "leaves no clip"),
-        ("--cost -1", "--cost must be 0 or more"),
         ("--device nowhere", "--device nowhere"),
         ("--device meta", "--device meta"),
         ("--minutes 0", "--minutes must be more than 0"),
-        ("--loss f", "is no loss of the family motion; it has one only"),
         ("--measure motion.pixels", "is no measure"),
         ("--measure motion.pixels.iou", "no measure of motion.pixels; wanted accuracy, "),
         ("--measure motion.target.hit", "no clip has truth for motion.target.hit"),

@@ -5,13 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.simulation.small import small
+from tests.lab.simulation.small import small
 from torchvision_dddas.config import load_config
-from torchvision_dddas.control import StartedSource, build_mission
-from torchvision_dddas.detection import load_engine
+from torchvision_dddas.control import StartedSource
 from torchvision_dddas.geometry import east_north, lonlat
-from torchvision_dddas.pipeline import Pipeline
-from torchvision_dddas.simulation import SimulatorSource
+from torchvision_dddas.lab.simulation import SimulatorSource
+from torchvision_dddas.pipeline import Pipeline, assemble_mission
 
 FAULTS = (
     {"what": "frozen", "time_s": 2.0, "seconds": 0.5},
@@ -43,9 +42,9 @@ def fly(overrides=(), seconds=6.0, **tables):
 
     simulated.steer = record  # type: ignore[method-assign]
     source, settings = StartedSource(simulated), load_config("patrol", [*overrides])
-    flown.mission = build_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
-    engine, settings = load_engine("onboard", flown.mission.settings), flown.mission.settings
-    for result in Pipeline.from_parts(engine, settings, None, flown.mission.watch, 1, flown.mission)(source):
+    ready = assemble_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
+    flown.mission = ready.mission
+    for result in Pipeline.from_assembly(ready)(source):
         flown.results.append(result)
         flown.noticed += [(notice.frame, notice.text) for notice in flown.mission.notices()]
         flown.places |= own_places(simulated)

@@ -8,7 +8,7 @@ import pytest
 from torchvision_dddas.config import IntervalParameters, Settings, SteeringParameters
 from torchvision_dddas.control import Steering
 from torchvision_dddas.geo.landmark_trajectories import best_spread, spread_m2
-from torchvision_dddas.geo.projection import axes_of, project
+from torchvision_dddas.geometry.projection import axes_of, project
 from torchvision_dddas.types import (
     AerialLocations,
     Camera,

@@ -56,6 +56,17 @@ def flows(inside: float, ground: float) -> list[np.ndarray]:
     return [-field, field]
 
 
+def test_a_blob_in_a_corner_does_not_change_the_flow_of_later_pictures():
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
+    grey = cv2.equalizeHist(cv2.GaussianBlur(noise, (0, 0), 3))
+    later, used = np.roll(grey, 3, axis=1), DenseFlow()
+    (corner,) = used(grey, [later], [(0, 0, 10, 10)])
+    tiny = np.ascontiguousarray(grey[:60, :80])
+    used(tiny, [np.roll(tiny, 1, axis=1)])
+    np.testing.assert_array_equal(used(grey, [later])[0], DenseFlow()(grey, [later])[0])
+    assert (corner[:40, :40] != 0).any() and not corner[100:].any()
+
+
 def test_a_blob_that_moves_with_its_surroundings_is_not_steady(box_blob):
     assert measure_motions([box_blob(BOX)], flows(6, 0), (-2, 2))[0].steady == 1
     assert measure_motions([box_blob(BOX)], flows(6, 6), (-2, 2))[0].steady == 0

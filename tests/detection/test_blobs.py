@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import MorphologyParameters
-from torchvision_dddas.detection.blobs import find_blobs, find_weak_blobs, group_fragments
-from torchvision_dddas.detection.observation import remove_shadow, smooth_along_edges
+from torchvision_dddas.config import Settings, with_parameters
+from torchvision_dddas.detection.blobs import find_blobs, group_fragments
+from torchvision_dddas.detection.observation import find_weak_blobs, remove_shadow, smooth_along_edges
 
 SIZE = (101, 67)
 
@@ -35,7 +35,8 @@ def test_a_region_without_a_peak_is_left_out_and_only_evidence_above_the_thresho
 def test_weak_blobs_come_from_wide_evidence_away_from_strong_blobs(painted):
     wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
     strong = found(painted(SIZE, (5, 6, 10, 10)))
-    (weak,) = find_weak_blobs(wide, strong, 10, MorphologyParameters(erode_px=1, close_px=1), 1, 0)
+    every = {"difference.peak": 0.1, "morphology.erode_px": 1, "morphology.close_px": 1, "gates.min_area_px": 1}
+    (weak,) = find_weak_blobs(wide, strong, with_parameters(Settings(), every))
     assert weak.weak and weak.box == (50, 30, 20, 20)
     assert not strong[0].weak
 

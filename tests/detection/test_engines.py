@@ -1,7 +1,7 @@
 """Both engines agree; batches equal single pairs and windows."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -47,7 +47,7 @@ def engines(request) -> tuple[Engine, Engine]:
     return load_engine("onboard", settings), TorchEngine(settings, components="opencv")
 
 
-def window(views: list[View], steps: list[np.ndarray], at: int, pairs: list[tuple[int, int]], far: bool) -> Window:
+def window(views: Sequence[View], steps: list[np.ndarray], at: int, pairs: list[tuple[int, int]], far: bool) -> Window:
     """The window at frame `at` whose pairs are given as frames; with `far`, the last pair is the wide and small one."""
     used = sorted({frame for pair in pairs for frame in pair})
     matrices = []

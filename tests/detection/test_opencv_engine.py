@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.synthetic_clip import flight, render
+from torchvision_dddas.chain import close_mask
+from torchvision_dddas.chain import opencv_operations as onboard_pixels
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.detection import Foreground, Window, detect_motion
 from torchvision_dddas.detection import opencv_engine as onboard_half
-from torchvision_dddas.detection import opencv_foreground as onboard_pixels
-from torchvision_dddas.detection.blobs import close_mask
-from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine, OpenCVView
 from torchvision_dddas.geometry import background_flow, corner_error, transfer
 from torchvision_dddas.types import Frame
 
@@ -146,9 +146,9 @@ def test_half_maps_give_the_masks_of_doubled_maps(images: list[np.ndarray], monk
         frames = (Frame(i + 1, i / 10, image) for i, image in enumerate(images))
         return [scene.mask for scene in detect_motion(frames, settings, OpenCVEngine(settings))]
 
-    def whole(engine: OpenCVEngine, windows: Sequence[Window]) -> list[Foreground]:
+    def whole(engine: OpenCVEngine, windows: Sequence[Window[OpenCVView]]) -> list[Foreground]:
         half = onboard_half.halve_settings(engine.parameters)
-        maps = [onboard_pixels.find_foreground(onboard_half.halve_window(window), half) for window in windows]
+        maps = [onboard_half.find_foreground(onboard_half.halve_window(window), half) for window in windows]
         return [
             onboard_half.double_maps(m, window.reference.size, False) for m, window in zip(maps, windows, strict=True)
         ]

@@ -8,8 +8,8 @@ import pytest
 
 from tests.synthetic_clip import render
 from torchvision_dddas import config as parameters
+from torchvision_dddas.chain import fit_exposure, match_exposure
 from torchvision_dddas.detection import View, Window, load_engine
-from torchvision_dddas.detection.engine import fit_exposure, match_exposure
 from torchvision_dddas.detection.opencv_engine import detect_keypoints
 from torchvision_dddas.geometry import corner_error
 
@@ -99,7 +99,6 @@ def test_corners_found_at_half_resolution_are_on_even_pixels_the_same_in_both_en
     whole = {tuple(point) for point in detect_keypoints(views[0].grey, settings.registration).tolist()}
     assert len(found & whole) < 0.5 * len(found)
     (step,) = engine.register([(views[0], views[1])])
-    (onboard,) = load_engine("onboard", settings).register(
-        [(View(v.image, v.grey), View(w.image, w.grey)) for v, w in [views]]
-    )
+    other = load_engine("onboard", settings)
+    (onboard,) = other.register([(other.prepare(clip.images[0]), other.prepare(clip.images[1]))])
     assert step.reliable and corner_error(step.later_from_earlier, onboard.later_from_earlier, size) <= 0.5

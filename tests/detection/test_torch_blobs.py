@@ -11,9 +11,10 @@ import torch
 from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import MotionDetector, View, Window
-from torchvision_dddas.detection.blobs import Blob, find_blobs, find_weak_blobs
+from torchvision_dddas.detection.blobs import Blob, find_blobs
+from torchvision_dddas.detection.observation import find_weak_blobs
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs, label_components
-from torchvision_dddas.detection.torch_engine import TorchEngine, weak_maps
+from torchvision_dddas.detection.torch_engine import TorchEngine
 
 SHAPE = (67, 101)
 KNOBS: dict[str, float] = {"difference.threshold": 6.0, "difference.peak": 9.0, "gates.min_area_px": 12}
@@ -84,7 +85,7 @@ def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> 
     islands = [smooth(10 + number, 2) for number in range(len(MASKS))]
     wide = [np.where(picture > 185, picture, 0).astype(np.uint8) for picture in islands]
     engine = TorchEngine(settings, "cpu")
-    weak = weak_maps(engine.segmenter, batch(wide))
+    weak = engine.segmenter.chain().find_weak(batch(wide))
     maps = batch(cores), batch(near), batch(wide), batch(near)
     windows = [window(one) for one in given]
     found = foregrounds_with_blobs(windows, settings, maps, weak, None, (maps[1], maps[2]))
@@ -92,7 +93,7 @@ def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> 
     for frame, own, core, evidence, far in zip(found, given, cores, near, wide, strict=True):
         limits = 16 * own.difference.threshold, own.gates.min_area_px, 16 * own.difference.peak
         wanted = find_blobs(core, evidence, *limits, hull)
-        wanted += find_weak_blobs(far, wanted, limits[0], own.morphology, *limits[1:])
+        wanted += find_weak_blobs(far, wanted, own)
         assert frame.blobs is not None
         assert_same(frame.blobs, wanted)
         for x, y, width, height in (blob.box for blob in frame.blobs):

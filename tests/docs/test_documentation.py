@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.evaluation.studies.world import three
+from tests.lab.evaluation.studies.world import three
 from tests.overflight import ORIGIN, Overflight, pictures
 from tests.synthetic_clip import film_into
 from torchvision_dddas.cli import app

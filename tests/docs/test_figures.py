@@ -126,9 +126,9 @@ def test_a_command_that_the_texts_give_can_be_typed(command) -> None:
 
     from torchvision_dddas.cli import app
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies.summary import parse_goal
-    from torchvision_dddas.evaluation.studies.sweep import parse_grid
-    from torchvision_dddas.simulation import load_scenario as load_scenario
+    from torchvision_dddas.lab.evaluation.studies.summary import parse_goal
+    from torchvision_dddas.lab.evaluation.studies.sweep import parse_grid
+    from torchvision_dddas.lab.simulation import load_scenario as load_scenario
 
     program, name, *words = command.split()
     options = [word for word in words if word.startswith("--")]

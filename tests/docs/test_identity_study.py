@@ -9,9 +9,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from torchvision_dddas.evaluation.metrics import tracking
-from torchvision_dddas.evaluation.metrics.matching import pair
-from torchvision_dddas.evaluation.metrics.truth import TrackTable
+from torchvision_dddas.lab.evaluation.metrics import tracking
+from torchvision_dddas.lab.evaluation.metrics.matching import pair
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 
 ROOT = Path(__file__).resolve().parents[2]
 PEERS = ROOT / "eval" / "peers"

@@ -19,11 +19,6 @@ from tests.fuzz.damage import damaged
 from torchvision_dddas.cli.colours import parse_box, parse_names
 from torchvision_dddas.config import PeopleParameters, changes, load_config
 from torchvision_dddas.errors import LONGEST, InputError, without_secrets
-from torchvision_dddas.evaluation.datasets import kinds
-from torchvision_dddas.evaluation.datasets.record import Source
-from torchvision_dddas.evaluation.evaluate import evaluate, load_result
-from torchvision_dddas.evaluation.metrics import truth
-from torchvision_dddas.evaluation.studies.runner import read_spec
 from torchvision_dddas.geo.site import looks_swapped
 from torchvision_dddas.geometry import poses_at
 from torchvision_dddas.io import camera_files
@@ -36,11 +31,16 @@ from torchvision_dddas.io.output.run_record import read_run_record
 from torchvision_dddas.io.sources import open_source, stream_target
 from torchvision_dddas.io.streams import About, open_stream
 from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.lab.evaluation.datasets import kinds
+from torchvision_dddas.lab.evaluation.datasets.record import Source
+from torchvision_dddas.lab.evaluation.evaluate import evaluate, load_result
+from torchvision_dddas.lab.evaluation.metrics import truth
+from torchvision_dddas.lab.evaluation.studies.runner import read_spec
+from torchvision_dddas.lab.simulation import load_scenario, scenario_toml
 from torchvision_dddas.live.server import parse_address
 from torchvision_dddas.people.classifiers import read_classifier
 from torchvision_dddas.people.onnx_scorer import find_graphs
 from torchvision_dddas.runtime import MANIFEST, SHIPPED
-from torchvision_dddas.simulation import load_scenario, scenario_toml
 from torchvision_dddas.types import Camera
 
 

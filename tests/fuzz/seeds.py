@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.evaluation.datasets.layouts import MAKE
 from tests.io.clips import write_by_av, write_video
 from tests.io.flights import (
     attitude,
@@ -22,6 +21,7 @@ from tests.io.flights import (
     transport_stream,
     ulog,
 )
+from tests.lab.evaluation.datasets.layouts import MAKE
 
 FEATURES = 3780
 """Of the descriptor that the classifiers here fit."""

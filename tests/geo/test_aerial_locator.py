@@ -11,7 +11,6 @@ from torchvision_dddas.detection import with_logged_focal
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
 from torchvision_dddas.geo.aerial_targets import Targets, reference_points
-from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_aerial_camera, read_camera
 from torchvision_dddas.io.colour_files import read_colours
@@ -154,7 +153,7 @@ def test_colours_lead_to_the_tables_pixels_and_a_blob_off_its_landmark_gives_way
     flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
     locator, _ = prepared(flight, pictured=False)
-    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), load_colours("onboard"))
+    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), "onboard")
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
         truth = flight.shown(frame, flight.marks(frame))
         found = watch.update(scene(frame, picture, truth[0] + (9.0 * (frame == 4), 0.0)))
@@ -169,7 +168,7 @@ def test_a_tables_pixels_remove_the_smallest_box_about_each_landmark_from_the_ta
     flight = Overflight(frames=1, geographic=False)
     locator, _ = prepared(flight)
     truth = flight.shown(1, flight.marks(1))
-    found = LandmarkWatch(locator, None, None).update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
+    found = LandmarkWatch(locator, None, "onboard").update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
     assert found.sighted_by == ("table",) * len(truth)
     assert found.scene.detections.box_px.tolist() == [[300, 30, 20, 20]]
 

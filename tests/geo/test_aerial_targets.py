@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torchvision_dddas.geo.aerial_targets import BODY_WIDTH_M, TargetSpeeds, remove_shadow, shadow_m, sun_at
 from torchvision_dddas.geo.landmark_watch import group_targets, merge_detections
 from torchvision_dddas.geometry import middles_of
-from torchvision_dddas.simulation.cameras import camera_axes, view_from_pose
+from torchvision_dddas.lab.simulation.cameras import camera_axes, view_from_pose
 from torchvision_dddas.types import Camera, CameraPose, Detections
 
 NAN = np.nan

@@ -11,7 +11,7 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.geo import AerialLocator, Targets
 from torchvision_dddas.geo.aerial_targets import TargetSpeeds
 from torchvision_dddas.geo.clock_offset import describe_clock_offset, find_clock_offset, logged_turns
-from torchvision_dddas.geo.projection import axes_of, project
+from torchvision_dddas.geometry.projection import axes_of, project
 from torchvision_dddas.types import Camera, CameraPose, Telemetry
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))

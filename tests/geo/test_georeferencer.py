@@ -10,7 +10,7 @@ from torchvision_dddas.config import Settings
 from torchvision_dddas.geo.georeferencer import BiasFilter, Georeferencer
 from torchvision_dddas.geo.plane_homography import load_solver, locate_pixels
 from torchvision_dddas.geo.pose_estimation import independent_expectation, pose_prior
-from torchvision_dddas.geo.projection import axes_of, project
+from torchvision_dddas.geometry.projection import axes_of, project
 from torchvision_dddas.types import Camera, CameraPose, Flight, LandmarkObservations
 
 SOLVER = load_solver("onboard")

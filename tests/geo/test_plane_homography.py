@@ -8,8 +8,8 @@ import pytest
 
 from tests.airborne import CAMERA, GPS_M, look, ring
 from torchvision_dddas.geo.plane_homography import PlaneSolver, fix_by_homography, load_solver, locate_pixels
-from torchvision_dddas.geo.projection import axes_of, ground_with_slopes, project
 from torchvision_dddas.geometry import lonlat, transfer
+from torchvision_dddas.geometry.projection import axes_of, ground_with_slopes, project
 from torchvision_dddas.types import CameraPose, Fix
 
 SOLVER = load_solver("onboard")

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.airborne import CAMERA
 from torchvision_dddas.geo.pose_estimation import move_pose
-from torchvision_dddas.geo.projection import (
+from torchvision_dddas.geometry import turn_of, turned
+from torchvision_dddas.geometry.projection import (
     axes_of,
     distort_pixels,
     ground_height,
@@ -19,7 +20,6 @@ from torchvision_dddas.geo.projection import (
     rays,
     undistort_pixels,
 )
-from torchvision_dddas.geometry import turn_of, turned
 from torchvision_dddas.types import CameraPose, Elevation
 
 BENT = replace(CAMERA, k1=-0.2, k2=0.05, focal_px=(1400.0, 1380.0))

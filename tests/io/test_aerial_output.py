@@ -10,7 +10,7 @@ import pytest
 from tests.cli.conftest import names, record, rows
 from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas import geometry
-from torchvision_dddas.geo.projection import axes_of
+from torchvision_dddas.geometry.projection import axes_of
 from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.io.output import AerialRecorder, Site
 from torchvision_dddas.io.output.tables import angles_deg, upper_edge_deg

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.studies.cache import Cache
 from torchvision_dddas.io.atomic_files import (
     ClaimedFolder,
     PartFile,
@@ -18,6 +17,7 @@ from torchvision_dddas.io.atomic_files import (
     utf8_name,
     write_whole,
 )
+from torchvision_dddas.lab.evaluation.studies.cache import Cache
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -86,7 +86,7 @@ def test_a_folder_made_for_nothing_is_not_left_behind(tmp_path):
 WRITE = """
 import sys
 from pathlib import Path
-from torchvision_dddas.evaluation.studies.cache import Cache
+from torchvision_dddas.lab.evaluation.studies.cache import Cache
 cache = Cache(Path(sys.argv[1]))
 for _ in range(30):
     cache.put("ab" * 32, bytes([int(sys.argv[2])]) * 300_000)

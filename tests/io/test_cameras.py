@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.colours import find_overlaps
 from torchvision_dddas.geometry import poses_at
 from torchvision_dddas.io.camera_files import (
     describe_missing,
@@ -16,7 +15,7 @@ from torchvision_dddas.io.camera_files import (
     read_measurements,
     read_poses,
 )
-from torchvision_dddas.io.colour_files import format_colours, read_colours
+from torchvision_dddas.io.colour_files import find_overlaps, format_colours, read_colours
 from torchvision_dddas.types import Colours
 
 LEAST = "focal_px = 1000\nwidth_px = 640\nheight_px = 480\n"

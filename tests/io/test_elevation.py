@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.projection import ground_height
 from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.geometry.projection import ground_height
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 
 rasterio = pytest.importorskip("rasterio")

@@ -18,8 +18,6 @@ from tests.io.flights import packet, sentence, ulog
 from torchvision_dddas.cli import app
 from torchvision_dddas.config import read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.evaluation.evaluate import Result, load_result
-from torchvision_dddas.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.io import detection_tables
 from torchvision_dddas.io.camera_files import read_poses
 from torchvision_dddas.io.ground_tables import read_landmarks, read_positions
@@ -28,6 +26,8 @@ from torchvision_dddas.io.sources import ImageSource, VideoSource
 from torchvision_dddas.io.tables import read_csv
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import KEY, local_sets
+from torchvision_dddas.lab.evaluation.evaluate import Result, load_result
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
 from torchvision_dddas.memory import check_memory
 from torchvision_dddas.people.classifiers import read_classifier
 
@@ -211,7 +211,7 @@ def test_rows_are_the_same_read_fast_and_cell_by_cell(tmp_path, monkeypatch, sco
     text = "".join(f"{k},2,{k}.25,-1e1,3,4{score}\n\n" for k in range(1, 9)).replace(",", separator)
     path.write_text(text)
     fast = read_rows(path, "truth")
-    monkeypatch.setattr("torchvision_dddas.evaluation.metrics.truth._read_fast", lambda lines: None)
+    monkeypatch.setattr("torchvision_dddas.lab.evaluation.metrics.text_rows._read_fast", lambda *_: None)
     slow = read_rows(path, "truth")
     for one, other in zip((*fast.table, *fast[1:]), (*slow.table, *slow[1:]), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.io.ground import DOWN, NAMES, positions, tracks
-from torchvision_dddas.geo.projection import axes_of, rays
+from torchvision_dddas.geometry.projection import axes_of, rays
 from torchvision_dddas.io.maps.map_picture import (
     FINE,
     LEFT,

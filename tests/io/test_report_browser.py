@@ -5,12 +5,12 @@ import pytest
 from markupsafe import Markup
 
 from tests.browser import evaluate, needs_browser
-from tests.evaluation.report.studied import HOSTILE, study
-from torchvision_dddas.evaluation.report import study_report
-from torchvision_dddas.evaluation.studies.summary import summarize
+from tests.lab.evaluation.report.studied import HOSTILE, study
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.io.report import Column, environment, number_cell, table, text_cell
 from torchvision_dddas.io.report.charts import Axis, Line, chart
+from torchvision_dddas.lab.evaluation.report import study_report
+from torchvision_dddas.lab.evaluation.studies.summary import summarize
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, needs_browser]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.io.flights import PLACE, START_US, attitude, local_set, packet, spread, transport_stream
-from torchvision_dddas.geo.projection import axes_of
+from torchvision_dddas.geometry.projection import axes_of
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.attitude import angles, axes, axes_of_quaternion
 from torchvision_dddas.io.telemetry.misb import imap, local_sets, mapped

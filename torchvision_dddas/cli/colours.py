@@ -43,9 +43,9 @@ def colours(
     Writes a TOML for `dddas run --colours`, and beside it a picture of all that the ranges mark: look at it.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.geo.colours import calibrate_colours
+    from torchvision_dddas.geo.colours import calibrate_colours, draw_calibration
     from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input, save_file
-    from torchvision_dddas.io.colour_files import draw_calibration, format_colours
+    from torchvision_dddas.io.colour_files import format_colours
     from torchvision_dddas.io.images import read_colour_image
 
     least_px = load_config(config, set_ or []).landmarks.least_area_px

@@ -1,7 +1,7 @@
 """`dddas compare`: two studies of the same clips, and whether what changed is beyond noise."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,13 +14,6 @@ from torchvision_dddas.cli.progress import open_console
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-MEANING = (
-    "better, worse: beyond noise, p below 0.05 after Holm's correction. On these clips: by blocks of their frames; "
-    "their number is too small, or they are too unlike, to say so of others. Within noise: no change is shown, "
-    "nor that there is none. Too little to tell: so few frames or clips could not show any change. The same: equal "
-    "figures."
-)
 
 
 @report_errors
@@ -35,15 +28,17 @@ def compare(
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
-    from torchvision_dddas.evaluation.studies.cache import read_scores
-    from torchvision_dddas.evaluation.studies.comparison import (
+    from torchvision_dddas.io.atomic_files import refuse_folder, save_file
+    from torchvision_dddas.io.output.run_record import finite, read_run_record
+    from torchvision_dddas.lab.evaluation.studies.cache import read_scores
+    from torchvision_dddas.lab.evaluation.studies.comparison import (
+        MEANING,
         compare_studies,
         comparison_report,
         differing_settings,
+        entries_of,
         settings_lines,
     )
-    from torchvision_dddas.io.atomic_files import refuse_folder, save_file
-    from torchvision_dddas.io.output.run_record import finite, read_run_record
 
     named = [(read_scores(folder), folder) for folder in (first, second)]
     studies = [replace(study, name=f"{study.name} ({folder})") for study, folder in named]
@@ -59,13 +54,13 @@ def compare(
     print_lines([f"A: {found['first']}", f"B: {found['second']}", *settings_lines(found["settings"])])
     console = open_console()
     for task, changes in found["tasks"].items():
-        pooled = [(f"{group} {name}", entry) for group, name, entry in _rows(changes["pooled"])]
+        pooled = [(f"{group} {name}", entry) for group, name, entry in entries_of(changes["pooled"])]
         count = len(changes["clips"]) + len(changes["same"])
         console.print(_table(f"{task}, {count} clip{'s' * (count != 1)} together", pooled))
         clips = [
             (f"{clip}: {group} {name}", entry)
             for clip, groups in changes["clips"].items()
-            for group, name, entry in _rows(groups)
+            for group, name, entry in entries_of(groups)
             if entry["change"]
         ]
         clips.sort(key=lambda row: row[1]["over_frames"]["p_holm"] if row[1]["over_frames"] else 2.0)
@@ -79,11 +74,7 @@ def compare(
     print_lines([f"note: {note}" for note in found["notes"]])
 
 
-def _rows(groups: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, Mapping[str, Any]]]:
-    return [(group, name, entry) for group, by_name in groups.items() for name, entry in by_name.items()]
-
-
-def _table(title: str, rows: list[tuple[str, Mapping[str, Any]]]) -> "Table":
+def _table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> "Table":
     from rich.table import Table
 
     table = Table(title=title)

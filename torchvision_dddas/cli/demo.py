@@ -20,7 +20,7 @@ def demo(
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import DetectionRecorder
-    from torchvision_dddas.simulation import film_clip, load_scenario
+    from torchvision_dddas.lab.simulation import film_clip, load_scenario
 
     length = load_scenario("demo").clip
     kept = noting(lambda: f"the pictures up to here are kept in {out / 'clip'}", (out / "clip").exists)

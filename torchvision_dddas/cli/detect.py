@@ -70,8 +70,8 @@ def detect_clip(
     from torchvision_dddas.detection import detect_motion, load_engine, with_logged_focal
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import DetectionRecorder, clip_facts
-    from torchvision_dddas.io.run_inputs import clip_notes
     from torchvision_dddas.io.telemetry import read_telemetry
+    from torchvision_dddas.pipeline import clip_notes
 
     refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
     with DetectionRecorder(folder, save) as output:

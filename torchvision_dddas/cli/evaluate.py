@@ -24,6 +24,7 @@ from torchvision_dddas.cli.options import (
     check_jobs,
     echo,
     print_lines,
+    refuse_options,
     report_errors,
     split_patterns,
 )
@@ -33,7 +34,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.studies.records import Results, Spec
+    from torchvision_dddas.lab.evaluation.studies.records import Results, Spec
 
 MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
 
@@ -102,7 +103,7 @@ def evaluate(
         study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
         study |= {"--worker-silent": worker_silent}
         study |= {"--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
-        _refuse(study, "is for a study; give --dataset FILE too")
+        refuse_options(study, "is for a study; give --dataset FILE too")
         if truth is None or result is None:
             raise InputError(
                 "evaluate needs TRUTH and RESULT, or --dataset FILE, the TOML of a study; see dddas evaluate --help"
@@ -114,11 +115,11 @@ def evaluate(
             show(report)
             echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
-    from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
-    from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
-    from torchvision_dddas.evaluation.studies.runner import write_study
+    from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
+    from torchvision_dddas.lab.evaluation.studies.jobs import SILENT_S, Workers
+    from torchvision_dddas.lab.evaluation.studies.runner import write_study
 
-    _refuse({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
+    refuse_options({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
     check_jobs(jobs, scheduler)
     check_interval(interval, 1000)
     folder, base, used = out or Path("dddas-study"), dataset.parent, split_patterns(clips, "--clips")
@@ -137,18 +138,11 @@ def evaluate(
         raise InputError(f"nothing could be scored; {case.clip.name}, {case.task}: {case.cause}")
 
 
-def _refuse(options: dict[str, object], why: str) -> None:
-    """Raise InputError for the first option that was given."""
-    for option, given in options.items():
-        if given is not None:
-            raise InputError(f"{option} {why}")
-
-
 def change_spec(
     file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
 ) -> "Spec":
     """Read a study's file and change it by what the command line says. Raises InputError for bad input."""
-    from torchvision_dddas.evaluation.studies.runner import read_spec
+    from torchvision_dddas.lab.evaluation.studies.runner import read_spec
 
     spec = read_spec(file)
     spec = replace(spec, config=config or spec.config, overrides=(*spec.overrides, *overrides))
@@ -164,9 +158,9 @@ def score(
     ignored: Literal["dropped", "removed"] = "dropped",
 ) -> dict[str, Any]:
     """Evaluate, and write metrics.json into a folder. Raises InputError."""
-    from torchvision_dddas.evaluation.evaluate import evaluate
     from torchvision_dddas.io.atomic_files import save_file
     from torchvision_dddas.io.output import finite
+    from torchvision_dddas.lab.evaluation.evaluate import evaluate
 
     report = evaluate(truth, result, first_frame, interval, ignored)
     save_file(out / "metrics.json", (json.dumps(finite(report), indent=2) + "\n").encode())
@@ -178,7 +172,7 @@ def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None)
 
     prefix: of titles. most: clips in a table, the worst of them if there are more. Without it, the notes follow.
     """
-    from torchvision_dddas.evaluation.metrics.registry import GROUPS
+    from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 
     console = open_console()
     for group in GROUPS:
@@ -189,7 +183,7 @@ def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None)
 
 def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -> None:
     """Print the main measures of each task, what was left out, and where the rest is."""
-    from torchvision_dddas.evaluation.studies.runner import FILES
+    from torchvision_dddas.lab.evaluation.studies.runner import FILES
 
     for task, found in measures["tasks"].items():
         show(found, f"{task}: ", MOST_CLIPS)
@@ -208,7 +202,7 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
     from rich.markup import escape
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.metrics.registry import GROUPS, describe, is_lower_better
+    from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS, describe, is_lower_better
 
     columns, title = GROUPS[group].columns, GROUPS[group].title
 

@@ -35,7 +35,7 @@ def export(
     agree with torch. `step` takes half a minute, the others seconds.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.export import GRAPHS, export_graphs
+    from torchvision_dddas.lab.export import GRAPHS, export_graphs
 
     if list_:
         print_lines([f"{name:16s} {about}" for name, about in GRAPHS.items()])
@@ -46,7 +46,7 @@ def export(
         raise InputError(f"--out {out} must be a folder for the graphs, got a file")
     if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise InputError(f"dddas export needs {', '.join(missing)}; pip install 'torchvision-dddas[torch,export]'")
-    from torchvision_dddas.export.graph_files import ExportedGraph, write_graphs
+    from torchvision_dddas.lab.export.graph_files import ExportedGraph, write_graphs
 
     files: dict[str, ExportedGraph] = {}
     for name, found in export_graphs(graph or list(GRAPHS), settings, sizes):

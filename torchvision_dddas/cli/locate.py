@@ -83,8 +83,8 @@ def aerial(
     from torchvision_dddas.io.camera_files import read_camera_keys
     from torchvision_dddas.io.detection_tables import check_within_clip, read_for_clip
     from torchvision_dddas.io.output import AerialRecorder, parse_save
-    from torchvision_dddas.io.run_inputs import AerialInput, locator_facts, map_site, read_locator
     from torchvision_dddas.io.sources import frame_times
+    from torchvision_dddas.pipeline import AerialInput, locator_facts, map_site, read_locator
 
     if landmarks is None and telemetry is None:
         raise InputError("locating from the air needs --telemetry FILE or --landmarks FILE; got neither")

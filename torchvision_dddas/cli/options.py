@@ -1,7 +1,7 @@
 """What all commands share: options, checks of them, exit codes, and errors as one line on stderr."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from signal import SIGINT
@@ -103,6 +103,13 @@ def print_lines(lines: Sequence[str], quiet: bool = False) -> None:
     """Print what a command reports at its end, unless --quiet was given."""
     for line in () if quiet else lines:
         echo(line)
+
+
+def refuse_options(options: Mapping[str, object], why: str) -> None:
+    """Raise InputError for the first option that was given."""
+    for option, given in options.items():
+        if given is not None and given != []:
+            raise InputError(f"{option} {why}")
 
 
 def check_rate(rate_hz: float | None) -> None:

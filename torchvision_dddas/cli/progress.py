@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-    from torchvision_dddas.evaluation.studies.jobs import Event
-    from torchvision_dddas.evaluation.studies.runner import Plan
     from torchvision_dddas.io.output import RunRecord, RunRecorder
+    from torchvision_dddas.lab.evaluation.studies.jobs import Event
+    from torchvision_dddas.lab.evaluation.studies.runner import Plan
     from torchvision_dddas.types import Source
 
     Hooks = tuple[Callable[[Plan], None], Callable[[Event], None]]

@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,6 +23,7 @@ from torchvision_dddas.cli.options import (
     Rate,
     check_interval,
     print_lines,
+    refuse_options,
     report_errors,
 )
 from torchvision_dddas.cli.progress import closing_lines, progress, record_results
@@ -110,7 +110,7 @@ def run(
     them).
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.io.run_inputs import AerialInput
+    from torchvision_dddas.pipeline import AerialInput
 
     check_interval(interval)
     clip = _with_password(clips[0], password_file)
@@ -122,23 +122,23 @@ def run(
         raise InputError(f"one clip and {len(logs)} logs; give one --telemetry")
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
-        _refuse(others, "is of no use with --live, which draws and steers nothing")
+        refuse_options(others, "is of no use with --live, which draws and steers nothing")
     else:
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
-        _refuse(others, "is for a run that keeps up with a camera; give --live too")
+        refuse_options(others, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, **beside}
         inputs["--interval"] = None if interval == 1 else interval
-        _refuse(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
+        refuse_options(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
         _fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, quiet)
         return
     if scene or seed is not None:
         raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
     if landmarks is None:
-        _refuse({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
+        refuse_options({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
     if landmarks is None and telemetry is None:
-        _refuse(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
+        refuse_options(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
     given = None
     if landmarks is not None or telemetry is not None:
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
@@ -154,8 +154,7 @@ def run(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.joined_clips import JoinedSource
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
-    from torchvision_dddas.io.run_inputs import clip_notes, locator_facts, map_site, prepare_run
-    from torchvision_dddas.pipeline import Pipeline
+    from torchvision_dddas.pipeline import Pipeline, assemble_files, clip_notes, locator_facts, map_site
 
     names = parse_save(save, PipelineRecorder.saved)
     files = [*(given.files if given is not None else ()), *logs]
@@ -163,7 +162,7 @@ def run(
     with PipelineRecorder(out, names) as output:
         opened = [open_video(name, rate_hz=rate, full_scale=settings.levels.given) for name in (clip, *clips[1:])]
         source = opened[0] if len(opened) == 1 else JoinedSource(opened, logs)
-        ready = prepare_run(given, telemetry, settings, source, backend.value, clip)
+        ready = assemble_files(given, telemetry, settings, source, backend.value, clip)
         facts: dict[str, Any] = {
             "input": clip if len(clips) == 1 else clips,
             "clip": clip_facts(source),
@@ -178,7 +177,7 @@ def run(
         record = output.begin(facts, source.rate_hz / interval, source.size, site)
         record.notes += ready.notes
         count = None if source.count is None else -(-source.count // interval)
-        pipeline = Pipeline.from_parts(ready.engine, ready.settings, ready.flight, ready.watch, interval)
+        pipeline = Pipeline.from_assembly(ready, interval)
         record_results(output, record, pipeline(source), source.name, count, quiet, source)
         record.notes += [*pipeline.notes, *clip_notes(source, interval, ready.settings)]
     lines = _summary(record, out, site is not None, "overlay" in names)
@@ -206,13 +205,6 @@ def _with_password(clip: str, path: Path | None) -> str:
     return f"{login[1]}:{quote(password, safe='')}@{login[2]}" if login is not None and password else clip
 
 
-def _refuse(options: Mapping[str, object], why: str) -> None:
-    """Raise InputError for the first option that was given."""
-    for option, given in options.items():
-        if given is not None and given != []:
-            raise InputError(f"{option} {why}")
-
-
 def _fly(
     scenario: str,
     out: Path,
@@ -224,9 +216,9 @@ def _fly(
     save: str | None,
     quiet: bool,
 ) -> None:
-    from torchvision_dddas.evaluation.simulated_run import run_scenario
     from torchvision_dddas.io.output import parse_save
-    from torchvision_dddas.simulation import SimulatedRunRecorder
+    from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
+    from torchvision_dddas.lab.simulation import SimulatedRunRecorder
 
     names = parse_save(save, SimulatedRunRecorder.saved)
     show = partial(progress, quiet=quiet)

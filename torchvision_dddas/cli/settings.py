@@ -19,6 +19,9 @@ def settings(
             metavar="GROUP", help="Only this group, such as track; scenario: what --scene changes. [default: all]"
         ),
     ] = None,
+    backends: Annotated[
+        bool, typer.Option("--backends", help="List which implementation computes each operation on which device.")
+    ] = False,
 ) -> None:
     """List the parameters that --set and a configuration can change: default, unit, range and meaning.
 
@@ -28,6 +31,9 @@ def settings(
 
     from torchvision_dddas.config import Settings, all_parameters, config_names, nearest
 
+    if backends:
+        _print_backends()
+        return
     groups = [*Settings.model_fields, _SCENARIO]
     if group is not None and group not in groups:
         raise InputError(
@@ -36,7 +42,7 @@ def settings(
     table = Table("parameter", "default", "unit", "range", "meaning")
     rows = [row for row in all_parameters() if group is None or row.name.startswith(f"{group}.")]
     if group == _SCENARIO:
-        from torchvision_dddas.simulation import scenario_parameters
+        from torchvision_dddas.lab.simulation import scenario_parameters
 
         rows = scenario_parameters()
     for parameter in rows:
@@ -48,3 +54,16 @@ def settings(
         console.print(
             f"Shipped configurations for --config: {', '.join(config_names())}", markup=False, highlight=False
         )
+
+
+def _print_backends() -> None:
+    from rich.table import Table
+
+    from torchvision_dddas.chain import IMPLEMENTATIONS
+
+    table = Table("operation", "device", "form", "Kornia's time by ours", "reason")
+    for line in IMPLEMENTATIONS:
+        ratio = "" if line.ratio != line.ratio else f"{line.ratio:.2g}"
+        reason = line.reason or ("more than twice the time" if line.ratio > 2 else "")
+        table.add_row(line.operation, line.device, line.form, ratio, reason)
+    open_console(width=160).print(table, markup=False)

@@ -12,7 +12,7 @@ from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
     from torchvision_dddas.io.output import RunRecord
-    from torchvision_dddas.simulation import Scenario
+    from torchvision_dddas.lab.simulation import Scenario
 
 
 @report_errors
@@ -44,7 +44,7 @@ def simulate(
     ground/ for `dddas people` and `dddas locate ground`, truth/ for `dddas evaluate`, scenario.toml and run.json.
     """
     from torchvision_dddas.io.output import parse_save
-    from torchvision_dddas.simulation import RECORDED, load_scenario, record_scenario, scenario_names
+    from torchvision_dddas.lab.simulation import RECORDED, load_scenario, record_scenario, scenario_names
 
     if scenario is None:
         print_lines([f"{name:12s} {load_scenario(name).about}" for name in scenario_names()])

@@ -29,7 +29,7 @@ from torchvision_dddas.cli.progress import EVERY_S, open_console, print_now
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.evaluation.studies.sweep import SweepRecord
+    from torchvision_dddas.lab.evaluation.studies.sweep import SweepRecord
 
 MOST_SHOWN = 20  # rows of the table
 MOST_PROPOSED = 10_000
@@ -81,11 +81,11 @@ def sweep(
     Results are kept as those of dddas evaluate --dataset: a repeated sweep continues where it stopped.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.evaluation.studies import sweep as sweeps
-    from torchvision_dddas.evaluation.studies.cache import Cache, cache_folder
-    from torchvision_dddas.evaluation.studies.jobs import SILENT_S, Workers
-    from torchvision_dddas.evaluation.studies.summary import parse_goal
     from torchvision_dddas.io.atomic_files import claimed
+    from torchvision_dddas.lab.evaluation.studies import sweep as sweeps
+    from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
+    from torchvision_dddas.lab.evaluation.studies.jobs import SILENT_S, Workers
+    from torchvision_dddas.lab.evaluation.studies.summary import parse_goal
 
     check_jobs(jobs, scheduler)
     _check_search(grid, optuna, range_)
@@ -160,7 +160,7 @@ def _show(record: "SweepRecord") -> None:
     """Print the best trials, the measures on held-out clips, and where the rest is."""
     from rich.table import Table
 
-    from torchvision_dddas.evaluation.studies.sweep import format_value, ranked
+    from torchvision_dddas.lab.evaluation.studies.sweep import format_value, ranked
 
     minimize = record.goal.minimize
     parameters = list(dict.fromkeys(parameter for trial in record.trials for parameter in trial.parameters))

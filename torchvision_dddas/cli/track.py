@@ -61,7 +61,7 @@ def track(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
-    from torchvision_dddas.io.run_inputs import clip_notes
+    from torchvision_dddas.pipeline import clip_notes
     from torchvision_dddas.types import is_sampled
 
     settings, names = load_config(config, set_ or []), parse_save(save, TrackRecorder.saved)

@@ -1,6 +1,5 @@
 """`dddas tune`: parameters fitted by gradient on the clips of a study, and what that was worth on clips held out."""
 
-import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -24,32 +23,26 @@ from torchvision_dddas.cli.options import (
     report_errors,
     split_patterns,
 )
-from torchvision_dddas.cli.progress import EVERY_S, open_console, progress, show_progress
-from torchvision_dddas.errors import InputError, printable
+from torchvision_dddas.cli.progress import EVERY_S, open_console, print_now, progress, show_progress
+from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.tuning.descent import Step
-    from torchvision_dddas.tuning.tuner import Tuned
+    from torchvision_dddas.lab.tuning.descent import Step
+    from torchvision_dddas.lab.tuning.tuner import Tuned
 
 
 @report_errors
 def tune(
     study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as of dddas evaluate.")],
     parameters: Annotated[
-        str | None,
-        typer.Option(metavar="NAME,...", help="What to tune, such as difference.threshold or 'difference.*'."),
-    ] = None,
-    knobs: Annotated[str | None, typer.Option("--knobs", hidden=True, help="Deprecated: --parameters.")] = None,
+        str, typer.Option(metavar="NAME,...", help="What to tune, such as difference.threshold or 'difference.*'.")
+    ],
     steps: Annotated[int, typer.Option(metavar="N", help="Most steps.")] = 100,
     holdout: Annotated[
         str | None,
         typer.Option(metavar="PATTERN,...", help="Clips that nothing is learned from, measured before and after."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed of the order of examples.")] = 0,
-    cost: Annotated[
-        float | None,
-        typer.Option(metavar="WEIGHT", help="The loss that a frame of twice the time is worth. [default: none]"),
-    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -81,10 +74,6 @@ def tune(
             metavar="TASK.GROUP.MEASURE", help="Measured before and after. [default: by the parameters' family]"
         ),
     ] = None,
-    loss: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Of the family's losses: f, dice or focal of motion. [default: the first]"),
-    ] = None,
     clips: Clips = None,
     jobs: Jobs = None,
     cache: CacheFolder = None,
@@ -100,17 +89,13 @@ def tune(
     """
     if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
         raise InputError(f"dddas tune needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]'")
-    if (given := knobs if parameters is None else parameters) is None:
-        raise InputError("dddas tune needs --parameters NAME,...: what to tune")
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.tuning.descent import Plan
-    from torchvision_dddas.tuning.tuner import FILES, Display, Tuner
+    from torchvision_dddas.lab.tuning.descent import Plan
+    from torchvision_dddas.lab.tuning.tuner import FILES, Display, Tuner
 
     check_jobs(jobs)
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes must be more than 0, got {minutes:g}")
-    if cost is not None and not 0 <= cost < float("inf"):
-        raise InputError(f"--cost must be 0 or more, the loss that a frame of twice the time is worth, got {cost:g}")
     longest_s = float("inf") if minutes is None else 60 * minutes
     plan = Plan(
         steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull, watched=watched
@@ -119,14 +104,12 @@ def tune(
     # The settings are read again for the figures before: tuned.toml must not have replaced them by then.
     read = [study, *([Path(spec.config)] if spec.config else [])]
     refuse_own_input(read, [out / name for name in FILES], "folder with --out")
-    names, held = split_patterns(given, "--parameters", "parameter"), split_patterns(holdout, "--holdout")
+    names, held = split_patterns(parameters, "--parameters", "parameter"), split_patterns(holdout, "--holdout")
     display = Display(study=partial(show_progress, quiet), progress=partial(progress, quiet=quiet))
     if not quiet:
-        display = replace(display, message=_print, step=_StepLines(steps))
-    tuner = Tuner(
-        out, plan, time_weight=cost, resume=resume, device=_device(device), jobs=jobs, cache=cache, display=display
-    )
-    tuned = tuner.run(spec, study.parent, names, held, split_patterns(clips, "--clips"), measure, loss)
+        display = replace(display, message=print_now, step=_StepLines(steps))
+    tuner = Tuner(out, plan, resume=resume, device=_device(device), jobs=jobs, cache=cache, display=display)
+    tuned = tuner.run(spec, study.parent, names, held, split_patterns(clips, "--clips"), measure)
     if not quiet:
         _show(tuned, out)
     if tuned.failed:
@@ -150,18 +133,14 @@ class _StepLines:
             self._least = min(self._least, (step.watched, step.step))
             line += f"{',' if step.step else ':'} watched {step.watched:.4f}"
             line += f" (least {self._least[0]:.4f} at step {self._least[1]})"
-        _print(line)
-
-
-def _print(line: str) -> None:
-    print(printable(line), file=sys.stderr, flush=True)
+        print_now(line)
 
 
 def _show(tuned: "Tuned", folder: Path) -> None:
     """Print the parameters, what tuning was worth, and where the rest is."""
     from rich.table import Table
 
-    from torchvision_dddas.tuning.tuner import REPORT, RUN, TUNED
+    from torchvision_dddas.lab.tuning.tuner import REPORT, RUN, TUNED
 
     verdict = tuned.verdict
     console = open_console()

@@ -25,9 +25,8 @@ from torchvision_dddas.detection import (
     pixels_per_metre,
 )
 from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
-from torchvision_dddas.geo.colours import load_colours
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.geo.projection import shift_origin
+from torchvision_dddas.geometry.projection import shift_origin
 from torchvision_dddas.people.detector import load_scorer
 from torchvision_dddas.types import (
     Adjustment,
@@ -133,7 +132,7 @@ def build_mission(source: Instrument, settings: Settings, backend: str, by_landm
     site = replace(site, elevation=elevation, sun_rad=source.sun_rad)
     locator = AerialLocator.from_site(site, source.camera, settings, load_solver(backend), source.rate_hz, True)
     colours = source.colours if by_landmarks and len(source.colours) else None
-    watch = LandmarkWatch(locator, colours, load_colours(backend) if colours is not None else None)
+    watch = LandmarkWatch(locator, colours, backend)
     confirmation, steering = None, None
     if len(source.colours):
         confirmation = GroundConfirmation(settings, load_scorer(settings.people, backend))

@@ -2,15 +2,10 @@
 
 from typing import TYPE_CHECKING
 
+from torchvision_dddas.chain import View, Window, match_exposure
 from torchvision_dddas.detection.blobs import fill_hull
 from torchvision_dddas.detection.detector import MotionDetector, Retune, check_length, detect_motion, load_engine
-from torchvision_dddas.detection.engine import (
-    Engine,
-    Foreground,
-    View,
-    Window,
-    match_exposure,
-)
+from torchvision_dddas.detection.engine import Engine, Foreground
 from torchvision_dddas.detection.interval import (
     WALKER_M_S,
     describe_distance,

@@ -1,4 +1,4 @@
-"""From a mask to blobs: cleaning, labelling, area and peak gates, convex hulls, fragments of one target."""
+"""From a mask to blobs: labelling, area and peak gates, convex hulls, fragments of one target."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from torchvision_dddas.config import HALF, MorphologyParameters
 from torchvision_dddas.geometry import occupied
 
 Box = tuple[int, int, int, int]
@@ -67,45 +66,6 @@ class Region:
     peak: float
 
 
-def ellipse(side: int) -> np.ndarray:
-    """The morphological element."""
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-
-
-def halve_side(side: int) -> int:
-    """The odd side nearest to half of an odd one: 25 -> 13, 7 -> 3, 3 -> 1."""
-    return 2 * (side // 4) + 1
-
-
-def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
-    """Close a mask with an ellipse: the result of OpenCV bit for bit, computed only around set pixels."""
-    if side <= 1:
-        return mask
-    out = np.zeros_like(mask)
-    # Dilation does not reach the edge of these boxes, nor what is set in another one.
-    for box in occupied(mask, side + 2):
-        part = box_slices(box)
-        cv2.morphologyEx(mask[part], cv2.MORPH_CLOSE, ellipse(side), dst=out[part])
-    return out
-
-
-def clean_silhouette(
-    silhouette: np.ndarray, morphology: MorphologyParameters, blur_px: int = 1, close_px: int = 0
-) -> np.ndarray:
-    """Smooth, erode, dilate and close a (H, W) uint8 silhouette of 0 and 255 (appendix B, step S5).
-
-    blur_px: Gaussian kernel of the smoothing, after which half of the full value is the outline; 1: none. close_px: in
-    place of the parameter.
-    """
-    if blur_px > 1:
-        smooth = cv2.GaussianBlur(silhouette, (blur_px, blur_px), 0)
-        silhouette = cv2.threshold(smooth, HALF, 255, cv2.THRESH_BINARY)[1]
-    silhouette = cv2.erode(silhouette, ellipse(morphology.erode_px))
-    if morphology.dilate_px > 1:
-        silhouette = cv2.dilate(silhouette, ellipse(morphology.dilate_px))
-    return close_mask(silhouette, close_px or morphology.close_px)
-
-
 def find_blobs(
     core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool, scale: int = 1
 ) -> list[Blob]:
@@ -159,30 +119,6 @@ def _contains(larger: Blob, box: Box) -> bool:
     if x < 0 or y < 0 or x + box[2] > larger.box[2] or y + box[3] > larger.box[3]:
         return False
     return bool(larger.mask[y : y + box[3], x : x + box[2]].mean() > 0.9)
-
-
-def find_weak_blobs(
-    wide: np.ndarray,
-    found: list[Blob],
-    threshold: float,
-    parameters: MorphologyParameters,
-    min_area_px: int,
-    peak: float,
-) -> list[Blob]:
-    """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow ones of even colour.
-
-    They are sought at half the resolution, an odd last row or column left out.
-    """
-    height, width = (side // 2 for side in wide.shape)
-    if not height or not width:
-        return []
-    half = cv2.resize(wide[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-    core = cv2.threshold(half, int(threshold), 255, cv2.THRESH_BINARY)[1]
-    names = ("erode_px", "dilate_px", "close_px")
-    small = parameters.model_copy(update={name: halve_side(getattr(parameters, name)) for name in names})
-    core = clean_silhouette(core, small)
-    others = find_blobs(core, half, threshold, min_area_px, peak, parameters.hull, scale=2)
-    return leave_touching(others, found, wide.shape)
 
 
 def leave_touching(others: list[Blob], found: list[Blob], shape: tuple[int, ...]) -> list[Blob]:

@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from torchvision_dddas.chain import View, Window, near_gaps
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.detection.blob_motion import DenseFlow
-from torchvision_dddas.detection.engine import Engine, View, Window
+from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.detection.interval import (
     DistanceSettings,
     adjust_interval,
@@ -32,7 +33,7 @@ from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.detection.repeats import RepeatRule
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import chain, near_gaps
+from torchvision_dddas.geometry import chain
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry, as_picture
 

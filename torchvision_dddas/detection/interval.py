@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchvision_dddas.chain import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.config import IntervalParameters, Settings, is_set, with_parameters
-from torchvision_dddas.geometry import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.types import Adjustment, Flight, Telemetry
 
 WALKER_M_S = 1.4

@@ -11,18 +11,18 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
+from torchvision_dddas.chain import DetectionChain, OpenCVOperations, View, Window, ellipse, evidence_scale
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings
 from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, measure_motions, split_by_flow
 from torchvision_dddas.detection.blobs import (
     Blob,
     Box,
     box_slices,
-    ellipse,
     find_blobs,
-    find_weak_blobs,
     group_fragments,
+    leave_touching,
 )
-from torchvision_dddas.detection.engine import Foreground, View, Window, evidence_scale
+from torchvision_dddas.detection.engine import Foreground
 from torchvision_dddas.detection.motion_history import MotionHistory, split_by_trail
 from torchvision_dddas.detection.persistence import Links, Sighting, find_persistent
 from torchvision_dddas.geometry import connected_parts
@@ -69,7 +69,7 @@ class Observation:
     links: of its blobs to those of the frames beside it, as far as they are known.
     """
 
-    window: Window | None = None
+    window: Window[View] | None = None
     foreground: Foreground | None = None
     blobs: list[Blob] = field(default_factory=list)
     motions: list[Motion] = field(default_factory=list)
@@ -78,7 +78,11 @@ class Observation:
 
 
 def observe(
-    window: Window, foreground: Foreground, flow: DenseFlow, settings: Settings, history: MotionHistory | None = None
+    window: Window[View],
+    foreground: Foreground,
+    flow: DenseFlow,
+    settings: Settings,
+    history: MotionHistory | None = None,
 ) -> Observation:
     """The blobs of a window's reference frame and how each of them moves.
 
@@ -102,17 +106,26 @@ def observe(
     return Observation(window, foreground, blobs, motions)
 
 
-def _blobs_of(window: Window, foreground: Foreground, settings: Settings) -> list[Blob]:
+def _blobs_of(window: Window[View], foreground: Foreground, settings: Settings) -> list[Blob]:
     """Strong and weak blobs, by OpenCV."""
-    morphology, scale = settings.morphology, evidence_scale(settings)
-    threshold, peak = settings.difference.threshold * scale, settings.difference.peak * scale
-    min_area_px = settings.gates.min_area_px
-    blobs = find_blobs(
-        foreground.core, foreground.evidence, threshold, min_area_px, peak, morphology.hull, foreground.scale
-    )
+    blobs = find_blobs(foreground.core, foreground.evidence, *_blob_limits(settings), foreground.scale)
     if settings.persistence.on and window.looks_both_ways:
-        blobs += find_weak_blobs(foreground.wide, blobs, threshold, morphology, min_area_px, peak)
+        blobs += find_weak_blobs(foreground.wide, blobs, settings)
     return blobs
+
+
+def find_weak_blobs(wide: np.ndarray, found: list[Blob], settings: Settings) -> list[Blob]:
+    """Blobs of the wide pair's evidence, (H, W) uint8, that touch none of those found: slow targets of even colour."""
+    if min(wide.shape) < 2:
+        return []
+    core, half = DetectionChain(settings, OpenCVOperations()).find_weak(wide)
+    return leave_touching(find_blobs(core, half, *_blob_limits(settings), scale=2), found, wide.shape)
+
+
+def _blob_limits(settings: Settings) -> tuple[float, int, float, bool]:
+    """Threshold, least area, least peak of `find_blobs`, and whether hulls are filled."""
+    difference, scale = settings.difference, evidence_scale(settings)
+    return difference.threshold * scale, settings.gates.min_area_px, difference.peak * scale, settings.morphology.hull
 
 
 def draw_targets(

@@ -10,15 +10,23 @@ pixels, so that place p there is place 2 p + 1/2 in the whole picture.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
 
+from torchvision_dddas.chain import (
+    DetectionChain,
+    OpenCVOperations,
+    View,
+    Window,
+    halve_side,
+    match_exposure,
+    no_texture,
+)
 from torchvision_dddas.config import RegistrationParameters, Settings
-from torchvision_dddas.detection.blobs import halve_side
-from torchvision_dddas.detection.engine import Engine, Foreground, View, Window, judge_points, match_exposure
-from torchvision_dddas.detection.opencv_foreground import find_foreground, no_texture
+from torchvision_dddas.detection.engine import Engine, Foreground, grey_of, judge_points
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.types import Registration
 
@@ -40,7 +48,36 @@ _TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
 LAST_TOLERANCE = _TOLERANCES[-1]
 
 
-class OpenCVEngine(Engine):
+@dataclass(frozen=True)
+class Carried:
+    """What a step of the registration leaves to the next one.
+
+    points: (N, 2) float32, its inliers. step: (3, 3) its homography, None before the first step. age: steps since
+    detection. count, cover: points and coarse cells that the detection gave.
+    """
+
+    points: np.ndarray
+    step: np.ndarray | None
+    age: int
+    count: int
+    cover: int
+
+
+@dataclass
+class OpenCVView(View):
+    """A frame, and what the engine uses again. carried: of the step that ends here, taken by the next one."""
+
+    carried: Carried | None = None
+
+    @cached_property
+    def half(self) -> "OpenCVView":
+        """The view at half its resolution, grey; an odd last row or column is left out."""
+        width, height = (max(side // 2, 1) for side in self.size)
+        grey = cv2.resize(self.grey[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        return OpenCVView(grey, grey)
+
+
+class OpenCVEngine(Engine[OpenCVView]):
     """Implements `Engine` one pair and one window at a time."""
 
     name = "onboard"
@@ -48,7 +85,11 @@ class OpenCVEngine(Engine):
     def __init__(self, settings: Settings) -> None:
         self.parameters = settings
 
-    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
+    def prepare(self, image: np.ndarray) -> OpenCVView:
+        """See `Engine.prepare`."""
+        return OpenCVView(image, grey_of(image))
+
+    def register(self, pairs: Sequence[tuple[OpenCVView, OpenCVView]]) -> list[Registration]:
         """See `Engine.register`."""
         parameters = self.parameters.registration
         if not parameters.halved:
@@ -58,14 +99,14 @@ class OpenCVEngine(Engine):
         lengths["min_distance_px"] = max(parameters.min_distance_px // 2, 1)
         lengths["forward_backward_px"] = parameters.forward_backward_px / 2
         small = parameters.model_copy(update=lengths)
-        steps = [_register(halve_view(earlier), halve_view(later), small) for earlier, later in pairs]
+        steps = [_register(earlier.half, later.half, small) for earlier, later in pairs]
         matrices = [_WHOLE_FROM_HALF @ step.later_from_earlier @ _HALF_FROM_WHOLE for step in steps]
         return [
             replace(step, later_from_earlier=m / m[2, 2], error_px=2 * step.error_px, flow_px=2 * step.flow_px)
             for step, m in zip(steps, matrices, strict=True)
         ]
 
-    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+    def foreground(self, windows: Sequence[Window[OpenCVView]]) -> list[Foreground]:
         """See `Engine.foreground`."""
         settings = self.parameters
         if not settings.difference.halved:
@@ -77,25 +118,26 @@ class OpenCVEngine(Engine):
         return [double_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
 
 
+def find_foreground(window: Window[OpenCVView], settings: Settings) -> Foreground:
+    """The chain's maps of a window; of a picture of a single row or column, all are 0."""
+    grey = window.reference.grey
+    if min(grey.shape) < 2:  # OpenCV takes a single column for a number
+        zero = np.zeros_like(grey)
+        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
+    chain: DetectionChain[OpenCVView, np.ndarray, np.ndarray] = DetectionChain(settings, OpenCVOperations())
+    maps, (a, b) = chain.find_foreground(window), window.near[-1]
+    return Foreground(**vars(maps), offsets=(window.offsets[a], window.offsets[b]))
+
+
 # -- half pictures -----------------------------------------------------------------------------------------------------
 
 
-def halve_view(view: View) -> View:
-    """The view at half its resolution, grey, computed once; an odd last row or column is left out."""
-    if "half" not in view.kept:
-        width, height = (max(side // 2, 1) for side in view.size)
-        grey = cv2.resize(view.grey[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        view.kept["half"] = View(grey, grey)
-    half: View = view.kept["half"]
-    return half
-
-
-def halve_window(window: Window) -> Window:
+def halve_window(window: Window[OpenCVView]) -> Window[OpenCVView]:
     """The same window on half pictures."""
     return replace(
         window,
-        reference=halve_view(window.reference),
-        neighbours=tuple(halve_view(neighbour) for neighbour in window.neighbours),
+        reference=window.reference.half,
+        neighbours=tuple(neighbour.half for neighbour in window.neighbours),
         neighbour_from_reference=_HALF_FROM_WHOLE @ window.neighbour_from_reference @ _WHOLE_FROM_HALF,
         close_px=halve_side(window.close_px) if window.close_px else 0,
     )
@@ -146,30 +188,15 @@ def double(picture: np.ndarray, size: tuple[int, int], smooth: bool = False) -> 
 # -- registration ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Carried:
-    """What a step leaves to the next one.
-
-    points: (N, 2) float32, its inliers. step: (3, 3) its homography, None before the first step. age: steps since
-    detection. count, cover: points and coarse cells that the detection gave.
-    """
-
-    points: np.ndarray
-    step: np.ndarray | None
-    age: int
-    count: int
-    cover: int
-
-
-def _register(earlier: View, later: View, parameters: RegistrationParameters) -> Registration:
-    """The background's motion from `earlier` to `later`; what the next step needs is left in `later.kept`."""
+def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationParameters) -> Registration:
+    """The background's motion from `earlier` to `later`; what the next step needs is left in `later.carried`."""
     carrying = parameters.redetect_frames > 1
 
-    def detect(step: np.ndarray | None) -> _Carried:
+    def detect(step: np.ndarray | None) -> Carried:
         points = detect_keypoints(earlier.grey, parameters, halved=parameters.halved_corners and not parameters.halved)
-        return _Carried(points, step, 0, len(points), _cover(points, earlier.size))
+        return Carried(points, step, 0, len(points), _cover(points, earlier.size))
 
-    carried: _Carried | None = earlier.kept.pop("carried", None) if carrying else None
+    carried, earlier.carried = earlier.carried if carrying else None, None
     if carried is not None:
         # Anew where the points carried on are too old, too few, too much in one place, or more than are now allowed.
         if (
@@ -187,7 +214,7 @@ def _register(earlier: View, later: View, parameters: RegistrationParameters) ->
         found, inliers = _register_points(earlier, later, carried, parameters)
     if carrying and found.reliable:
         step = found.later_from_earlier
-        later.kept["carried"] = replace(carried, points=inliers, step=step, age=carried.age + 1)
+        later.carried = replace(carried, points=inliers, step=step, age=carried.age + 1)
     return found
 
 
@@ -241,7 +268,7 @@ def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
 
 
 def _register_points(
-    earlier: View, later: View, carried: _Carried, parameters: RegistrationParameters
+    earlier: OpenCVView, later: OpenCVView, carried: Carried, parameters: RegistrationParameters
 ) -> tuple[Registration, np.ndarray]:
     """The registration by the points that are carried, and its inliers' places in the later frame."""
     start = end = carried.points if len(carried.points) >= 4 else carried.points[:0]

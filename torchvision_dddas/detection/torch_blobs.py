@@ -14,9 +14,10 @@ from jaxtyping import Bool, Int64, UInt8
 from kornia.contrib import connected_components_union_find
 from torch import Tensor
 
+from torchvision_dddas.chain import Window, evidence_scale
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.blobs import Box, Region, box_slices, leave_touching, make_blobs
-from torchvision_dddas.detection.engine import Foreground, Window, evidence_scale
+from torchvision_dddas.detection.engine import Foreground
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ def foregrounds_with_blobs(
     """The foregrounds of windows of one structure, with their blobs.
 
     maps: core, evidence, wide and texture, (B, 1, H, W) uint8 as all others. weak: where the wide evidence is certain
-    at half the resolution, and that evidence, as `find_weak_blobs` makes them; None where no weak blobs are wanted.
+    at half the resolution, and that evidence, of `DetectionChain.find_weak`; None where no weak blobs are wanted.
     settings: of windows that have none of their own.
     """
     core, near, wide, texture = maps

@@ -2,29 +2,20 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-import torchvision_dddas.functional as F
+from torchvision_dddas.chain import View, Window, match_exposure
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.blobs import halve_side
-from torchvision_dddas.detection.engine import (
-    Engine,
-    Foreground,
-    View,
-    Window,
-    exposure_between,
-    judge_points,
-    match_exposure,
-)
+from torchvision_dddas.detection.engine import Engine, Foreground, grey_of, judge_points
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.filters import to_bytes
-from torchvision_dddas.nn import MotionSegmenter, WarpedWindows, close_masks
+from torchvision_dddas.nn import MotionSegmenter
 from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import Registration
 
@@ -35,7 +26,19 @@ _PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
 _POINTS_AT_ONCE = 100_000
 
 
-class TorchEngine(Engine):
+@dataclass
+class TensorView(View):
+    """A frame, and what the engine computed of it.
+
+    levels: (1, 1, H, W) float32. keypoints: (1, N, 2) and (1, N), which are valid. pyramid: of the levels.
+    """
+
+    levels: Tensor | None = None
+    keypoints: tuple[Tensor, Tensor] | None = None
+    pyramid: list[Tensor] = field(default_factory=list)
+
+
+class TorchEngine(Engine[TensorView]):
     """Implements `Engine` on all pairs and windows of equal structure at once."""
 
     name = "torch"
@@ -65,36 +68,37 @@ class TorchEngine(Engine):
         """The hard chain of the settings in force, whose numbers are no tensors."""
         return MotionSegmenter(self.parameters, tuned=()).to(self.device)
 
+    def prepare(self, image: np.ndarray) -> TensorView:
+        """See `Engine.prepare`."""
+        return TensorView(image, grey_of(image))
+
     @torch.inference_mode()
-    def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
-        """See `Engine.register`. Pyramids, and the keypoints of the earlier frames, are left in `View.kept`."""
+    def register(self, pairs: Sequence[tuple[TensorView, TensorView]]) -> list[Registration]:
+        """See `Engine.register`. Pyramids, and the keypoints of the earlier frames, are kept in the views."""
         return _apply_in_groups(pairs, lambda pair: (pair[0].size, pair[1].size), self._register)
 
-    def _register(self, pairs: list[tuple[View, View]]) -> list[Registration]:
+    def _register(self, pairs: list[tuple[TensorView, TensorView]]) -> list[Registration]:
         registration, parameters = self.segmenter.registration, self.parameters.registration
-        for earlier, _ in pairs:
-            if "points" not in earlier.kept:
-                found = registration.keypoints(_levels_of(earlier, self.device))
-                earlier.kept["points"], earlier.kept["valid"] = found
+        keypoints = [self._keypoints(earlier) for earlier, _ in pairs]
         matched = []
         for pair in pairs:  # where exposures differ, one of the two is a view of its own
             greys = zip(pair, match_exposure(*pair), strict=True)
-            matched.append([view if grey is view.grey else View(view.image, grey) for view, grey in greys])
-        missing = list({id(view): view for pair in matched for view in pair if "pyramid" not in view.kept}.values())
+            matched.append([view if grey is view.grey else TensorView(view.image, grey) for view, grey in greys])
+        missing = list({id(view): view for pair in matched for view in pair if not view.pyramid}.values())
         width, height = pairs[0][0].size
         step = self._at_once(width * height)
         for views in (missing[first : first + step] for first in range(0, len(missing), step)):
-            pyramid = registration.pyramid(_join([_levels_of(view, self.device) for view in views]))
+            pyramid = registration.pyramid(_join([self._levels(view) for view in views]))
             for number, view in enumerate(views):
-                view.kept["pyramid"] = [level[number : number + 1] for level in pyramid]
-        count = max(pairs[0][0].kept["points"].shape[1], 1)
+                view.pyramid = [level[number : number + 1] for level in pyramid]
+        count = max(keypoints[0][0].shape[1], 1)
         step = max(1, _POINTS_AT_ONCE // count)
         made: list[Registration] = []
         for first in range(0, len(pairs), step):
             part = np.s_[first : first + step]
-            points, valid = (_join([view.kept[name] for view, _ in pairs[part]]) for name in ("points", "valid"))
+            points, valid = (_join(kept) for kept in zip(*keypoints[part], strict=True))
             before, after = (
-                [_join(level) for level in zip(*(view.kept["pyramid"] for view in views), strict=True)]
+                [_join(level) for level in zip(*(view.pyramid for view in views), strict=True)]
                 for views in zip(*matched[part], strict=True)
             )
             motion = registration.match(points, valid, before, after)
@@ -106,14 +110,14 @@ class TorchEngine(Engine):
         return made
 
     @torch.inference_mode()
-    def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
+    def foreground(self, windows: Sequence[Window[TensorView]]) -> list[Foreground]:
         """See `Engine.foreground`."""
 
-        def structure(window: Window) -> tuple[Any, ...]:
+        def structure(window: Window[TensorView]) -> tuple[Any, ...]:
             sizes = tuple(view.size for view in window.neighbours)
             return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px
 
-        def work(group: list[Window]) -> list[Foreground]:
+        def work(group: list[Window[TensorView]]) -> list[Foreground]:
             width, height = group[0].reference.size
             step = self._at_once(width * height * max(len(group[0].neighbours), 1))
             return [made for i in range(0, len(group), step) for made in self._foreground(group[i : i + step])]
@@ -124,67 +128,45 @@ class TorchEngine(Engine):
         """How many items of so many pixels are worked on at once."""
         return max(1, _PIXELS_AT_ONCE.get(self.device.type, _PIXELS_AT_ONCE["cpu"]) // pixels)
 
-    def warp_neighbours(self, windows: list[Window]) -> WarpedWindows:
-        """Windows of equal structure with their neighbours warped to the references, in the references' light."""
-        levels = _join([_levels_of(window.reference, self.device) for window in windows])
+    def batch_of(self, windows: Sequence[Window[TensorView]]) -> Window[Tensor]:
+        """Windows of equal structure as one whose frames are batches."""
+        one = windows[0]
         matrices = torch.from_numpy(np.stack([window.neighbour_from_reference for window in windows])).to(self.device)
-        neighbours = (
-            _join([_levels_of(view, self.device) for view in views])
-            for views in zip(*(window.neighbours for window in windows), strict=True)
-        )
-        light = None
-        if self.parameters.difference.kind == "to_reference":
-            fits = [[exposure_between(w.reference, view) for view in w.neighbours] for w in windows]
-            gain, offset = torch.tensor(fits, dtype=torch.float64, device=self.device).unbind(-1)
-            light = gain, offset
-        return self.segmenter.warp(levels, neighbours, matrices, light)
+        reference = _join([self._levels(window.reference) for window in windows])
+        by_place = zip(*(window.neighbours for window in windows), strict=True)
+        neighbours = tuple(_join([self._levels(view) for view in views]) for views in by_place)
+        return Window(reference, neighbours, matrices, one.offsets, one.near, one.wide, one.small, one.close_px)
 
-    def _foreground(self, windows: list[Window]) -> list[Foreground]:
-        settings, one, segmenter = self.parameters, windows[0], self.segmenter
-        views = self.warp_neighbours(windows)
-        weight = segmenter.noise_weight(views.texture)
-
-        def evidence(pair: tuple[int, int]) -> Tensor:
-            return segmenter.pair_evidence(views.least(pair), views.both(pair), views.texture, weight)
-
-        near = evidence(one.near[0])
-        for pair in one.near[1:]:
-            near = torch.maximum(near, evidence(pair))
-        wide = near if one.wide is None else evidence(one.wide)
-        core = segmenter.core(near, close_px=one.close_px)
-        small: Tensor | None = None
-        if one.small is not None:
-            least = F.gaussian_blur2d(views.smaller(one.small), 5) * views.both(one.small)
-            mean = least.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
-            level = (settings.small.noise_ratio * mean).clamp(min=settings.small.threshold).floor()
-            small = close_masks((least > level).to(torch.uint8) * 255, settings.small.close_px)
-        a, b = one.near[-1]
-        texture = to_bytes(views.texture)
+    def _foreground(self, windows: list[Window[TensorView]]) -> list[Foreground]:
+        settings, one, chain = self.parameters, windows[0], self.segmenter.chain()
+        maps = chain.find_foreground(self.batch_of(windows))
+        texture = to_bytes(maps.texture)
         if self.components == "torch":
             is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
-            weak = weak_maps(segmenter, wide, one.close_px) if is_weak_wanted else None
-            warped = views.warped[a], views.warped[b]
-            return foregrounds_with_blobs(windows, settings, (core, near, wide, texture), weak, small, warped)
-        smalls = [None] * len(windows) if small is None else list(small[:, 0].cpu().numpy())
-        maps = core, near, wide, texture, views.warped[a], views.warped[b]
-        rows = zip(*(made[:, 0].cpu().numpy() for made in maps), strict=True)
+            is_weak_wanted &= min(maps.wide.shape[-2:]) > 1
+            weak = chain.find_weak(maps.wide, one.close_px) if is_weak_wanted else None
+            whole = maps.core, maps.evidence, maps.wide, texture
+            return foregrounds_with_blobs(windows, settings, whole, weak, maps.small, maps.warped)
+        pictures = (maps.core, maps.evidence, maps.wide, texture, *maps.warped)
+        rows = zip(*(made[:, 0].cpu().numpy() for made in pictures), strict=True)
+        smalls = [None] * len(windows) if maps.small is None else list(maps.small[:, 0].cpu().numpy())
+        a, b = one.near[-1]
         return [
             Foreground(core, near, wide, texture, small, (first, other), (window.offsets[a], window.offsets[b]))
             for window, (core, near, wide, texture, first, other), small in zip(windows, rows, smalls, strict=True)
         ]
 
+    def _keypoints(self, view: TensorView) -> tuple[Tensor, Tensor]:
+        """The view's keypoints and which of them are valid, computed once."""
+        if view.keypoints is None:
+            view.keypoints = self.segmenter.registration.keypoints(self._levels(view))
+        return view.keypoints
 
-def weak_maps(segmenter: MotionSegmenter, wide: Tensor, close_px: int = 0) -> tuple[Tensor, Tensor] | None:
-    """Where the wide evidence is certain at half the resolution, and that evidence: as `find_weak_blobs` has them.
-
-    wide: (B, 1, H, W) uint8. None for pictures of a single row or column.
-    """
-    if min(wide.shape[-2:]) < 2:
-        return None
-    half = functional.avg_pool2d(wide.float(), 2).add_(0.5).to(torch.uint8)
-    morphology = segmenter.settings.morphology
-    sides = {"erode": morphology.erode_px, "dilate": morphology.dilate_px, "close": close_px or morphology.close_px}
-    return segmenter.core(half, {f"morphology.{name}_px": halve_side(side) for name, side in sides.items()}), half
+    def _levels(self, view: TensorView) -> Tensor:
+        """(1, 1, H, W) float32 grey levels, computed once."""
+        if view.levels is None:
+            view.levels = torch.from_numpy(view.grey)[None, None].to(self.device).float()
+        return view.levels
 
 
 def _apply_in_groups(
@@ -198,14 +180,6 @@ def _apply_in_groups(
     for group in places.values():
         results |= zip(group, work([items[place] for place in group]), strict=True)
     return [results[place] for place in range(len(items))]
-
-
-def _levels_of(view: View, device: torch.device) -> Tensor:
-    """(1, 1, H, W) float32 grey levels, computed once."""
-    if "levels" not in view.kept:
-        view.kept["levels"] = torch.from_numpy(view.grey)[None, None].to(device).float()
-    levels: Tensor = view.kept["levels"]
-    return levels
 
 
 def _join(pictures: Sequence[Tensor]) -> Tensor:

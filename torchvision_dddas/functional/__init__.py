@@ -17,6 +17,7 @@ from kornia.geometry import oneway_transfer_error, transform_points
 
 from torchvision_dddas.functional.affinity import pair_affinity, triplet_affinity
 from torchvision_dddas.functional.assignment import dispersion, log_partition
+from torchvision_dddas.functional.chain_operations import TensorOperations, close_masks
 from torchvision_dddas.functional.color import bgr_to_hsv, rgb_histogram, within_ranges
 from torchvision_dddas.functional.difference import (
     fit_exposure,
@@ -73,12 +74,14 @@ from torchvision_dddas.functional.warp import columns_between, resize, seen_by_b
 __all__ = [
     "MODELS",
     "Layout",
+    "TensorOperations",
     "all_true",
     "arrange_weights",
     "bgr_to_hsv",
     "blend_sizes",
     "box_sum",
     "build_pyramid",
+    "close_masks",
     "closing",
     "columns_between",
     "corner_min_eigenvalue",

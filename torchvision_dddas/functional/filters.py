@@ -1,24 +1,25 @@
 """Gaussian smoothing (appendix B, step S5), gradients, box sums, and what pictures are outside their edges.
 
-On a CPU Kornia's convolutions hold a copy of the picture for every weight: its Gaussian takes five times the memory and
-1.1 to 1.7 times the time, its `sobel` and `box_blur` 5 to 10 times that of `mean_gradient`
-(`python eval/speed.py operations`).
+Kornia's `sobel` and `box_blur` take 5 to 10 times the time of `mean_gradient` on a CPU (`python eval/speed.py
+operations`). Its Gaussian is fastest on whole batches: in strips of rows it takes 2 to 8 times as long.
 
 Outside its edges a picture is mirrored, the edge pixel not repeated: Kornia's border `reflect`, OpenCV's 101.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-import cv2
 import torch
 from jaxtyping import Bool, Float, Int64, Shaped, UInt8
 from kornia import filters
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.chain import uses_kornia
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.soft import is_traced
 
+# The sigmas whose weights are nearest to the binomial ones that OpenCV takes for small kernels.
+_SIGMAS = {3: 0.8493, 5: 1.0647, 7: 1.4474, 9: 1.7054}
 # Pixels in work at once on a CPU: temporaries then stay in its cache, and their memory is used again.
 _STRIP_PIXELS = 100_000
 
@@ -26,52 +27,36 @@ _STRIP_PIXELS = 100_000
 def gaussian_blur2d(
     input: Shaped[Tensor, "B C H W"],  # noqa: A002 (Kornia's name)
     kernel_size: int | tuple[int, int],
-    sigma: tuple[float, float] | None = None,
+    sigma: tuple[float, float] | Tensor | None = None,
     border_type: str = "reflect",
 ) -> Shaped[Tensor, "B C H W"]:
-    """`kornia.filters.gaussian_blur2d`, which is called where a sigma is given; without one, cv2.GaussianBlur.
+    """`kornia.filters.gaussian_blur2d`; without a sigma it is that of cv2.GaussianBlur, and bytes stay bytes.
 
-    OpenCV's own weights are binomial for small kernels, the border is mirrored, and pictures may be of any size. Bytes
-    stay bytes, halves rounded up: equal to OpenCV's up to a kernel of 9; beyond, OpenCV rounds its weights, and one
-    level may differ.
+    Halves are rounded up. Pictures may be of any size. OpenCV's weights for kernels up to 9 differ by up to 0.006.
 
-    Raises InputError for an even size, and another border without a sigma.
+    Raises InputError for an even size, and another border than `reflect` without a sigma.
     """
-    if isinstance(kernel_size, int) and (kernel_size < 1 or kernel_size % 2 == 0):
-        raise InputError(f"kernel_size must be odd and at least 1, got {kernel_size}")
-    if sigma is None and border_type != "reflect":
-        raise InputError(f"border_type must be reflect where no sigma is given, got {border_type}; give a sigma")
-    if sigma is not None or not isinstance(kernel_size, int):
-        blurred: Tensor = filters.gaussian_blur2d(input, kernel_size, sigma or (0.0, 0.0), border_type)
+    if sigma is not None:
+        blurred: Tensor = filters.gaussian_blur2d(input, kernel_size, sigma, border_type)
         return blurred
-    if kernel_size == 1:
+    sides = (kernel_size, kernel_size) if isinstance(kernel_size, int) else kernel_size
+    if any(side < 1 or side % 2 == 0 for side in sides):
+        raise InputError(f"kernel_size must be odd and at least 1, got {kernel_size}")
+    if border_type != "reflect":
+        raise InputError(f"border_type must be reflect where no sigma is given, got {border_type}; give a sigma")
+    if sides == (1, 1):
         return input
-    weights: list[float] = cv2.getGaussianKernel(kernel_size, 0).ravel().tolist()
-    border = (kernel_size // 2,) * 4
-    if input.dtype != torch.uint8:
-        return _weighted(_weighted(pad_reflect(input, *border), weights, -1), weights, -2)
-    if kernel_size > 9:
-        return to_bytes(gaussian_blur2d(input.float(), kernel_size) + 0.5)
-    # Sums in whole numbers are exact, and 16 bits hold those of the small kernels at half the time of floats.
-    unit = {3: 4, 5: 16, 7: 64, 9: 256}[kernel_size]
-    whole = [round(weight * unit) for weight in weights]
-    across = _weighted(pad_reflect(input, *border).to(torch.int16 if kernel_size < 9 else torch.int32), whole, -1)
-    if kernel_size > 5 or is_traced():
-        return to_bytes(_weighted(across.float(), whole, -2).mul_(1.0 / unit**2).add_(0.5))
-    # A sum of up to 65280 wraps into the sign of 16 bits; its high byte, which is what is wanted, does not care.
-    down = _weighted(across, whole, -2)
-    return down.mul_(256 // unit**2).add_(128).bitwise_right_shift_(8).to(torch.uint8)
+    sigma = (_SIGMAS.get(sides[0], 0.15 * sides[0] + 0.35), _SIGMAS.get(sides[1], 0.15 * sides[1] + 0.35))
 
-
-def _weighted(padded: Tensor, weights: Sequence[float], dim: int) -> Tensor:
-    """Weighted sum of shifts along one axis; symmetric weights."""
-    middle = len(weights) // 2
-    length = padded.shape[dim] - 2 * middle
-    total = padded.narrow(dim, middle, length) * weights[middle]
-    for shift in range(1, middle + 1):
-        for place in (middle - shift, middle + shift):
-            total.add_(padded.narrow(dim, place, length), alpha=weights[middle + shift])
-    return total
+    levels = input.float() if input.dtype == torch.uint8 else input
+    down, across = sides[0] // 2, sides[1] // 2
+    if down < levels.shape[-2] and across < levels.shape[-1]:
+        blurred = filters.gaussian_blur2d(levels, sides, sigma, border_type)
+    else:  # Kornia mirrors once only
+        padded = pad_reflect(levels, across, across, down, down)
+        around = filters.gaussian_blur2d(padded, sides, sigma, "constant")
+        blurred = around[..., down : down + levels.shape[-2], across : across + levels.shape[-1]]
+    return to_bytes(blurred + 0.5) if input.dtype == torch.uint8 else blurred
 
 
 def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B C H W"]:
@@ -94,6 +79,9 @@ def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], block: int = 5) -> Shaped[T
     255 before and after the mean, as OpenCV's 8-bit pictures are. Kornia's `sobel` repeats the edge pixel: the rim
     differs. No gradient passes.
     """
+    if uses_kornia("gradient", levels.device.type) and not is_traced():
+        slope = filters.sobel(levels.detach(), normalized=False, eps=0.0).mul(0.5).round_().clamp_(max=255.0)
+        return filters.box_blur(slope, block).round_()
     padded = pad_reflect(levels.detach(), 1, 1, 1, 1)
     steep = padded[..., 2:, :] - padded[..., :-2, :]
     smooth = torch.add(padded[..., 2:, :] + padded[..., :-2, :], padded[..., 1:-1, :], alpha=2.0)

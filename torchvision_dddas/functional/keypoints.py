@@ -7,15 +7,27 @@ Kornia's gradients repeat the edge pixel.
 
 import torch
 from jaxtyping import Bool, Float
+from kornia.filters import box_blur, spatial_gradient
 from torch import Tensor
 from torch.nn import functional
 
+from torchvision_dddas.chain import uses_kornia
 from torchvision_dddas.functional.filters import box_sum, in_strips, pad_reflect
+from torchvision_dddas.functional.soft import is_traced
 
 
 def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tensor, "B 1 H W"]:
     """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values."""
+    if uses_kornia("corners", gray.device.type) and not is_traced():
+        return _min_eigenvalue_by_kornia(gray, block)
     return in_strips(lambda strip: _min_eigenvalue(strip, block), gray, 1 + block // 2)
+
+
+def _min_eigenvalue_by_kornia(gray: Tensor, block: int) -> Tensor:
+    # Kornia's Sobel filters are an eighth of OpenCV's sums, its box is a mean.
+    du, dv = spatial_gradient(gray, order=1).mul(2.0 / block).unbind(2)
+    uu, vv, uv = (box_blur(product, block).mul(block**2) for product in (du * du, dv * dv, du * dv))
+    return 0.5 * (uu + vv) - torch.addcmul((0.5 * (uu - vv)).square(), uv, uv).clamp(min=1e-24).sqrt()
 
 
 def _min_eigenvalue(gray: Tensor, block: int) -> Tensor:

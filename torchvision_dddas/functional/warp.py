@@ -1,13 +1,14 @@
 """Warping one frame into another (appendix B, step S3), and resizing.
 
-kornia.geometry.warp_perspective takes 1.5 to 2.3 times as long on a CPU as one `grid_sample` over a broadcast
-grid; its resize takes 0.3 to 0.4 of the time of the exact one here (`python eval/speed.py operations`).
+Kornia's warp_perspective takes 4 to 6 times as long on a CPU as its `remap` over maps that are made by broadcasting, in
+strips that stay in the cache. Its resize takes 0.3 of the time of the exact one here (`python eval/speed.py
+operations`).
 """
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int32, Int64, Shaped
+from kornia.geometry import remap
 from torch import Tensor
-from torch.nn import functional
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.filters import strip_rows, to_bytes
@@ -41,27 +42,20 @@ def warp_perspective(
         raise InputError(f"M has {len(M)} matrices for {len(src)} pictures: M.expand(len(src), -1, -1)")
     if padding_mode not in ("zeros", "border"):
         raise InputError(f"padding_mode must be zeros or border, got {padding_mode}; Kornia's function has others")
-    height, width = src.shape[-2:]
     rows, columns = dsize
     matrix = M.double() if inverse_map else invert_map(M.double())
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
-    # Row y is the first of these rows plus y times the second; along it are u, v, u, v, ...: what `grid_sample` reads.
-    start = matrix[:, :, 0, None] * u + matrix[:, :, 2:]
-    slope = matrix[:, :, 1, None].expand(-1, -1, columns)
-    ahead = [(part[:, :2] * max(subpixels, 1)).mT.flatten(1)[:, None].to(src.dtype) for part in (start, slope)]
-    # Numbers of every column, not of every pixel: other runtimes are slow where two meet a picture of pairs.
-    depth = [part[:, 2:].mT.expand(-1, -1, 2).flatten(1)[:, None].to(src.dtype) for part in (start, slope)]
-    per_pixel = torch.tensor([2.0 / width, 2.0 / height], dtype=src.dtype, device=src.device).repeat(columns)
-    offset, per_pixel = per_pixel / 2 - 1, per_pixel / max(subpixels, 1)
+    # Row y is the first of these rows plus y times the second.
+    start = (matrix[:, :, 0, None] * u + matrix[:, :, 2:]).to(src.dtype)
+    slope = matrix[:, :, 1, None].to(src.dtype)
     y = torch.arange(rows, dtype=src.dtype, device=src.device)[:, None]
 
     def sample(y: Tensor) -> Tensor:
-        place, far = torch.addcmul(ahead[0], y, ahead[1]), torch.addcmul(depth[0], y, depth[1])
-        place = place / far if place.requires_grad else place.div_(far)
+        along_u, along_v, depth = (start[:, k, None] + y * slope[:, k, None] for k in range(3))
+        places = [along_u / depth, along_v / depth]
         if subpixels:
-            place = place.round_()
-        place = torch.addcmul(offset, place, per_pixel).unflatten(-1, (columns, 2))
-        found = functional.grid_sample(src, place, mode=mode, padding_mode=padding_mode, align_corners=False)
+            places = [place.mul(subpixels).round_().div_(subpixels) for place in places]
+        found = remap(src, places[0], places[1], mode=mode, padding_mode=padding_mode, align_corners=True)
         return to_bytes(found.add_(0.5)) if whole else found
 
     step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)

@@ -31,8 +31,8 @@ from torchvision_dddas.geo.plane_homography import (
     no_fix,
     relative_width,
 )
-from torchvision_dddas.geo.projection import ground_height, surface_of
 from torchvision_dddas.geo.site import Site, build_site, complete_site, fit_lens, resolve_camera
+from torchvision_dddas.geometry.projection import ground_height, surface_of
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

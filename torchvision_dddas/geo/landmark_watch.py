@@ -13,11 +13,11 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix
-from torchvision_dddas.geo.colours import ColourFinder
+from torchvision_dddas.geo.colours import ColourFinder, load_colours
 from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
 from torchvision_dddas.geo.plane_homography import LEAST
-from torchvision_dddas.geo.projection import distort_pixels, project
 from torchvision_dddas.geometry import connected_parts, inside, middles_of, transfer
+from torchvision_dddas.geometry.projection import distort_pixels, project
 from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, Int, LandmarkObservations, Landmarks, Scene
 
 # A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.
@@ -71,9 +71,10 @@ def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -
 class LandmarkWatch:
     """Locates the scenes of a clip in order, and removes landmarks from their targets."""
 
-    def __init__(self, locator: AerialLocator, colours: Colours | None, finder: ColourFinder | None) -> None:
-        """colours, finder: None where the table of landmarks gives their pixels."""
-        self.locator, self._colours, self._finder = locator, colours, finder
+    def __init__(self, locator: AerialLocator, colours: Colours | None, backend: str) -> None:
+        """colours: None where the table of landmarks gives their pixels. backend: finds colours; see `load_colours`."""
+        self.locator, self._colours, self._backend = locator, colours, backend
+        self._finder = load_colours(backend) if colours is not None else None
         self._fix: Fix | None = None
         if colours is not None:
             names = locator.site.landmarks.names
@@ -84,7 +85,7 @@ class LandmarkWatch:
 
     def restarted(self) -> "LandmarkWatch":
         """The same watch as before its first scene."""
-        return LandmarkWatch(self.locator.restarted(), self._colours, self._finder)
+        return LandmarkWatch(self.locator.restarted(), self._colours, self._backend)
 
     def update(self, scene: Scene) -> WatchedScene:
         """The next scene, without its landmarks, and its fix."""

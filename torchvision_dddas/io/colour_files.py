@@ -1,4 +1,4 @@
-"""The colours of landmarks in TOML files, and a picture that shows them.
+"""The colours of landmarks in TOML files.
 
 Ranges of hue (0 to 180), saturation and value (0 to 255):
 
@@ -7,17 +7,14 @@ low = [172, 90, 60]       # a hue above the one of `high`: the range goes over 0
 high = [8, 255, 255]
 """
 
-from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.config import format_toml, read_toml
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.colours import CalibratedColours, find_overlaps, mask_range, to_hsv
-from torchvision_dddas.io.overlay import label, line_width, rectangle
 from torchvision_dddas.types import Colours
 
 HIGHEST = (180, 255, 255)
@@ -71,32 +68,14 @@ def format_colours(colours: Colours) -> str:
     return format_toml({name: {"low": low, "high": high} for name, low, high in ranges}, [comment])
 
 
-def draw_calibration(images: Sequence[np.ndarray], found: CalibratedColours) -> bytes:
-    """A PNG of all pictures, one below the other: grey but where a range marks it, each landmark named.
-
-    A range is outlined in its colour.
-    """
-    ranges = found.ranges
-    # A bright BGR colour for each range: that of the middle of its hues.
-    low, high = ranges.low[:, 0], ranges.high[:, 0]
-    vivid = np.full((1, len(low), 3), 255, np.uint8)
-    vivid[0, :, 0] = (low + (high - low) % 180 / 2) % 180
-    shades = [(b, g, r) for b, g, r in cv2.cvtColor(vivid, cv2.COLOR_HSV2BGR)[0].tolist()]
-    sheets = []
-    for number, image in enumerate(images):
-        hsv = to_hsv(image)
-        masks = np.stack([mask_range(hsv, *ends) for ends in zip(ranges.low, ranges.high, strict=True)])
-        is_marked, thick = masks.any(axis=0), line_width(image)
-        sheet = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) // 2 + 40, cv2.COLOR_GRAY2BGR)
-        sheet[is_marked] = image[is_marked]
-        for name, mask, shade, group in zip(ranges.names, masks, shades, found.groups, strict=True):
-            grown = cv2.dilate(mask, np.ones((2 * thick + 1,) * 2, np.uint8))
-            sheet[(grown > 0) & ~is_marked] = shade
-            for sighting in group:
-                if sighting.picture == number:
-                    around = np.array(sighting.box_px, float) + 4 * thick * np.array([-1, -1, 2, 2])
-                    rectangle(sheet, around, shade, thick)
-                    label(sheet, around, name, shade)
-        width = images[0].shape[1]
-        sheets.append(cv2.resize(sheet, (width, max(round(sheet.shape[0] * width / sheet.shape[1]), 1))))
-    return cv2.imencode(".png", np.concatenate(sheets))[1].tobytes()
+def find_overlaps(low: np.ndarray, high: np.ndarray) -> list[tuple[int, int]]:
+    """The pairs of ranges, (K, 3) lowest and highest, that have a colour in common."""
+    hues = [
+        {hue % 180 for hue in range(first, last + 1 if first <= last else last + 181)}
+        for first, last in zip(low[:, 0], high[:, 0], strict=True)
+    ]
+    return [
+        (a, b)
+        for a, b in combinations(range(len(low)), 2)
+        if hues[a] & hues[b] and (np.maximum(low[a, 1:], low[b, 1:]) <= np.minimum(high[a, 1:], high[b, 1:])).all()
+    ]

@@ -24,7 +24,6 @@ from torchvision_dddas.io.output import (
     make_session_folder,
     without_numbers,
 )
-from torchvision_dddas.io.run_inputs import AerialInput, PreparedRun, locator_facts, prepare_run
 from torchvision_dddas.io.sources import stream_target
 from torchvision_dddas.io.streams import About, Stream, open_streams
 from torchvision_dddas.live.capture import LiveSource
@@ -43,7 +42,7 @@ from torchvision_dddas.live.runner import (
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
 from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
-from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, locator_facts
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.tracking import FrameTracker
 from torchvision_dddas.types import Adjustment, Frame, FrameResult
@@ -123,10 +122,10 @@ def run_live(
         health.begin()
         if source.recorded is not None:
             check_length(source.recorded)
-        prepare = partial(prepare_run, given, telemetry, settings, source, backend, clip)
+        prepare = partial(assemble_files, given, telemetry, settings, source, backend, clip)
         ready = prepare()
         ready.notes.extend([str(source.levels)] if source.levels else [])
-        flight, is_recording, offset_s = ready.flight, stream_target(clip) is None, settings.aerial.clock_offset_s
+        flight, is_recording, offset_s = ready.telemetry, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
         if flight is not None:
             ready.notes.append(describe_log(flight, is_recording, time.time(), offset_s))
@@ -239,13 +238,13 @@ class _Located:
 
 
 def build_path(
-    ready: PreparedRun,
+    ready: Assembly,
     source: LiveSource,
     people: bool,
     interval: int,
     backend: str,
     health: Health,
-    prepare: Callable[[], PreparedRun],
+    prepare: Callable[[], Assembly],
 ) -> Callable[[Feed], Iterator[Result]]:
     """The path from frames to results, which restarts each time that it is called, and sheds load.
 
@@ -289,11 +288,8 @@ def build_path(
             locator = running.locator
             feed.aligned = lambda log: locator.set_site(replace(locator.site, telemetry=log))
             feed.aligned(feed.log)
-        pipeline = Pipeline.from_parts(
-            engine,
-            shedding.settings,
-            None,
-            running,
+        pipeline = Pipeline.from_assembly(
+            Assembly(shedding.settings, engine, None, running),
             interval,
             seen=None if person_tracker is None else person_tracker.update,
             retune=retune,

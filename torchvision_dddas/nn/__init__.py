@@ -7,9 +7,9 @@ from torchvision_dddas.nn.motion_segmenter import (
     MotionSegmenter,
     Regions,
     Segmentation,
+    TensorChain,
     Values,
-    WarpedWindows,
-    close_masks,
+    differences_of,
 )
 from torchvision_dddas.nn.people import HOGDescriptor, PersonScorer
 from torchvision_dddas.nn.plane_homography import PlaneHomography
@@ -29,7 +29,7 @@ __all__ = [
     "Regions",
     "Registration",
     "Segmentation",
+    "TensorChain",
     "Values",
-    "WarpedWindows",
-    "close_masks",
+    "differences_of",
 ]

@@ -206,7 +206,7 @@ def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
 
 
 def arrange_weights(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
-    """(down, across, F) weights as `functional.hog.arranged` has them.
+    """(down, across, F) weights as `functional.arrange_weights` has them.
 
     Raises InputError where the SVM is of another length than the descriptor.
     """

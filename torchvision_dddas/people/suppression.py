@@ -1,7 +1,5 @@
 """From windows that score to people: non-maximum suppression, one body box a person, and its probability."""
 
-from typing import Any
-
 import numpy as np
 
 from torchvision_dddas.config import PeopleParameters
@@ -12,10 +10,6 @@ from torchvision_dddas.types import Float, Int, People
 _WHOLE = 1 - 1e-9
 # A body nearer to the picture's border, in its own heights, may be cut by it: twice the error of foot rows.
 _NEAR = 0.05
-
-# Arrays here, tensors where parameters are tuned by gradient: one formula for both.
-Column = Any
-Share = Any
 
 
 def people_from_windows(
@@ -44,27 +38,14 @@ def people_from_windows(
 def body_boxes(window_px: Float[np.ndarray, "N 4"], parameters: PeopleParameters) -> Float[np.ndarray, "N 4"]:
     """The body's box in each window, by ratios that were calibrated on true boxes."""
     x, y, width, height = window_px.T
-    sides = body_sides(x, y, width, height, parameters.height_share, parameters.width_share, parameters.feet_share)
-    return np.stack(sides, axis=1)
-
-
-def body_sides(
-    x: Column, y: Column, width: Column, height: Column, height_share: Share, width_share: Share, feet_share: Share
-) -> tuple[Column, Column, Column, Column]:
-    """Left, top, width, height of the body, as arrays, numbers or tensors."""
-    wide, tall = width_share * width, height_share * height
-    return x + (width - wide) / 2, y + feet_share * height - tall, wide, tall
+    wide, tall = parameters.width_share * width, parameters.height_share * height
+    return np.stack([x + (width - wide) / 2, y + parameters.feet_share * height - tall, wide, tall], axis=1)
 
 
 def probability(margin: Float[np.ndarray, " N"], parameters: PeopleParameters) -> Float[np.ndarray, " N"]:
     """Probability that a window of this score shows a person (Platt scaling)."""
-    odds = log_odds(margin, parameters.probability_slope, parameters.probability_even)
+    odds = parameters.probability_slope * (margin - parameters.probability_even)
     return 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
-
-
-def log_odds(margin: Column, slope: Share, even: Share) -> Column:
-    """Log-odds of that probability, as array, number or tensor."""
-    return slope * (margin - even)
 
 
 def is_cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarray:

@@ -12,7 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -198,8 +198,8 @@ def scale_histograms(affinity: Float[np.ndarray, "..."], scale: float) -> Float[
     return scaled
 
 
-def histogram_cut(parameters: PaperParameters) -> Any:
-    """The dissimilarity of histograms, before scaling, at which their clusters end. Numbers or tensors."""
+def histogram_cut(parameters: PaperParameters) -> float:
+    """The dissimilarity of histograms, before scaling, at which their clusters end."""
     return parameters.appearance_cut / parameters.histogram_scale
 
 
@@ -210,21 +210,13 @@ def gate(
 
     score: two or three axes, index 0 of each the dummy. reading: one_dummy raises entries with exactly one dummy;
     every_dummy is the text to the letter, so that entries with two dummies are raised too and the best assignment
-    leaves every target alone; off raises none. The entry of dummies alone is never raised.
+    leaves every target alone; off raises none. The entry of dummies alone is never raised. Of an entry with two dummies
+    the smaller of both indices' best alternatives counts.
     """
     score = np.array(score, float)
-    is_raised = (best_alternatives(score, reading) < 1 - threshold).astype(float)
-    return blend_gate(score, is_raised, threshold)
-
-
-def best_alternatives(score: Float[np.ndarray, "..."], reading: str) -> Float[np.ndarray, "..."]:
-    """For each entry the best real alternative, which must be below 1 - threshold to raise it; inf where never.
-
-    Of an entry with two dummies the smaller of both indices' alternatives counts. score, reading: as for `gate`.
-    """
-    best = np.full(score.shape, np.inf)
     if reading == "off":
-        return best
+        return score
+    best = np.full(score.shape, np.inf)
     firsts = [np.index_exp[:] * axis + (0,) for axis in range(score.ndim)]
     dummies = np.zeros(score.shape, np.int64)
     for first in firsts:
@@ -233,12 +225,7 @@ def best_alternatives(score: Float[np.ndarray, "..."], reading: str) -> Float[np
     for axis, first in enumerate(firsts):
         real = score.take(np.arange(1, score.shape[axis]), axis).max(axis=axis, initial=-np.inf)
         best[first] = np.where(allowed[first], np.minimum(best[first], real), best[first])
-    return best
-
-
-def blend_gate(score: Any, raised: Any, threshold: Any) -> Any:
-    """Entries raised to 1 - threshold by a share: not where it is 0, wholly where it is 1. Arrays or tensors."""
-    return raised * (1 - threshold) + (1 - raised) * score
+    return np.where(best < 1 - threshold, 1 - threshold, score)
 
 
 # -- which feature counts ----------------------------------------------------------------------------------------------
@@ -265,16 +252,6 @@ def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
         return 1.0
     share = np.unique(cluster, return_counts=True)[1] / len(cluster)
     return float(np.abs((share * np.log2(share)).sum()) / np.log2(len(cluster)))
-
-
-def joined_at(feature: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N N"]:
-    """The least cut at which each two targets are in one of the clusters of `dispersion`."""
-    if len(feature) < 2:
-        return np.zeros((len(feature), len(feature)))
-    from scipy.cluster.hierarchy import cophenet
-    from scipy.spatial.distance import squareform
-
-    return np.asarray(squareform(cophenet(_tree(similarity(feature, feature)))))
 
 
 def _tree(alike: Float[np.ndarray, "N N"]) -> np.ndarray:
@@ -420,16 +397,12 @@ def assign(
     if not by_feature:
         score = gate(score, parameters.threshold, parameters.gate)
     if score.ndim == 2:
-        pairs = add_lone_targets(best_pairs(pair_gain_over_alone(score)) + 1, score.shape)
+        over_alone = score[1:, 1:] - score[1:, :1] - score[:1, 1:]
+        pairs = add_lone_targets(best_pairs(over_alone) + 1, score.shape)
         return pairs[np.lexsort(pairs.T[::-1])]
     if max(score.shape) - 1 <= parameters.exact_targets:
         return assign_triplets(score, gap=0.0, most_exact=None).triplets
     return assign_triplets(score, parameters.gap).triplets
-
-
-def pair_gain_over_alone(score: Any) -> Any:
-    """What each pair scores above both left with the dummy: (..., N + 1, M + 1) -> (..., N, M), arrays or tensors."""
-    return score[..., 1:, 1:] - score[..., 1:, :1] - score[..., :1, 1:]
 
 
 class SourceTracker:

@@ -1,0 +1,43 @@
+"""The detection chain, written once, and its operations on OpenCV: no torch."""
+
+from torchvision_dddas.chain.exposure import View, exposure_between, fit_exposure, match_exposure
+from torchvision_dddas.chain.foreground import (
+    DetectionChain,
+    Maps,
+    Neighbours,
+    Pair,
+    Window,
+    evidence_scale,
+    halve_side,
+)
+from torchvision_dddas.chain.frame_pairs import later_pair, near_gaps, near_pairs, next_pair, pair_about
+from torchvision_dddas.chain.implementations import IMPLEMENTATIONS, uses_kornia
+from torchvision_dddas.chain.opencv_operations import OpenCVOperations, close_mask, ellipse, no_texture
+from torchvision_dddas.chain.operations import Number, Operations
+
+__all__ = [
+    "IMPLEMENTATIONS",
+    "DetectionChain",
+    "Maps",
+    "Neighbours",
+    "Number",
+    "OpenCVOperations",
+    "Operations",
+    "Pair",
+    "View",
+    "Window",
+    "close_mask",
+    "ellipse",
+    "evidence_scale",
+    "exposure_between",
+    "fit_exposure",
+    "halve_side",
+    "later_pair",
+    "match_exposure",
+    "near_gaps",
+    "near_pairs",
+    "next_pair",
+    "no_texture",
+    "pair_about",
+    "uses_kornia",
+]

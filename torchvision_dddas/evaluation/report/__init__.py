@@ -1,5 +1,0 @@
-"""report.html of a study: measures, charts, the frames that went worst, costs."""
-
-from torchvision_dddas.evaluation.report.study import study_report
-
-__all__ = ["study_report"]

@@ -1,0 +1,47 @@
+"""Geometry that several fields share: boxes, plane maps, rotations, matching, geodesy, projection. NumPy only."""
+
+from torchvision_dddas.geometry.boxes import Box, connected_parts, inside, middles_of, occupied, shared_px, window_of
+from torchvision_dddas.geometry.geodesy import (
+    DEGREE_M,
+    Degrees,
+    east_north,
+    great_circle_m,
+    lonlat,
+    plain_east_north,
+    plain_lonlat,
+)
+from torchvision_dddas.geometry.matching import best_pairs, cheapest
+from torchvision_dddas.geometry.namespace import namespace
+from torchvision_dddas.geometry.plane_maps import background_flow, chain, corner_error, transfer
+from torchvision_dddas.geometry.poses import poses_at
+from torchvision_dddas.geometry.rotations import about_up, cross, slope_of_turn, turn_of, turned
+
+__all__ = [
+    "DEGREE_M",
+    "Box",
+    "Degrees",
+    "about_up",
+    "background_flow",
+    "best_pairs",
+    "chain",
+    "cheapest",
+    "connected_parts",
+    "corner_error",
+    "cross",
+    "east_north",
+    "great_circle_m",
+    "inside",
+    "lonlat",
+    "middles_of",
+    "namespace",
+    "occupied",
+    "plain_east_north",
+    "plain_lonlat",
+    "poses_at",
+    "shared_px",
+    "slope_of_turn",
+    "transfer",
+    "turn_of",
+    "turned",
+    "window_of",
+]

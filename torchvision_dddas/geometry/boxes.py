@@ -1,0 +1,90 @@
+"""Boxes and masks: overlap, containment, and the boxes that hold what is set in a mask."""
+
+import cv2
+import numpy as np
+
+Box = tuple[int, int, int, int]
+"""x, y, width, height in pixels."""
+
+# Masks are searched in blocks of this side, px.
+_BLOCK_PX = 16
+
+
+def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
+    """(...) area in both of two boxes (..., 4), broadcast against each other; 0 where they lie apart."""
+    low = np.maximum(box_px[..., :2], other_px[..., :2])
+    high = np.minimum(box_px[..., :2] + box_px[..., 2:], other_px[..., :2] + other_px[..., 2:])
+    across, down = np.moveaxis(high - low, -1, 0)
+    return np.maximum(across, 0) * np.maximum(down, 0)
+
+
+def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """(P, N) bool: which points lie in which boxes."""
+    offset = points[:, None] - boxes[None, :, :2] + 0.5
+    return ((offset >= 0) & (offset <= boxes[None, :, 2:])).all(axis=2)
+
+
+def window_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The rows and columns of a box in a picture (H, W, ...), as far as it is inside."""
+    left, top, right, bottom = (round(v) for v in (*box[:2], *(box[:2] + box[2:])))
+    return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
+
+
+def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
+    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
+
+    core: (H, W) bool, the pixels that count, without what lies between the people of a crowd. None: all.
+    """
+    middles = np.full((len(boxes), 2), np.nan)
+    for row, box in enumerate(boxes):
+        rows, columns = window_of(box, foreground.shape)
+        mine = foreground[rows, columns] == row + 1
+        v, u = np.nonzero(mine if core is None else mine & core[rows, columns])
+        if len(u):
+            middles[row] = columns.start + u.mean(), rows.start + v.mean()
+    return middles
+
+
+def occupied(mask: np.ndarray, apart: int) -> list[Box]:
+    """Disjoint boxes, x, y, width, height, that hold all pixels set in a (H, W) uint8 mask.
+
+    Set pixels lie at least `apart` / 2 px inside their box, save at the picture's border, and more than `apart` px from
+    those in other boxes.
+    """
+    height, width = mask.shape
+    block = _BLOCK_PX
+    padded = cv2.copyMakeBorder(mask, 0, -height % block, 0, -width % block, cv2.BORDER_CONSTANT, value=0)
+    blocks = cv2.resize(padded, (padded.shape[1] // block, padded.shape[0] // block), interpolation=cv2.INTER_AREA)
+    reach = -(-apart // (2 * block))
+    blocks = cv2.dilate(blocks, np.ones((2 * reach + 1,) * 2, np.uint8))
+    count, _, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(blocks, 0, 255, cv2.THRESH_BINARY)[1])
+    waiting: list[Box] = [(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()]
+    # Boxes (left, top, right, bottom) that overlap are joined until none do.
+    apart_boxes: list[Box] = []
+    while waiting:
+        box = waiting.pop()
+        over = [b for b in apart_boxes if b[0] < box[2] and box[0] < b[2] and b[1] < box[3] and box[1] < b[3]]
+        if over:
+            apart_boxes = [b for b in apart_boxes if b not in over]
+            left, top, right, bottom = zip(box, *over, strict=True)
+            waiting.append((min(left), min(top), max(right), max(bottom)))
+        else:
+            apart_boxes.append(box)
+    return [
+        (block * x0, block * y0, min(block * x1, width) - block * x0, min(block * y1, height) - block * y0)
+        for x0, y0, x1, y1 in apart_boxes
+    ]
+
+
+def connected_parts(mask: np.ndarray, box: Box, min_area_px: float) -> list[tuple[Box, np.ndarray]]:
+    """The connected parts (8 neighbours) of a (height, width) bool mask in a box, (box, mask) each.
+
+    box: x, y, width, height in the picture. Parts of less than min_area_px pixels are left out.
+    """
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
+    parts = []
+    for label, (left, top, width, height, area) in enumerate(stats[1:count].tolist(), 1):
+        if area >= min_area_px:
+            part = labels[top : top + height, left : left + width] == label
+            parts.append(((box[0] + left, box[1] + top, width, height), part))
+    return parts

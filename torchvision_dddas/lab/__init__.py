@@ -1,0 +1,1 @@
+"""The laboratory: what simulates, proves, tunes and exports the system. Only `cli` imports it."""

@@ -1,0 +1,291 @@
+"""Results against the truth, for one clip or many: per clip, pooled over the counts, and the mean over clips."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.images import decode_image
+from torchvision_dddas.lab.evaluation.metrics import boxes, pixels, tracking
+from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
+from torchvision_dddas.lab.evaluation.metrics.registry import Counts, figures, mean, pooled
+from torchvision_dddas.lab.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
+from torchvision_dddas.lab.evaluation.metrics.truth import (
+    Ignoring,
+    TrackTable,
+    Truth,
+    check_identities,
+    find_truth,
+    labels_of,
+    load_truth,
+    read_rows,
+)
+from torchvision_dddas.memory import MASK
+
+DETECTIONS, TRACKS = "detections.txt", "tracks.txt"
+
+
+def evaluate(
+    truth: Path,
+    result: Path,
+    first_frame: int | None = None,
+    interval: int = 1,
+    ignoring: Ignoring = "dropped",
+) -> dict[str, Any]:
+    """Score results: {"clips": {name: measures}, "pooled": measures, "mean": measures, "notes": [...]}.
+
+    truth and result are one clip's (masks, boxes, tracks; a folder that dddas detect or dddas track wrote, or
+    MOTChallenge text), or folders of clips by name. Measures come in registry.GROUPS. Raises InputError where
+    the two do not fit together.
+    """
+    if interval < 1:
+        raise InputError(f"interval must be at least 1 frame, got {interval}")
+    notes: list[str] = []
+    clips = {}
+    for name, (true_place, found_place) in _pairs(truth, result, notes).items():
+        clips[name] = score_clip(
+            load_truth(true_place, first_frame), load_result(found_place), notes, interval, ignoring
+        )
+    scored = {name: {"frames": clip.frames, **figures(clip.counts)} for name, clip in clips.items()}
+    report = {"clips": scored, "notes": notes}
+    if len(clips) > 1:
+        report["pooled"] = figures(pooled([clip.counts for clip in clips.values()]))
+        report["mean"] = mean(list(scored.values()))
+    return report
+
+
+def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path, Path]]:
+    """The clips to score by name: (truth, result)."""
+    for place, what in ((truth, "truth"), (result, "result")):
+        if not place.exists():
+            raise InputError(f"no {what} at {place}")
+    if find_truth(truth) is not None or _is_result(result):
+        name = result.resolve()
+        return {name.stem if result.is_file() else name.name: (truth, result)}
+    names = sorted(p.name for p in truth.iterdir() if p.is_dir()) if truth.is_dir() else []
+    places = {n: p for n in names for p in (result / f"{n}.txt", result / n) if _is_result(p)}
+    pairs = {n: (truth / n, p) for n, p in places.items() if find_truth(truth / n) is not None}
+    if not pairs:
+        raise InputError(
+            f"no clip to score: no folder in {truth} that holds masks, boxes or tracks has its like in {result} "
+            f"with a {DETECTIONS} or {TRACKS}"
+        )
+    notes += [f"{n}: no result, not scored" for n in names if n not in places]
+    notes += [f"{n}: no truth, not scored" for n in places if n not in pairs]
+    return pairs
+
+
+def _is_result(place: Path) -> bool:
+    """Whether a place looks like a result: a file, or a folder that dddas detect or dddas track wrote."""
+    return place.is_file() or any((place / name).is_file() for name in (DETECTIONS, TRACKS))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A result. frames: the last one of the run, 0 where nothing says. state: of the run.
+
+    place: the folder or file. detected: (N, 4) boxes of each frame with targets, None where only tracks were written.
+    tracks: the boxes with identities, None where there are none.
+    """
+
+    place: Path
+    frames: int
+    detected: dict[int, np.ndarray] | None
+    has_masks: bool
+    state: str
+    tracks: TrackTable | None = None
+
+    @property
+    def name(self) -> str:
+        """What to call it: the folder's name, or the file's without its ending."""
+        place = self.place.resolve()
+        return place.stem if place.is_file() else place.name
+
+    def boxes_at(self, frame: int) -> np.ndarray:
+        """(N, 4) boxes of a frame: the detections, or the tracks' where there are none."""
+        if self.detected is not None:
+            return self.detected.get(frame, np.zeros((0, 4)))
+        return self._tracked.get(frame, np.zeros((0, 4)))
+
+    @cached_property
+    def _tracked(self) -> dict[int, np.ndarray]:
+        return {} if self.tracks is None else self.tracks.boxes_by_frame()
+
+    def mask_at(self, frame: int) -> np.ndarray:
+        """(H, W) mask of a frame. Raises InputError if it is not there."""
+        path = self.place / "masks" / f"{frame:06d}.png"
+        mask = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK) if path.is_file() else None
+        if mask is None:
+            raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
+        return mask if mask.ndim == 2 else mask.max(axis=2)
+
+
+def load_result(place: Path) -> Result:
+    """Read a result folder, or a file of MOTChallenge text. Raises InputError if it is none."""
+    if place.is_file():
+        rows = read_rows(place, "result")
+        if not rows.named:
+            return Result(place, 0, rows.table.boxes_by_frame(), False, "complete")
+        check_identities(rows.table, rows.line, place)
+        return Result(place, 0, None, False, "complete", rows.table)
+    if not _is_result(place):
+        raise InputError(
+            f"{place} is no result of dddas detect: it holds no {DETECTIONS}; nor of dddas track: no {TRACKS}"
+        )
+    detected = tracks = None
+    if (place / DETECTIONS).is_file():
+        detected = read_rows(place / DETECTIONS, "detections").table.boxes_by_frame()
+    if (place / TRACKS).is_file():
+        rows = read_rows(place / TRACKS, "tracks")
+        check_identities(rows.table, rows.line, place / TRACKS)
+        tracks = rows.table
+    try:
+        record = json.loads((place / "run.json").read_text(encoding="utf-8"))
+        written, state, outputs = int(record["frames"]["written"]), str(record["state"]), list(record["outputs"])
+        # dddas track writes every interval-th frame, from wherever its table begins; dddas detect each.
+        counted = max(written - 1, 0) * int(record.get("interval_frames", 1)) + min(written, 1)
+        frames = int(record.get("last_frame", counted)) if written else 0
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
+        numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
+        frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []
+    return Result(place, frames, detected, "masks" in outputs, state, tracks)
+
+
+@dataclass(frozen=True)
+class ClipScore:
+    """A clip's counts by group. frames: how many were scored. each: the counts of single frames, by group."""
+
+    frames: int
+    counts: Counts
+    each: dict[str, Each]
+
+
+def score_clip(
+    truth: Truth, result: Result, notes: list[str], interval: int = 1, ignoring: Ignoring = "dropped"
+) -> ClipScore:
+    """Count what a clip's truth and result allow; what is left out is added to the notes.
+
+    interval: frames 1, 1 + interval, ... alone. ignoring: see matching.pair. Raises InputError where truth and result
+    share no frame, or the result lacks what the truth asks for.
+    """
+    frames: list[int] = []
+    of_frames: dict[str, list[Any]] = {}
+    has_tracks = truth.tracks is not None and result.tracks is not None
+    if truth.kind == "masks":
+        if result.tracks is not None:
+            notes.append(f"{result.name}: tracks are not scored, for masks do not tell identities")
+        frames = _labelled(truth, result, interval, notes)
+        of_frames = _count_masks(truth, result, frames)
+    elif truth.kind == "one target":
+        if result.has_masks:
+            frames = _labelled(truth, result, interval, notes)
+            counted = [boxes.one_target(result.mask_at(f), result.boxes_at(f), truth.boxes[f][0]) for f in frames]
+            of_frames = {"target": counted}
+        elif not has_tracks:
+            raise InputError(
+                f"{result.place} has no masks, which the hit rate needs; run dddas detect with --save masks"
+            )
+    elif result.detected is not None or not has_tracks:
+        frames = _labelled(truth, result, interval, notes)
+        of_frames = {"boxes": [boxes.match(result.boxes_at(f), truth.boxes[f]) for f in frames]}
+    counts: Counts = {}
+    each: dict[str, Each] = {}
+    for group, counted in of_frames.items():
+        counts[group] = whole = reduce(add_counts, counted)
+        columns = dict(zip(whole._fields, np.array(counted, float).T, strict=True))
+        each[group] = {"frame": np.array(frames, np.int64), **columns}
+    scored = len(frames)
+    if truth.tracks is not None and result.tracks is not None:
+        length, name, found, by_frame = _count_tracks(
+            truth, truth.tracks, result, result.tracks, notes, interval, ignoring
+        )
+        scored, counts[name], each[name] = max(scored, length), found, by_frame
+    return ClipScore(scored, counts, each)
+
+
+def _labelled(truth: Truth, result: Result, interval: int, notes: list[str]) -> list[int]:
+    """The labelled frames that the result has."""
+    end = result.frames or truth.frames[-1]
+    frames = [f for f in truth.frames if 1 <= f <= end and (f - 1) % interval == 0]
+    beyond = [f for f in truth.frames if not 1 <= f <= end]
+    if not frames:
+        raise InputError(
+            f"{truth.place} and {result.place} share no frame{_of(interval)}: truth {truth.frames[0]} to "
+            f"{truth.frames[-1]}, result 1 to {end}"
+        )
+    if result.state != "complete":
+        notes.append(f"{result.name}: the run is {result.state} after frame {end}; later frames are not scored")
+    elif beyond and truth.kind == "masks":
+        raise InputError(
+            f"{result.place} has {end} frames, but {truth.place} labels frame {beyond[-1]}; "
+            "is it the same clip? See --first-frame"
+        )
+    elif beyond:
+        notes.append(f"{result.name}: truth goes to frame {beyond[-1]}, the result to {end}; the rest is not scored")
+    return frames
+
+
+def _count_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
+    if not result.has_masks:
+        raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
+    counted: dict[str, list[Any]] = {"pixels": [], "boxes": []} if truth.labels.separate else {"pixels": []}
+    for f in frames:
+        labels, mask = labels_of(truth, f), result.mask_at(f)
+        if labels.shape != mask.shape:
+            raise InputError(
+                f"frame {f}: the truth is {labels.shape[1]}×{labels.shape[0]} pixels ({truth.masks[f]}), "
+                f"the result {mask.shape[1]}×{mask.shape[0]} ({result.place})"
+            )
+        counted["pixels"].append(pixels.count(mask, labels))
+        if truth.labels.separate:
+            counted["boxes"].append(boxes.match(result.boxes_at(f), boxes.boxes_of(labels)))
+    return counted
+
+
+def _count_tracks(
+    truth: Truth,
+    true: TrackTable,
+    result: Result,
+    found: TrackTable,
+    notes: list[str],
+    interval: int,
+    ignoring: Ignoring,
+) -> tuple[int, str, TrackCounts | TargetTrack, Each]:
+    """Tracks are scored on every frame of the clip, labelled or not: a box where nobody is labelled is false."""
+    labelled = max(truth.frames[-1], truth.length)
+    end = labelled if result.state == "complete" else min(labelled, result.frames)
+    last = int(found.frame.max(initial=0))
+    if len(found.frame) and (found.frame.min() > labelled or last < truth.frames[0]):
+        raise InputError(
+            f"{truth.place} and {result.place} share no frame: truth {truth.frames[0]} to {labelled}, "
+            f"result {found.frame.min()} to {last}"
+        )
+    if len(true.frame) and not ((true.frame - 1) % interval == 0).any():
+        raise InputError(f"{truth.place} has no box{_of(interval)}")
+    if last > labelled:
+        notes.append(f"{result.name}: tracks go to frame {last}, the truth to {labelled}; no more counts")
+    if end < labelled:
+        note = f"{result.name}: the run is {result.state} after frame {end}; later frames are not scored"
+        notes += [note] if note not in notes else []
+    step = int(np.gcd.reduce(found.frame - 1)) if len(found.frame) else 0
+    if step > interval:
+        notes.append(f"{result.name}: the tracks have every {step}th frame alone; --interval {step} scores just those")
+
+    def cut(table: TrackTable) -> TrackTable:
+        return table.at((table.frame <= end) & ((table.frame - 1) % interval == 0))
+
+    frames = len(range(1, end + 1, interval))
+    if truth.kind == "one target":
+        return frames, "target_track", *tracking.count_one_target(cut(true), cut(found))
+    ignored = None if truth.ignored is None else cut(truth.ignored)
+    return frames, "tracks", *tracking.count(cut(true), cut(found), ignored, ignoring, interval)
+
+
+def _of(interval: int) -> str:
+    return f" of every {interval}th" if interval > 1 else ""

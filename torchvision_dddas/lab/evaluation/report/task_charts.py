@@ -1,0 +1,182 @@
+"""The charts of a task: ranked curves, course over the frames, maps, errors on the ground."""
+
+from collections.abc import Sequence
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from torchvision_dddas.io.report.charts import Axis, Dots, Line, chart
+from torchvision_dddas.lab.evaluation.metrics.boxes import precision_recall
+from torchvision_dddas.lab.evaluation.studies.records import Case, Scored
+from torchvision_dddas.lab.evaluation.studies.summary import rank
+
+MOST_CLIPS = 6
+"""Clips whose accuracy over the frames is drawn."""
+MOST_FAINT = 40
+"""Curves of single clips behind that of all."""
+_BINS = 80
+_LEAST, _MOST = 0.01, 10.0
+"""False positives an image from which and up to which misses are drawn."""
+_MOST_TARGETS = 60
+_MOST_ERRORS = 500
+
+
+class Tally(NamedTuple):
+    """Of each frame (F,): what is right, false, missed, changed identity, and the rest (of pixels) that is right too.
+
+    unit: what is counted. measure: what 2 right / (2 right + false + missed) is called.
+    """
+
+    right: np.ndarray
+    false: np.ndarray
+    missed: np.ndarray
+    switched: np.ndarray
+    rest: np.ndarray
+    unit: str
+    measure: str
+
+
+def tally(scored: Scored) -> Tally | None:
+    """The counts of each frame in the group that shows best where a clip goes wrong, 0 where it has no use for one.
+
+    None without such a group.
+    """
+    groups = ("pixels", "tracks", "boxes", "target_track", "target", "still")
+    group = next((group for group in groups if group in scored.per_frame), None)
+    if group is None:
+        return None
+    counts = scored.per_frame[group]
+
+    def first_of(*names: str) -> np.ndarray:
+        known = [np.nan_to_num(np.asarray(counts[name], float)) for name in names if name in counts]
+        return known[0] if known else np.zeros(len(scored.frames))
+
+    right, false = first_of("tp", "hit", "found"), first_of("fp", "false", "blobs")
+    missed, switched = first_of("fn", "missed"), first_of("switches")
+    if group in ("target", "target_track"):  # in a frame with the target it is found or missed
+        missed = np.maximum(first_of("frames") - right, 0)
+        return Tally(right, false, missed, switched, np.zeros(len(right)), "boxes", "hit")
+    if group == "pixels":
+        return Tally(right, false, missed, switched, first_of("tn"), "pixels", "F")
+    return Tally(right, false, missed, switched, np.zeros(len(right)), "boxes", "F1")
+
+
+def ranked_charts(cases: Sequence[Case]) -> list[Markup]:
+    """Precision against recall, and the miss rate against false positives an image, of all clips with scores."""
+    having = [(case.clip.name, [case.scored]) for case in cases if case.scored and "boxes" in case.scored.ranked]
+    each = [(name, clips) for name, clips in having if rank(clips).true.any()]
+    if not each:
+        return []
+    exact, missing = [], []
+    faint = each[:MOST_FAINT] if len(each) > 1 else []
+    several = "each clip" if len(faint) == len(each) else f"{len(faint)} of {len(each)} clips"
+    whole = ("all clips", [scored for _, (scored,) in each]) if len(each) > 1 else each[0]
+    for k, (name, clips) in enumerate([*faint, whole]):
+        is_faint = k < len(faint)
+        label, colour = (("" if k else several), 6) if is_faint else (name, 1)
+        ranked = rank(clips)
+        curve = ranked.curve()
+        precision, recall = precision_recall(curve, float(ranked.true.sum()))
+        false = curve.false / sum(len(scored.frames) for scored in clips)
+        # Both curves go on to where nothing is found, and the second to where no more can be had.
+        start, end = precision[:1], recall[-1:]
+        exact.append(Line(label, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, is_faint))
+        ways = np.r_[_LEAST, np.maximum(false, _LEAST), _MOST], 1 - np.r_[0.0, recall, end if len(end) else 0.0]
+        missing.append(Line(label, *ways, colour, is_faint, steps=True))
+    across = Axis("false positives an image", _LEAST, _MOST, log=True)
+    return [
+        chart("Precision and recall", Axis("recall", 0, 1), Axis("precision", 0, 1), exact),
+        chart("Misses and false alarms", across, Axis("miss rate", 0, 1), missing),
+    ]
+
+
+def course_charts(cases: Sequence[Case]) -> list[Markup]:
+    """The accuracy over the frames of each of the first MOST_CLIPS clips that have it."""
+    scored = ((case.clip.name, case.scored) for case in cases if case.scored is not None)
+    charts = (_metres_chart(name, one) or _course(name, one) for name, one in scored)
+    return list(islice(filter(None, charts), MOST_CLIPS))
+
+
+def _course(name: str, scored: Scored) -> Markup | None:
+    """F or F1 in bins of frames; crosses where identities change."""
+    counts = tally(scored)
+    if counts is None or len(scored.frames) < 2:
+        return None
+    size = max(1, -(-len(scored.frames) // _BINS))
+    starts = np.arange(0, len(scored.frames), size)
+    right, wrong = (np.add.reduceat(x, starts) for x in (counts.right, counts.false + counts.missed))
+    whole = 2 * right + wrong
+    share = np.divide(2 * right, whole, out=np.full(len(starts), np.nan), where=whole > 0)
+    at = np.add.reduceat(scored.frames.astype(float), starts) / np.diff(np.r_[starts, len(scored.frames)])
+    changed = scored.frames[counts.switched > 0]
+    words = [f"frame {frame}" for frame in changed.tolist()]
+    dots = [Dots("change of identity", changed.astype(float), np.zeros(len(changed)), 2, words, "cross")]
+    line = Line(counts.measure, at, share, 1)
+    return chart(name, Axis("frame"), Axis(counts.measure, 0, 1), [line], dots if len(changed) else [])
+
+
+def _metres_chart(name: str, scored: Scored) -> Markup | None:
+    """The errors on the ground in bins of frames; None without any."""
+    if "error_m" not in scored.samples or not np.isfinite(scored.samples["error_m"]).any():
+        return None
+    known = np.isfinite(scored.samples["error_m"])
+    frame, error = scored.samples["frame"][known], scored.samples["error_m"][known]
+    numbers = np.unique(frame)
+    bins = np.array_split(numbers, min(_BINS, len(numbers)))
+    errors = [error[(frame >= part[0]) & (frame <= part[-1])] for part in bins]
+    at, middle = np.array([part.mean() for part in bins]), np.array([np.median(mine) for mine in errors])
+    high = np.array([np.percentile(mine, 95) for mine in errors])
+    lines = [Line("95 % of the targets", at, high, 6, dashed=True), Line("median", at, middle, 1)]
+    return chart(name, Axis("frame"), Axis("error, m", 0), lines)
+
+
+def maps(cases: Sequence[Case]) -> list[Markup]:
+    """A map a clip with places, of the first MOST_CLIPS: true ways, and those that were found for the same targets."""
+    drawn: list[Markup] = []
+    for case in cases:
+        scored, truth = case.scored, case.clip.truth
+        if scored is None or truth is None or truth.positions is None or len(drawn) == MOST_CLIPS:
+            continue
+        true, samples = truth.positions, scored.samples
+        if not len(samples.get("east_m", ())):
+            continue
+        seen = np.isin(true.frame, scored.frames)
+        row_of = {key: row for row, key in enumerate(zip(true.frame.tolist(), true.identity.tolist(), strict=True))}
+        whose = zip(samples["frame"].tolist(), samples["identity"].tolist(), strict=True)
+        rows = [row_of[int(frame), int(identity)] for frame, identity in whose]
+        # The error is added to the true place: each side may count its metres from an origin of its own.
+        found_m = true.east_north_m[rows] + np.stack([samples["east_m"], samples["north_m"]], axis=1)
+        lines = [
+            *_ways("true", true.identity[seen], true.frame[seen], true.east_north_m[seen], 5, True),
+            *_ways("found", samples["identity"], samples["frame"], found_m, 1, False),
+        ]
+        drawn.append(chart(case.clip.name, Axis("east, m"), Axis("north, m"), lines, equal=True))
+    return drawn
+
+
+def _ways(
+    name: str, identity: np.ndarray, frame: np.ndarray, east_north_m: np.ndarray, colour: int, dashed: bool
+) -> list[Line]:
+    """A line an identity, the longest first; a single name for all of them."""
+    numbers, counts = np.unique(identity, return_counts=True)
+    lines: list[Line] = []
+    for number in numbers[np.argsort(-counts, kind="stable")][:_MOST_TARGETS].tolist():
+        mine = identity == number
+        way = east_north_m[mine][np.argsort(frame[mine], kind="stable")]
+        lines.append(Line("" if lines else name, way[:, 0], way[:, 1], colour, dashed=dashed))
+    return lines
+
+
+def error_clouds(cases: Sequence[Case]) -> list[Markup]:
+    """The errors of all clips together, east and north; a cloud off the middle is a bias."""
+    having = [case.scored.samples for case in cases if case.scored and len(case.scored.samples.get("east_m", ()))]
+    if not having:
+        return []
+    off = np.concatenate([np.stack([samples["east_m"], samples["north_m"]], axis=1) for samples in having])
+    kept = off[np.unique(np.linspace(0, len(off) - 1, _MOST_ERRORS).astype(int))]
+    reach = float(np.percentile(np.abs(kept), 99)) * 1.1 or 1.0
+    across, up = Axis("error to the east, m", -reach, reach), Axis("error to the north, m", -reach, reach)
+    none = [Dots("no error", np.zeros(1), np.zeros(1), 2, sign="ring")]
+    return [chart("Errors", across, up, dots=[Dots("found", kept[:, 0], kept[:, 1], 1), *none], equal=True)]

@@ -1,0 +1,103 @@
+"""A scenario flown in the closed loop: simulated vehicles, the pipeline that steers them, its files and its score."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torchvision_dddas import geometry
+from torchvision_dddas.config import load_config
+from torchvision_dddas.control import Mission, StartedSource
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.output import NOTICED, RunRecord, clip_facts
+from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScore, CrowdScorer
+from torchvision_dddas.lab.simulation import (
+    SimulatedRunRecorder,
+    SimulatorSource,
+    load_scenario,
+    name_scenario_in_errors,
+    scenario_settings,
+)
+from torchvision_dddas.pipeline import Pipeline, assemble_mission, map_site
+
+CONFIG = "patrol"  # the shipped configuration of a simulated run, unless another is given
+
+
+def run_scenario(
+    folder: Path,
+    scenario: str,
+    config: str | None = None,
+    overrides: Sequence[str] = (),
+    scene: Sequence[str] = (),
+    seed: int | None = None,
+    backend: str = "auto",
+    save: Sequence[str] = (),
+    progress: Callable[[str, int | None], AbstractContextManager[Callable[[], None]]] | None = None,
+) -> tuple[RunRecord, CrowdScore]:
+    """Fly a scenario and write everything under a folder; returns the record of the run and its score.
+
+    overrides: of the settings; scene: of the scenario. progress: given a name and the number of frames, a context with
+    a function that is called for each frame. Raises InputError for bad input.
+    """
+    with SimulatedRunRecorder(folder, save) as output:
+        chosen = load_scenario(scenario, scene, seed)
+        if chosen.clip.located_by == "nothing":
+            raise InputError(
+                f"scenario {scenario} is located by nothing, so that nothing can be steered; add "
+                "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
+            )
+        own = scenario_settings(chosen)
+        own.setdefault("landmarks.common_sigma_m", chosen.gps.common_m)
+        settings = load_config(config or CONFIG, overrides, own)
+        with name_scenario_in_errors(scenario):
+            simulated = SimulatorSource(chosen, Path(scenario).stem)
+        source: Any = StartedSource(simulated)
+        ready = assemble_mission(source, settings, backend, chosen.clip.located_by == "landmarks")
+        mission = ready.mission
+        assert mission is not None
+        locator = mission.watch.locator
+        facts: dict[str, Any] = {
+            "input": f"sim:{simulated.name}",
+            "clip": clip_facts(simulated),
+            "scenario": chosen.model_dump(),
+            "backend": ready.engine.name,
+            "origin_deg": locator.site.origin_deg,
+            "settings": mission.settings.model_dump(),
+        }
+        record = output.begin(facts, simulated.rate_hz, simulated.size, map_site(locator, None))
+        output.record_truth(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
+        scorer = CrowdScorer(partial(geometry.east_north, origin_deg=simulated.origin_deg))
+        try:
+            with (progress or _no_progress)(simulated.name, simulated.count) as tick:
+                done = 0
+                for result in Pipeline.from_assembly(ready)(source):
+                    for truth in simulated.truths():
+                        scorer.feed(truth)
+                        output.add_truth(truth)
+                        for event in truth.events:
+                            output.story.event(truth.frame, event, truth.time_s)
+                    _log_notices(output, mission)
+                    scorer.feed(result)
+                    output.write(result)
+                    for _ in range(result.tracked.number - done):
+                        tick()
+                    done = result.tracked.number
+        finally:
+            _log_notices(output, mission)
+            record.problems += [str(problem) for problem in simulated.problems]
+            for problem in simulated.problems:
+                output.story.event(problem.frame, str(problem), kind="problem")
+        score = scorer.score()
+        output.story.score(score.by_name(), score.lines())
+    return record, score
+
+
+def _no_progress(name: str, count: int | None) -> AbstractContextManager[Callable[[], None]]:
+    return nullcontext(lambda: None)
+
+
+def _log_notices(output: SimulatedRunRecorder, mission: Mission) -> None:
+    """Log what the run itself noticed to go wrong."""
+    for notice in mission.notices():
+        output.story.event(notice.frame, notice.text, notice.time_s, NOTICED)

@@ -1,0 +1,285 @@
+"""Two studies of the same clips compared: what changed, whether it is beyond noise, and the page compare.html."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.report import Cell, Column, format_number, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
+from torchvision_dddas.lab.evaluation.metrics import bootstrap
+from torchvision_dddas.lab.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
+from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS, describe, is_lower_better, title_of_group
+from torchvision_dddas.lab.evaluation.studies.records import Scored, ScoredStudy
+from torchvision_dddas.lab.evaluation.studies.summary import Estimate, flat, measures, over_clips, over_frames
+
+LEVEL = 0.05
+
+MEANING = (
+    "Better and worse are beyond noise: p below 0.05 after Holm's correction for all tests of this table. "
+    "“On these clips”: significant over blocks of their frames, which holds for these clips alone. "
+    "“Within noise”: no change is shown, nor that there is none. "
+    "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures."
+)
+
+WAYS = ("over_clips", "over_frames")
+
+Entry = dict[str, Any]
+Pairs = dict[str, tuple[Scored, Scored]]
+
+
+def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
+    """What changed from the first study to the second, on the clips that both have.
+
+    {"first", "second": names, "tasks": {task: {"same": clips whose counts are alike to the last digit, "pooled":
+    {group: {measure: {"first", "second", "change", "over_clips", "over_frames", "says"}}}, "clips": {name: {group:
+    {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames,
+    {"interval", "p", "p_holm", "enough"} or None, hold for other clips like these, and for other frames of the same
+    clips. p_holm is corrected for all tests of a task's pooled figures, or of all its clips. Not enough: so few clips
+    or blocks of frames could not make it small, whatever changed. Raises InputError where no task has a clip in
+    both.
+    """
+    by_key = [{(case.task, case.clip): case.scored for case in study.cases} for study in (first, second)]
+    both = sorted(by_key[0].keys() & by_key[1].keys())
+    notes = [
+        f"{clip}, {task}: only in {'the first' if place == 0 else 'the second'} study, {study.name}"
+        for place, study in enumerate((first, second))
+        for task, clip in sorted(by_key[place].keys() - by_key[1 - place].keys())
+    ]
+    if not both:
+        has = [", ".join(sorted({f"{clip} ({task})" for task, clip in keys})[:3]) or "nothing" for keys in by_key]
+        raise InputError(
+            f"the studies {first.name} and {second.name} have no clip of the same task and name in common: "
+            f"the first has {has[0]}, the second {has[1]}"
+        )
+    pairs: dict[str, Pairs] = {}
+    for task, clip in both:
+        one, other = (keys[task, clip] for keys in by_key)
+        if unlike := _unlike(one, other):
+            notes.append(f"{clip}, {task}: {unlike}; not compared")
+        else:
+            pairs.setdefault(task, {})[clip] = one, other
+    if not pairs:
+        raise InputError(f"no clip can be compared; {notes[-1]}")
+    tasks = {task: _compare_task(of_task) for task, of_task in pairs.items()}
+    return {"first": first.name, "second": second.name, "tasks": tasks, "notes": notes}
+
+
+def differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """{"group.parameter": [first, second]} of the settings that differ. first, second: by group, as in run.json."""
+    flat = [
+        {f"{group}.{name}": value for group in side for name, value in side[group].items()} for side in (first, second)
+    ]
+    names = dict.fromkeys([*flat[0], *flat[1]])
+    return {name: [side.get(name) for side in flat] for name in names if flat[0].get(name) != flat[1].get(name)}
+
+
+def settings_lines(settings: Mapping[str, Sequence[Any]] | None) -> list[str]:
+    """A line for each setting that differs. None: not known."""
+    if settings is None:
+        return ["settings: unknown, as a run.json lacks them"]
+    return [f"{name}: {one} in A, {other} in B" for name, (one, other) in settings.items()] or ["settings: the same"]
+
+
+def _compare_task(pairs: Pairs) -> dict[str, Any]:
+    same = [clip for clip, (one, other) in pairs.items() if _same(one, other)]
+    clips = {clip: _changes([pair], 1, {}) for clip, pair in pairs.items() if clip not in same}
+    every = [scored for side in zip(*pairs.values(), strict=True) for scored in side]
+    pooled = _changes(list(pairs.values()), None, {"over_clips": over_clips(every) if len(pairs) >= FEWEST else {}})
+    of_clips = [entry for clip in clips.values() for _, _, entry in entries_of(clip)]
+    of_pooled = [entry for _, _, entry in entries_of(pooled)]
+    for entries, way in ((of_clips, "over_frames"), (of_pooled, "over_clips"), (of_pooled, "over_frames")):
+        # All entries that are tested together are corrected together.
+        effects = [entry[way] for entry in entries if entry[way] is not None]
+        adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(effects)})
+        for i, one in enumerate(effects):
+            one["p_holm"] = adjusted[str(i)]
+            one["enough"] = one.pop("least") * len(effects) < LEVEL
+    for groups in (pooled, *clips.values()):
+        for _, name, entry in entries_of(groups):
+            entry["says"] = verdict(entry, name)
+    return {"same": same, "pooled": pooled, "clips": clips}
+
+
+def _changes(
+    pairs: Sequence[tuple[Scored, Scored]], most: int | None, estimates: Mapping[str, Mapping[str, Estimate]]
+) -> dict[str, dict[str, Entry]]:
+    """Each measure before and after by group. most: measures of a group. estimates: of ways beside over_frames."""
+    sides = [list(side) for side in zip(*pairs, strict=True)]
+    before, after = (measures(side) for side in sides)
+    estimates = {**estimates, "over_frames": over_frames([*sides[0], *sides[1]])}
+    effects = {
+        way: {group: found for group, one in groups.items() if (found := _effects(one))}
+        for way, groups in estimates.items()
+    }
+    changes: dict[str, dict[str, Entry]] = {}
+    for group in before:
+        for name in GROUPS[group].compared[:most]:
+            one, other = before[group][name], after[group][name]
+            entry: Entry = {"first": one, "second": other, "change": other - one}
+            for way, groups in effects.items():
+                effect = groups.get(group, {}).get(name)
+                entry[way] = None
+                if effect is not None and not math.isnan(effect.p):
+                    interval = None if effect.interval is None else list(effect.interval)
+                    entry[way] = {"interval": interval, "p": effect.p, "least": effect.least}
+            if not (math.isnan(one) and math.isnan(other)):
+                changes.setdefault(group, {})[name] = entry
+    return changes
+
+
+def _effects(estimate: Estimate) -> dict[str, Effect]:
+    """The effects between the two halves of an estimate's units; none for fewer than FEWEST clips."""
+    half = len(estimate.strata) // 2
+    if half:  # a clip's frames are drawn in the longer of the blocks that its two results ask for
+        halves = zip(estimate.strata[:half], estimate.strata[half:], strict=True)
+        strata = [Stratum(one.units, max(one.block, other.block)) for one, other in halves]
+    else:
+        strata = [Stratum(estimate.strata[0].units // 2)]
+        if strata[0].units < FEWEST:
+            return {}
+    return bootstrap.effects(estimate.statistic, tuple(strata), estimate.seed)
+
+
+def verdict(entry: Mapping[str, Any], name: str, p: str = "p_holm") -> str:
+    """What a change of a measure amounts to, in words. p: the entry's own, `p`, or the one corrected for all."""
+    change = entry["change"]
+    if not change:
+        return "the same"
+    word = "better" if (change < 0) == is_lower_better(name) else "worse"
+    ways = [way for over in WAYS if (way := entry.get(over)) is not None]
+    for way in ways:
+        if way[p] < LEVEL:
+            return f"{word} on these clips" if "over_clips" in entry and way is not entry["over_clips"] else word
+    return "within noise" if any(way["enough"] for way in ways) else "too little to tell"
+
+
+def _same(one: Scored, other: Scored) -> bool:
+    return all(np.array_equal(flat(one.counts[group]), flat(other.counts[group])) for group in one.counts) and all(
+        np.array_equal(one.samples[name], other.samples[name], equal_nan=True) for name in one.samples
+    )
+
+
+def _unlike(one: Scored, other: Scored) -> str:
+    """Why two results of a clip cannot be compared; empty where they can."""
+    if one.counts.keys() != other.counts.keys():
+        return f"one has {', '.join(one.counts)}, the other {', '.join(other.counts)}"
+    if not np.array_equal(one.frames, other.frames):
+        return f"other frames were scored, {len(one.frames)} and {len(other.frames)}"
+    names = {"pixels": ("tp", "fn"), "boxes": ("hit", "missed"), "tracks": ("tp", "fn"), "location": ("targets",)}
+    for group in one.counts:
+        columns = names.get(group, ("frames",))  # what there truly is in each frame: pixels, boxes, the target, places
+        true = [sum(np.nan_to_num(scored.per_frame[group][name]) for name in columns) for scored in (one, other)]
+        if not np.array_equal(true[0], true[1]):
+            return f"its truth is another, {np.sum(true[0]):g} and {np.sum(true[1]):g} in {group}"
+    return ""
+
+
+def comparison_report(comparison: Mapping[str, Any]) -> str:
+    """The HTML of compare.html. comparison: as `compare_studies` returns it, NaN as None; "settings": that differ."""
+    first, second = str(comparison["first"]), str(comparison["second"])
+    tasks = []
+    for task, changes in comparison["tasks"].items():
+        verdicts = [rows[0][2]["says"] for groups in changes["clips"].values() if (rows := entries_of(groups))]
+        n_better, n_worse = (sum(text.startswith(word) for text in verdicts) for word in ("better", "worse"))
+        card = {
+            "id": task,
+            "title": task.capitalize(),
+            "change": "",
+            "n_better": n_better,
+            "n_worse": n_worse,
+            "n_others": len(verdicts) - n_better - n_worse,
+            "n_same": len(changes["same"]),
+            "section": comparison_section(task, task.capitalize(), changes, first, second),
+        }
+        if pooled := entries_of(changes["pooled"]):
+            group, name, entry = pooled[0]
+            before, after = (number_cell(entry[end], describe(name).digits).text for end in ("first", "second"))
+            card |= {"change": _signed(entry, name), "metric": _title(group, name), "before": before, "after": after}
+            card["verdict"] = entry["says"]
+        tasks.append(card)
+    return render_page(
+        "comparison.html",
+        title=f"{first} and {second}: comparison",
+        first=first,
+        second=second,
+        meaning=MEANING,
+        tasks=tasks,
+        notes=comparison["notes"],
+        settings=settings_lines(comparison.get("settings")),
+    )
+
+
+def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
+    """The section of a task: plots clip by clip, all clips together, single clips.
+
+    anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
+    """
+    pooled = [_cells(group, name, entry, WAYS) for group, name, entry in entries_of(changes["pooled"])]
+    by_clip = [
+        [text_cell(clip), *_cells(group, name, entry, WAYS[1:])]
+        for clip, groups in changes["clips"].items()
+        for group, name, entry in entries_of(groups)
+    ]
+    columns = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
+    says = Column("verdict", text=True)
+    section = render_page(
+        "comparison_section.html",
+        id=anchor,
+        title=title,
+        charts=_charts(changes["clips"]),
+        pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), says], pooled),
+        by_clip=by_clip and table("clip by clip", [Column("clip", text=True), *columns, Column("p"), says], by_clip),
+        same=changes["same"],
+    )
+    return Markup(section)
+
+
+def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
+    """The change of each group's first measure clip by clip, the largest loss first, and a note."""
+    charts = []
+    for group in dict.fromkeys(group for groups in clips.values() for group in groups):
+        changed = {clip: next(iter(groups[group].items())) for clip, groups in clips.items() if groups.get(group)}
+        rows = [Interval(clip, *_change(entry)) for clip, (_, entry) in changed.items() if entry["change"] is not None]
+        if not rows:
+            continue
+        name = next(iter(changed.values()))[0]
+        rows.sort(key=lambda row: row.value * (-1 if describe(name).better < 0 else 1))
+        reach = max(abs(v) for row in rows for v in (row.value, row.low, row.high) if math.isfinite(v)) or 1.0
+        svg = interval_chart(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
+        charts.append((svg, f"{len(rows) - MOST_ROWS} more in the table" if len(rows) > MOST_ROWS else ""))
+    return charts
+
+
+def _cells(group: str, name: str, entry: Mapping[str, Any], ways: Sequence[str]) -> list[Cell]:
+    digits = describe(name).digits
+    small = number_cell(entry["change"], digits, _change(entry)[1:]).small
+    cells = [number_cell(entry["first"], digits), number_cell(entry["second"], digits)]
+    cells.append(Cell(_signed(entry, name), entry["change"], small))
+    cells += [number_cell(None if (effect := entry.get(way)) is None else effect["p_holm"]) for way in ways]
+    return [text_cell(_title(group, name)), *cells, text_cell(str(entry["says"]))]
+
+
+def entries_of(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
+    """Group, measure and entry of each change."""
+    return [(group, name, entry) for group, names in groups.items() for name, entry in names.items()]
+
+
+def _change(entry: Mapping[str, Any]) -> tuple[float, float, float]:
+    """The change and the ends of its interval: over clips where there is one, else over frames."""
+    spans = [effect["interval"] for way in WAYS if (effect := entry.get(way)) is not None and effect["interval"]]
+    low, high = spans[0] if spans else (math.nan, math.nan)
+    return math.nan if entry["change"] is None else float(entry["change"]), low, high
+
+
+def _signed(entry: Mapping[str, Any], name: str) -> str:
+    change = entry["change"]
+    text = format_number(math.nan if change is None else change, describe(name).digits)
+    return f"+{text}" if change and change > 0 else text
+
+
+def _title(group: str, name: str) -> str:
+    return f"{describe(name).title}, {title_of_group(group)}"

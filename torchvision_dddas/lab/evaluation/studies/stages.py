@@ -1,0 +1,405 @@
+"""The stages that process one clip, each as its own command does: motion, tracking, association, people, location."""
+
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from torchvision_dddas import geo
+from torchvision_dddas.config import Settings
+from torchvision_dddas.detection import detect_motion, load_engine
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.ground_locator import GroundLocator
+from torchvision_dddas.io.camera_files import read_camera
+from torchvision_dddas.io.detection_tables import check_table, read_detections
+from torchvision_dddas.io.images import IMAGE_SUFFIXES
+from torchvision_dddas.io.sources import ImageSource, open_source
+from torchvision_dddas.lab.evaluation.datasets.record import Clip
+from torchvision_dddas.lab.evaluation.studies.records import Found, Task, round_as_written
+from torchvision_dddas.people.detector import detect_in_clip, load_scorer
+from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, read_locator
+from torchvision_dddas.tracking import track_clip, track_scenes, track_table
+from torchvision_dddas.types import (
+    Detections,
+    DetectionTable,
+    Frame,
+    Positions,
+    Registration,
+    Scene,
+    Source,
+    TrackedFrame,
+)
+
+OnFrame = Callable[[], object]
+
+_MOTION = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
+_TRACKING = ("track", "paper")
+
+PARAMETER_GROUPS: Mapping[Task, tuple[str, ...]] = {
+    "motion": _MOTION,
+    "tracking": ("registration", *_TRACKING),
+    "association": ("registration", *_TRACKING),
+    "people": ("people",),
+    "location": (*_MOTION, *_TRACKING, "people", "ground", "landmarks", "aerial", "crowds"),
+}
+"""The groups of settings that each stage depends on by itself. It gets the defaults of all others."""
+
+_FILES: Mapping[Task, tuple[str, ...]] = {
+    "motion": ("pictures",),
+    "tracking": ("pictures", "given"),
+    "association": ("pictures",),
+    "people": ("pictures",),
+    "location": ("pictures", "given", "telemetry", "landmarks", "colours", "camera", "elevation"),
+}
+
+_COLUMNS = {
+    "frame": np.zeros(0, np.int64),
+    "box_px": np.zeros((0, 4)),
+    "score": np.zeros(0),
+    "identity": np.zeros(0, np.int64),
+    "east_north_m": np.zeros((0, 2)),
+    "covariance_m2": np.zeros((0, 2, 2)),
+}
+"""The columns of every `Found`, and their types; others go to its `more`."""
+
+_SHUFFLE_SEED = 7  # the order of true boxes within their frames must not reveal their identities
+
+
+def find(
+    clip: Clip,
+    task: Task,
+    settings: Settings,
+    backend: str = "auto",
+    interval: int = 1,
+    before: Found | None = None,
+    on_frame: OnFrame = lambda: None,
+) -> Found:
+    """Run a stage on a clip. before: the result of `upstream_task`. on_frame: called once per frame.
+
+    Raises InputError if the clip's files are unusable.
+    """
+    with suppress(OSError):  # where the system allows, the peak memory counts from now on
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    start, run = time.perf_counter(), _Run(clip, narrow_settings(settings, task), backend, interval, before, on_frame)
+    STAGES[task](run)
+    run.seconds["other"] = time.perf_counter() - start - sum(run.seconds.values())
+    more = {name: np.concatenate(parts) for name, parts in run.columns.items()}
+    return Found(
+        **{name: more.pop(name, empty).astype(empty.dtype) for name, empty in _COLUMNS.items()},
+        looked=np.array(run.looked, np.int64),
+        masks=run.masks,
+        steps=run.steps,
+        more=more,
+        seconds=dict(run.seconds),
+        peak_mb=_peak_memory_mb(),
+        notes=tuple(run.notes),
+    )
+
+
+def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
+    """The tasks that a clip's pictures and truth allow, each after those that it depends on."""
+    truth, has_pictures = clip.truth, bool(clip.pictures)
+    shows_movers = has_pictures and "movers" in clip.shows
+    tasks: list[Task] = []
+    if shows_movers and (clip.still or truth is not None):
+        tasks.append("motion")
+    if truth is None:
+        return tuple(tasks)
+    if truth.tracks is not None and (shows_movers or clip.given is not None):
+        tasks.append("tracking")
+    if truth.tracks is not None and truth.kind != "one target":
+        tasks.append("association")
+    if has_pictures and "people" in clip.shows and truth.kind == "boxes":
+        tasks.append("people")
+    placed = clip.landmarks is not None or clip.camera is not None
+    if truth.positions is not None and placed and ((has_pictures and clip.landmarks) or clip.given is not None):
+        tasks.append("location")
+    return tuple(tasks)
+
+
+def upstream_task(clip: Clip, task: Task) -> Task | None:
+    """The task whose result a task depends on; None if there is none."""
+    return "motion" if task == "tracking" and bool(clip.pictures) and "movers" in clip.shows else None
+
+
+def narrow_settings(settings: Settings, task: Task) -> Settings:
+    """The settings that a stage gets: defaults for all groups that its key in the cache does not hold."""
+    return Settings().model_copy(update={group: getattr(settings, group) for group in PARAMETER_GROUPS[task]})
+
+
+def files_of(clip: Clip, task: Task) -> list[Path]:
+    """The files that a stage reads."""
+    values = [getattr(clip, name) for name in _FILES[task]]
+    return [path for value in values for path in (value if isinstance(value, tuple) else (value,)) if path is not None]
+
+
+def open_clip(clip: Clip) -> Source:
+    """Open the pictures of a clip. Raises InputError if they cannot be read."""
+    if not clip.pictures:
+        raise InputError(f"{clip.name} has no pictures: {clip.place}")
+    if len(clip.pictures) == 1 and clip.pictures[0].suffix.lower() not in IMAGE_SUFFIXES:
+        return open_source(clip.pictures[0], rate_hz=clip.rate_hz)
+    return ImageSource(clip.pictures, clip.name, clip.rate_hz or 10.0)
+
+
+def labelled_frames(clip: Clip) -> set[int]:
+    """The frames whose masks are kept: those for which the truth labels pixels."""
+    truth = clip.truth
+    return set() if truth is None or truth.kind == "boxes" else set(truth.frames)
+
+
+def true_boxes(clip: Clip, interval: int) -> DetectionTable:
+    """The true boxes of each interval-th frame as certain detections. Raises InputError if there are none."""
+    assert clip.truth is not None and clip.truth.tracks is not None, "allowed_tasks() asks for tracks"
+    table = clip.truth.tracks.every(interval)
+    if not len(table.frame):
+        raise InputError(f"{clip.truth.place} has no box on frames 1, {1 + interval}, {1 + 2 * interval}, ...")
+    order = np.random.default_rng(_SHUFFLE_SEED).permutation(len(table.frame))
+    order = order[np.argsort(table.frame[order], kind="stable")]
+    frame, box_px = table.frame[order], np.asarray(table.box_px, float)[order]
+    return DetectionTable(clip.name, frame, box_px, np.ones(len(frame)), np.arange(1, len(frame) + 1))
+
+
+def replay_scenes(clip: Clip, found: Found) -> Iterator[Scene]:
+    """The scenes of a clip as the detector gave them, without their masks. The pictures are read again."""
+    source = open_clip(clip)
+    shape: tuple[int, ...] = (source.size[1], source.size[0])
+    pictures = iter(source)
+    picture = next(pictures, None)
+    for number in found.looked.tolist():
+        while picture is not None and picture.number < number:
+            picture = next(pictures, None)
+        frame = Frame(number, (number - 1) / source.rate_hz, np.zeros(shape, np.uint8))
+        if picture is not None and picture.number == number:
+            frame, shape = picture, picture.image.shape
+        rows = slice(*np.searchsorted(found.frame, [number, number + 1]))
+        names = ("area_px", "heading_rad", "speed_px", "middle_px")
+        columns: dict[str, Any] = {name: found.more[name][rows] for name in names}
+        step = None
+        if number in found.steps:
+            step = Registration(found.steps[number], 0, 0, float("nan"), float("nan"))
+        detections = Detections(found.box_px[rows], found.score[rows], **columns)
+        yield Scene(frame, np.zeros((0, 0), np.uint16), detections, 0, step=step)
+
+
+@dataclass
+class _Run:
+    """The input of a stage, see `find`; and its results so far, frame by frame."""
+
+    clip: Clip
+    settings: Settings
+    backend: str
+    interval: int
+    before: Found | None
+    on_frame: OnFrame
+    looked: list[int] = field(default_factory=list)
+    columns: dict[str, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
+    masks: dict[int, bytes] = field(default_factory=dict)
+    steps: dict[int, np.ndarray] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    notes: list[str] = field(default_factory=list)
+
+    def add(self, number: int, seconds: Mapping[str, float], **columns: np.ndarray) -> None:
+        """Add the boxes of a frame, one row each, in columns of one length."""
+        self.looked.append(number)
+        for stage, spent in seconds.items():
+            self.seconds[stage] += spent
+        count = len(columns["box_px"])
+        default = {
+            "frame": np.full(count, number),
+            "identity": np.full(count, -1),
+            "east_north_m": np.full((count, 2), np.nan),
+            "covariance_m2": np.full((count, 2, 2), np.nan),
+        }
+        for name, column in (default | columns).items():
+            self.columns[name].append(column)
+        self.on_frame()
+
+
+def _find_motion(run: _Run) -> None:
+    """Moving targets: `dddas detect`."""
+    source, labelled, causes = open_clip(run.clip), labelled_frames(run.clip), dict[int, str]()
+    for scene in detect_motion(source, run.settings, run.backend):
+        number = scene.frame.number
+        names = ("box_px", "score", "middle_px", "area_px", "heading_rad", "speed_px")
+        run.add(number, scene.seconds, **{name: getattr(scene.detections, name) for name in names})
+        if number in labelled:
+            # One bit would be enough; the numbers of the targets cost little more, and reports show them.
+            mask = np.minimum(scene.mask, 255).astype(np.uint8)
+            run.masks[number] = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        if scene.step is not None and scene.step.reliable:
+            run.steps[number] = scene.step.later_from_earlier
+        if not scene.reliable:
+            causes[number] = scene.cause
+    if causes:
+        first = min(causes)
+        run.notes.append(f"{len(causes)} frames with unreliable registration, first {first}: {causes[first]}")
+    run.notes += map(str, source.problems)
+
+
+def _find_tracks(run: _Run) -> None:
+    """Identities: `dddas track CLIP`, or of the data set's own detections."""
+    if upstream_task(run.clip, "tracking") is not None:
+        assert run.before is not None, "tracking needs the result of motion"
+        scenes, size = replay_scenes(run.clip, run.before), open_clip(run.clip).size
+        _add_tracks(run, track_scenes(scenes, run.settings, run.interval, size, False, run.backend))
+    else:
+        assert run.clip.given is not None, "allowed_tasks() asks for detections"
+        _track_table(run, read_detections(run.clip.given))
+
+
+def _find_associations(run: _Run) -> None:
+    """Identities of the true boxes."""
+    _track_table(run, true_boxes(run.clip, run.interval))
+
+
+def _track_table(run: _Run, table: DetectionTable) -> None:
+    """Track the boxes of a table, with the clip's pictures where it has any."""
+    if not run.clip.pictures:
+        run.notes += check_table(table, run.interval)
+        _add_tracks(run, track_table(table, run.settings, run.interval))
+        return
+    source = open_clip(run.clip)
+    run.notes += check_table(table, run.interval, source)
+    engine = load_engine(run.backend, run.settings)
+    _add_tracks(run, track_clip(source, table, engine, run.settings, run.interval, run.backend))
+    run.notes += map(str, source.problems)
+
+
+def _add_tracks(run: _Run, frames: Iterable[TrackedFrame]) -> None:
+    for result in frames:
+        tracks = result.tracks
+        box_px = round_as_written(tracks.box_px)
+        run.add(result.number, result.seconds, box_px=box_px, score=tracks.score, identity=tracks.identity)
+
+
+def _find_people(run: _Run) -> None:
+    """People by their shape: `dddas people`."""
+    source = open_clip(run.clip)
+    for result in detect_in_clip(source, load_scorer(run.settings.people, run.backend), run.settings):
+        box_px = round_as_written(result.people.box_px)
+        run.add(result.frame.number, result.seconds, box_px=box_px, score=result.people.score)
+    run.notes += map(str, source.problems)
+
+
+def _find_locations(run: _Run) -> None:
+    """Places on the ground: `dddas run`, or `dddas locate` of the data set's own detections."""
+    clip = run.clip
+    if clip.landmarks is None:
+        _locate_from_ground(run)
+        return
+    if clip.pictures:
+        _locate_clip(run)
+    else:
+        _locate_table(run)
+
+
+def aerial_input(clip: Clip) -> AerialInput:
+    """The files that locating from the air takes."""
+    assert clip.landmarks is not None
+    return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
+
+
+def open_pipeline(
+    clip: Clip, settings: Settings, backend: str = "auto", interval: int = 1
+) -> tuple[Source, Assembly, Pipeline]:
+    """The pictures of a clip with landmarks, and what `dddas run` does with them."""
+    source = open_clip(clip)
+    ready = assemble_files(aerial_input(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
+    return source, ready, Pipeline.from_assembly(ready, interval, pictures=False)
+
+
+def open_table(
+    clip: Clip, settings: Settings, backend: str = "auto"
+) -> tuple[DetectionTable, geo.AerialLocator, list[str]]:
+    """The detections of a clip with landmarks and without pictures, what locates them, and notes."""
+    if clip.given is None:
+        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
+    table = read_detections(clip.given)
+    span = (table.first, table.last)
+    locator, notes = read_locator(
+        aerial_input(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
+    )
+    geo.check_table(table, locator)
+    return table, locator, notes
+
+
+def _locate_clip(run: _Run) -> None:
+    source, ready, pipeline = open_pipeline(run.clip, run.settings, run.backend, run.interval)
+    for result in pipeline(source):
+        tracks, located = result.tracked.tracks, result.locations
+        seen = tracks.row >= 0
+        columns = {"box_px": round_as_written(tracks.box_px[seen]), "identity": tracks.identity[seen]}
+        found = () if located is None else (located.row, located.positions, located.relative_m2)
+        seconds = result.tracked.seconds if located is None else located.seconds
+        columns |= {"score": tracks.score[seen], **_place_columns(int(seen.sum()), *found)}
+        run.add(result.tracked.number, seconds, **columns)
+    run.notes += [*ready.notes, *map(str, source.problems)]
+
+
+def _locate_table(run: _Run) -> None:
+    table, locator, notes = open_table(run.clip, run.settings, run.backend)
+    for located in locator.locate_table(table):
+        places = _place_columns(len(located.box_px), located.row, located.positions, located.relative_m2)
+        score = table.score[table.rows(located.frame)]
+        run.add(located.frame, located.seconds, **_given_columns(table, located.frame, located.box_px, score), **places)
+    run.notes += notes
+
+
+def _locate_from_ground(run: _Run) -> None:
+    clip = run.clip
+    if clip.given is None or clip.camera is None:
+        raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
+    table = read_detections(clip.given)
+    locator = GroundLocator(read_camera(clip.camera), run.settings, rate_hz=clip.rate_hz)
+    for located in locator.locate_tables([table]):
+        rows = np.flatnonzero(located.sightings.by != "bearing")
+        places = _place_columns(len(located.box_px), rows, located.positions)
+        run.add(located.frame, {}, **_given_columns(table, located.frame, located.box_px, located.score), **places)
+
+
+def _given_columns(table: DetectionTable, frame: int, box_px: np.ndarray, score: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns of a frame's given detections."""
+    identity = np.full(len(box_px), -1) if table.identity is None else table.identity[table.rows(frame)]
+    return {"box_px": round_as_written(box_px), "score": score.clip(0, 1), "identity": identity}
+
+
+def _place_columns(
+    count: int, row: np.ndarray | None = None, found: Positions | None = None, relative_m2: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """The columns of places of a frame's boxes, NaN where not located. row: the box of each position."""
+    shapes = {"east_north_m": (2,), "covariance_m2": (2, 2), "lonlat_deg": (2,), "relative_m2": (2, 2)}
+    places = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
+    for name, column in places.items() if found is not None else ():
+        if (values := getattr(found, name, relative_m2)) is not None:
+            column[row] = values
+    return places
+
+
+STAGES: Mapping[Task, Callable[[_Run], None]] = {
+    "motion": _find_motion,
+    "tracking": _find_tracks,
+    "association": _find_associations,
+    "people": _find_people,
+    "location": _find_locations,
+}
+
+
+def _peak_memory_mb() -> float:
+    """The process's peak in units of 2**20 bytes, since its start on some systems; NaN where it is not reported."""
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 1024

@@ -1,0 +1,394 @@
+"""Sweeps: the same study with other parameters, on a grid or as Optuna proposes, and which of them measure best.
+
+Everything random has a seed, and every study takes from the cache what was computed before: an interrupted sweep
+measures the same points when it is started again, and soon continues where it was.
+"""
+
+import glob
+import itertools
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, nearest, with_parameters
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.atomic_files import save_file
+from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
+from torchvision_dddas.lab.evaluation.studies.jobs import Event, Workers
+from torchvision_dddas.lab.evaluation.studies.records import Spec
+from torchvision_dddas.lab.evaluation.studies.runner import plan_study, run_jobs, run_study
+from torchvision_dddas.lab.evaluation.studies.summary import Goal, goal_value
+
+MAX_POINTS = 10_000
+AHEAD = 12  # points of a grid whose clips the workers share
+
+_RANGE = re.compile(r"\s*([^\s:,\[\]]+)\s*:\s*([^\s:,\[\]]+)\s*(?::\s*(\w+)\s*)?")
+
+Measured = tuple[float, str]
+"""The measure, NaN if there is none, and then why."""
+
+Measure = Callable[[Mapping[str, object]], Measured]
+"""What a study measures with some parameters changed."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A parameter and its values; without values the range from low to high, both included.
+
+    step: of whole numbers; 0: continuous. log: sample on a logarithmic scale.
+    """
+
+    parameter: str
+    values: tuple[object, ...] = ()
+    low: float = 0
+    high: float = 0
+    step: int = 0
+    log: bool = False
+
+
+def parse_grid(texts: Sequence[str], settings: Settings) -> list[Axis]:
+    """Axes from texts such as `difference.threshold=10,20,30`.
+
+    Raises InputError for an unknown parameter, one that is named twice, no values, a bad value, or too many points.
+    """
+    axes: list[Axis] = []
+    for text in texts:
+        parameter, values = _split(text, "group.parameter=value,value", axes)
+        axes.append(_choice(parameter, values, text, settings))
+    if (count := count_points(axes)) > MAX_POINTS:
+        raise InputError(f"the grid may have {MAX_POINTS} points, got {count}; give fewer values, or take --optuna")
+    return axes
+
+
+def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
+    """Axes from texts such as `difference.threshold=8:30`, `small.gap_frames=2:20:log`, `difference.kind=a,b`.
+
+    Raises InputError as `parse_grid`, and for bad ends of a range.
+    """
+    axes: list[Axis] = []
+    for text in texts:
+        parameter, values = _split(text, "group.parameter=low:high", axes)
+        found = _RANGE.fullmatch(values)
+        axes.append(_range(parameter, found, text, settings) if found else _choice(parameter, values, text, settings))
+    return axes
+
+
+def count_points(axes: Sequence[Axis]) -> int:
+    """The number of points of a grid."""
+    return math.prod(len(axis.values) for axis in axes)
+
+
+def _split(text: str, wanted: str, axes: Sequence[Axis]) -> tuple[str, str]:
+    parameter, equals, values = (part.strip() for part in text.partition("="))
+    if not equals or not parameter or not values:
+        raise InputError(f"'{text}' is no axis of a sweep; wanted {wanted}, such as difference.threshold=10,20")
+    names = [known.name for known in all_parameters()]
+    if parameter not in names:
+        raise InputError(f"unknown parameter '{parameter}'; {nearest(parameter, names)}")
+    if any(axis.parameter == parameter for axis in axes):
+        raise InputError(f"{parameter} is given twice; give all its values in one place")
+    return parameter, values
+
+
+def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Axis:
+    """Values between commas, as TOML has them; words need no quotes."""
+    try:
+        values = list(tomllib.loads(f"values = [{listed}]")["values"])
+    except (ValueError, RecursionError):
+        values = []
+        for word in filter(None, (part.strip() for part in listed.split(","))):
+            try:
+                values.append(tomllib.loads(f"value = {word}")["value"])
+            except (ValueError, RecursionError):
+                values.append(word)
+    if not values:
+        raise InputError(f"'{text}' has no values; wanted some, such as difference.threshold=10,20")
+    values = [tuple(value) if isinstance(value, list) else value for value in values]
+    for value in values:
+        _check(parameter, value, settings)
+    if isinstance(_current(settings, parameter), float):
+        values = [float(value) if isinstance(value, int) else value for value in values]
+    return Axis(parameter, tuple(dict.fromkeys(values)))
+
+
+def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Axis:
+    current = _current(settings, parameter)
+    if isinstance(current, bool) or not isinstance(current, int | float):
+        raise InputError(f"{parameter} is no number and has no range; give its values, as {parameter}=first,second")
+    try:
+        low, high = float(found[1]), float(found[2])
+    except ValueError:
+        raise InputError(f"'{text}': the ends of a range must be numbers, low:high") from None
+    if not low < high:
+        raise InputError(f"'{text}': the lower end must come first, got {low:g}:{high:g}")
+    log = found[3] is not None
+    if log and found[3] != "log":
+        raise InputError(f"'{text}' ends in '{found[3]}'; wanted low:high, or low:high:log")
+    if log and low <= 0:
+        raise InputError(f"'{text}': the lower end of a logarithmic range must be above 0, got {low:g}")
+    odd = next(known.range for known in all_parameters() if known.name == parameter).endswith(", odd")
+    if isinstance(current, int):
+        if fractions := [end for end in (low, high) if end != int(end)]:
+            raise InputError(f"{parameter} takes whole numbers, got {fractions[0]:g}")
+        low, high = int(low), int(high)
+    for end in (low, high):
+        _check(parameter, end, settings)
+    if log and odd:
+        raise InputError(f"{parameter} takes odd numbers, which have no logarithmic range; leave out :log")
+    return Axis(parameter, (), low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
+
+
+def _check(parameter: str, value: object, settings: Settings) -> None:
+    """Raises InputError for a bad value. Rules over several parameters are checked at each point."""
+    cause = _why_impossible(settings, {parameter: value})
+    if cause.startswith((f"{parameter} = ", f"{parameter} must ")):
+        raise InputError(cause)
+
+
+def _why_impossible(settings: Settings, parameters: Mapping[str, object]) -> str:
+    """Why parameters cannot have these values together; empty if they can."""
+    try:
+        with_parameters(settings, parameters)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def _current(settings: Settings, parameter: str) -> object:
+    group, name = parameter.split(".")
+    return getattr(getattr(settings, group), name)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One point. number: 0 for the settings as they were. cause: why it has no value."""
+
+    number: int
+    parameters: Mapping[str, object]
+    value: float
+    cause: str = ""
+
+
+def search_grid(
+    axes: Sequence[Axis],
+    settings: Settings,
+    measure: Measure,
+    prepare: Callable[[Sequence[Mapping[str, object]]], None] = lambda points: None,
+) -> Iterator[Trial]:
+    """Measure the settings as they are, then every point of a grid, the last axis the quickest.
+
+    prepare: called with the next points before they are measured. A point whose values exclude each other has a cause
+    and no value. Raises InputError if no point is possible.
+    """
+    points: list[tuple[dict[str, object], str]] = [({}, "")]
+    for values in itertools.product(*(axis.values for axis in axes)):
+        parameters = {axis.parameter: value for axis, value in zip(axes, values, strict=True)}
+        points.append((parameters, _why_impossible(settings, parameters)))
+    if all(cause for _, cause in points[1:]):
+        raise InputError(f"no point of the grid is possible; the first: {points[1][1]}")
+    for first in range(0, len(points), AHEAD):
+        part = points[first : first + AHEAD]
+        prepare([parameters for parameters, cause in part if not cause])
+        for number, (parameters, cause) in enumerate(part, first):
+            yield Trial(number, parameters, *((math.nan, cause) if cause else measure(parameters)))
+
+
+def check_optuna() -> None:
+    """Raises InputError if Optuna is not installed."""
+    if find_spec("optuna") is None:
+        raise InputError("--optuna needs optuna; pip install 'torchvision-dddas[tune]', or take --grid")
+
+
+def search_ranges(
+    axes: Sequence[Axis], settings: Settings, measure: Measure, count: int, seed: int = 0, minimize: bool = False
+) -> Iterator[Trial]:
+    """Measure the settings as they are, then `count` points that Optuna's TPESampler proposes.
+
+    Raises InputError if Optuna is not installed.
+    """
+    check_optuna()
+    import optuna
+
+    def suggest(axis: Axis) -> object:
+        if axis.values:  # by their places, as Optuna takes no lists as values
+            return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
+        if axis.step:
+            return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
+        return proposal.suggest_float(axis.parameter, axis.low, axis.high, log=axis.log)
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    sampler = optuna.samplers.TPESampler(seed=seed)
+    study = optuna.create_study(direction="minimize" if minimize else "maximize", sampler=sampler)
+    yield Trial(0, {}, *measure({}))
+    for number in range(1, count + 1):
+        proposal = study.ask()
+        parameters = {axis.parameter: suggest(axis) for axis in axes}
+        cause = _why_impossible(settings, parameters)
+        trial = Trial(number, parameters, *((math.nan, cause) if cause else measure(parameters)))
+        if math.isnan(trial.value):
+            study.tell(proposal, state=optuna.trial.TrialState.FAIL)
+        else:
+            study.tell(proposal, trial.value)
+        yield trial
+
+
+def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
+    """The best first, equal ones in their order, those without a value last."""
+    sign = 1 if minimize else -1
+    return sorted(trials, key=lambda t: (math.isnan(t.value), 0 if math.isnan(t.value) else sign * t.value, t.number))
+
+
+def best(trials: Sequence[Trial], minimize: bool) -> Trial | None:
+    """The trial with the best value, of equal ones the first; None if none has a value."""
+    return next((trial for trial in ranked(trials, minimize) if not math.isnan(trial.value)), None)
+
+
+@dataclass
+class StudyMeasure:
+    """Runs the studies of a sweep. on_progress: called with the number of clips that are done, and of all."""
+
+    spec: Spec
+    base: Path
+    goal: Goal
+    workers: Workers
+    cache: Path | None
+    on_progress: Callable[[int, int], object]
+
+    def measure(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
+        """The goal's value over clips of these names; if it has none, why."""
+        changed = tuple(f"{name}={toml_value(value)}" for name, value in parameters.items())
+        spec = replace(self.spec, overrides=(*self.spec.overrides, *changed))
+        names = [glob.escape(name) for name in clips]
+        results = run_study(spec, self.base, self.workers, self.cache, names, self._counter(len(clips)))
+        return goal_value(self.goal, results.cases)
+
+    def prepare(self, points: Sequence[Mapping[str, object]], clips: Sequence[str]) -> None:
+        """Compute what the studies of several points need, so that no worker has to wait between them."""
+        planned = plan_study(self.spec, self.base, [glob.escape(name) for name in clips])
+        pairs = enumerate(itertools.product(points, planned.jobs))
+        jobs = [replace(j, number=k, settings=with_parameters(j.settings, point)) for k, (point, j) in pairs]
+        run_jobs(jobs, self.workers, Cache(self.cache or cache_folder()), self._counter(len(jobs)))
+
+    def _counter(self, total: int) -> Callable[[Event], None]:
+        done = 0
+
+        def count(event: Event) -> None:
+            nonlocal done
+            done += event.done is not None
+            self.on_progress(done, total)
+
+        return count
+
+
+def split_clips(
+    spec: Spec, base: Path, clips: Sequence[str], holdout: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of the clips that are tuned on, and of those held out. Raises InputError if either is empty."""
+    names = [job.clip.name for job in plan_study(spec, base, clips).jobs]
+    held = tuple(name for name in names if any(fnmatchcase(name, pattern) for pattern in holdout))
+    tuned = tuple(name for name in names if name not in held)
+    if holdout and not held:
+        raise InputError(f"--holdout {','.join(holdout)} fits no clip; there are {', '.join(names)}")
+    if not tuned:
+        raise InputError(f"--holdout {','.join(holdout)} leaves no clip to measure; there are {', '.join(names)}")
+    return tuned, held
+
+
+@dataclass
+class SweepRecord:
+    """What a sweep has found so far: sweep.json after every trial, best.toml at the end.
+
+    tuned, held: names of clips. on_held: the measure on those held out, with the settings as they were and the best.
+    """
+
+    folder: Path
+    settings: Settings
+    goal: Goal
+    search: dict[str, Any]
+    tuned: tuple[str, ...]
+    held: tuple[str, ...]
+    trials: list[Trial] = field(default_factory=list)
+    best: Trial | None = None
+    on_held: tuple[Measured, Measured] | None = None
+
+    def add(self, trial: Trial) -> None:
+        """Record a trial. Raises InputError if it cannot be written."""
+        self.trials.append(trial)
+        self._write_json()
+
+    def finish(self, best: Trial, on_held: tuple[Measured, Measured] | None) -> None:
+        """Record the best trial. Raises InputError if it cannot be written."""
+        self.best, self.on_held = best, on_held
+        before = format_value(self.trials[0].value)
+        about = [f"dddas sweep: {self.heading}: {format_value(best.value)}, with the settings as they were {before}."]
+        about += [f"{name}: {value} (default {self.defaults[name]})" for name, value in best.parameters.items()]
+        if on_held is not None:
+            about.append(f"On the clips held out: {format_value(on_held[1][0])}, before {format_value(on_held[0][0])}.")
+        self._write_json()
+        text = settings_toml(with_parameters(self.settings, best.parameters), about)
+        save_file(self.folder / "best.toml", text.encode())
+
+    @property
+    def heading(self) -> str:
+        """What is measured, in words."""
+        return f"{self.goal.name}, {self.goal.by} over {len(self.tuned)} clip{'s' * (len(self.tuned) != 1)}"
+
+    @property
+    def defaults(self) -> dict[str, object]:
+        """The default of each parameter that is tried."""
+        tried = {name for trial in self.trials for name in trial.parameters}
+        return {known.name: known.default for known in all_parameters() if known.name in tried}
+
+    def value_of(self, trial: Trial, parameter: str) -> object:
+        """A parameter in a trial: what was tried, else as the settings have it."""
+        return trial.parameters.get(parameter, _current(self.settings, parameter))
+
+    def _write_json(self) -> None:
+        def null_if_nan(value: float) -> float | None:
+            return None if math.isnan(value) else value
+
+        held = self.on_held and {"before": null_if_nan(self.on_held[0][0]), "best": null_if_nan(self.on_held[1][0])}
+        content = {
+            "format": 1,
+            "measure": self.goal.name,
+            "by": self.goal.by,
+            "better": "less" if self.goal.minimize else "more",
+            "search": self.search,
+            "settings": changes(self.settings),
+            "defaults": self.defaults,
+            "clips": self.tuned,
+            "held_out": self.held,
+            "trials": [
+                {"number": t.number, "knobs": dict(t.parameters), "value": null_if_nan(t.value), "cause": t.cause}
+                for t in self.trials
+            ],
+            "best": None if self.best is None else self.best.number,
+            "on_held_out": held,
+        }
+        save_file(self.folder / "sweep.json", (json.dumps(content, indent=2) + "\n").encode())
+
+
+def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
+    """What differs from the defaults, as `--config` takes it, below some lines of comment."""
+    groups: dict[str, dict[str, object]] = {}
+    for name, value in changes(settings).items():
+        group, parameter = name.split(".")
+        groups.setdefault(group, {})[parameter] = value
+    return format_toml(groups, heading)
+
+
+def toml_value(value: object) -> str:
+    """A parameter's value as `--set` takes it."""
+    return format_toml({"value": value}).removeprefix("value = ").rstrip()
+
+
+def format_value(value: float) -> str:
+    """A measure to four digits; a dash if there is none."""
+    return "–" if math.isnan(value) else f"{value:.4f}"

@@ -1,0 +1,396 @@
+"""Gradient descent on parameters: Adam, annealed softness, early stopping on watched examples."""
+
+import hashlib
+import json
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchvision_dddas.config import Settings, changes
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.lab.tuning.checkpoint import read_checkpoint, write_checkpoint
+from torchvision_dddas.lab.tuning.family import Example, Family
+from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters
+
+FINAL_RATE = 0.1
+"""The rate at the last step, as a share of the first."""
+
+SIZES_FIXED = 0.5
+"""After this share of the steps sizes are whole numbers and only the other parameters move, if there are such."""
+
+GAIN = 1e-5
+"""A loss that is less by no more than this is rounding, and no reason to move a parameter."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to descend. rate: of Adam, in units of which one is about a factor e of a parameter.
+
+    look_every: steps between two measurements of the watched examples. patience: measurements without a gain that end
+    the descent. watched: share of each clip's examples, its last, that is held back for this. most_watched: of all
+    clips together. most_s: no step begins after this many seconds. pull: weight of half the squared distance from the
+    start in the loss, in the rate's units; it keeps parameters in place that few examples determine weakly.
+    Raises InputError for a value out of its range.
+    """
+
+    steps: int = 100
+    batch: int = 8
+    rate: float = 0.05
+    seed: int = 0
+    look_every: int = 5
+    patience: int = 10
+    watched: float = 0.25
+    most_watched: int = 32
+    most_s: float = math.inf
+    pull: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "look_every", "patience", "most_watched"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be 1 or more, got {getattr(self, name)}")
+        if not 0 < self.rate <= 10:
+            raise InputError(f"rate must be more than 0 and at most 10, got {self.rate:g}")
+        if not 0 <= self.watched <= 0.9:
+            raise InputError(f"watched must be between 0 and 0.9, got {self.watched:g}")
+        if not 0 <= self.pull < math.inf:
+            raise InputError(f"pull must be 0 or more, got {self.pull:g}")
+
+
+@dataclass(frozen=True)
+class Step:
+    """The parameters after a step, where step 0 is the start, and the losses.
+
+    loss: of the step's batch, NaN at step 0. watched: mean of the watched examples at the final softness; None where
+    they were not measured.
+    """
+
+    step: int
+    softness: float
+    loss: float
+    watched: float | None
+    parameters: Mapping[str, float]
+
+
+@dataclass
+class Descended:
+    """The result of a descent. parameters: in their best state, which is that after step `best`. ended: why.
+
+    failed: in one line, which clip, frame and parameter gave a value that is not finite; empty otherwise. idle:
+    parameters without any effect on the loss. taken: steps in `seconds`, without those of a resumed checkpoint.
+    """
+
+    parameters: Parameters
+    best: int
+    history: list[Step] = field(default_factory=list)
+    ended: str = ""
+    failed: str = ""
+    seconds: float = 0.0
+    idle: tuple[str, ...] = ()
+    taken: int = 0
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the best state."""
+        return self.parameters.settings()
+
+
+def descend(
+    family: Family,
+    parameters: Parameters,
+    examples: Sequence[Example],
+    plan: Plan | None = None,
+    tell: Callable[[Step], object] = lambda step: None,
+    place: Path | None = None,
+    resume: bool = False,
+) -> Descended:
+    """Move parameters to where the family's loss is least. They are changed in place and end in their best state.
+
+    tell: called with each step, those of a resumed checkpoint included. place: file of a checkpoint, written at every
+    measurement. resume: go on from it if it exists. Raises InputError where there are no examples, where no parameter
+    has an effect on the loss, where the loss is not finite at the start, and for a checkpoint of another descent.
+    """
+    plan = plan or Plan()
+    if not examples:
+        raise InputError(f"there is nothing to tune {family.name} on; give clips with the truth that it needs")
+    run = _Run(family, parameters, examples, plan)
+    began = time.perf_counter()
+    if resume and place is not None and place.is_file():
+        run.load(place)
+    resumed = run.history[-1].step if run.history else 0
+    for step in run.history:
+        tell(step)
+    if not run.history:
+        tell(run.begin())
+        run.save(place)
+    while not (run.ended or run.failed):
+        if time.perf_counter() - began >= plan.most_s:
+            run.stop(f"{plan.most_s:g} s are over")
+            break
+        taken = run.step()
+        if taken is not None:
+            tell(taken)
+        if taken is None or taken.watched is not None:
+            run.save(place)
+    parameters.load_state_dict(run.best)
+    return Descended(
+        parameters,
+        run.best_step,
+        run.history,
+        run.ended or "a loss was not finite",
+        run.failed,
+        time.perf_counter() - began,
+        tuple(name for name in parameters.names if len(run.history) > 1 and name not in run.moved),
+        run.history[-1].step - resumed,
+    )
+
+
+class _Run:
+    """A descent under way.
+
+    moved: parameters that had a gradient. best, least, best_step: the best state, its watched loss and its step. since:
+    measurements without a gain.
+    """
+
+    _SAVED = ("best", "least", "best_step", "since", "ended", "failed")
+
+    def __init__(self, family: Family, parameters: Parameters, examples: Sequence[Example], plan: Plan) -> None:
+        self._family, self._parameters, self._plan = family, parameters, plan
+        self._learned, self._watched = split_examples(examples, plan.watched, plan.most_watched)
+        self._adam = torch.optim.Adam(parameters.parameters(), lr=plan.rate, betas=(0.9, 0.99))
+        self._hardest = family.softness[1]
+        self.moved: set[str] = set()
+        self.best: dict[str, Tensor] = {}
+        self.least, self.best_step, self.since = math.inf, 0, 0
+        self.history: list[Step] = []
+        self.ended = self.failed = ""
+        # What the descent depends on, which a checkpoint must agree with.
+        used = "\n".join(f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched))
+        self._facts = {
+            "family": family.name,
+            "task": family.task,
+            "interval": family.interval,
+            "knobs": ", ".join(parameters.names),
+            "settings": json.dumps(changes(parameters.base), default=str),
+            **{name: value for name, value in asdict(plan).items() if name != "most_s"},
+            "examples": hashlib.sha256(used.encode()).hexdigest()[:16],
+        }
+
+    def begin(self) -> Step:
+        """Measure the start."""
+        with torch.no_grad():
+            values = self._parameters.values()
+        if cause := self._explain(self._watched, values, self._hardest):
+            raise InputError(f"{cause}, before the first step")
+        return self._record(0, self._softness(1), math.nan, measure=True)
+
+    def step(self) -> Step | None:
+        """One step; None where it failed."""
+        plan, number = self._plan, self.history[-1].step + 1
+        softness = self._softness(number)
+        clips = [example.clip for example in self._learned]
+        batch = [self._learned[i] for i in draw_batch(number - 1, clips, plan.batch, plan.seed)]
+        has_others = any(TUNABLE[name].rounding == "none" for name in self.moved)
+        whole = number > SIZES_FIXED * plan.steps and has_others
+        values = self._parameters.values(whole)
+        for value in values.values():
+            if value.requires_grad:
+                value.retain_grad()
+        wrong = self._family.loss(values, batch, softness).mean()
+        loss = wrong + self._pull_term(whole)
+        if not bool(torch.isfinite(loss)):
+            self._fail(number, batch, values, softness)
+            return None
+        # The examples of one batch may depend on no parameter; all together must.
+        if not wrong.requires_grad and not self.moved:
+            parts = self._parts(self._learned)
+            if not any(self._family.loss(values, part, softness).requires_grad for part in parts):
+                raise InputError(f"the loss of {self._family.name} does not depend on {', '.join(values)}")
+        self._adam.zero_grad()
+        if loss.requires_grad:
+            loss.backward()
+        gradients = {name: value.grad for name, value in values.items() if value.grad is not None}
+        if not all(bool(torch.isfinite(gradient).all()) for gradient in gradients.values()):
+            self._fail(number, batch, values, softness)
+            return None
+        self.moved |= {name for name, gradient in gradients.items() if bool(gradient.any())}
+        for group in self._adam.param_groups:
+            group["lr"] = plan.rate * (1 - (1 - FINAL_RATE) * (number - 1) / plan.steps)
+        self._adam.step()
+        is_last = number == plan.steps
+        step = self._record(number, softness, float(loss.detach()), is_last or number % plan.look_every == 0)
+        if is_last and not self.ended:
+            self.ended = f"all {number} steps were taken"
+        return None if self.failed else step
+
+    def stop(self, reason: str) -> None:
+        """End here, with a measurement of the last state."""
+        last = self.history[-1]
+        if last.watched is None:
+            self.history.pop()
+            self._record(last.step, last.softness, last.loss, measure=True)
+        self.ended = self.ended or reason
+
+    def load(self, place: Path) -> None:
+        """Take up a checkpoint. Raises InputError for one of another descent."""
+        state = read_checkpoint(place, self._facts)
+        self._parameters.load_state_dict(state["knobs"])
+        self._adam.load_state_dict(state["adam"])
+        self.moved, self.history = set(state["moved"]), [Step(**step) for step in state["history"]]
+        for name in self._SAVED:
+            setattr(self, name, state[name])
+
+    def save(self, place: Path | None) -> None:
+        """Write a checkpoint. Raises InputError where the disk refuses."""
+        if place is not None:
+            state = {
+                "knobs": self._parameters.state_dict(),
+                "adam": self._adam.state_dict(),
+                "moved": sorted(self.moved),
+                "history": [asdict(step) for step in self.history],
+            }
+            write_checkpoint(place, self._facts, state | {name: getattr(self, name) for name in self._SAVED})
+
+    def _record(self, number: int, softness: float, loss: float, measure: bool) -> Step:
+        """Note the parameters as they are now; measure: and the loss of the watched examples."""
+        watched = None
+        with torch.no_grad():
+            values = {name: float(value) for name, value in self._parameters.values().items()}
+            if measure:
+                # Rounded as the settings are: a blend of two sizes may do well where either alone does badly.
+                settled = self._parameters.settled()
+                watched = self._watched_mean(settled)
+        if watched is not None and not math.isfinite(watched):
+            self._fail(number, self._watched, settled, self._hardest)
+            return Step(number, softness, loss, None, values)
+        step = Step(number, softness, loss, watched, values)
+        self.history.append(step)
+        if watched is not None and (not self.best or watched < self.least - GAIN):
+            self.least, self.best_step, self.since = watched, number, 0
+            self.best = {name: value.clone() for name, value in self._parameters.state_dict().items()}
+        elif watched is not None:
+            self.since += 1
+            if self.since >= self._plan.patience:
+                self.ended = f"no gain on the watched examples since step {self.best_step}"
+        return step
+
+    def _watched_mean(self, values: Mapping[str, Tensor]) -> float:
+        """The pull, and the mean loss of the watched examples at the final softness, each clip with the same weight."""
+        shares = iter(clip_shares([example.clip for example in self._watched]))
+        losses = (self._family.loss(values, part, self._hardest).tolist() for part in self._parts(self._watched))
+        # Each part is summed exactly, so that the result does not depend on the order within it.
+        total = sum(math.fsum(loss * next(shares) for loss in part) for part in losses)
+        return total + float(self._pull_term())
+
+    def _pull_term(self, whole: bool = False) -> Tensor:
+        pull = self._plan.pull
+        return pull / 2 * self._parameters.moved(whole) if pull else torch.zeros((), dtype=torch.float64)
+
+    def _parts(self, examples: Sequence[Example]) -> Iterator[Sequence[Example]]:
+        return (examples[i : i + self._plan.batch] for i in range(0, len(examples), self._plan.batch))
+
+    def _softness(self, number: int) -> float:
+        first, last = self._family.softness
+        share = (number - 1) / max(self._plan.steps - 1, 1)
+        return first ** (1 - share) * last**share if first > 0 and last > 0 else first + (last - first) * share
+
+    def _fail(self, number: int, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> None:
+        self.failed = f"{self._explain(batch, values, softness) or 'the pull is not finite'}, at step {number}"
+
+    def _explain(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
+        """Name the first example whose loss or gradient is not finite, and the parameter; empty where all are finite.
+
+        A parameter is named if its earlier value alone makes the loss finite, or if its gradient is not finite.
+        """
+
+        def finite(part: Sequence[Example], values: Mapping[str, Tensor]) -> bool:
+            with torch.no_grad():
+                return bool(torch.isfinite(self._family.loss(values, part, softness)).all())
+
+        if all(finite(part, values) for part in self._parts(batch)):
+            return self._explain_gradient(batch, values, softness)
+        problem = f"the loss of {self._family.name} is not finite for"
+        example = next((one for one in batch if not finite([one], values)), None)
+        if example is None:
+            return f"{problem} {batch[0].clip}, frame {batch[0].frame} and those beside it"
+        where = f"{problem} {example.clip}, frame {example.frame}"
+        known = [self.history[i].parameters for i in (-1, self.best_step, 0)] if self.history else []
+        earlier = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
+        good = next((before for before in earlier if finite([example], before)), None)
+        if good is None:
+            return f"{where}, whatever the parameters"
+        guilty = [name for name in values if finite([example], {**values, name: good[name]})]
+        return f"{where}, with {', '.join(f'{name} = {float(values[name].detach()):.6g}' for name in guilty or values)}"
+
+    def _explain_gradient(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
+        if not any(value.requires_grad for value in values.values()):
+            return ""
+        for example in batch:
+            leaves = {name: value.detach().clone().requires_grad_() for name, value in values.items()}
+            loss = self._family.loss(leaves, [example], softness).sum()
+            if loss.requires_grad:
+                loss.backward()
+            for name, value in leaves.items():
+                if value.grad is not None and not bool(torch.isfinite(value.grad).all()):
+                    where = f"{example.clip}, frame {example.frame}"
+                    return f"the gradient of the loss in {name} = {float(value.detach()):.6g} is not finite for {where}"
+        return ""
+
+
+def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
+    """The examples to learn from, and those to watch: the last ones of each clip.
+
+    Of a clip of three or more at least one is learned from and one watched. most: to watch; of more, some evenly among
+    them. Neighbouring frames are alike, so that one piece in time says more than single frames. Where no clip has
+    three, or watched is 0, all are learned from and watched.
+    """
+    clips: dict[str, list[Example]] = {}
+    for example in examples:
+        clips.setdefault(example.clip, []).append(example)
+    learned, kept = list[Example](), list[Example]()
+    for mine in clips.values():
+        count = min(max(1, round(watched * len(mine))), len(mine) - 1) if watched and len(mine) >= 3 else 0
+        learned += mine[: len(mine) - count]
+        kept += mine[len(mine) - count :]
+    kept = kept or learned
+    if len(kept) > most:
+        kept = [kept[i * len(kept) // most] for i in range(most)]
+    return learned, kept
+
+
+def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
+    """The places of the examples that a step takes, from step 0; clips: the clip of each example.
+
+    All examples come in a random order, those of clips with fewer several times, so that every clip has the same
+    weight; then all in another order. The result depends on the arguments alone, so that a descent can be resumed.
+    """
+    batch = min(batch, len(clips))
+    of_clip: dict[str, list[int]] = {}
+    for place, clip in enumerate(clips):
+        of_clip.setdefault(clip, []).append(place)
+    most = max(len(places) for places in of_clip.values())
+
+    def draw_order(turn: int) -> list[int]:
+        """One turn: as many examples of each clip as the largest has."""
+        generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
+        drawn: list[int] = []
+        for places in of_clip.values():
+            rounds = [torch.randperm(len(places), generator=generator) for _ in range(-(-most // len(places)))]
+            drawn += [places[i] for i in torch.cat(rounds)[:most].tolist()]
+        return [drawn[i] for i in torch.randperm(len(drawn), generator=generator).tolist()]
+
+    first, count = step * batch, len(of_clip) * most
+    turns = range(first // count, (first + batch - 1) // count + 1)
+    order = [place for turn in turns for place in draw_order(turn)]
+    return order[first - turns[0] * count :][:batch]
+
+
+def clip_shares(clips: Sequence[str]) -> list[float]:
+    """The weight of each example in a mean in which every clip has the same weight; clips: the clip of each."""
+    count = Counter(clips)
+    return [1 / (len(count) * count[clip]) for clip in clips]

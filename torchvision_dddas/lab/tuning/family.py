@@ -1,0 +1,161 @@
+"""What can be tuned: the base class of all families of parameters, and the preparation of a study for one of them."""
+
+import glob
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Self
+
+from torch import Tensor
+
+from torchvision_dddas.config import Settings, load_config
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.lab.evaluation.datasets.record import Clip
+from torchvision_dddas.lab.evaluation.studies.records import Spec, Task
+from torchvision_dddas.lab.evaluation.studies.runner import plan_study
+from torchvision_dddas.lab.evaluation.studies.summary import Goal, check_possible, parse_goal
+from torchvision_dddas.lab.evaluation.studies.sweep import split_clips
+from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters, expand_names
+
+Tick = Callable[[], object]
+
+FAMILIES = {
+    "motion": "motion.MotionFamily",
+    "tracking": "tracking.TrackingFamily",
+    "location": "location.LocationFamily",
+}
+"""Family -> its module and class in this package; a module is loaded when its family is used."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One labelled piece of a clip. clip, frame: named in messages. content: what the loss takes, on the CPU.
+
+    settings: those it was prepared with, for what is not tuned; the same for all examples of a descent.
+    """
+
+    clip: str
+    frame: int
+    content: Any
+    settings: Settings = field(default_factory=Settings)
+
+
+class Family(ABC):
+    """A stage of the pipeline whose parameters can be tuned: examples of what is true, and a loss on them.
+
+    name: a key of FAMILIES. task: of a study, whose clips are used. measure: judged before and after, such as
+    motion.pixels.f. softness: of the loss at the first and at the last step. interval: frames between examples. empty:
+    why a clip may give no example; a clip without any is an error where this is set.
+    """
+
+    name: str
+    task: Task
+    measure: str
+    softness: tuple[float, float]
+    interval: int = 1
+    empty = ""
+
+    @abstractmethod
+    def clip_examples(self, clip: Clip, settings: Settings) -> Iterable[tuple[int, Any]]:
+        """Frame number and content of each example of a clip, in the order of its frames.
+
+        Raises InputError where the clip lacks the truth that the loss needs.
+        """
+
+    def check(self, names: Sequence[str], settings: Settings) -> None:  # noqa: B027
+        """Raises InputError, with what to set, where a parameter has no effect under these settings."""
+
+    def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:  # noqa: B027
+        """Raises InputError, before anything is computed, for clips that cannot be used."""
+
+    def at(self, interval_frames: int, task: Task) -> Self:
+        """The family for a study's interval and for the task of the measure."""
+        return self
+
+    def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
+        """The examples of all clips. tick is called once an example. Raises InputError for a clip without any."""
+        self.check_clips(clips, settings)
+        found: list[Example] = []
+        for clip in clips:
+            before = len(found)
+            for frame, content in self.clip_examples(clip, settings):
+                found.append(Example(clip.name, frame, content, settings))
+                tick()
+            if self.empty and len(found) == before:
+                raise InputError(f"{clip.name}: {self.empty}")
+        return found
+
+    @abstractmethod
+    def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
+        """(B,) how wrong each example is, with a gradient in the parameters, on their device.
+
+        parameters: the tuned values by name, in the units of the settings; all others are as the examples were prepared
+        with. The result depends on nothing else.
+        """
+
+
+def load_family(name: str) -> Family:
+    """The family of a name. Raises InputError where there is none."""
+    if name not in FAMILIES:
+        raise InputError(f"'{name}' is no family of parameters that can be tuned; wanted one of {', '.join(FAMILIES)}")
+    module, kind = FAMILIES[name].split(".")
+    found: Family = getattr(import_module(f"{__package__}.{module}"), kind)()
+    return found
+
+
+@dataclass
+class Prepared:
+    """A study that is ready for tuning. spec: the study with the family's task alone. tuned, held: names of clips.
+
+    clips: those tuned on. goal: the measure that is judged before and after.
+    """
+
+    spec: Spec
+    base: Path
+    family: Family
+    parameters: Parameters
+    clips: tuple[Clip, ...]
+    tuned: tuple[str, ...]
+    held: tuple[str, ...]
+    goal: Goal
+    examples: list[Example]
+
+
+def prepare(
+    spec: Spec,
+    base: Path,
+    names: Sequence[str],
+    holdout: Sequence[str] = (),
+    clips: Sequence[str] = (),
+    measure: str | None = None,
+    tick: Tick = lambda: None,
+) -> Prepared:
+    """Read a study's clips and prepare the examples of those that are not held out.
+
+    names: of parameters, as `expand_names` takes them. holdout, clips: patterns of clips' names. measure: in place of
+    the family's. tick: called once an example. Raises InputError for a parameter that cannot be tuned or has
+    no effect under the settings, parameters of several families, clips without the needed truth, and
+    as `plan_study` does.
+    """
+    settings = load_config(spec.config, spec.overrides)
+    by_family: dict[str, list[str]] = {}
+    for name in expand_names(names):
+        by_family.setdefault(TUNABLE[name].family, []).append(name)
+    if len(by_family) > 1:
+        groups = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
+        raise InputError(
+            f"the parameters are of several families, {groups}; tune one of them, then the next with --config "
+            "tuned.toml"
+        )
+    family = load_family(*by_family)
+    parameters = Parameters(settings, names)
+    family.check(parameters.names, settings)
+    goal = parse_goal(measure or family.measure)
+    family = family.at(spec.interval, goal.task)
+    spec = replace(spec, tasks=(goal.task,))
+    tuned, held = split_clips(spec, base, clips, holdout)
+    used = tuple(job.clip for job in plan_study(spec, base, [glob.escape(name) for name in tuned]).jobs)
+    check_possible(goal, used)
+    return Prepared(spec, base, family, parameters, used, tuned, held, goal, family.examples(used, settings, tick))

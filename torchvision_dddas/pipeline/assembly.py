@@ -1,0 +1,280 @@
+"""Puts a run together: settings, engine, telemetry, camera, landmarks, elevation and colours, before the first picture.
+
+`assemble` takes records, as `Pipeline` is given them. `assemble_files` reads the files that `dddas run` takes beside
+the pictures; `read_locator` those of `dddas locate`. `assemble_mission` closes the loop around a source that can be
+steered. Commands, live runs, studies, the simulator and tuning all use these.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from torchvision_dddas import geometry
+from torchvision_dddas.config import Settings, is_set, with_parameters
+from torchvision_dddas.control import Instrument, Mission, build_mission
+from torchvision_dddas.detection import Engine, load_engine, with_logged_focal
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import (
+    AerialLocator,
+    LandmarkWatch,
+    build_site,
+    check_colours,
+    complete_site,
+    describe_no_place,
+    describe_unknown_heights,
+    has_places,
+    resolve_camera,
+    without_pixels,
+)
+from torchvision_dddas.geo.plane_homography import load_solver
+from torchvision_dddas.io.camera_files import read_aerial_camera
+from torchvision_dddas.io.colour_files import read_colours
+from torchvision_dddas.io.elevation import read_elevation, read_ortho
+from torchvision_dddas.io.ground_tables import read_landmarks
+from torchvision_dddas.io.joined_clips import JoinedSource
+from torchvision_dddas.io.output import NONE_LOCATED, Site
+from torchvision_dddas.io.telemetry import read_telemetry
+from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Source, Telemetry
+
+
+@dataclass(frozen=True)
+class AerialInput:
+    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as the options of `dddas locate`."""
+
+    landmarks: Path | None = None
+    telemetry: Path | None = None
+    camera: Path | None = None
+    dem: Path | None = None
+    background: Path | None = None
+    colours: Path | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """All that are given."""
+        return [file for file in vars(self).values() if file is not None]
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The files as run.json records them."""
+        facts = dict(vars(self))
+        return {"landmarks_file": facts.pop("landmarks"), **facts}
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """The parts of a run beside its pictures.
+
+    settings: with the camera's focal length, where that is known. telemetry: None without a log. watch: None if nothing
+    is located; notes say why. mission: steers a source that can be steered. notes: what the user should know.
+    """
+
+    settings: Settings
+    engine: Engine
+    telemetry: Telemetry | None = None
+    watch: LandmarkWatch | None = None
+    mission: Mission | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def assemble(
+    settings: Settings,
+    backend: str,
+    size_px: tuple[int, int],
+    rate_hz: float,
+    telemetry: Telemetry | None = None,
+    landmarks: Landmarks | None = None,
+    camera: Camera | None = None,
+    colours: Colours | None = None,
+    elevation: Elevation | None = None,
+) -> Assembly:
+    """A run of records; nothing is located without landmarks or telemetry with places.
+
+    Raises InputError as AerialLocator, and for landmarks that cannot be found.
+    """
+    if landmarks is None and not has_places(telemetry):
+        return Assembly(settings, load_engine(backend, settings), telemetry)
+    locator = AerialLocator(
+        camera, telemetry, landmarks, elevation, settings, rate_hz=rate_hz, backend=backend, size_px=size_px
+    )
+    if landmarks is not None:
+        check_colours(landmarks, colours, telemetry is not None and settings.aerial.mode == "pose")
+    return _with_locator(locator, colours, settings, backend, list(locator.notes))
+
+
+def _with_locator(
+    locator: AerialLocator, colours: Colours | None, settings: Settings, backend: str, notes: list[str]
+) -> Assembly:
+    settings, more = with_focal_length(settings, locator)
+    watch, engine = LandmarkWatch(locator, colours, backend), load_engine(backend, settings)
+    return Assembly(settings, engine, locator.site.telemetry, watch, notes=[*notes, *more])
+
+
+def assemble_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool) -> Assembly:
+    """The closed loop around a source whose first frame has been read. Raises InputError as `build_mission`."""
+    mission = build_mission(source, settings, backend, by_landmarks)
+    return Assembly(mission.settings, load_engine(backend, mission.settings), None, mission.watch, mission)
+
+
+def assemble_files(
+    given: AerialInput | None,
+    telemetry: Path | None,
+    settings: Settings,
+    source: Source,
+    backend: str,
+    clip: str,
+) -> Assembly:
+    """A run of the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
+    flight, of = None, source if isinstance(source, JoinedSource) else clip
+    reason = "neither --telemetry nor --landmarks were given"
+    if given is not None and given.landmarks is None:
+        flight, reason = _read_flight(given, settings, of)
+    if given is not None and not (given.landmarks is None and reason):
+        colours = read_colours(given.colours) if given.colours is not None else None
+        frames = None if source.count is None else (1, source.count)
+        locator, notes = read_locator(
+            given, settings, source.size, source.rate_hz, backend, frames, "clip", of, colours
+        )
+        landmarks = locator.site.landmarks
+        if given.landmarks is not None:
+            check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
+        if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
+            notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
+        return _with_locator(locator, colours, settings, backend, notes)
+    if flight is None and telemetry is not None:
+        flight = _read_telemetry(telemetry, settings, of)
+    if given is not None:
+        _check_unused(given, source.size)
+    settings, more = with_logged_focal(settings, flight, source.size)
+    notes = [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
+    return Assembly(settings, load_engine(backend, settings), flight, notes=notes)
+
+
+def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
+    """Set gates.focal_px from telemetry, else from the camera, given telemetry, unless it is set.
+
+    Returns settings and notes.
+    """
+    telemetry, camera = locator.site.telemetry, locator.camera
+    settings, notes = with_logged_focal(settings, telemetry, camera.size_px)
+    if notes or telemetry is None or is_set(settings, "gates.focal_px"):
+        return settings, notes
+    focal = camera.focal_px[0]
+    note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
+    if not locator.focal_known:
+        note = f"gates.focal_px is {focal:.0f} px by a guess: sizes in metres may be off by as much as the lens is"
+    return with_parameters(settings, {"gates.focal_px": focal}), [note]
+
+
+def _check_unused(given: AerialInput, size: tuple[int, int]) -> None:
+    """Raises InputError for a file that is wrong also where nothing can be located with it."""
+    if given.camera is not None:
+        read_aerial_camera(given.camera, size)
+    for path in (given.dem, given.background):
+        if path is not None and not path.is_file():
+            raise InputError(f"{path} is no file; wanted a GeoTIFF")
+
+
+def _read_flight(
+    given: AerialInput, settings: Settings, clip: str | JoinedSource | None
+) -> tuple[Telemetry | None, str]:
+    """The telemetry of a run without landmarks, and why it cannot locate anything; "" where it may."""
+    flight = None if given.telemetry is None else _read_telemetry(given.telemetry, settings, clip)
+    if not has_places(flight):
+        return flight, describe_no_place(flight)
+    try:
+        build_site(None, flight)
+    except InputError as error:
+        return flight, str(error)
+    return flight, ""
+
+
+def _read_telemetry(path: Path, settings: Settings, clip: str | JoinedSource | None) -> Telemetry:
+    aerial = settings.aerial
+
+    def read(path: Path, clip: str | None) -> Telemetry:
+        return read_telemetry(path, aerial.clock_offset_s, clip, aerial.time_zone, aerial.order)
+
+    return clip.read_logs(read) if isinstance(clip, JoinedSource) else read(path, clip)
+
+
+def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:
+    """What keeps anything from being found in a clip that was read to its end: the interval, or its size."""
+    notes = []
+    if interval > 1 and interval >= source.last:
+        notes.append(f"--interval {interval} is beyond the clip's {source.last} frames: only frame 1 was tracked")
+    (width, height), least = source.size, settings.gates.min_area_px
+    if settings.small.on:
+        least = min(least, settings.small.min_area_px)
+    if width * height < least:
+        notes.append(f"pictures of {width}x{height} px are too small for any target, which has {least} px or more")
+    return notes
+
+
+def read_locator(
+    given: AerialInput,
+    settings: Settings,
+    size: tuple[int, int] | None,
+    rate_hz: float | None,
+    backend: str,
+    frames: tuple[int, int] | None,
+    what: str,
+    clip: str | JoinedSource | None,
+    colours: Colours | None = None,
+    extent: tuple[float, float] | None = None,
+) -> tuple[AerialLocator, list[str]]:
+    """Make the aerial locator from the files; also the notes that the user should read.
+
+    size: (width, height) of the pictures; rate_hz; frames: numbers of the first and last; each None if unknown.
+    what: whose frames these are, for messages. clip: the video, as for `read_telemetry`. colours: if given, they find
+    the landmarks in the pictures, whatever the table says. extent: as for `resolve_camera`.
+    Raises InputError for bad input.
+    """
+    offset = settings.aerial.clock_offset_s
+    notes: list[str] = []
+    landmarks = None if given.landmarks is None else read_landmarks(given.landmarks, rate_hz, offset)
+    telemetry = _read_telemetry(given.telemetry, settings, clip) if given.telemetry is not None else None
+    if telemetry is not None:
+        if rate_hz is None:
+            raise InputError(
+                "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
+            )
+        if frames is not None and frames[1] > 0:
+            telemetry.check_overlap((frames[1] - 1) / rate_hz, (frames[0] - 1) / rate_hz, what)
+        notes += telemetry.notes
+    if rate_hz is None:
+        notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
+    site = build_site(landmarks if landmarks is None or colours is None else without_pixels(landmarks), telemetry)
+    if given.dem is not None:
+        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
+    known = read_aerial_camera(given.camera, size) if given.camera is not None else None
+    site, more = complete_site(site, known, settings)
+    notes += [*more, *describe_unknown_heights(site)]
+    camera, focal_known, more = resolve_camera(known, size, site.telemetry, settings, extent)
+    locator = AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
+    return locator, [*notes, *more]
+
+
+def locator_facts(locator: AerialLocator) -> dict[str, Any]:
+    """An aerial locator as run.json records it."""
+    camera = locator.camera
+    return {
+        "origin_deg": locator.site.origin_deg,
+        "rate_hz": locator.rate_hz,
+        "lens": {"size_px": camera.size_px, "focal_px": camera.focal_px, "centre_px": camera.centre_px},
+    }
+
+
+def map_site(locator: AerialLocator, background: Path | None) -> Site:
+    """What the maps show of the ground. Raises InputError for a background that cannot be read."""
+    site = locator.site
+    return Site(
+        names=site.landmarks.names,
+        origin_deg=site.origin_deg,
+        start_utc_s=site.telemetry.start_utc_s if site.telemetry is not None else math.nan,
+        rate_hz=locator.rate_hz,
+        background=None if background is None else read_ortho(background, site.places, site.origin_deg),
+        camera=locator.camera,
+        to_degrees=None if site.origin_deg is None else partial(geometry.lonlat, origin_deg=site.origin_deg),
+    )
