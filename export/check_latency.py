@@ -24,8 +24,8 @@ from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.simulation import film, load_scenario
 from torchvision_dddas.people.detector import load_scorer
-from torchvision_dddas.simulation import film, load_scenario
 from torchvision_dddas.types import Frame
 
 WARM_UP = 10

@@ -95,6 +95,9 @@ class RegistrationParameters(Group):
     )
     halved_corners: bool = parameter(False, "detect keypoints at half resolution: faster, less accurate")
     halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
+    direct: bool = parameter(
+        False, "register a frame with each frame that it is compared with, as the source does; else steps are chained"
+    )
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
     min_inlier_share: float = parameter(0.4, "with a smaller share of inliers registration is unreliable", "-", 0, 1)
 

@@ -8,7 +8,7 @@ import torch
 
 from tests.synthetic_clip import render
 from torchvision_dddas.config import EVIDENCE_SCALE, Settings, load_config, with_parameters
-from torchvision_dddas.detection import Window
+from torchvision_dddas.detection import MotionDetector, Window, detect_masks
 from torchvision_dddas.detection.interval import choose_pairs
 from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
@@ -183,6 +183,19 @@ def test_of_a_clip_it_finds_bit_for_bit_what_the_torch_engine_does(kind, images,
             np.testing.assert_array_equal(found.mask[number, at, 0].numpy() > 0.5, wanted.core > 0)
             np.testing.assert_array_equal(found.evidence[number, at, 0].numpy() * unit, wanted.evidence)
     assert found.mask.any() and set(found.mask.unique().tolist()) == {0.0, 1.0}
+
+
+def test_with_the_later_steps_it_is_the_detector_with_the_torch_engine(images, clip) -> None:
+    model = MotionSegmenter(with_parameters(Settings(), {"gates.min_area_px": 40}))
+    with torch.no_grad():
+        model.difference_threshold.mul_(1.2)
+    settings = model.tuned_settings()
+    assert settings.difference.threshold == pytest.approx(1.2 * Settings().difference.threshold)
+    detector = MotionDetector(settings, TorchEngine(settings, "cpu"))
+    scenes = [scene for image in images for scene in detector.update(image)] + detector.flush()
+    found = detect_masks(model, torch.cat([clip, clip.flip(1)]))
+    assert found.shape == (2, FRAMES, 1, *reversed(SIZE)) and found[0].any()
+    np.testing.assert_array_equal(found[0, :, 0].numpy(), np.stack([scene.mask > 0 for scene in scenes]))
 
 
 def test_of_a_clip_it_finds_the_motion_that_the_torch_engine_does(images, clip) -> None:

@@ -17,7 +17,7 @@ from torchvision_dddas.detection.interval import (
 )
 
 if TYPE_CHECKING:
-    from torchvision_dddas.detection.torch_engine import TorchEngine
+    from torchvision_dddas.detection.torch_engine import TorchEngine, detect_masks
 
 __all__ = [
     "WALKER_M_S",
@@ -30,6 +30,7 @@ __all__ = [
     "Window",
     "check_length",
     "describe_distance",
+    "detect_masks",
     "detect_motion",
     "fill_hull",
     "interval_from_flow",

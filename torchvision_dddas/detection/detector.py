@@ -387,11 +387,7 @@ class MotionDetector:
             return None
         used = sorted({i for pair in [*near, wide, small] if pair for i in pair})
         place = {i: k for k, i in enumerate(used)}
-        matrices = []
-        for other in used:
-            steps = [self._at(i).step for i in range(min(index, other), max(index, other))]
-            last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
-            matrices.append(last_from_first if other > index else np.linalg.inv(last_from_first))
+        matrices = [self._motion_between(index, other) for other in used]
         return Window(
             slot.view,
             tuple(self._at(i).view for i in used),
@@ -403,6 +399,16 @@ class MotionDetector:
             settings.morphology.close_px,
             settings,
         )
+
+    def _motion_between(self, index: int, other: int) -> np.ndarray:
+        """(3, 3) the background's motion from a frame to another one that reliable steps link to it."""
+        if self.settings.registration.direct:
+            (step,) = self.engine.register([(self._at(index).view, self._at(other).view)])
+            if step.reliable:
+                return step.later_from_earlier
+        steps = [self._at(i).step for i in range(min(index, other), max(index, other))]
+        last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
+        return last_from_first if other > index else np.linalg.inv(last_from_first)
 
     def _follow_small(self, index: int) -> None:
         start, observation, boxes = time.perf_counter(), self._at(index).observation, []

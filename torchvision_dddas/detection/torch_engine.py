@@ -7,10 +7,12 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.chain import View, Window, match_exposure
 from torchvision_dddas.config import Settings
+from torchvision_dddas.detection.detector import MotionDetector
 from torchvision_dddas.detection.engine import Engine, Foreground, grey_of, judge_points
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
 from torchvision_dddas.errors import InputError
@@ -167,6 +169,20 @@ class TorchEngine(Engine[TensorView]):
         if view.levels is None:
             view.levels = torch.from_numpy(view.grey)[None, None].to(self.device).float()
         return view.levels
+
+
+def detect_masks(model: MotionSegmenter, clip: Float[Tensor, "B T C H W"]) -> Bool[Tensor, "B T 1 H W"]:
+    """The masks of `MotionDetector` on the torch engine, with the numbers that a model has learned.
+
+    clip: RGB or grey pictures in [0, 1]. Raises InputError as `MotionDetector`.
+    """
+    settings, masks = model.tuned_settings(), []
+    for pictures in (clip.detach() * 255).round().to(torch.uint8).cpu().numpy():
+        detector = MotionDetector(settings, TorchEngine(settings, clip.device))
+        frames = pictures[:, 0] if clip.shape[2] == 1 else pictures[:, ::-1].transpose(0, 2, 3, 1)
+        scenes = [scene for frame in frames for scene in detector.update(np.ascontiguousarray(frame))]
+        masks.append(np.stack([scene.mask > 0 for scene in [*scenes, *detector.flush()]]))
+    return torch.from_numpy(np.stack(masks))[:, :, None].to(clip.device)
 
 
 def _apply_in_groups(

@@ -25,7 +25,7 @@ from torchvision_dddas.chain import (
     near_pairs,
     next_pair,
 )
-from torchvision_dddas.config import Settings, check_settings
+from torchvision_dddas.config import Settings, check_settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.nn.registration import LEVEL, Registration
 
@@ -98,7 +98,9 @@ class Regions:
 
 
 class MotionSegmenter(nn.Module):
-    """Masks of what moves in clips of a moving camera.
+    """Masks of what moves in clips of a moving camera, up to the cleaned mask.
+
+    `detection.detect_masks` adds the detector's later steps: weak blobs, hulls, persistence, outlines.
 
     Parameters that are named in `tuned` are nn.Parameters, float64 as the settings' numbers; others are those of the
     settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
@@ -131,6 +133,18 @@ class MotionSegmenter(nn.Module):
         for name, attribute in self.tuned.items():
             start = torch.tensor(float(chain.value(name)), dtype=torch.float64)
             self.register_parameter(attribute, nn.Parameter(start))
+
+    def tuned_settings(self) -> Settings:
+        """The settings with the learned numbers, sizes rounded: the detector that the module is.
+
+        >>> detector = td.MotionDetector(model.tuned_settings(), "torch")
+        """
+        learned: dict[str, object] = {}
+        for name, attribute in self.tuned.items():
+            number = float(getattr(self, attribute).detach())
+            is_whole = isinstance(DetectionChain(self.settings, F.TensorOperations()).value(name), int)
+            learned[name] = round(number) if is_whole else number
+        return with_parameters(self.settings, learned)
 
     def forward(
         self,
