@@ -1,9 +1,8 @@
 """The motion detector: frames of a moving camera in, scenes with targets out, a few frames later."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,36 +11,27 @@ from torchvision_dddas.chain import View, Window, near_gaps
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.engine import Engine
+from torchvision_dddas.detection.frame_buffer import FrameBuffer, Slot
 from torchvision_dddas.detection.interval import (
-    DistanceSettings,
-    adjust_interval,
     choose_pairs,
-    describe_distance,
-    follow_distance,
-    interval_from_flow,
-    interval_from_telemetry,
     look_ahead,
-    look_cost,
-    settings_at,
     settling_delay,
     small_gap_follows_distance,
     with_logged_focal,
 )
+from torchvision_dddas.detection.interval_controller import IntervalController
 from torchvision_dddas.detection.motion_history import MotionHistory
-from torchvision_dddas.detection.observation import Observation, Target, build_detections, draw_targets, observe
+from torchvision_dddas.detection.observation import Target, build_detections, draw_targets, observe
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.detection.repeats import RepeatRule
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import chain
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry, as_picture
 
 Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
 """Called before a frame is taken: returns the settings from then on, and the record of what changed."""
 
-# A picture whose grey levels have a smaller standard deviation is blank: even fog shows more.
-_BLANK_LEVELS = 1.0
 _MIN_FRAMES = 3  # that a window needs
 _JUDGED_FRAMES = 5  # that persistence uses: two before and two after the frame
 _TORCH_BATCH = 8
@@ -106,34 +96,6 @@ def check_length(frames: int) -> None:
         raise InputError(f"the clip has {few} that can be read, a window needs {_MIN_FRAMES}: {missing} missing")
 
 
-@dataclass
-class _Slot:
-    """One frame in flight. look: its number if frames that are skipped on purpose, or repeated, did not count.
-
-    passed: those frames since the slot before. step: registration to the next slot; None while unknown and at the end.
-    interval: 0 until it is chosen. repeats: the frames that repeat this one.
-    """
-
-    frame: Frame
-    view: View
-    look: int
-    passed: int
-    is_blank: bool
-    distance: DistanceSettings
-    adjustments: tuple[Adjustment, ...]
-    seconds: dict[str, float]
-    step: Registration | None = None
-    interval: int = 0
-    repeats: list[Frame] = field(default_factory=list)
-    observation: Observation = field(default_factory=Observation)
-    cause: str = ""
-
-    @property
-    def next_from_this(self) -> np.ndarray | None:
-        """(3, 3) registration to the next frame; None if it is unknown or unreliable."""
-        return self.step.later_from_earlier if self.step is not None and self.step.reliable else None
-
-
 class MotionDetector:
     """Finds what moves against the background in the frames of a moving camera.
 
@@ -160,14 +122,12 @@ class MotionDetector:
         if not rate_hz > 0 or not isinstance(telemetry, Telemetry | None):
             got = f"{rate_hz} and {type(telemetry).__name__}"
             raise InputError(f"rate_hz must be positive and telemetry of td.read_telemetry(path), got {got}")
-        self.rate_hz, self.telemetry = rate_hz, telemetry
-        self.interval = self.settings.interval.frames
-        self._slots: deque[_Slot] = deque()
+        self.rate_hz = rate_hz
+        self._controller = IntervalController(self.settings, rate_hz, telemetry)
+        self._buffer = FrameBuffer()
         self._memory = _memory_frames(self.settings, telemetry is not None)
-        self._first = 0  # index of _slots[0]; indices count the frames that were read
-        # Slots below these indices are registered, observed, have their targets, are in the history, were returned.
+        # Frames below these indices are registered, observed, have their targets, are in the history, were returned.
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
-        self._total = 0
         self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest one
         self._returned = self._last  # of the scenes returned
         self._skipped = 0  # frames skipped on purpose, or repeated, so far
@@ -175,12 +135,23 @@ class MotionDetector:
         self._repeats, self._most_repeats = RepeatRule(), _MOST_REPEATS
         self._held: tuple[Adjustment, ...] = ()  # of repeated frames
         self._ended = False
-        self._flows: deque[float] = deque(maxlen=self.settings.interval.memory_frames)
-        self._costs: deque[float] = deque(maxlen=self.settings.interval.memory_frames)  # seconds that looks took
         self._flow = DenseFlow()
         self._small_tracks = SmallTracks(self.settings.small)
-        self._distance = DistanceSettings(self.settings)
         self._history = MotionHistory(self.settings.history.duration_frames)
+
+    @property
+    def interval(self) -> int:
+        """The detection interval in force, frames."""
+        return self._controller.interval
+
+    @property
+    def telemetry(self) -> Telemetry | None:
+        """What steers the interval and the gates; it may be replaced between two frames."""
+        return self._controller.telemetry
+
+    @telemetry.setter
+    def telemetry(self, telemetry: Telemetry | None) -> None:
+        self._controller.telemetry = telemetry
 
     def update(self, frame: Frame | np.ndarray, adjustments: tuple[Adjustment, ...] = ()) -> list[Scene]:
         """Take one frame; returns the scenes that are settled by it, oldest first, often none.
@@ -204,11 +175,7 @@ class MotionDetector:
             return
         self.settings = self.engine.parameters = settings
         self._memory = max(self._memory, _memory_frames(settings, self.telemetry is not None))
-        distance_m = self._distance.distance_m
-        if distance_m is None:
-            self._distance = DistanceSettings(settings)
-        else:
-            self._distance = settings_at(distance_m, self.rate_hz, settings)
+        self._controller.change_settings(settings)
 
     def _as_frame(self, frame: Frame | np.ndarray) -> Frame:
         image = as_picture(frame.image if isinstance(frame, Frame) else frame)
@@ -228,7 +195,7 @@ class MotionDetector:
         if not self._total:
             self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1::-1])[0])
         view = self.engine.prepare(frame.image)
-        repeats = self._at(self._total - 1).repeats if self._total else []
+        repeats = self._buffer[self._total - 1].repeats if self._total else []
         most = _MOST_REPEATS_LIVE if np.isfinite(frame.taken_s) else self._most_repeats
         if self._repeats.is_repeat(view.grey) and len(repeats) < most:
             self._last = replace(frame, image=self._last.image)  # one picture for all of them
@@ -243,19 +210,17 @@ class MotionDetector:
     def _add(self, frame: Frame, view: View, adjustments: tuple[Adjustment, ...], prepare_s: float) -> None:
         passed, self._passed, self._held = self._passed + frame.skipped, 0, ()
         self._skipped += passed
-        is_blank = float(view.grey[::4, ::4].std()) < _BLANK_LEVELS
         self._last, look, seconds = frame, frame.number - self._skipped, {"prepare": prepare_s}
-        self._slots.append(_Slot(frame, view, look, passed, is_blank, self._distance, adjustments, seconds))
-        self._total += 1
+        self._buffer.append(Slot(frame, view, look, passed, self._controller.distance, adjustments, seconds))
 
     def _settle_rest(self, last_number: int = 0) -> Iterator[Scene]:
         """As `flush`, one scene at a time."""
-        if self._slots and self._total < _MIN_FRAMES:  # nothing changes: its copies are looks all the same
-            few, repeats = _MIN_FRAMES - self._total, self._slots[-1].repeats
-            self._slots[-1].repeats, self._passed = [], 0
+        if 0 < self._total < _MIN_FRAMES:  # nothing changes: its copies are looks all the same
+            last, few = self._buffer[self._total - 1], _MIN_FRAMES - self._total
+            repeats, last.repeats, self._passed = last.repeats, [], 0
             for frame in repeats[:few]:
-                self._add(frame, self._slots[-1].view, (), 0.0)
-            self._slots[-1].repeats += repeats[few:]
+                self._add(frame, last.view, (), 0.0)
+            self._buffer[self._total - 1].repeats += repeats[few:]
         check_length(self._total)
         self._ended = True
         yield from self._advance()
@@ -272,19 +237,13 @@ class MotionDetector:
                 self._draw()
                 yield from self._emit()  # after every frame: what is settled must not depend on the batch
 
-    def _at(self, index: int) -> _Slot:
-        return self._slots[index - self._first]
-
-    def _from_before(self, index: int) -> Registration | None:
-        """The registration from the frame before."""
-        return self._at(index - 1).step if index > self._first else None
-
-    def _this_from_last(self, index: int) -> np.ndarray | None:
-        return self._at(index - 1).next_from_this if index > self._first else None
+    @property
+    def _total(self) -> int:
+        return self._buffer.total
 
     def _register(self) -> None:
         """Register all successive frames that are here."""
-        slots = [self._at(i) for i in range(self._registered, self._total)]
+        slots = self._buffer.span(self._registered, self._total)
         if len(slots) < 2:
             return
         start = time.perf_counter()
@@ -292,63 +251,25 @@ class MotionDetector:
         for i in range(0, len(slots) - 1, self.batch):
             part = slots[i : i + self.batch + 1]
             steps += self.engine.register([(a.view, b.view) for a, b in pairwise(part)])
-        seconds = (time.perf_counter() - start) / len(steps)
-        for (slot, after), step in zip(pairwise(slots), steps, strict=True):
-            # Tracking onto a blank picture seems to succeed: keypoints stay where the search began.
-            is_blank = slot.is_blank or after.is_blank
-            slot.step = replace(step, reliable=False, cause="the picture is blank") if is_blank else step
-            slot.seconds["register"] = seconds
+        self._buffer.set_steps(self._registered, steps, (time.perf_counter() - start) / len(steps))
         self._registered += len(steps)
 
     def _find_ready(self) -> list[int]:
         """Up to `batch` frames whose windows are complete."""
         ready: list[int] = []
         for index in range(self._observed, min(self._observed + self.batch, self._total)):
-            slot = self._at(index)
+            slot = self._buffer[index]
             if not slot.interval:
                 if slot.step is None and not self._ended:
                     break
-                self._steer(index, slot)
+                if self.telemetry is not None:
+                    self._memory = max(self._memory, _memory_frames(self.settings, True))
+                self._controller.steer(self._buffer, index)
             if not self._ended and self._registered < index + look_ahead(slot.interval, slot.distance.settings):
                 break
             ready.append(index)
         # Whole batches only while the clip runs: a batching engine takes as long for four windows as for eight.
         return ready if self._ended or len(ready) == self.batch else []
-
-    def _steer(self, index: int, slot: _Slot) -> None:
-        """Apply the feedback rules of the detection interval and of the distance to the ground."""
-        parameters, number = self.settings.interval, slot.frame.number
-        flight = None
-        if self.telemetry is not None:
-            flight = self.telemetry.at(slot.frame.time_s)
-            self._memory = max(self._memory, _memory_frames(self.settings, True))
-        # A log may say one of altitude and speed without the other, or fall silent for a while. A height of 0 or less,
-        # as on the ground or below a take-off on a hill, tells nothing of the distance to what is seen.
-        high = flight if flight is not None and flight.altitude_m > 0 else None
-        self._distance, moved = follow_distance(number, self._distance, high, self.rate_hz, self.settings)
-        slot.adjustments += moved
-        slot.distance = self._distance
-        if slot.step is not None and slot.step.reliable:
-            self._flows.append(slot.step.flow_px / (self._at(index + 1).passed + 1))
-        wanted, cause = None, ""
-        cost, measured = look_cost(self._costs, parameters)
-        if not parameters.rule:
-            pass
-        elif high is not None and np.isfinite(high.speed_m_s):
-            wanted = interval_from_telemetry(high.distance_m, high.speed_m_s, self.rate_hz, cost, parameters)
-            cause = f"{describe_distance(high)}, speed {high.speed_m_s:.1f} m/s"
-        elif self._flows and parameters.reference_flow:
-            wanted = interval_from_flow(self._flows, slot.view.size[0], cost, parameters)
-            cause = f"background flow {np.median(self._flows):.2f} px a frame"
-        if wanted is not None:
-            wanted /= slot.passed + 1
-            if left := slot.passed:
-                cause += f", {left} frame{'s' * (left > 1)} before it dropped or left out"
-                cause += " or repeated" * (left > slot.frame.skipped)
-            used = self._distance.settings
-            self.interval, moved = adjust_interval(number, self.interval, wanted, cause + measured, used)
-            slot.adjustments += moved
-        slot.interval = self.interval
 
     def _observe(self, indices: list[int]) -> None:
         start = time.perf_counter()
@@ -356,30 +277,26 @@ class MotionDetector:
         foregrounds = self.engine.foreground([window for _, window in made]) if made else []
         seconds = (time.perf_counter() - start) / max(len(made), 1)
         for (index, window), foreground in zip(made, foregrounds, strict=True):
-            slot = self._at(index)
+            slot = self._buffer[index]
             start = time.perf_counter()
             history = None
             if self.settings.history.on:
                 history = self._history
-                for i in range(max(self._remembered, self._first), index + 1):
-                    history.move(self._at(i).look, self._this_from_last(i))
+                for i in range(max(self._remembered, self._buffer.first), index + 1):
+                    history.move(self._buffer[i].look, self._buffer.this_from_last(i))
                 self._remembered = index + 1
             slot.observation = observe(window, foreground, self._flow, slot.distance.settings, history)
             slot.seconds |= {"foreground": seconds, "blobs": time.perf_counter() - start}
 
     def _build_window(self, index: int) -> Window | None:
-        slot, settings = self._at(index), self._at(index).distance.settings
-        before = self._from_before(index)
+        slot, settings = self._buffer[index], self._buffer[index].distance.settings
+        before = self._buffer.step_before(index)
         if before is not None and not before.reliable:  # a cut or a blank picture: reported once, at this frame
             slot.cause = before.cause
             return None
-        # The first and last frame that reliable steps link to this one.
-        parameters, first, last = self.settings.difference, index, index
+        parameters = self.settings.difference
         back = index - max(parameters.wide_frames, 2 * slot.interval, 2 * max(parameters.near_frames))
-        while first > max(self._first, back) and self._this_from_last(first) is not None:
-            first -= 1
-        while last < min(self._registered, index + 2 * slot.interval) and self._at(last).next_from_this is not None:
-            last += 1
+        first, last = self._buffer.linked(index, back, min(self._registered, index + 2 * slot.interval))
         near, wide, small = choose_pairs(index, slot.interval, first, last, settings)
         if not near:
             is_cut = slot.step is not None and not slot.step.reliable
@@ -390,7 +307,7 @@ class MotionDetector:
         matrices = [self._motion_between(index, other) for other in used]
         return Window(
             slot.view,
-            tuple(self._at(i).view for i in used),
+            tuple(self._buffer[i].view for i in used),
             np.array(matrices),
             tuple(i - index for i in used),
             tuple((place[a], place[b]) for a, b in near),
@@ -403,27 +320,25 @@ class MotionDetector:
     def _motion_between(self, index: int, other: int) -> np.ndarray:
         """(3, 3) the background's motion from a frame to another one that reliable steps link to it."""
         if self.settings.registration.direct:
-            (step,) = self.engine.register([(self._at(index).view, self._at(other).view)])
+            (step,) = self.engine.register([(self._buffer[index].view, self._buffer[other].view)])
             if step.reliable:
                 return step.later_from_earlier
-        steps = [self._at(i).step for i in range(min(index, other), max(index, other))]
-        last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
-        return last_from_first if other > index else np.linalg.inv(last_from_first)
+        return self._buffer.motion(index, other)
 
     def _follow_small(self, index: int) -> None:
-        start, observation, boxes = time.perf_counter(), self._at(index).observation, []
+        start, observation, boxes = time.perf_counter(), self._buffer[index].observation, []
         if observation.foreground is not None and observation.foreground.small is not None:
             boxes = find_candidates(observation.foreground.small, self.settings.small)
             observation.foreground = replace(observation.foreground, small=None)  # not needed again
-        self._small_tracks.step(index, self._this_from_last(index), boxes)
-        self._at(index).seconds["small"] = time.perf_counter() - start
+        self._small_tracks.step(index, self._buffer.this_from_last(index), boxes)
+        self._buffer[index].seconds["small"] = time.perf_counter() - start
 
     def _draw(self) -> None:
         """Draw the targets of the frames whose following frames, as far as persistence needs them, are observed."""
         followers = 2 if self.settings.persistence.on else 0
         while self._drawn < self._observed and (self._drawn + followers < self._observed or self._all_observed):
             index, start = self._drawn, time.perf_counter()
-            slot, slots, at = self._at(index), *self._around(index)
+            slot, slots, at = self._buffer[index], *self._around(index)
             observations, steps = [s.observation for s in slots], [s.next_from_this for s in slots]
             slot.observation.targets = draw_targets(observations, steps, at, slot.distance.settings)
             slot.observation.window = slot.observation.foreground = None
@@ -434,15 +349,15 @@ class MotionDetector:
     def _all_observed(self) -> bool:
         return self._ended and self._observed == self._total
 
-    def _around(self, index: int) -> tuple[list[_Slot], int]:
+    def _around(self, index: int) -> tuple[list[Slot], int]:
         """The observed frames at most two away, and the place of this one among them."""
-        first = max(index - 2, self._first)
-        return [self._at(i) for i in range(first, min(index + 3, self._observed))], index - first
+        slots = self._buffer.span(index - 2, min(index + 3, self._observed))
+        return slots, index - max(index - 2, self._buffer.first)
 
     def _emit(self) -> Iterator[Scene]:
         """The scenes that no later frame can change, and let go of what no window needs again."""
         while self._emitted < self._drawn:
-            slot = self._at(self._emitted)
+            slot = self._buffer[self._emitted]
             delay = settling_delay(slot.interval, slot.distance.settings)
             if not self._all_observed and self._emitted + delay >= self._observed:
                 break
@@ -456,12 +371,8 @@ class MotionDetector:
             # Colour is most of the memory: the scene has it, and windows use the view's only.
             slot.frame = replace(slot.frame, image=slot.view.grey)
             self._emitted += 1
-            if (old := self._emitted - 1 - self.settings.difference.wide_frames) >= self._first:
-                view = self._at(old).view
-                view.image = view.grey
-            while self._first < min(self._emitted - 2, self._observed - self._memory):
-                self._slots.popleft()
-                self._first += 1
+            self._buffer.drop_colours(self._emitted - 1 - self.settings.difference.wide_frames)
+            self._buffer.drop_before(min(self._emitted - 2, self._observed - self._memory))
 
     def _fill_gap(self, until: int, following: Frame | None, interval: int) -> Iterator[Scene]:
         """Empty scenes for the frame numbers below `until` that could not be read. following: the frame after them."""
@@ -475,8 +386,8 @@ class MotionDetector:
             missing = Frame(number, time_s, image)
             yield Scene(missing, mask, detections, interval, False, "the frame could not be read")
 
-    def _build_scene(self, slot: _Slot, index: int) -> Scene:
-        self._costs.append(sum(slot.seconds.values()))
+    def _build_scene(self, slot: Slot, index: int) -> Scene:
+        self._controller.add_cost(slot)
         targets = slot.observation.targets
         targets = targets + self._small_targets(index, targets)
         if slot.passed:  # what moved from look to look, per frame
@@ -493,7 +404,7 @@ class MotionDetector:
             cause=slot.cause,
             adjustments=slot.adjustments,
             seconds=slot.seconds,
-            step=self._from_before(index),
+            step=self._buffer.step_before(index),
             core=core,
         )
 

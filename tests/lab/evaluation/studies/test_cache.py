@@ -143,8 +143,8 @@ def test_a_file_is_read_again_only_after_a_change_and_one_just_written_is_not_re
 @pytest.mark.parametrize(
     ("path", "counts"),
     [
-        *(("detection/detector.py", True), ("evaluation/metrics/boxes.py", True), ("graphs/manifest.json", True)),
-        *(("cli/run.py", False), ("live/runner.py", False), ("evaluation/report/__init__.py", False)),
+        *(("detection/detector.py", True), ("lab/evaluation/metrics/boxes.py", True), ("graphs/manifest.json", True)),
+        *(("cli/run.py", False), ("live/runner.py", False), ("lab/evaluation/report/__init__.py", False)),
     ],
 )
 def test_results_depend_on_the_code_that_a_study_can_run(monkeypatch, path, counts) -> None:
