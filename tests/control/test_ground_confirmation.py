@@ -10,9 +10,9 @@ import pytest
 
 from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.control import ground_confirmation
+from torchvision_dddas.control.confirmation import GroundObservation
 from torchvision_dddas.control.ground_confirmation import GroundConfirmation, drop_fast_targets, expected_regions
 from torchvision_dddas.control.prediction import Prediction
-from torchvision_dddas.people.confirmation import GroundObservation
 from torchvision_dddas.types import (
     AerialLocations,
     Camera,

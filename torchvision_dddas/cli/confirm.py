@@ -23,7 +23,7 @@ from torchvision_dddas.cli.progress import closing_lines, record_results
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.people.confirmation import Vehicle
+    from torchvision_dddas.control.confirmation import Vehicle
 
 KINDS = {True: "positions (east_m, north_m)", False: "boxes"}
 
@@ -66,12 +66,12 @@ def confirm(
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
     from torchvision_dddas.config import load_config
+    from torchvision_dddas.control.confirmation import confirm_pictures, confirm_positions
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import read_detections, read_rows
     from torchvision_dddas.io.ground_tables import read_positions
     from torchvision_dddas.io.output import CONFIRMATION_NAMES, ConfirmationRecorder
     from torchvision_dddas.io.tables import LAST_FRAME
-    from torchvision_dddas.people.confirmation import confirm_pictures, confirm_positions
 
     settings, cameras, poses = load_config(config, set_ or []), camera or [], poses or []
     check_interval(interval, LAST_FRAME)
@@ -134,9 +134,9 @@ def _read_vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
     """The tables with their cameras: one each, or all of them for a single table. Raises InputError otherwise."""
+    from torchvision_dddas.control.confirmation import Vehicle
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.ground_tables import read_positions
-    from torchvision_dddas.people.confirmation import Vehicle
 
     if len(people) > 1 and cameras and len(cameras) != len(people):
         raise InputError(

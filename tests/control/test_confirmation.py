@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters
-from torchvision_dddas.people.confirmation import (
+from torchvision_dddas.control.confirmation import (
     Beliefs,
     GroundObservation,
     View,
