@@ -188,7 +188,7 @@ def test_of_a_clip_it_finds_bit_for_bit_what_the_torch_engine_does(kind, images,
 def test_with_the_later_steps_it_is_the_detector_with_the_torch_engine(images, clip) -> None:
     model = MotionSegmenter(with_parameters(Settings(), {"gates.min_area_px": 40}))
     with torch.no_grad():
-        model.difference_threshold.mul_(1.2)
+        model.get_parameter("difference_threshold").mul_(1.2)
     settings = model.tuned_settings()
     assert settings.difference.threshold == pytest.approx(1.2 * Settings().difference.threshold)
     detector = MotionDetector(settings, TorchEngine(settings, "cpu"))

@@ -1,0 +1,85 @@
+"""Every parameter: its default, unit, range and meaning; TOML files and `group.parameter=value` overrides."""
+
+from torchvision_dddas.config.detection import (
+    EVIDENCE_CAP,
+    EVIDENCE_SCALE,
+    HALF,
+    WHITE,
+    DifferenceParameters,
+    HistoryParameters,
+    IntervalParameters,
+    PersistenceParameters,
+    RegistrationParameters,
+    SmallParameters,
+    exposure_step,
+)
+from torchvision_dddas.config.geo import AerialParameters, GroundParameters, LandmarkParameters
+from torchvision_dddas.config.group import Group, parameter
+from torchvision_dddas.config.loader import (
+    config_folder,
+    config_names,
+    describe_error,
+    format_toml,
+    is_file,
+    load_config,
+    nearest,
+    parse_override,
+    read_toml,
+    with_parameters,
+)
+from torchvision_dddas.config.operation import ConfirmParameters, LiveParameters, SteeringParameters
+from torchvision_dddas.config.people import PeopleParameters
+from torchvision_dddas.config.settings import (
+    Parameter,
+    Settings,
+    all_parameters,
+    changes,
+    check_settings,
+    describe_parameter,
+    is_set,
+    range_of,
+)
+from torchvision_dddas.config.tracking import PaperParameters, TrackParameters
+
+__all__ = [
+    "EVIDENCE_CAP",
+    "EVIDENCE_SCALE",
+    "HALF",
+    "WHITE",
+    "AerialParameters",
+    "ConfirmParameters",
+    "DifferenceParameters",
+    "GroundParameters",
+    "Group",
+    "HistoryParameters",
+    "IntervalParameters",
+    "LandmarkParameters",
+    "LiveParameters",
+    "PaperParameters",
+    "Parameter",
+    "PeopleParameters",
+    "PersistenceParameters",
+    "RegistrationParameters",
+    "Settings",
+    "SmallParameters",
+    "SteeringParameters",
+    "TrackParameters",
+    "all_parameters",
+    "changes",
+    "check_settings",
+    "config_folder",
+    "config_names",
+    "describe_error",
+    "describe_parameter",
+    "exposure_step",
+    "format_toml",
+    "is_file",
+    "is_set",
+    "load_config",
+    "nearest",
+    "parameter",
+    "parse_override",
+    "range_of",
+    "read_toml",
+    "with_parameters",
+]
