@@ -53,6 +53,24 @@ def test_a_source_and_single_frames_give_the_same_results(frames):
     assert any(len(r.tracks) for r in called)
 
 
+def test_the_backend_of_a_pipeline_is_that_of_its_tracker_too(frames, monkeypatch):
+    pytest.importorskip("torch")
+    from torchvision_dddas.tracking import torch_source_tracker
+
+    made: list[object] = []
+
+    class Watched(torch_source_tracker.TorchSourceTracker):
+        def __init__(self, *given: Any) -> None:
+            made.append(given)
+            super().__init__(*given)
+
+    monkeypatch.setattr(torch_source_tracker, "TorchSourceTracker", Watched)
+    for backend, count in (("onboard", 0), ("torch", 1)):
+        made.clear()
+        list(Pipeline("paper", backend)(frames))
+        assert len(made) == count
+
+
 def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))

@@ -98,7 +98,7 @@ def test_landmarks_that_fit_hopelessly_leave_a_gap_and_no_place():
     seen = look(8, n=6)
     fix = georeferencer().update(7, 0.0, None, replace(seen.marks, image_px=seen.marks.image_px[[4, 2, 1, 0, 5, 3]]))
     assert fix.by == "" and fix.pose is None and fix.state == ("excluded",) * 6
-    assert "the landmarks disagree" in fix.cause and "10 times as large" in fix.cause
+    assert "the landmarks disagree" in fix.cause
 
 
 # Flights with slow errors.

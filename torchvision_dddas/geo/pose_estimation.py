@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchvision_dddas.config import AerialParameters
+from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
 from torchvision_dddas.geometry.projection import axes_of, normalize, project_with_slopes, rays
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
@@ -317,15 +318,10 @@ def _turned_about_up(
 def _by_homography(marks: LandmarkObservations, camera: Camera) -> list[CameraPose]:
     """Poses that see the ground as an unweighted homography does, and as its mirror, hard to tell apart from afar."""
     ground, flat = marks.east_north_m, normalize(marks.image_px, camera)
-    middle, size = ground.mean(axis=0), max(float(np.abs(ground - ground.mean(axis=0)).max()), 1e-9)
-    (x, y), (u, v) = ((ground - middle) / size).T, flat.T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows_u = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=1)
-    rows_v = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=1)
-    matrix = np.linalg.svd(np.concatenate([rows_u, rows_v]))[2][-1].reshape(3, 3)
-    # From metres about the landmarks' middle to metres right and down a metre of depth.
-    matrix = matrix @ np.diag([1 / size, 1 / size, 1.0])
-    if not np.isfinite(matrix).all():
+    middle = ground.mean(axis=0)
+    # From metres about the landmarks' middle to metres right and down a metre of depth, by the graph that ships.
+    (matrix,), (is_valid,) = load_solver("onboard").solve((ground - middle)[None], flat[None], np.ones((1, len(flat))))
+    if not is_valid or not np.isfinite(matrix).all():
         return []
     scale = np.sqrt(np.linalg.norm(matrix[:, 0]) * np.linalg.norm(matrix[:, 1]))
     if not scale > 0:

@@ -204,7 +204,8 @@ class Pipeline:
         self.settings, self.telemetry = assembly.settings, assembly.telemetry
         self._watch, self._mission = assembly.watch, assembly.mission
         self._clip_rate_hz = rate_hz
-        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures, rate_hz=rate_hz)
+        backend = assembly.engine.name
+        self._tracker = SceneTracker(self.settings, self.interval, size_px, self._pictures, backend, rate_hz)
         self._crowds = CrowdIdentities() if self.settings.crowds.join_m and self._watch is not None else None
         self._waiting: dict[int, WatchedScene] = {}
         self._watched: WatchedScene | None = None  # the last one
