@@ -12,6 +12,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator
 from torchvision_dddas.geo.ground_locator import GroundLocator
 from torchvision_dddas.pipeline import Pipeline
+from torchvision_dddas.pipeline.assembly import view_reach_m
 from torchvision_dddas.types import Camera, Detections, Frame, People, Registration, Scene, Telemetry, Tracks
 
 CAMERA = Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
@@ -230,3 +231,18 @@ def test_people_are_located_by_a_camera_alone():
     )
     found = GroundLocator(camera).locate(people)
     assert found.positions.east_north_m[0, 1] == pytest.approx(10.1, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    ("altitude_m", "pitch_deg", "reach_m"), [(50.0, 90.0, 500.0), (1500.0, 30.0, 2598.0), (3000.0, 1.0, 10_000.0)]
+)
+def test_elevations_are_read_as_far_as_the_camera_sees(altitude_m, pitch_deg, reach_m):
+    log = Telemetry(
+        np.arange(3.0),
+        np.full(3, np.nan),
+        np.zeros(3),
+        above_sea_m=np.full(3, altitude_m),
+        pitch_rad=np.radians(np.full(3, pitch_deg)),
+    )
+    assert view_reach_m(log) == pytest.approx(reach_m, abs=1.0)
+    assert view_reach_m(None) == 500.0

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, is_set, with_parameters
 from torchvision_dddas.control import Instrument, Mission, build_mission
@@ -247,13 +249,28 @@ def read_locator(
         notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
     site = build_site(landmarks if landmarks is None or colours is None else without_pixels(landmarks), telemetry)
     if given.dem is not None:
-        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg))
+        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg, view_reach_m(telemetry)))
     known = read_aerial_camera(given.camera, size) if given.camera is not None else None
     site, more = complete_site(site, known, settings)
     notes += [*more, *describe_unknown_heights(site)]
     camera, focal_known, more = resolve_camera(known, size, site.telemetry, settings, extent)
     locator = AerialLocator.from_site(site, camera, settings, load_solver(backend), rate_hz or 10.0, focal_known)
     return locator, [*notes, *more]
+
+
+def view_reach_m(telemetry: Telemetry | None) -> float:
+    """How far from the vehicle the ground is that its camera sees: 500 m, or more for a view to the side.
+
+    By the 95th percentile of the heights over the tangents of the pitch, at most 10 km.
+    """
+    least_m, most_m = 500.0, 10_000.0
+    if telemetry is None:
+        return least_m
+    heights = (telemetry.altitude_m, telemetry.above_sea_m, telemetry.above_ellipsoid_m)
+    height_m = next((h for h in heights if np.isfinite(h).any()), np.full(len(telemetry), np.nan))
+    reach_m = height_m / np.tan(np.clip(telemetry.pitch_rad, np.radians(3), np.radians(90)))
+    reach_m = reach_m[np.isfinite(reach_m)]
+    return float(np.clip(np.percentile(reach_m, 95), least_m, most_m)) if len(reach_m) else least_m
 
 
 def locator_facts(locator: AerialLocator) -> dict[str, Any]:
