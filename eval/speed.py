@@ -5,6 +5,7 @@ python eval/speed.py memory             peak memory of one chain alone, of `ddda
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
 python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
+python eval/speed.py batches            the torch engine with more or fewer pictures in work at once
 python eval/speed.py gpu                frames a second and the operations' forms on an accelerator; see `make gpu`
 python eval/speed.py association SEQ    the source's association of a MOTChallenge sequence, onboard and torch
 
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ import numpy as np
 import plain_chain
 from clips import Size, clips_in, film_of, frames_of, read_frames, resize, scene, there_and_back, truth_of, write_video
 
-from torchvision_dddas.config import PeopleParameters, load_config
+from torchvision_dddas.config import PeopleParameters, Settings, load_config
 from torchvision_dddas.detection import Engine, Foreground, MotionDetector, View, Window, load_engine
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.tracking import Tracker, source_tracker
@@ -374,6 +376,26 @@ def measure_operations(options: bench.Options) -> tuple[str, Any]:
     return f"{about}\n\n{bench.format_table(head, table)}", figures
 
 
+def measure_batches(options: bench.Options) -> tuple[str, Any]:
+    """The torch engine with more or fewer megabytes of pictures in work at once, batch 8."""
+    from torchvision_dddas.detection.torch_engine import TorchEngine
+
+    frames, found, text = scene(bench.parse_size(options.size), 24), {}, []
+    for config in ("fast", "default"):
+        settings = load_config(None if config == "default" else config)
+
+        def run(turn: int, batch_mb: float, settings: Settings = settings) -> None:
+            detector = MotionDetector(settings, TorchEngine(settings, "cpu", batch_mb=batch_mb), batch=8)
+            for frame in frames:
+                detector.update(frame)
+            detector.flush()
+
+        calls = {f"{batch_mb:g} MB": partial(run, batch_mb=batch_mb) for batch_mb in options.batch_mb}
+        words, found[config] = _beside_first(calls, options.rounds, f"{config}, {options.size}, 24 frames")
+        text.append(words)
+    return "\n\n".join(text), found
+
+
 def measure_gpu(options: bench.Options) -> tuple[str, Any]:
     """See `gpu_speed.measure_gpu`, which needs torch."""
     from gpu_speed import measure_gpu as measure
@@ -480,6 +502,7 @@ if __name__ == "__main__":
         "people": (measure_people, {"data": None, "--size": "640x480", "--rounds": 15}),
         "geo": (measure_geo, {"--rounds": 15}),
         "operations": (measure_operations, {"--size": "640x480", "--batch": 8, "--rounds": 9}),
+        "batches": (measure_batches, {"--size": "640x480", "--batch_mb": [6.0, 24.0, 80.0], "--rounds": 5}),
         "gpu": (
             measure_gpu,
             {

@@ -23,8 +23,10 @@ from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
 
-# Pixels of pictures in work at once: larger temporaries leave a CPU's cache, a GPU wants many.
-_PIXELS_AT_ONCE = {"cpu": 1_500_000, "cuda": 400_000_000}
+# Megabytes of pictures in work at once, as floats: eight windows of 640x480. With 6 MB, one window, the default takes
+# 1.15 times as long and `fast` 1.11 times (`python eval/speed.py batches`).
+BATCH_MB = {"cpu": 72.0, "cuda": 1600.0}
+_MB_OF_PIXEL = 4e-6
 _POINTS_AT_ONCE = 100_000
 
 
@@ -50,9 +52,11 @@ class TorchEngine(Engine[TensorView]):
         settings: Settings,
         device: str | torch.device | None = None,
         components: Literal["opencv", "torch"] | None = None,
+        batch_mb: float | None = None,
     ) -> None:
         """device: by default the GPU where there is one.
 
+        batch_mb: megabytes of pictures that are worked on at once, by default BATCH_MB of the device.
         components: who labels regions. torch does so on the device, and whole maps stay there; by default OpenCV for
         the CPU and torch for others. Raises InputError for Apple's MPS and for settings at half resolution.
         """
@@ -63,6 +67,7 @@ class TorchEngine(Engine[TensorView]):
         self.device = torch.device(device or torch_device())
         if self.device.type == "mps":
             raise InputError("the torch engine needs float64, which mps does not have; give device cpu or cuda")
+        self.batch_mb = batch_mb or BATCH_MB.get(self.device.type, BATCH_MB["cpu"])
         self.components = components or ("opencv" if self.device.type == "cpu" else "torch")
 
     @property
@@ -128,7 +133,7 @@ class TorchEngine(Engine[TensorView]):
 
     def _at_once(self, pixels: int) -> int:
         """How many items of so many pixels are worked on at once."""
-        return max(1, _PIXELS_AT_ONCE.get(self.device.type, _PIXELS_AT_ONCE["cpu"]) // pixels)
+        return max(1, int(self.batch_mb / (_MB_OF_PIXEL * pixels)))
 
     def batch_of(self, windows: Sequence[Window[TensorView]]) -> Window[Tensor]:
         """Windows of equal structure as one whose frames are batches."""
