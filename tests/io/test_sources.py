@@ -1,5 +1,6 @@
 """Videos, folders and globs: what is whole is read, what is damaged is reported, and every frame keeps its number."""
 
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -244,6 +245,38 @@ def test_time_stamps_that_begin_anew_in_the_middle_go_on(tmp_path):
     frames = list(open_source(write_changing(tmp_path, "mpg2.ts", [(64, 48)] * 2, each=40)))
     assert [frame.number for frame in frames] == list(range(1, len(frames) + 1)) and len(frames) >= 78
     assert [frame.time_s for frame in frames] == pytest.approx(np.arange(len(frames)) / 25, abs=1e-3)
+
+
+def without_stamps(path: Path, numbers: set[int]) -> Path:
+    """Clear the time stamps of some pictures of a transport stream."""
+    data, seen = bytearray(path.read_bytes()), 0
+    for place in range(0, len(data), 188):
+        begins = data.find(b"\0\0\1\xe0", place, place + 188) if data[place + 1] & 0x40 else -1
+        seen += begins >= 0
+        if begins >= 0 and seen in numbers:
+            data[begins + 7] &= 0x3F
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("numbers", [{1}, {2}, {20}, {39, 40}, {1, 2, 12, 13, 14}, set(range(1, 41))])
+def test_a_picture_without_a_time_stamp_shifts_no_other(tmp_path, numbers):
+    path = write_by_av(tmp_path / "clip.ts", "libx264", list(range(0, 4000, 100)), bf="0", g="12")
+    source = open_source(without_stamps(path, numbers))
+    frames = list(source)
+    assert [frame.number for frame in frames] == list(range(1, 41))
+    assert [frame.time_s for frame in frames] == pytest.approx(np.arange(40) / 10, abs=1e-3)
+    assert not source.notes and not source.problems
+    assert frame_times(source) == pytest.approx({frame.number: frame.time_s for frame in frames})
+
+
+def test_a_missing_stamp_of_a_varying_rate_lies_between_its_neighbours(tmp_path, monkeypatch):
+    source = open_source(write_video(tmp_path / "clip.avi", "MJPG"))
+    script = [0, 1.3, 2.1, 4.4, math.nan, 5.3, math.nan, None, 7.9]
+    for name, value in (("count", None), ("_open", lambda: ScriptedCapture(script))):
+        monkeypatch.setattr(source, name, value)
+    frames = {frame.number: frame.time_s for frame in source}
+    assert frames == pytest.approx({1: 0, 2: 0.13, 3: 0.21, 4: 0.44, 5: 0.52, 6: 0.53, 7: 0.61, 9: 0.79}, abs=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Where frames come from: video files, folders and globs of images, cameras, network streams."""
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -232,19 +233,25 @@ class _Stamps:
 
     def __init__(self, own_hz: float, given_hz: float | None) -> None:
         self.number, self.time_s, self.regular = 0, 0.0, True
-        self._own_hz, self._given_hz, self._damaged = own_hz, given_hz, False
-        self._start_s = self._before_s = 0.0
+        self._own_hz, self._given_hz, self._damaged, self._is_stamped = own_hz, given_hz, False, False
+        self._start_s, self._before_s = math.nan, 0.0  # the stamp of the first frame, the latest time
         self._steps_ms = Counter[int]()  # between successive frames
 
     def add(self, stamp_s: float, lost: int, damaged: bool) -> int:
         """Number the next frame; returns how many are missing before it, or -1 if it came out of order.
 
-        lost: reads that failed before it. damaged: whether its data are.
+        stamp_s: NaN where it has none, which counts as one step after the frame before. lost: reads that failed before
+        it. damaged: whether its data are.
         """
         self._damaged |= damaged or lost > 0
-        if not self.number or stamp_s - self._start_s < self._before_s - _ANEW_S:
-            self._start_s = stamp_s - (self._before_s + 1 / self._own_hz if self.number else 0)
-        stamp_s -= self._start_s
+        # Of a varying rate the shortest step, so that the next stamp is not passed.
+        steps_ms = () if self.regular else (step for step in self._steps_ms if step > 0)
+        step_s = min(steps_ms, default=1000 / self._own_hz) / 1000
+        expected_s = self._before_s + (lost + 1) * step_s if self.number else 0.0
+        is_stamped = not math.isnan(stamp_s)
+        if is_stamped and not stamp_s - self._start_s >= self._before_s - _ANEW_S:  # the first one, or anew
+            self._start_s = stamp_s - expected_s
+        stamp_s = stamp_s - self._start_s if is_stamped else expected_s
         place = round(stamp_s * self._own_hz)
         # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
         on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR and place - self.number < _MOST_LOST
@@ -252,7 +259,8 @@ class _Stamps:
         missing = place - self.number if self.regular else lost
         if missing < 0:
             return -1
-        if not missing and self.number:
+        is_step, self._is_stamped = is_stamped and self._is_stamped and not missing, is_stamped
+        if is_step:
             self._steps_ms[round(1000 * (stamp_s - self._before_s))] += 1
         self.number += missing + 1
         self._before_s = max(stamp_s, self._before_s)
@@ -423,10 +431,12 @@ def frame_times(source: Source) -> dict[int, float]:
         return {}
     capture, stamps, times_s = source._open(), _Stamps(source._own_hz, source._given_hz), dict[int, float]()
     try:
-        stored = sorted(capture.stamps_s()) if isinstance(capture, AvCapture) else []
+        stored = capture.stamps_s() if isinstance(capture, AvCapture) else []
     finally:
         capture.release()
-    for stamp_s in stored:
+    # In the order in which they are shown; those without a stamp after what was stored before.
+    places_s = np.where(np.isnan(stored), np.fmax.accumulate(stored), stored)
+    for stamp_s in np.array(stored)[np.argsort(places_s, kind="stable")].tolist():
         stamps.add(stamp_s, 0, False)
         times_s[stamps.number] = stamps.time_s
     return times_s
