@@ -490,6 +490,35 @@ def test_what_a_thermal_camera_stores_in_16_bits_is_read_as_its_8_bit_picture(tm
     assert {problem.frame for problem in source.problems} <= {8}
 
 
+@pytest.mark.parametrize(
+    ("rows", "columns", "value"),
+    [(6, 0, 0), (0, 16, 0), (0, 45, 0), (0, 16, 65535), (0, 16, "warm"), (6, 16, "both")],
+)
+@pytest.mark.parametrize("gain", [5, 7])
+def test_bars_and_the_sun_take_nothing_from_the_range_of_the_scene(tmp_path, rows, columns, value, gain):
+    rng, images = np.random.default_rng(2), thermal()
+    filled = [image * gain + 29311 + rng.integers(0, gain - 4, image.shape) for image in images]
+    for k, image in enumerate(filled):
+        for part in (image[:rows], image[96 - rows :], image[:, :columns], image[:, 128 - columns :]):
+            part[:] = 60000 + rng.integers(0, 50, part.shape) if value == "warm" else 0 if value == "both" else value
+        if value == "both":
+            image[:, :20] = 65535 - k
+    scene = np.s_[rows : 96 - rows, max(32, columns) : 128 - max(32, columns)]
+    bare = open_source(stored(tmp_path, filled))
+    found = [frame.image[scene] for frame in bare]
+    assert bare.problems == []
+    for k, image in enumerate(found):
+        contrast = np.ptp(np.percentile(image, [5, 95])) / np.ptp(np.percentile(images[k][scene], [5, 95]))
+        low, high = np.percentile(image[:30], [1, 99])
+        assert contrast > 0.99 and low > 0 and high < 255, (k, contrast)
+
+
+def test_the_few_counts_of_a_dull_scene_fill_most_of_the_range(tmp_path):
+    (first, *_), (image, *_) = open_source(stored(tmp_path, [image + 29000 for image in thermal()])), thermal()
+    assert np.unique(first.image[:30] - 3 * image[:30].astype(np.uint8)).size == 1  # exactly, and brighter than before
+    assert first.image[40:52].max() == 255
+
+
 @pytest.mark.parametrize("drift", [0, -13, 300])
 def test_the_range_of_many_values_is_that_of_most_pixels_and_follows_a_drift(tmp_path, drift):
     rng = np.random.default_rng(1)
