@@ -513,7 +513,7 @@ def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
     held = {name: given[name] for name in names if name in given} if isinstance(given, Mapping) else {}
     held = held or {name: getattr(given, name) for name in names if hasattr(given, name)}
     name = next((name for name in held if held[name] is not None), next(iter(held), ""))
-    value = held.get(name)
+    value: Any = held.get(name)
     return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
 
 

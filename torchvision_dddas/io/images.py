@@ -27,10 +27,13 @@ _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def read_image(file: Path) -> np.ndarray | None:
-    """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture."""
+def read_image(file: Path, cost: int = PICTURE, size: int | None = None) -> np.ndarray | None:
+    """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture.
+
+    cost: bytes of memory a pixel. size: bytes of the input that it belongs to; None: of its own file.
+    """
     try:
-        return decode_image(file.read_bytes(), _FLAGS, file)
+        return decode_image(file.read_bytes(), _FLAGS, file, cost, size)
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
@@ -45,16 +48,18 @@ def read_colour_image(file: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, :3])
 
 
-def decode_image(data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE) -> np.ndarray | None:
+def decode_image(
+    data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE, input_size: int | None = None
+) -> np.ndarray | None:
     """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_...
 
-    name: of the file, for the message. cost: bytes of memory a pixel. A picture whose size its header does not say is
-    not decoded. Raises InputError, before anything is decoded, for more pixels than a file of this length may have.
+    name: of the file, for the message. cost, input_size: cost and size of `read_image`. A picture whose size its header
+    does not say is not decoded. Raises InputError, before anything is decoded, for more pixels than the input may have.
     """
     size = size_in_header(data)
     if size is None or not _is_whole(data):
         return None
-    check_memory(cost * size[0] * size[1], f"{name} is {size[0]}x{size[1]} pixels", len(data))
+    check_memory(cost * size[0] * size[1], f"{name} is {size[0]}x{size[1]} pixels", input_size or len(data))
     with quiet_opencv():
         try:
             image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

@@ -5,6 +5,8 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -31,6 +33,7 @@ from torchvision_dddas.io.images import (
     quiet_opencv,
     read_image,
 )
+from torchvision_dddas.memory import SMALL_FILE, cost_of_pictures
 from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
 _WANTED = "a video file, a folder or glob of images, camera:0, rtsp://... or sim:SCENARIO"
@@ -170,7 +173,11 @@ class ImageSource(_Clip):
         if not files:
             raise InputError(f"{name} holds no images")
         self.files, self.count, self.rate_hz = list(files), len(files), rate_hz
-        first = read_image(self.files[0])
+        # All pictures together are the input: a few hundred photos are no small one.
+        sizes = accumulate(file.stat().st_size for file in files if file.is_file())
+        size = next((size for size in sizes if size >= SMALL_FILE), None)
+        self._read = partial(read_image, cost=cost_of_pictures(len(files)), size=size)
+        first = self._read(self.files[0])
         if first is None:
             raise InputError(f"the first image, {self.files[0]}, cannot be decoded; repair it or leave it out")
         if first.dtype not in (np.uint8, np.uint16):
@@ -179,7 +186,7 @@ class ImageSource(_Clip):
         self._depth, self._grey = first.dtype, first.ndim == 2
         if self._depth == np.uint16:
             samples = np.unique(np.linspace(0, len(files) - 1, _SAMPLES if scale is None else 1).astype(int))
-            images = (first, *(read_image(self.files[i]) for i in samples[1:]))
+            images = (first, *(self._read(self.files[i]) for i in samples[1:]))
             self.levels = Levels([i for i in images if i is not None and i.dtype == np.uint16], scale)
 
     def every(self, interval: int) -> Iterator[Frame]:
@@ -189,7 +196,7 @@ class ImageSource(_Clip):
             self.last = number
             if not is_sampled(number, interval):
                 continue
-            image = read_image(file)
+            image = self._read(file)
             if image is None:
                 self._note(number, f"frame {number} ({file.name}) could not be decoded and was left out")
                 continue
