@@ -262,7 +262,7 @@ def without_stamps(path: Path, numbers: set[int]) -> Path:
 @pytest.mark.parametrize("numbers", [{1}, {2}, {20}, {39, 40}, {1, 2, 12, 13, 14}, set(range(1, 41))])
 def test_a_picture_without_a_time_stamp_shifts_no_other(tmp_path, numbers):
     path = write_by_av(tmp_path / "clip.ts", "libx264", list(range(0, 4000, 100)), bf="0", g="12")
-    source = open_source(without_stamps(path, numbers))
+    source: Any = open_source(without_stamps(path, numbers))
     frames = list(source)
     assert [frame.number for frame in frames] == list(range(1, 41))
     assert [frame.time_s for frame in frames] == pytest.approx(np.arange(40) / 10, abs=1e-3)

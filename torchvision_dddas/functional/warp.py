@@ -84,7 +84,7 @@ def check_batch(name: str, value: object, shape: str, axes: int) -> None:
     code, shown = name, getattr(value, "shape", None)
     if not isinstance(value, Tensor):
         with suppress(ValueError, TypeError):
-            shown = np.shape(value)  # type: ignore[arg-type] # of lists too
+            shown = np.shape(np.asarray(value))  # of lists too
         code = f"torch.as_tensor({name})"
         code += ".permute(2, 0, 1) / 255" if axes == 4 and shown is not None and len(shown) == 3 else ""
     got, missing = f"{type(value).__name__} {tuple(shown or ())}", axes - len(shown or ())

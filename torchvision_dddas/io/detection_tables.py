@@ -224,7 +224,7 @@ def _in_pixels(
 def _check_columns(identity: np.ndarray, box_px: np.ndarray, path: str | Path) -> None:
     """Raises InputError for text without names whose columns are others than frame,id,x,y,w,h."""
     is_small = ((box_px > 0) & (box_px < 1)).all(axis=0) & (len(box_px) >= np.array([5, 5, 1, 1]))
-    if 2 * (identity % 1 > 0).sum() > len(identity) or (is_small & (len(box_px) > 0)).any():
+    if 2 * (identity[np.isfinite(identity)] % 1 > 0).sum() > len(identity) or (is_small & (len(box_px) > 0)).any():
         what = ["x", "y", "width", "height"][int(is_small.argmax())] if is_small.any() else ""
         raise InputError(
             f"detections {path}: {f'every {what} is below 1 px' if what else 'the second column holds no identities'}; "

@@ -192,10 +192,8 @@ def _pairs(
     middle_x, middle_y = box_px[:, 0] + box_px[:, 2] / 2, box_px[:, 1] + box_px[:, 3] / 2
     # Of each track, the boxes between its left and its right reach: a run of those sorted by x.
     by_x = np.argsort(middle_x, kind="stable")
-    first, last = (
-        np.searchsorted(middle_x[by_x], edge, side)
-        for edge, side in ((x[0] - radius, "left"), (x[0] + radius, "right"))
-    )
+    first = np.searchsorted(middle_x[by_x], x[0] - radius)
+    last = np.searchsorted(middle_x[by_x], x[0] + radius, "right")
     count = np.maximum(last - first, 0)
     row = np.repeat(np.arange(len(state)), count)
     column = by_x[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - first, count)]
