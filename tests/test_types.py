@@ -151,8 +151,15 @@ BOXES = SimpleNamespace(
         ({"boxes": Tensor(CORNERS), "scores": Tensor([0.5, 0.9]), "labels": Tensor([2, 0])}, ["2", "0"], [2, 0]),
         ({"boxes": CORNERS, "scores": [0.5, 0.9], "labels": ["car", "person"]}, ["car", "person"], [-1, -1]),
         (SimpleNamespace(bboxes=CORNERS, scores=[0.5, 0.9], labels=[2, -1]), ["2", ""], [2, -1]),
+        (SimpleNamespace(boxes=BOXES, names=None), ["2", "0"], [2, 0]),
+        (SimpleNamespace(xyxy=CORNERS, conf=[0.5, 0.9], cls=[2.0, np.nan]), ["2", ""], [2, -1]),
+        (
+            SimpleNamespace(xyxy=CORNERS, confidence=None, conf=[0.5, 0.9], class_id=None, cls=[2, 0]),
+            ["2", "0"],
+            [2, 0],
+        ),
     ],
-    ids=["Boxes", "Results", "torchvision", "words", "InstanceData"],
+    ids=["Boxes", "Results", "torchvision", "words", "InstanceData", "no names", "unknown class", "empty fields"],
 )
 def test_results_of_other_libraries_keep_their_scores_and_classes(given, label, number):
     found = Detections.from_supervision(given)
@@ -249,7 +256,8 @@ def test_a_picture_of_another_kind_is_refused_with_the_code_that_converts_it(giv
 
 def test_a_single_channel_is_dropped_and_what_no_code_converts_is_named():
     assert as_picture(GREY[..., None]).shape == GREY.shape and as_picture(COLOUR) is COLOUR
-    for given, words in ((None, "is None; could its file be read?"), ("a.png", "got str"), ([[1]], "got list")):
+    others = ((None, "is None; could its file be read?"), ("a.png", "got str"), ([[1]], "got list"))
+    for given, words in (*others, (COLOUR[..., :2], r"uint8 of shape \(180, 250, 2\); choose its channels$")):
         with pytest.raises(InputError, match=words):
             as_picture(given)
 

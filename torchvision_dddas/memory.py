@@ -11,14 +11,19 @@ from torchvision_dddas.errors import InputError
 SMALL_FILE = 5_000_000
 """Files of fewer bytes have the smaller budget."""
 
-SMALL_MB, LARGE_MB = 1000, 6000
+SMALL_MB, LARGE_MB = 1100, 6000
 """Megabytes (10^6 bytes) that a small file may take, and a larger one or what comes from no file."""
 
 VARIABLE = "DDDAS_MEMORY_MB"
 """The environment variable that sets another budget for all files."""
 
-PICTURE, VIDEO, MASK = 58, 100, 40
-"""Bytes for each pixel: of a picture in a file, of a frame of a video, whose decoder holds others, and of a mask."""
+PHOTO, PICTURE, VIDEO, MASK = 30, 52, 100, 40
+"""Bytes for each pixel: of a clip of one picture, of one of a few, of a frame of a video, and of a mask."""
+
+
+def cost_of_pictures(count: int) -> int:
+    """Bytes for each pixel of a clip of so many pictures: detection holds up to 14 of them."""
+    return PHOTO if count == 1 else min(max(PICTURE, 16 + 6 * count), VIDEO)
 
 
 def check_memory(needed: float, what: str, size: int | None = None, advice: str = "make it smaller") -> None:

@@ -166,6 +166,8 @@ def as_picture(image: Any, name: str = "frame") -> np.ndarray:
         code += "[..., ::-1]" if shape[2] == 3 else ""  # colours are RGB there
     if len(shape) == 3 and shape[2] == 4:
         code = f"{code}[..., :3]"
+    elif len(shape) == 3 and shape[2] not in (1, 3):
+        raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}; choose its channels")
     values = np.nan_to_num(image)
     low, high = float(values.min()), float(values.max())
     if image.dtype.kind in "fb" and low >= 0 and high <= 1:
@@ -242,7 +244,8 @@ class Telemetry:
     heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
-    start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
+    start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. start_local_s: the same by a clock of unknown zone.
+    origin: the file. notes: remarks for the user.
     Raises InputError for columns of other lengths and times that decrease.
     """
 
@@ -265,6 +268,7 @@ class Telemetry:
     heading_from: str = ""
     is_nominal: bool = False
     start_utc_s: float = float("nan")
+    start_local_s: float = float("nan")
     origin: str = ""
     notes: tuple[str, ...] = ()
 
@@ -456,8 +460,8 @@ class Detections(Boxes):
         None count as 1. Classes are those of `data["class_name"]` (N,), else what `names` calls the numbers.
         Raises InputError where boxes or scores are missing, have other shapes, or are not what `check_boxes` wants.
         """
-        given, names = detections, getattr(detections, "names", {})
-        names = names if isinstance(names, Mapping) else dict(enumerate(names))
+        given, names = detections, getattr(detections, "names", None)
+        names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
         if hasattr(getattr(given, "boxes", None), "xyxy"):  # ultralytics' Results
             given = given.boxes
         (edges, xyxy), (conf, confidence), (_, number) = (_first_of(given, line) for line in _FOREIGN)
@@ -488,6 +492,8 @@ class Detections(Boxes):
         if number.dtype.kind not in "iuf":  # classes by their names
             number, words = np.full(count, -1), number
         check_boxes(box_px, score, certain=False)
+        if not np.isfinite(number).all():
+            number = np.where(np.isfinite(number), number, -1)  # not known
         label = np.array(["" if word is None else str(word) for word in words], object)
         if named is None and (number >= 0).any():
             label = np.array([names.get(int(k), str(int(k))) if k >= 0 else "" for k in number], object)
@@ -500,12 +506,15 @@ _FOREIGN = (("xyxy", "boxes", "bboxes"), ("confidence", "conf", "scores"), ("cla
 
 
 def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
-    """The first of the names that an object or mapping has, and its value, off any device; "" and None without one."""
-    for name in names:
-        if (name in given) if isinstance(given, Mapping) else hasattr(given, name):
-            value = given[name] if isinstance(given, Mapping) else getattr(given, name)
-            return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
-    return "", None
+    """The first of the names that an object or mapping has, and its value, off any device; "" and None without one.
+
+    One that is None counts only where all are.
+    """
+    held = {name: given[name] for name in names if name in given} if isinstance(given, Mapping) else {}
+    held = held or {name: getattr(given, name) for name in names if hasattr(given, name)}
+    name = next((name for name in held if held[name] is not None), next(iter(held), ""))
+    value: Any = held.get(name)
+    return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
 
 
 def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:

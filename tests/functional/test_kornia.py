@@ -1,6 +1,7 @@
 """Where an operation of ours stands beside Kornia's: the same numbers, or what differs by design."""
 
 import inspect
+from typing import Any, cast
 
 import cv2
 import kornia
@@ -165,6 +166,8 @@ def test_a_homography_is_kornias_fit_of_the_pairs_that_have_a_weight():
         ("M", torch.rand(1, 1, 8, 9), torch.eye(3)),
         ("M", torch.rand(1, 1, 8, 9), np.eye(3)),
         ("M", torch.rand(2, 1, 8, 9), torch.eye(3)[None]),
+        ("M", torch.rand(1, 1, 8, 9), [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
+        ("src", (200 * torch.rand(1, 1, 8, 9)).byte(), torch.eye(3)[None]),
         ("src", torch.rand(3, 8, 9), torch.eye(3)[None]),
         ("src", np.zeros((8, 9, 3), np.uint8), torch.eye(3)[None]),
         ("src", np.zeros((8, 9), np.float32), torch.eye(3)[None]),
@@ -175,3 +178,11 @@ def test_warping_what_is_no_batch_is_refused_with_the_code_that_makes_one(name, 
         F.warp_perspective(src, M, (8, 9))
     made = eval(str(error.value).rpartition(": ")[2], {"torch": torch, "src": src, "M": M})
     assert F.warp_perspective(**{"src": src, "M": M, name: made}, dsize=(8, 9)).shape[-2:] == (8, 9)
+
+
+def test_an_affine_map_and_one_number_as_size_are_refused():
+    src, M = torch.rand(1, 1, 8, 9), torch.eye(3)[None]
+    with pytest.raises(InputError, match=r"M must have the shape \(B, 3, 3\), got \(1, 2, 3\); add the row 0, 0, 1"):
+        F.warp_perspective(src, M[:, :2], (8, 9))
+    with pytest.raises(InputError, match=r"dsize must be \(height, width\), got 60; "):
+        F.warp_perspective(src, M, cast(Any, 60))

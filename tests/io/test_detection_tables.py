@@ -135,7 +135,14 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
         ("1,-1,inf,3,4,5", "x_px is 'inf'"),
         ("1,-1,2,3,4,5,nan", "score is 'nan'; wanted a finite number"),
         ("1,-1,2,3,0.000999,5", "width_px is '0.000999'; wanted pixels from 0.001"),
-        ("0,-1,2,3,4,5", "frame is '0'; wanted a whole number from 1"),
+        ("-1,-1,2,3,4,5", "frame is '-1'; wanted a whole number from 1 to 10000000, or from 0 throughout"),
+        # Other columns than those of MOTChallenge.
+        (
+            "1,104.1,101.9,144.1,131.9,0.9,2\n2,108.3,103.9,148.1,133.9,0.9,2",
+            "every height is below 1 px; wanted frame",
+        ),
+        ("1,104.1,101.9,144.1,131.9,9,2\n2,108.3,103.9,148.1,133.9,9,2", "the second column holds no identities"),
+        ("".join(f"{k},2,0.9,104,101,40,30\n" for k in range(1, 7)), "every x is below 1 px"),
         (f"{LAST_FRAME + 1},-1,2,3,4,5", "frame is"),
         ("1,-1,2,3,4", "5 columns; wanted frame,id,x,y,w,h[,score]"),
         ("1:-1:2:3:4:5", "1 column; wanted"),
@@ -191,7 +198,6 @@ def lines_of(box: np.ndarray, second: object = -1, score: object = 0.5, sep: str
 @pytest.mark.parametrize(
     ("order", "shares", "given"),
     [
-        ("yolo", True, None),
         ("xyxy", True, None),
         ("xyxy", False, None),
         ("xywh", False, None),
@@ -214,11 +220,85 @@ def test_columns_of_other_programs_are_known_by_their_names(write, order, names,
 
 
 def test_the_class_of_yolo_is_kept_and_shares_without_a_size_are_refused(write, refused):
-    table = read_detections(write(lines_of(in_order("yolo", True), 0, sep=" ")), None, SHAPE)
+    table = read_detections(write(lines_of(in_order("yolo", True), 0, sep=" ")), "yolo", SHAPE)
     assert set(table.at(1).class_id) == {0} and set(table.at(1).label) == {"0"} and unique(table.identity) == {-1}
     assert "are shares of a picture (yolo or xywh), whose size is not known" in refused(
         read_detections, lines_of(in_order("yolo", True))
     )
+
+
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        ("Frame,X1,Y1,X2,Y2,Score", "xyxy"),
+        ("frame,bbox_x,bbox_y,bbox_w,bbox_h,conf", "xywh"),
+        ("frame,bbox_left,bbox_top,bbox_width,bbox_height,conf", "xywh"),
+        ("FRAME_ID,box_xmin,box_ymin,box_xmax,box_ymax,Confidence", "xyxy"),
+        ("frame,xcenter,ycenter,width,height,confidence,class,name", "yolo"),
+    ],
+)
+def test_capitals_prefixes_and_the_names_of_yolov5_are_known(write, header, order):
+    cells = [[k, *row, 0.9, 3, "car"][: header.count(",") + 1] for k, row in enumerate(in_order(order, False), 1)]
+    table = read_detections(write("\n".join([header, *(",".join(map(str, row)) for row in cells)])))
+    np.testing.assert_allclose(table.box_px, PLACES)
+    assert (table.first, set(table.score)) == (1, {0.9})
+    if "class" in header:
+        assert (unique(table.class_id), unique(table.label)) == ({3}, {"car"})
+
+
+@pytest.mark.parametrize("names", ["x_px,y_px,width_px,height_px", "x,y,w,h", "x1,y1,x2,y2"])
+def test_names_tell_the_order_of_shares_too(write, names):
+    box = in_order("xyxy" if "x1" in names else "xywh", True)
+    text = "".join(",".join(map(str, (k, *row))) + "\n" for k, row in enumerate(box, 1))
+    np.testing.assert_allclose(read_detections(write(f"frame,{names}\n{text}"), None, SHAPE).box_px, PLACES)
+
+
+def test_shares_and_percent_without_names_are_refused_where_their_order_is_not_known(write):
+    for order in ("yolo", "xywh"):
+        with pytest.raises(InputError, match=r"boxes in \[0, 1\] may be yolo or xywh; pass --box-format"):
+            read_detections(write(lines_of(in_order(order, True))), None, SHAPE)
+    # Some of these would leave the picture if they were top left corners.
+    table = read_detections(write(lines_of(in_order("yolo", True) + np.array([0.655, 0, 0, 0]))), None, SHAPE)
+    np.testing.assert_allclose(table.box_px, PLACES + np.array([0.655 * SHAPE[0], 0, 0, 0]), atol=1e-3)
+
+
+@pytest.mark.parametrize("order", ["yolo", "xyxy", "xywh"])
+@pytest.mark.parametrize("many", [True, False])
+def test_boxes_in_percent_are_read_where_there_are_many_and_noted_else(write, order, many):
+    count = 24 if many else 6
+    first = np.c_[np.linspace(3, 70, count), np.linspace(60, 7, count)]
+    box = np.c_[first + 0.123, np.full((count, 2), 8)] + (4 * np.eye(4)[:2].sum(0) if order == "yolo" else 0)
+    box[:, 2:] += box[:, :2] if order == "xyxy" else 0
+    given = order if many else None
+    table = read_detections(write(lines_of(box)), given, (1280, 720))
+    if many:
+        corner = (first + 0.123) * [12.80, 7.20]
+        np.testing.assert_allclose(table.box_px, np.c_[corner, np.full((count, 2), 8) * [12.80, 7.20]], atol=1e-4)
+        assert any("in percent of 1280 x 720" in note for note in table.notes)
+    else:
+        assert any("divide them by 100 if they are percent" in note for note in table.notes)
+
+
+def test_labels_of_a_folder_in_pixels_are_centre_and_size_or_refused(tmp_path):
+    for k in range(8):
+        (tmp_path / f"img_{k:03d}.txt").write_text(f"2 {60 + 5 * k} 70 90 90 0.9\n")
+    table = read_detections(tmp_path, None, SHAPE)
+    np.testing.assert_allclose(table.box_px[0], [15, 25, 90, 90])
+    assert unique(table.class_id) == {2} and unique(table.identity) == {-1}
+    assert "centre and size in pixels" in " ".join(table.notes)
+    for k in range(8):
+        (tmp_path / f"img_{k:03d}.txt").write_text(f"2 {60 + 9 * k} {70 + 5 * k} {80 + 9 * k} {90 + 5 * k} 0.9\n")
+    with pytest.raises(InputError, match="corners; pass --box-format xyxy if so"):
+        read_detections(tmp_path, None, SHAPE)
+    table = read_detections(tmp_path, "xyxy", SHAPE)
+    np.testing.assert_allclose(table.box_px[0], [60, 70, 20, 20])
+    assert unique(table.class_id) == {2} and unique(table.identity) == {-1}
+
+
+def test_frames_that_count_from_0_are_the_pictures_in_order(read):
+    table = read("frame,x1,y1,x2,y2\n2,0,0,5,5\n0,0,0,5,5\n1,0,0,5,5\n")
+    assert table.frame.tolist() == [1, 2, 3] and "frames count from 0" in " ".join(table.notes)
+    assert read("1,-1,0,0,5,5\n").notes == ()
 
 
 @pytest.mark.parametrize("first", [0, 1, 7])
@@ -257,6 +337,11 @@ def test_a_folder_of_yolos_labels_is_read_frame_by_frame(tmp_path, first):
 def test_scores_in_percent_and_missing_ones_are_noted(read, scores, read_as, note):
     table = read("".join(f"{k},-1,{10 * k},2,30,4,{score}\n" for k, score in enumerate(scores, 1)))
     assert table.score.tolist() == read_as and note in " ".join(table.notes)
+
+
+def test_scores_with_decimals_up_to_100_are_percent_where_a_name_says_scores(read):
+    table = read(f"{NAMED},score\n1,0,0,5,5,87.5\n2,0,0,5,5,40\n")
+    assert table.score.tolist() == [0.875, 0.4] and "read as percent" in " ".join(table.notes)
 
 
 # -- Whether a table fits its clip -------------------------------------------------------------------------------------

@@ -282,9 +282,9 @@ def test_a_picture_of_too_many_pixels_is_refused_by_its_header(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("content", "width"),
     [
-        (jpeg2000(4200, 4200, boxes=False), 4200),
-        (jpeg2000(4200, 4200).replace(struct.pack(">II", 4200, 4200), struct.pack(">II", 99, 99), 1), 4200),
-        (jpeg2000(99, 99).replace(struct.pack(">II", 99, 99), struct.pack(">II", 4200, 4200), 1), 4200),
+        (jpeg2000(4700, 4700, boxes=False), 4700),
+        (jpeg2000(4700, 4700).replace(struct.pack(">II", 4700, 4700), struct.pack(">II", 99, 99), 1), 4700),
+        (jpeg2000(99, 99).replace(struct.pack(">II", 99, 99), struct.pack(">II", 4700, 4700), 1), 4700),
         (tiff_of_one_tile(9, 9, 30_000), 30_000),
         (announced(".jpg", 20_000, 20_000).replace(b"\xff\xdb", b"rubbish\xff\xff\xff\xdb", 1), 20_000),
         (announced(".pgm", 20_000, 20_000).replace(b"P5", b"P5" + b" " * 5000 + b"#" * 5000, 1), 20_000),
@@ -335,10 +335,28 @@ def test_a_png_whose_end_says_a_length_is_not_decoded(monkeypatch, length):
 
 def test_a_large_file_may_take_more_memory_than_a_small_one():
     check_memory(5e9, "a.png is large", 5_000_000)
-    with pytest.raises(InputError, match=r"a\.png is large; that takes 5,000 MB of memory, wanted at most 1,000 MB"):
+    with pytest.raises(InputError, match=r"a\.png is large; that takes 5,000 MB of memory, wanted at most 1,100 MB"):
         check_memory(5e9, "a.png is large", 4_999_999)
     with pytest.raises(InputError, match="that takes 7,000 MB of memory, wanted at most 6,000 MB: make it smaller"):
         check_memory(7e9, "a camera is large")
+
+
+@pytest.mark.parametrize(
+    ("count", "each", "taken"),
+    [(1, 10, ""), (3, 1_600_000, ""), (12, 1_600_000, ""), (12, 10, r"1,757"), (40, 10, r"1,996")],
+    ids=["one photo", "three", "a folder of 19 MB", "twelve that hold nothing", "forty"],
+)
+def test_photos_of_20_million_pixels_are_read_unless_many_hold_next_to_nothing(
+    tmp_path, monkeypatch, count, each, taken
+):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: np.zeros((4, 6, 3), np.uint8))
+    for k in range(count):
+        (tmp_path / f"{k}.jpg").write_bytes(announced(".jpg", 5472, 3648) + bytes(each))
+    if not taken:
+        assert len(list(ImageSource(sorted(tmp_path.iterdir()), "clip"))) == count
+        return
+    with pytest.raises(InputError, match=f"that takes {taken} MB of memory, wanted at most 1,100 MB"):
+        ImageSource(sorted(tmp_path.iterdir()), "clip")
 
 
 def test_the_budget_of_memory_can_be_set(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from tests.io.clips import number_of, write_video
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.joined_clips import JoinedSource
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.types import Telemetry
 
 FRAMES, RATE_HZ = (20, 12, 8), 10.0
@@ -28,12 +29,14 @@ def joining(*given: Any, **options: Any) -> Any:
     return JoinedSource(*given, **options)
 
 
-def log(k, start_utc_s=np.nan, frames=None):
+def log(k, start_utc_s=np.nan, frames=None, **more: Any):
     """The log of a clip, a sample a picture: from one to the next the vehicle flies 1 m to the east."""
     time_s = np.arange(frames or FRAMES[k]) / RATE_HZ
     east = time_s * RATE_HZ + (0 if k == 0 else ENDS[k - 1])
     place = np.stack([east, 0 * east], axis=1)
-    return Telemetry(time_s, 50 + 0 * east, 10 + 0 * east, place, False, start_utc_s=start_utc_s, notes=("a", f"b{k}"))
+    return Telemetry(
+        time_s, 50 + 0 * east, 10 + 0 * east, place, False, start_utc_s=start_utc_s, notes=("a", f"b{k}"), **more
+    )
 
 
 def test_numbers_and_times_go_on_from_clip_to_clip(tmp_path):
@@ -55,7 +58,12 @@ def test_each_log_belongs_to_its_clip(tmp_path, clock):
     for frame in joined:
         state = flight.at(frame.time_s)
         assert state is not None and state.place[0] == pytest.approx(frame.number - 1, abs=1e-6)
-    assert flight.notes[0] == "a" and sorted(note[-2:] for note in flight.notes[1:]) == ["b0", "b1", "b2"]
+    assert flight.notes[0] == "a" and sorted(note[-2:] for note in flight.notes if note[-2:-1] == "b") == [
+        "b0",
+        "b1",
+        "b2",
+    ]
+    assert any("no clock in common" in note for note in flight.notes) != clock
 
 
 def test_samples_beyond_the_end_of_a_clip_do_not_count_for_the_next(tmp_path):
@@ -73,6 +81,45 @@ def test_a_pause_between_two_clips_stays_one_and_nothing_is_known_in_it(tmp_path
     assert np.diff(times).max() == pytest.approx(30.1) and times[-1] == pytest.approx(33.9)
     assert [flight.at(at).place[0] for at in times] == pytest.approx(np.arange(40), abs=1e-6)
     assert not np.isfinite(flight.at(15.0).place).any()
+
+
+def subtitles(k, begun_s, frames):
+    """DJI's subtitles of a clip: dates without a zone."""
+    timings = (f"{n}\n00:00:0{n // 10},{n % 10}00 --> 00:00:0{n // 10},{n % 10}90" for n in range(frames))
+    dates = (f"2023-05-03 23:59:{(begun_s + n / 10):06.3f}" for n in range(frames))
+    place = f"[latitude: 48.{k}] [longitude: 11.5] [rel_alt: 15.0 abs_alt: 540.0]"
+    return "".join(f"{timing}\n{date}\n{place}\n\n" for timing, date in zip(timings, dates, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("begun_s", "pause_s"), [((0.0, 2.0, 3.2), 0.0), ((0.0, 22.0, 23.2), 20.0), ((5.0, 0.0, 9.0), None)]
+)
+def test_the_local_dates_of_subtitles_tell_pauses_and_order(tmp_path, begun_s, pause_s):
+    logs = [tmp_path / f"{k}.srt" for k in range(3)]
+    for k, path in enumerate(logs):
+        path.write_text(subtitles(k, begun_s[k], FRAMES[k]))
+    joined = joining(clips(tmp_path), logs)
+    if pause_s is None:
+        with pytest.raises(InputError, match=r"1\.mp4 begins 7\.0 s before .*0\.mp4 ends"):
+            joined.read_logs(lambda path, _: read_telemetry(path))
+        return
+    flight = joined.read_logs(lambda path, _: read_telemetry(path))
+    times = [frame.time_s for frame in joined]
+    assert times[20] == pytest.approx(2 + pause_s, abs=0.01) and times[32] == pytest.approx(3.2 + pause_s, abs=0.01)
+    assert flight.at(times[21]).place[1] == pytest.approx(48.1)
+    assert not any("no clock in common" in note for note in flight.notes)
+
+
+@pytest.mark.parametrize("column", ["date", "UTC time"])
+def test_the_dates_of_tables_tell_pauses_too(tmp_path, column):
+    logs = [tmp_path / f"{k}.csv" for k in range(3)]
+    for k, path in enumerate(logs):
+        begun_s = (0.0, 12.0, 33.2)[k]
+        rows = (f"2023-05-03 10:00:{begun_s + n / 10:06.3f},48.{k},11.5,15\n" for n in range(FRAMES[k]))
+        path.write_text(f"{column},latitude,longitude,height\n" + "".join(rows))
+    joined = joining(clips(tmp_path), logs)
+    joined.read_logs(lambda path, _: read_telemetry(path))
+    assert [frame.time_s for frame in joined if frame.number in (21, 33)] == pytest.approx([12.0, 33.2], abs=0.01)
 
 
 def test_one_log_for_all_clips_goes_through(tmp_path):

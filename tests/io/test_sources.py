@@ -1,5 +1,6 @@
 """Videos, folders and globs: what is whole is read, what is damaged is reported, and every frame keeps its number."""
 
+import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -246,6 +247,38 @@ def test_time_stamps_that_begin_anew_in_the_middle_go_on(tmp_path):
     assert [frame.time_s for frame in frames] == pytest.approx(np.arange(len(frames)) / 25, abs=1e-3)
 
 
+def without_stamps(path: Path, numbers: set[int]) -> Path:
+    """Clear the time stamps of some pictures of a transport stream."""
+    data, seen = bytearray(path.read_bytes()), 0
+    for place in range(0, len(data), 188):
+        begins = data.find(b"\0\0\1\xe0", place, place + 188) if data[place + 1] & 0x40 else -1
+        seen += begins >= 0
+        if begins >= 0 and seen in numbers:
+            data[begins + 7] &= 0x3F
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("numbers", [{1}, {2}, {20}, {39, 40}, {1, 2, 12, 13, 14}, set(range(1, 41))])
+def test_a_picture_without_a_time_stamp_shifts_no_other(tmp_path, numbers):
+    path = write_by_av(tmp_path / "clip.ts", "libx264", list(range(0, 4000, 100)), bf="0", g="12")
+    source: Any = open_source(without_stamps(path, numbers))
+    frames = list(source)
+    assert [frame.number for frame in frames] == list(range(1, 41))
+    assert [frame.time_s for frame in frames] == pytest.approx(np.arange(40) / 10, abs=1e-3)
+    assert not source.notes and not source.problems
+    assert frame_times(source) == pytest.approx({frame.number: frame.time_s for frame in frames})
+
+
+def test_a_missing_stamp_of_a_varying_rate_lies_between_its_neighbours(tmp_path, monkeypatch):
+    source = open_source(write_video(tmp_path / "clip.avi", "MJPG"))
+    script = [0, 1.3, 2.1, 4.4, math.nan, 5.3, math.nan, None, 7.9]
+    for name, value in (("count", None), ("_open", lambda: ScriptedCapture(script))):
+        monkeypatch.setattr(source, name, value)
+    frames = {frame.number: frame.time_s for frame in source}
+    assert frames == pytest.approx({1: 0, 2: 0.13, 3: 0.21, 4: 0.44, 5: 0.52, 6: 0.53, 7: 0.61, 9: 0.79}, abs=2e-3)
+
+
 @pytest.mark.parametrize(
     ("rate", "stamps", "hz"),
     [
@@ -455,6 +488,35 @@ def test_what_a_thermal_camera_stores_in_16_bits_is_read_as_its_8_bit_picture(tm
     same = [(a == o).mean() for a, o in zip(apart, offset, strict=True)]
     assert min([*same[:7], *same[8:]]) > 0.999
     assert {problem.frame for problem in source.problems} <= {8}
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "value"),
+    [(6, 0, 0), (0, 16, 0), (0, 45, 0), (0, 16, 65535), (0, 16, "warm"), (6, 16, "both")],
+)
+@pytest.mark.parametrize("gain", [5, 7])
+def test_bars_and_the_sun_take_nothing_from_the_range_of_the_scene(tmp_path, rows, columns, value, gain):
+    rng, images = np.random.default_rng(2), thermal()
+    filled = [image * gain + 29311 + rng.integers(0, gain - 4, image.shape) for image in images]
+    for k, image in enumerate(filled):
+        for part in (image[:rows], image[96 - rows :], image[:, :columns], image[:, 128 - columns :]):
+            part[:] = 60000 + rng.integers(0, 50, part.shape) if value == "warm" else 0 if value == "both" else value
+        if value == "both":
+            image[:, :20] = 65535 - k
+    scene = np.s_[rows : 96 - rows, max(32, columns) : 128 - max(32, columns)]
+    bare = open_source(stored(tmp_path, filled))
+    found = [frame.image[scene] for frame in bare]
+    assert bare.problems == []
+    for k, image in enumerate(found):
+        contrast = np.ptp(np.percentile(image, [5, 95])) / np.ptp(np.percentile(images[k][scene], [5, 95]))
+        low, high = np.percentile(image[:30], [1, 99])
+        assert contrast > 0.99 and low > 0 and high < 255, (k, contrast)
+
+
+def test_the_few_counts_of_a_dull_scene_fill_most_of_the_range(tmp_path):
+    (first, *_), (image, *_) = open_source(stored(tmp_path, [image + 29000 for image in thermal()])), thermal()
+    assert np.unique(first.image[:30] - 3 * image[:30].astype(np.uint8)).size == 1  # exactly, and brighter than before
+    assert first.image[40:52].max() == 255
 
 
 @pytest.mark.parametrize("drift", [0, -13, 300])

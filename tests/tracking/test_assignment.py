@@ -1,5 +1,7 @@
 """Assignment of three frames: gated triplets, dense scores with a bound, and links in view of the next frame."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -119,6 +121,33 @@ def chosen(links, onward=None, born=None, bridging=None):
 def test_without_a_next_frame_the_links_are_the_best_pairs(seed, tracks, detections):
     links = np.random.default_rng(seed).normal(0, 3, (tracks, detections))
     assert chosen(links) == sorted(map(tuple, best_pairs(links).tolist()))
+
+
+def test_links_of_a_crowd_take_little_room_beside_their_scores():
+    count, random = 600, np.random.default_rng(0)
+    near = np.arange(count)
+    links = np.full((count, count), -np.inf)
+    for away in (-1, 0, 1):
+        links[near, (near + away) % count] = random.normal(3, 1, count)
+    tracks, now = plausible_links(links)
+    onward = links[now] + random.normal(0, 1, (len(now), 1))
+    tracemalloc.start()
+    kept = choose_links(links[tracks, now], tracks, now, onward, links, links)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert kept.sum() > 0.9 * count
+    assert most < 2 * onward.nbytes  # no copy of all scores: twelve rounds over such copies took most of the time
+
+
+@pytest.mark.parametrize("size", [(30, 40), (5, 4), (40, 7)])
+def test_plausible_links_are_the_largest_of_their_row_or_column(size):
+    score = np.random.default_rng(1).normal(0, 3, size).round(1)  # with ties
+    tracks, now = plausible_links(score)
+    rows, columns = size
+    distinct = score - 1e-6 * ((np.arange(columns) - np.arange(rows)[:, None]) % columns)
+    rank = [(-part).argsort(axis=axis).argsort(axis=axis) for axis, part in enumerate((distinct, distinct))]
+    wanted = (score > -2) & ((rank[0] < 6) | (rank[1] < 6))
+    assert list(zip(tracks.tolist(), now.tolist(), strict=True)) == list(map(tuple, np.argwhere(wanted).tolist()))
 
 
 TIE, STRAIGHT = [[2.0, 2.1], [2.1, 2.0]], {(0, 0): [4.0, -9.0], (1, 1): [-9.0, 4.0]}

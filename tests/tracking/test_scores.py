@@ -56,6 +56,17 @@ def moved(*steps: tuple[float, float], box: np.ndarray = PERSON) -> np.ndarray:
     return np.array([[box[0] + x, box[1] + y, *box[2:]] for x, y in steps])
 
 
+def test_the_nearest_of_many_tracks_are_those_that_sorting_all_gives():
+    random = np.random.default_rng(0)
+    flow, state = (np.zeros((count, kalman.COLUMNS)) for count in (120, 30))
+    flow[:, : kalman.Y + 1] = random.integers(0, 9, (120, 2))  # with many at the same distance
+    state[:, : kalman.Y + 1] = random.integers(0, 9, (30, 2))
+    flow[:, VX], flow[:, VY] = np.arange(120), random.normal(0, 1, 120)
+    away = ((flow[None, :, :2] - state[:, None, :2]) ** 2).sum(2)
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :6]
+    np.testing.assert_array_equal(ways(state, flow)[1:, :, 0].T, nearest)
+
+
 @pytest.mark.parametrize("direction", [(1, 0), (0, -1), (0.6, 0.8)])
 @pytest.mark.parametrize("score_of", [scored, first])
 def test_a_score_falls_with_distance_to_below_zero(direction, score_of):

@@ -186,7 +186,7 @@ class AvCapture:
         return self.retrieve() if self.grab() else (False, None)
 
     def get(self, propId: int, /) -> float:
-        """The time stamp of the picture grabbed last, the announced rate or number of pictures, as OpenCV has them."""
+        """As OpenCV: the time stamp of the picture grabbed last (NaN: none), the announced rate or frame count."""
         video, frame = self._video, self._frame
         rate_hz = float(video.guessed_rate or video.average_rate or 0)
         if propId == cv2.CAP_PROP_FPS:
@@ -194,7 +194,7 @@ class AvCapture:
         if propId == cv2.CAP_PROP_FRAME_COUNT:
             return float(video.frames or int((self._container.duration or 0) / 1e6 * rate_hz + 0.5))
         stamp = None if frame is None else frame.dts if frame.pts is None else frame.pts
-        return 0.0 if stamp is None else 1000 * self._tick_s * stamp
+        return float("nan") if stamp is None else 1000 * self._tick_s * stamp
 
     def sample(self, count: int) -> list[np.ndarray]:
         """Up to `count` - 1 pictures spread over the rest of a file, which can then not be read in order."""
@@ -208,15 +208,16 @@ class AvCapture:
         return found
 
     def stamps_s(self, most: int | None = None) -> list[float]:
-        """Time stamps of the next pictures, at most so many, as they are stored. The pictures are not read."""
-        packets, stamps = islice(self._packets, most), list[float]()
+        """Time stamps of the next pictures, at most so many, as stored, NaN for none. The pictures are not read."""
+        packets, stamps = islice(self._packets, most), list[int | None]()
         with suppress(*self._failures):
-            stamps.extend(self._tick_s * packet.pts for packet in packets if packet.pts is not None)
-        return stamps
+            stamps.extend(packet.dts if packet.pts is None else packet.pts for packet in packets if packet.size)
+        return [float("nan") if stamp is None else self._tick_s * stamp for stamp in stamps]
 
     def measure_hz(self) -> float | None:
         """The usual rate of the next pictures by their time stamps, None where unknown. They are not read."""
-        steps_s = np.diff(np.unique(self.stamps_s(_MEASURED)))
+        stamps_s = np.array(self.stamps_s(_MEASURED))
+        steps_s = np.diff(np.unique(stamps_s[np.isfinite(stamps_s)]))
         if len(steps_s) < _LEAST_MEASURED:
             return None
         usual_s = np.median(steps_s)  # the mean of those near it, because stamps may be rounded to milliseconds

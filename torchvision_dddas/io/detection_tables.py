@@ -14,6 +14,7 @@ from torchvision_dddas.io.tables import (
     BOX,
     FARTHEST,
     FRAME,
+    LAST_FRAME,
     Column,
     CsvTable,
     CsvText,
@@ -35,17 +36,25 @@ CLASS = ("class", "class_name", "label")
 """Names that the column of classes may have; the first that is there counts."""
 
 ORDERS = {
-    "yolo": ("x_center y_center width height", "cx cy w h", "xc yc w h"),
+    "yolo": ("x_center y_center width height", "xcenter ycenter width height", "cx cy w h", "xc yc w h"),
     "xyxy": ("x1 y1 x2 y2", "xmin ymin xmax ymax", "x_min y_min x_max y_max", "left top right bottom"),
-    "xywh": ("x y w h", "x y width height", "left top width height", "bb_left bb_top bb_width bb_height"),
+    "xywh": ("x y w h", "x y width height", "left top w h", "left top width height"),
 }
-"""Orders of a box's four columns, with names that other programs give them; yolo: the centre, and the size."""
+"""Orders of a box's four columns, with names that other programs give them; yolo: the centre, and the size.
+
+Capitals and what _BEFORE matches before a name do not count.
+"""
+
+_BEFORE = re.compile(r"(bbox|bb|box)_")
 
 _OWN_NAMES = {
     **dict.fromkeys(("frame_id", "frame_index", "frame_number"), "frame"),
     **dict.fromkeys(("id", "track_id", "tracker_id"), "identity"),
     **dict.fromkeys(("confidence", "conf"), "score"),
 }
+
+_MANY, _FILLS = 20, 50
+"""So many boxes in [0, 100] that go beyond the second in both directions are percent of a larger picture."""
 
 FEW_SHARE = 0.01
 """Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
@@ -57,7 +66,7 @@ REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
 
 SCHEMA = Schema(
     "detections",
-    FRAME,
+    replace(FRAME, low=0, wanted=f"a whole number from 1 to {LAST_FRAME}, or from 0 throughout"),
     *(replace(column, low=-FARTHEST) for column in BOX),  # in any order
     Column("score", ".6g", may_be_empty=True),
     Column("identity"),
@@ -76,20 +85,19 @@ def read_detections(
 
     Or a folder of YOLO's labels, `class cx cy w h [score]`, a file a picture. pictures: their names without endings, in
     order; else the number at the end of a file's name is its frame. order: of a box's columns, one of ORDERS; None: as
-    names and numbers tell. size: (width, height) of the pictures; boxes within [0, 1] are shares of it.
+    names and numbers tell. size: (width, height) of the pictures; boxes within [0, 1] are shares of it. Frames may
+    count from 0.
     An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET, CLASS, `class_id`
     may be there; any other and all that follows the score are ignored. Rows may come in any order.
     A table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
-    range, a few scores outside [0, 1] (see FEW_SHARE), shares where the size is not known.
+    range, a few scores outside [0, 1] (see FEW_SHARE), shares where the size is not known, boxes of unknown order.
     """
     is_folder = os.path.isdir(path)  # noqa: PTH112 (pathlib raises for a name that no file can have)
     text, is_named = _read_labels(Path(path), pictures) if is_folder else _read_cells(path, "detections")
-    for kind, names in ORDERS.items() if is_named and not set(REQUIRED) <= set(text.header) else ():
-        for known in (several.split() for several in names):
-            if set(known) <= set(text.header):
-                own, order = dict(zip(known, REQUIRED[1:], strict=True)), order or kind
-                text = text._replace(header=[own.get(name, name) for name in text.header])
+    if is_named:
+        header, found = _rename(text)
+        text, order = text._replace(header=header), order or found
     if not is_named:
         for line, row in zip(text.line, text.rows, strict=True):
             if len(row) < 6:
@@ -98,17 +106,21 @@ def read_detections(
         text = CsvText([*MOT_NAMES], text.line, [[*row[:7], ""][:7] for row in text.rows])
     table = read_table(path, SCHEMA, REQUIRED, text=text)
     check_crowding(table["frame"], f"detections {path}")
-    box_px, order, notes = _in_pixels(table, order, size, is_named, path)
+    box_px, order, notes = _in_pixels(table, order, size, is_folder, path)
     for k, column in enumerate(BOX):
         is_wrong = box_px[:, k] < column.low
         table.refuse(is_wrong, f"{column.name} is '{box_px[is_wrong, k][:1].sum():g}'; wanted {column.wanted}")
+    if not is_named:
+        _check_columns(parse_numbers(table.columns["identity"]), box_px, path)
     has_none = np.isnan(table["score"])
     if has_none.any() and not has_none.all():
         notes.append(f"{has_none.sum()} of {len(table)} rows have no score: they count as certain")
     score = np.where(has_none, 1.0, table["score"])
-    if (score == np.round(score)).all() and score.min(initial=0) >= 0 and 20 <= score.max(initial=0) <= 100:
+    # Without names, 87.5 may be on any scale: detectors of MOTChallenge give such scores.
+    is_score = is_named or (score == np.round(score)).all()
+    if is_score and score.min(initial=0) >= 0 and 20 <= score.max(initial=0) <= 100:
         score = score / 100
-        notes.append("scores are whole numbers up to 100: they were read as percent")
+        notes.append("scores are numbers up to 100: they were read as percent")
     is_outside = (score < 0) | (score > 1)
     # One score of 1.3 among thousands of probabilities must not make all of these certain.
     if 0 < is_outside.sum() < FEW_SHARE * len(score):
@@ -121,16 +133,20 @@ def read_detections(
     is_identity = (identity >= 1) & (identity <= 2**53) & (identity == np.round(identity))
     kinds = set(table.columns.get("kind", ()))
     class_id = table.columns.get("class_id")
-    if order == "yolo" and not is_named:
+    if is_folder or (order == "yolo" and not is_named):
         class_id, is_identity = identity, np.zeros(len(table), bool)
     label = next((table.columns[name] for name in CLASS if name in table), None)
     if class_id is not None:
         class_id = np.where(np.isfinite(class_id), class_id, -1).astype(np.int64)
         label = [str(k) if k >= 0 else "" for k in class_id.tolist()] if label is None else label
-    rows = np.argsort(table["frame"], kind="stable")
+    frame = table["frame"].astype(np.int64)
+    if (frame == 0).any():
+        frame += 1
+        notes.append("frames count from 0: frame 0 of the table is the first picture, frame 1 here")
+    rows = np.argsort(frame, kind="stable")
     return DetectionTable(
         str(path),
-        table["frame"][rows].astype(np.int64),
+        frame[rows],
         box_px[rows],
         score[rows],
         table.line[rows],
@@ -146,29 +162,74 @@ def read_detections(
     )
 
 
+def _rename(text: CsvText) -> tuple[list[str], str | None]:
+    """The header with our names for the columns of other programs, and the order of a box that these names tell."""
+    header, bare = list(text.header), [_BEFORE.sub("", name.lower()) for name in text.header]
+    order = "xywh" if set(REQUIRED) <= set(header) else None
+    for kind, names in ORDERS.items():
+        for known in (several.split() for several in names):
+            if order is None and set(known) <= set(bare):
+                own, order = dict(zip(known, REQUIRED[1:], strict=True)), kind
+                header = [own.get(short, name) for short, name in zip(bare, header, strict=True)]
+    if {"class", "name"} <= set(header) and "class_id" not in header:  # of YOLOv5: the number, and its name
+        at = header.index("class")
+        if all(row[at].isdigit() for row in text.rows if len(row) > at):
+            header = [{"class": "class_id", "name": "class"}.get(name, name) for name in header]
+    return header, order
+
+
 def _in_pixels(
-    table: CsvTable, order: str | None, size: tuple[float, float] | None, is_named: bool, path: str | Path
+    table: CsvTable, order: str | None, size: tuple[float, float] | None, is_folder: bool, path: str | Path
 ) -> tuple[np.ndarray, str, list[str]]:
     """Boxes (N, 4) as x, y, width, height in pixels, the order of the columns, and notes. Raises InputError."""
-    box, notes = table.stack(*REQUIRED[1:]), list[str]()
-    shares, found = share_orders(box), order or "xywh"
-    if order is None and shares:
-        found = "xyxy" if "xyxy" in shares and are_corners(box, (1, 1)) else shares[0]
-    elif order is None and not is_named and are_corners(box, size):
-        found = "xyxy"
-        notes.append("by their numbers the boxes are corners, and were read as xyxy; --box-format says it otherwise")
+    box, notes, whole = table.stack(*REQUIRED[1:]), list[str](), 1
+    shares, first, last = share_orders(box), box[:, :2], box[:, 2:]
+    if not shares and len(percent := share_orders(box / 100)) and size is not None and min(size) > 200:
+        if len(box) >= _MANY and (np.maximum(first, last).max(axis=0) > _FILLS).all() and (box % 1).any():
+            shares, whole = percent, 100
+        else:
+            notes.append("all boxes lie within the first 100 px of the picture: divide them by 100 if they are percent")
+    is_corners = are_corners(box, (whole, whole) if shares else size)
+    found, limits = order or "xywh", f"[0, {whole}]"
     if shares and size is None:
         raise InputError(
             f"detections {path}: boxes in [0, 1] are shares of a picture ({' or '.join(shares)}), whose "
             "size is not known: give the clip too, or boxes in pixels"
         )
+    if order is None and is_folder:
+        found = "yolo"
+        if (found not in shares) if shares else is_corners:
+            raise InputError(f"labels {path}: by their numbers the boxes are corners; pass --box-format xyxy if so")
+        if not shares:
+            notes.append("the labels are no shares: they were read as centre and size in pixels")
+    elif order is None and shares:
+        found = "xyxy" if "xyxy" in shares and is_corners else shares[0]
+        if len(shares) > 1 and not is_corners:
+            raise InputError(
+                f"detections {path}: boxes in {limits} may be {' or '.join(shares)}; pass --box-format to say which"
+            )
+    elif order is None and is_corners:
+        found = "xyxy"
+        notes.append("by their numbers the boxes are corners, and were read as xyxy; --box-format says it otherwise")
     if shares and size is not None:
-        box = box * np.array([*size, *size])
-        notes.append(f"boxes lie in [0, 1]: they were read as {found} in shares of {size[0]:g} x {size[1]:g} px")
+        box = box * np.array([*size, *size]) / whole
+        kind = "shares" if whole == 1 else "percent"
+        notes.append(f"boxes lie in {limits}: they were read as {found} in {kind} of {size[0]:g} x {size[1]:g} px")
     first, last = box[:, :2], box[:, 2:]
     if found == "xyxy":
         return np.c_[first, last - first], found, notes
     return np.c_[first - last / 2, last] if found == "yolo" else box, found, notes
+
+
+def _check_columns(identity: np.ndarray, box_px: np.ndarray, path: str | Path) -> None:
+    """Raises InputError for text without names whose columns are others than frame,id,x,y,w,h."""
+    is_small = ((box_px > 0) & (box_px < 1)).all(axis=0) & (len(box_px) >= np.array([5, 5, 1, 1]))
+    if 2 * (identity[np.isfinite(identity)] % 1 > 0).sum() > len(identity) or (is_small & (len(box_px) > 0)).any():
+        what = ["x", "y", "width", "height"][int(is_small.argmax())] if is_small.any() else ""
+        raise InputError(
+            f"detections {path}: {f'every {what} is below 1 px' if what else 'the second column holds no identities'}; "
+            "wanted frame,id,x,y,w,h[,score], or a first line that names the columns"
+        )
 
 
 def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
@@ -233,7 +294,8 @@ def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
     # The first name may be empty: so a table with an index begins.
     first, *_ = [*" ".join(rows[0]).split(), ""] if rows else [""]
     if first[:1].isalpha() and first.lower() not in ("nan", "inf", "infinity"):
-        header = [_OWN_NAMES.get(name, name) if _OWN_NAMES.get(name) not in rows[0] else name for name in rows[0]]
+        low = [name.lower() if name.lower() in SCHEMA.names or name.lower() in _OWN_NAMES else name for name in rows[0]]
+        header = [_OWN_NAMES.get(name, name) if _OWN_NAMES.get(name) not in low else name for name in low]
         return CsvText(header, line[1:], rows[1:]), True
     rows = [row if len(row) > 1 else row[0].split() for row in rows]
     widest = max((len(row) for row in rows), default=len(MOT_NAMES))

@@ -27,10 +27,13 @@ _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
-def read_image(file: Path) -> np.ndarray | None:
-    """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture."""
+def read_image(file: Path, cost: int = PICTURE, size: int | None = None) -> np.ndarray | None:
+    """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture.
+
+    cost: bytes of memory a pixel. size: bytes of the input that it belongs to; None: of its own file.
+    """
     try:
-        return decode_image(file.read_bytes(), _FLAGS, file)
+        return decode_image(file.read_bytes(), _FLAGS, file, cost, size)
     except OSError as error:
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
@@ -45,16 +48,18 @@ def read_colour_image(file: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, :3])
 
 
-def decode_image(data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE) -> np.ndarray | None:
+def decode_image(
+    data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE, input_size: int | None = None
+) -> np.ndarray | None:
     """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_...
 
-    name: of the file, for the message. cost: bytes of memory a pixel. A picture whose size its header does not say is
-    not decoded. Raises InputError, before anything is decoded, for more pixels than a file of this length may have.
+    name: of the file, for the message. cost, input_size: cost and size of `read_image`. A picture whose size its header
+    does not say is not decoded. Raises InputError, before anything is decoded, for more pixels than the input may have.
     """
     size = size_in_header(data)
     if size is None or not _is_whole(data):
         return None
-    check_memory(cost * size[0] * size[1], f"{name} is {size[0]}x{size[1]} pixels", len(data))
+    check_memory(cost * size[0] * size[1], f"{name} is {size[0]}x{size[1]} pixels", input_size or len(data))
     with quiet_opencv():
         try:
             image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -223,6 +228,11 @@ _WIDTH = 2.5
 _GUARD = 0.25
 # A value that is as frequent is one that the sensor gives, and no fault of a pixel.
 _FREQUENT = 2e-4
+# Values so many times their core's width away from all others are bars, padding or the sun, and no part of the scene;
+# of one value alone, as bars are, half the width will do.
+_APART, _APART_CONSTANT = 4.0, 0.5
+# Levels that one step may become: more would only show the noise.
+_MOST_GAIN = 4
 _SENSOR_BITS = (8, 10, 12, 14, 16)
 
 
@@ -234,9 +244,10 @@ class Levels:
     """How the 16-bit pictures of a clip become 8-bit ones: by one gain, so that they do not flicker.
 
     black, white: the values that become 0 and 255. Samples of the clip give the range. Where their values are no more
-    than 256 steps, one step becomes one level, and nothing is lost. Otherwise the range is 2.5 times as wide as the
-    middle 90 % of the values, within that of the sensor. Where a picture's values drift towards an end of the range,
-    the range follows by as few whole levels as will do.
+    than 256 steps, one step becomes one level, and nothing is lost; of a few counts up to four. Otherwise the range is
+    2.5 times as wide as the middle 90 % of the values, within that of the sensor. Bars, padding and the sun, far from
+    all other values, do not count. Where a picture's values drift towards an end of the range, the range follows by as
+    few whole levels as will do.
     """
 
     def __init__(self, samples: Sequence[np.ndarray], given: Scale = None) -> None:
@@ -274,11 +285,14 @@ class Levels:
         values, counts = np.unique(np.concatenate([_thin_out(image) for image in samples]), return_counts=True)
         frequent = values[counts > _FREQUENT * counts.sum()].astype(np.int64)
         step = int(np.gcd.reduce(np.diff(frequent))) if len(frequent) > 1 else 1
-        is_whole = np.median(shares[:, 3] - shares[:, 0]) <= 255 * step
+        whole = max(float(np.median(shares[:, 3] - shares[:, 0])), step)
+        is_whole = whole <= 255 * step
         self._core = float(np.median(shares[:, 2] - shares[:, 1]))
         brightest = max(int(image.max()) for image in samples)
         top = next(2**bits - 1 for bits in _SENSOR_BITS if brightest < 2**bits)
         self.width = float(min(255 * step if is_whole else max(_WIDTH * self._core, 255), top))
+        if is_whole and step == 1 and top > 255:  # a sensor of few counts: they fill half of the levels
+            self.width /= min(max(128 // whole, 1), _MOST_GAIN)
         self._most = top - self.width
         low, high = (shares[:, 0].min(), shares[:, 3].max()) if is_whole else (shares[:, 1].min(), shares[:, 2].max())
         if high - low > self.width:  # the values drift: begin where the clip does
@@ -292,13 +306,25 @@ class Levels:
 
 
 def _thin_out(image: np.ndarray) -> np.ndarray:
-    return image[:: 1 + image.shape[0] // 64, :: 1 + image.shape[1] // 64].ravel()
+    """Some values of a picture, sorted, without those that are no part of the scene."""
+    values = np.sort(image[:: 1 + image.shape[0] // 64, :: 1 + image.shape[1] // 64], axis=None)
+    while True:
+        step = np.diff(values)
+        if not step.any():
+            return values
+        at = int(step.argmax()) + 1
+        # A side of one value is none of the scene, however large it is.
+        rest, scene = sorted((values[:at], values[at:]), key=lambda part: (bool(np.ptp(part)), len(part)))
+        low, high = scene[[round(share * (len(scene) - 1)) for share in _SHARES[1:3]]].astype(int)
+        limit = (_APART if np.ptp(rest) else _APART_CONSTANT) * (high - low)
+        if low == high or step[at - 1] <= limit or len(scene) < len(values) / 20:
+            return values
+        values = scene
 
 
 def _find_shares(image: np.ndarray) -> np.ndarray:
     values = _thin_out(image)
-    places = np.array([round(share * (len(values) - 1)) for share in _SHARES])
-    return np.partition(values, places)[places].astype(float)
+    return values[[round(share * (len(values) - 1)) for share in _SHARES]].astype(float)
 
 
 class Masks(Part[Scene]):

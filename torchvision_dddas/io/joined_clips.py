@@ -19,7 +19,7 @@ _SEAM_S = 2.0
 class JoinedSource:
     """A Source of clips of one flight, in order. Frame numbers go on from clip to clip, and so do times.
 
-    Where the logs of all clips tell the time of day, a pause between two clips is kept.
+    Where the logs of all clips tell the time of day, in whatever zone, a pause between two clips is kept.
     """
 
     def __init__(self, parts: Sequence[Source], logs: Sequence[Path] = ()) -> None:
@@ -65,8 +65,10 @@ class JoinedSource:
     def read_logs(self, read: Callable[[Path, str], Telemetry]) -> Telemetry:
         """The logs as one. read: reads that of a clip. Raises InputError where their clocks contradict the order."""
         logs = [read(path, part.name) for path, part in zip(self._logs, self._parts, strict=False)]
-        begun_s = np.array([log.start_utc_s - logs[0].start_utc_s for log in logs])
-        if np.isfinite(begun_s).all():
+        clocks_s = np.array([[log.start_utc_s, log.start_local_s] for log in logs])
+        is_known = np.isfinite(clocks_s).all(axis=0)
+        if is_known.any():
+            begun_s = clocks_s[:, is_known.argmax()] - clocks_s[0, is_known.argmax()]
             for k in range(1, len(logs)):
                 early_s = self.starts_s[k] - begun_s[k]
                 if early_s > _SEAM_S:
@@ -75,6 +77,9 @@ class JoinedSource:
                         "clocks of their logs; give the clips in the order in which they were filmed"
                     )
                 self.starts_s[k:] -= min(early_s, 0.0) * (early_s < -_SEAM_S)
+        elif len(logs) > 1:
+            note = "the logs have no clock in common: a pause between the clips, or a wrong order, is not noticed"
+            logs = [replace(log, notes=(*log.notes, note)) for log in logs]
         return _joined(logs, self.starts_s)
 
 

@@ -1,9 +1,12 @@
 """Where frames come from: video files, folders and globs of images, cameras, network streams."""
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -28,6 +31,7 @@ from torchvision_dddas.io.images import (
     quiet_opencv,
     read_image,
 )
+from torchvision_dddas.memory import SMALL_FILE, cost_of_pictures
 from torchvision_dddas.types import Frame, Problem, Source, is_sampled
 
 _WANTED = "a video file, a folder or glob of images, camera:0, rtsp://... or sim:SCENARIO"
@@ -167,7 +171,11 @@ class ImageSource(_Clip):
         if not files:
             raise InputError(f"{name} holds no images")
         self.files, self.count, self.rate_hz = list(files), len(files), rate_hz
-        first = read_image(self.files[0])
+        # All pictures together are the input: a few hundred photos are no small one.
+        sizes = accumulate(file.stat().st_size for file in files if file.is_file())
+        size = next((size for size in sizes if size >= SMALL_FILE), None)
+        self._read = partial(read_image, cost=cost_of_pictures(len(files)), size=size)
+        first = self._read(self.files[0])
         if first is None:
             raise InputError(f"the first image, {self.files[0]}, cannot be decoded; repair it or leave it out")
         if first.dtype not in (np.uint8, np.uint16):
@@ -176,7 +184,7 @@ class ImageSource(_Clip):
         self._depth, self._grey = first.dtype, first.ndim == 2
         if self._depth == np.uint16:
             samples = np.unique(np.linspace(0, len(files) - 1, _SAMPLES if scale is None else 1).astype(int))
-            images = (first, *(read_image(self.files[i]) for i in samples[1:]))
+            images = (first, *(self._read(self.files[i]) for i in samples[1:]))
             self.levels = Levels([i for i in images if i is not None and i.dtype == np.uint16], scale)
 
     def every(self, interval: int) -> Iterator[Frame]:
@@ -186,7 +194,7 @@ class ImageSource(_Clip):
             self.last = number
             if not is_sampled(number, interval):
                 continue
-            image = read_image(file)
+            image = self._read(file)
             if image is None:
                 self._note(number, f"frame {number} ({file.name}) could not be decoded and was left out")
                 continue
@@ -230,19 +238,25 @@ class _Stamps:
 
     def __init__(self, own_hz: float, given_hz: float | None) -> None:
         self.number, self.time_s, self.regular = 0, 0.0, True
-        self._own_hz, self._given_hz, self._damaged = own_hz, given_hz, False
-        self._start_s = self._before_s = 0.0
+        self._own_hz, self._given_hz, self._damaged, self._is_stamped = own_hz, given_hz, False, False
+        self._start_s, self._before_s = math.nan, 0.0  # the stamp of the first frame, the latest time
         self._steps_ms = Counter[int]()  # between successive frames
 
     def add(self, stamp_s: float, lost: int, damaged: bool) -> int:
         """Number the next frame; returns how many are missing before it, or -1 if it came out of order.
 
-        lost: reads that failed before it. damaged: whether its data are.
+        stamp_s: NaN where it has none, which counts as one step after the frame before. lost: reads that failed before
+        it. damaged: whether its data are.
         """
         self._damaged |= damaged or lost > 0
-        if not self.number or stamp_s - self._start_s < self._before_s - _ANEW_S:
-            self._start_s = stamp_s - (self._before_s + 1 / self._own_hz if self.number else 0)
-        stamp_s -= self._start_s
+        # Of a varying rate the shortest step, so that the next stamp is not passed.
+        steps_ms = () if self.regular else (step for step in self._steps_ms if step > 0)
+        step_s = min(steps_ms, default=1000 / self._own_hz) / 1000
+        expected_s = self._before_s + (lost + 1) * step_s if self.number else 0.0
+        is_stamped = not math.isnan(stamp_s)
+        if is_stamped and not stamp_s - self._start_s >= self._before_s - _ANEW_S:  # the first one, or anew
+            self._start_s = stamp_s - expected_s
+        stamp_s = stamp_s - self._start_s if is_stamped else expected_s
         place = round(stamp_s * self._own_hz)
         # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
         on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR and place - self.number < _MOST_LOST
@@ -250,7 +264,8 @@ class _Stamps:
         missing = place - self.number if self.regular else lost
         if missing < 0:
             return -1
-        if not missing and self.number:
+        is_step, self._is_stamped = is_stamped and self._is_stamped and not missing, is_stamped
+        if is_step:
             self._steps_ms[round(1000 * (stamp_s - self._before_s))] += 1
         self.number += missing + 1
         self._before_s = max(stamp_s, self._before_s)
@@ -413,10 +428,12 @@ def frame_times(source: Source) -> dict[int, float]:
         return {}
     capture, stamps, times_s = source._open(), _Stamps(source._own_hz, source._given_hz), dict[int, float]()
     try:
-        stored = sorted(capture.stamps_s()) if isinstance(capture, AvCapture) else []
+        stored = capture.stamps_s() if isinstance(capture, AvCapture) else []
     finally:
         capture.release()
-    for stamp_s in stored:
+    # In the order in which they are shown; those without a stamp after what was stored before.
+    places_s = np.where(np.isnan(stored), np.fmax.accumulate(stored), stored)
+    for stamp_s in np.array(stored)[np.argsort(places_s, kind="stable")].tolist():
         stamps.add(stamp_s, 0, False)
         times_s[stamps.number] = stamps.time_s
     return times_s

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry import best_pairs
+from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import Bool, Float, Int
 
 if TYPE_CHECKING:
@@ -31,9 +31,11 @@ _PRICE_ROUNDS, _EASY_COLUMNS = 6, 30
 
 def plausible_links(score: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
     """Tracks and detections (P,) of the links worth following into the next frame, from association scores."""
-    distinct = _without_ties(score)
-    tracks, now = np.nonzero((score > _LEAST_SCORE) & (_is_leading(distinct) | _is_leading(distinct.T).T))
-    return tracks, now
+    row, column = np.nonzero(score > _LEAST_SCORE)
+    # Boxes that lie on each other have equal scores, and searching them all never ends.
+    distinct = score[row, column] - _TIE_BREAK * ((column - row) % max(score.shape[1], 1))
+    leading = _is_leading(distinct, row) | _is_leading(distinct, column)
+    return row[leading], column[leading]
 
 
 def choose_links(
@@ -56,32 +58,37 @@ def choose_links(
     leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
     n, m = len(bridging), len(born)
-    if not len(value):
-        return np.zeros(0, bool)
-    onward, born, bridging = (np.maximum(_NEXT_WEIGHT * further, 0.0) for further in (onward, born, bridging))
     price = np.zeros(onward.shape[1])
     best, answer = -np.inf, np.zeros(len(value), bool)
-    place = np.full((n, m), -1)
-    place[tracks, now] = np.arange(len(value))
-    worth = np.zeros((n, m))
+    if not len(value):
+        return answer
+    # Scores to the next frame, below one another. Only those above 0 can be chosen: a hundredth, of 1000 boxes a frame.
+    parts, last = (onward, born, bridging), np.cumsum([len(value), m, n])
+    row, column = np.concatenate(
+        [np.nonzero(part > 0) + np.array([[end - len(part)], [0]]) for part, end in zip(parts, last, strict=True)], 1
+    )
+    gain = _NEXT_WEIGHT * np.concatenate([part[part > 0] for part in parts])
     for _ in range(_ROUNDS):
         # The next frame's detections cost their price; what they are worth then is added to this frame's links.
-        (ahead, to), (fresh, born_to), (bridged, bridge_to) = (
-            _dearest(rows, price) for rows in (onward, born, bridging)
+        most, to = _dearest(row, column, gain - price[column], last[2])
+        ahead, fresh, bridged = np.split(most, last[:2])
+        worth = np.maximum(value + ahead - fresh[now] - bridged[tracks], 0.0)
+        links = np.flatnonzero(worth)
+        chosen = links[_best_entries(tracks[links], now[links], worth[links])]
+        bound = float(worth[chosen].sum() + fresh.sum() + bridged.sum() + price.sum())
+        number, left = np.full(last[2], -1), np.ones(last[2], bool)
+        left[: len(value)] = False
+        left[chosen] = True
+        left[len(value) + now[chosen]] = left[last[1] + tracks[chosen]] = False
+        number[left] = np.arange(left.sum())
+        kept = np.flatnonzero(left[row])
+        found = float(
+            value[chosen].sum() + gain[kept[_best_entries(number[row[kept]], column[kept], gain[kept])]].sum()
         )
-        worth[tracks, now] = np.maximum(value + ahead - fresh[now] - bridged[tracks], 0.0)
-        row, column = best_pairs(worth).T
-        bound = float(worth[row, column].sum() + fresh.sum() + bridged.sum() + price.sum())
-        chosen = place[row, column]
-        free_now, free_track = np.ones(m, bool), np.ones(n, bool)
-        free_now[column], free_track[row] = False, False
-        rows = np.concatenate([onward[chosen], born[free_now], bridging[free_track]])
-        at, k = best_pairs(rows).T
-        found = float(value[chosen].sum() + rows[at, k].sum())
         if found > best:
             best, answer = found, np.zeros(len(value), bool)
             answer[chosen] = True
-        wanted = np.concatenate([to[chosen], born_to[free_now], bridge_to[free_track]])
+        wanted = to[left]
         excess = np.bincount(wanted[wanted >= 0], minlength=len(price)) - 1
         excess[(excess < 0) & (price <= 0)] = 0
         if bound - best < _CLOSE * max(1.0, best) or not excess.any():
@@ -116,27 +123,35 @@ def link_confidences(
     return 1 / (1 + np.exp(-np.clip(lead, -50.0, 50.0)))
 
 
-def _dearest(worth: np.ndarray, price: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(P,) the largest worth over price of each row, at least 0, and its column, -1 for none."""
-    if not worth.shape[1]:
-        return np.zeros(len(worth)), np.full(len(worth), -1)
-    left = worth - price
-    column = left.argmax(axis=1)
-    most = left[np.arange(len(left)), column]
-    return np.maximum(most, 0.0), np.where(most > 0, column, -1)
+def _dearest(row: np.ndarray, column: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """(R,) the largest value of each of `count` rows, at least 0, and its column, -1 for none; entries row by row."""
+    most, at = np.zeros(count), np.full(count, -1)
+    if len(row):
+        starts = np.flatnonzero(np.diff(row, prepend=-1))
+        most[row[starts]] = np.maximum(np.maximum.reduceat(value, starts), 0.0)
+    first = np.flatnonzero((value > 0) & (value == most[row]))[::-1]  # of equal ones the first column stays
+    at[row[first]] = column[first]
+    return most, at
 
 
-def _without_ties(score: np.ndarray) -> np.ndarray:
-    """Scores (N, M) without ties: boxes that lie on each other have equal ones, and searching them all never ends."""
-    rows, columns = score.shape
-    return score - _TIE_BREAK * ((np.arange(columns) - np.arange(rows)[:, None]) % max(columns, 1))
+def _best_entries(row: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Which entries, all above 0, are the one-to-one pairs with the largest sum; as `best_pairs`, by row."""
+    (_, row), (_, column) = (np.unique(nodes, return_inverse=True) for nodes in (row, column))
+    cost = np.zeros((row.max(initial=-1) + 1, column.max(initial=-1) + 1))
+    place = np.full(cost.shape, -1)
+    cost[row, column], place[row, column] = -value, np.arange(len(row))
+    found = place[cheapest(cost)]
+    return found[found >= 0]
 
 
-def _is_leading(score: np.ndarray) -> np.ndarray:
-    """(N, M) whether a score is among the largest _RIVALS of its row."""
-    if score.shape[1] <= _RIVALS:
-        return np.ones(score.shape, bool)
-    return score >= -np.partition(-score, _RIVALS - 1, axis=1)[:, _RIVALS - 1 : _RIVALS]
+def _is_leading(value: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """(P,) whether a value is among the largest _RIVALS of its group."""
+    order = np.lexsort((-value, group))
+    starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
+    limit = np.full(len(starts) - 1, -np.inf)
+    many = np.flatnonzero(np.diff(starts) >= _RIVALS)
+    limit[many] = value[order[starts[many] + _RIVALS - 1]]
+    return value >= limit[group]
 
 
 def choose_triplets(

@@ -109,8 +109,17 @@ def likely_velocities(state: np.ndarray, flow: np.ndarray, common: np.ndarray) -
     state: (N, kalman.COLUMNS). flow: (K, kalman.COLUMNS) other tracks, which show how targets move here. common: (2,)
     their common velocity.
     """
-    away = np.hypot(flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1])
-    nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEIGHBOURS]
+    right, down = flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1]
+    if len(flow) > 8 * _NEIGHBOURS:  # sort those alone that are as near as the last of the nearest
+        away = right * right
+        away += down * down
+        limit = np.partition(away, _NEIGHBOURS - 1, axis=1)[:, _NEIGHBOURS - 1 : _NEIGHBOURS]
+        row, column = np.nonzero(away <= limit)
+        order = np.lexsort((column, away[row, column], row))
+        starts = np.searchsorted(row, np.arange(len(state)))
+        nearest = column[order[starts[:, None] + np.arange(_NEIGHBOURS)]]
+    else:
+        nearest = np.argsort(np.hypot(right, down), axis=1, kind="stable")[:, :_NEIGHBOURS]
     found = np.empty((1 + nearest.shape[1], len(state), 2))
     found[0], found[1:] = common, np.swapaxes(flow[nearest, VX : VY + 1], 0, 1)
     return found
@@ -180,9 +189,17 @@ def _pairs(
     reach = np.sqrt(parameters.tail * unit * np.expm1(np.clip(fall, 0, 50))) * max(1.0, parameters.upright)
     x, y = place_px[..., 0], place_px[..., 1]
     radius = (reach + np.hypot(x - x[0], y - y[0])).max(axis=0)
-    across, along = box_px[:, 0] + box_px[:, 2] / 2 - x[0, :, None], box_px[:, 1] + box_px[:, 3] / 2 - y[0, :, None]
-    row, column = np.nonzero(across * across + along * along < (radius * radius)[:, None])
-    return _Near(row, column, (len(state), len(box_px)))
+    middle_x, middle_y = box_px[:, 0] + box_px[:, 2] / 2, box_px[:, 1] + box_px[:, 3] / 2
+    # Of each track, the boxes between its left and its right reach: a run of those sorted by x.
+    by_x = np.argsort(middle_x, kind="stable")
+    first = np.searchsorted(middle_x[by_x], x[0] - radius)
+    last = np.searchsorted(middle_x[by_x], x[0] + radius, "right")
+    count = np.maximum(last - first, 0)
+    row = np.repeat(np.arange(len(state)), count)
+    column = by_x[np.arange(len(row)) - np.repeat(np.cumsum(count) - count - first, count)]
+    across, along = middle_x[column] - x[0, row], middle_y[column] - y[0, row]
+    near = across * across + along * along < (radius * radius)[row]
+    return _Near(row[near], column[near], (len(state), len(box_px)))
 
 
 def _place_density(

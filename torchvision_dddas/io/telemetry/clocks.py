@@ -245,5 +245,6 @@ def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | Non
     elif clock.is_utc or zone is not None:
         return start_s if clock.is_utc or zone is None else to_utc(start_s, zone)
     else:
+        log.start_local_s = start_s
         log.note(UNKNOWN_ZONE)
     return math.nan

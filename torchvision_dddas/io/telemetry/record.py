@@ -49,8 +49,8 @@ class Log:
     """The samples of a log. path: of the file. kind: in words, for messages. where: unit of places in the file.
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
-    jitter_s: how far time may run back; more is another recording, or damage. is_nominal: as in Telemetry.
-    height_zero: what altitude_m counts from, as in Telemetry. splits: times at which another flight begins.
+    jitter_s: how far time may run back; more is another recording, or damage. is_nominal, height_zero,
+    start_local_s: as in Telemetry. splits: times at which another flight begins.
     samples: column of the record, or another quantity of `fields` -> rows (N, 3) of time, value (NaN where unknown) and
     place in the file. Positions are longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any
     value, of each row of a log whose rows hold all quantities, also of empty rows.
@@ -63,6 +63,7 @@ class Log:
     jitter_s: float = 1.0
     height_zero: Literal["ground", "takeoff", "unknown"] = "takeoff"
     is_nominal: bool = False
+    start_local_s: float = float("nan")
     splits: list[float] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     samples: dict[str, Any] = field(default_factory=dict)
@@ -161,6 +162,7 @@ def build_record(
         height_zero=log.height_zero,
         is_nominal=log.is_nominal,
         start_utc_s=float(clock_s - clock_offset_s),
+        start_local_s=log.start_local_s + start - clock_offset_s,
         origin=f"{log.path.name} ({log.kind})",
         notes=tuple(log.notes),
     )

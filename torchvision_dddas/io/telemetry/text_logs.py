@@ -88,6 +88,7 @@ def read_subtitles(
     if not is_zoned and zone is not None and math.isfinite(first_s):
         first_s, is_zoned = to_utc(first_s, zone), True
     elif not is_zoned and math.isfinite(first_s):
+        log.start_local_s = first_s - (log.moments[0][0] if log.moments else 0.0)
         log.note(UNKNOWN_ZONE)
     return build_record(log, clock_offset_s, first_s - log.moments[0][0] if is_zoned and log.moments else math.nan)
 
