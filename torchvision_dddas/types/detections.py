@@ -1,0 +1,253 @@
+"""Detections of a frame, and tables of detections."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types.table import Boxes, complete_table
+
+
+@dataclass(frozen=True)
+class Detections(Boxes):
+    """The targets detected in one frame, one row per target; row i has value i + 1 in the frame's mask.
+
+    box_px: (N, 4) float64, x, y of the top left pixel, width, height. score: (N,) in [0, 1].
+    area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
+    (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
+    middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. class_id: (N,)
+    int64, its number, -1 if unknown. Other unknown values are NaN. Raises InputError for arrays of other lengths.
+    """
+
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    area_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    heading_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    kind: str = "moving"
+    middle_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    # Of objects, because one long word would widen each row of an array of characters.
+    label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        nan = np.nan
+        unknown = {"area_px": nan, "heading_rad": nan, "speed_px": nan, "middle_px": nan, "label": "", "class_id": -1}
+        complete_table(self, len(self.box_px), **unknown)
+
+    def __len__(self) -> int:
+        return len(self.box_px)
+
+    @classmethod
+    def from_supervision(cls, detections: Any) -> Self:
+        """Detections of another detector, in pixels: of supervision, ultralytics (Results, Boxes), torchvision, ...
+
+        detections: an object or a mapping that has a name of each line of _FOREIGN, arrays or tensors. Scores that are
+        None count as 1. Classes are those of `data["class_name"]` (N,), else what `names` calls the numbers.
+        Raises InputError where boxes or scores are missing, have other shapes, or are not what `check_boxes` wants.
+        """
+        given, names = detections, getattr(detections, "names", None)
+        names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
+        if hasattr(getattr(given, "boxes", None), "xyxy"):  # ultralytics' Results
+            given = given.boxes
+        (edges, xyxy), (conf, confidence), (_, number) = (_first_of(given, line) for line in _FOREIGN)
+        if not edges or not conf:
+            raise InputError(
+                f"from_supervision got {type(detections).__name__} without {_FOREIGN[bool(edges)][0]}; wanted the "
+                "result for one picture, or Tracker.update((boxes, scores)) with boxes x, y, width, height"
+            )
+        corners = np.asarray(xyxy, np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 4:
+            raise InputError(f"detections.{edges} must have the shape (N, 4), got {corners.shape}")
+        box_px = np.concatenate([corners[:, :2], corners[:, 2:] - corners[:, :2]], axis=1)
+        if not (np.isfinite(box_px).all() and (box_px[:, 2:] > 0).all()):
+            raise InputError(
+                f"detections.{edges} must hold finite left, top, right and bottom edges, right of left, below top"
+            )
+        count, data = len(box_px), getattr(given, "data", None)
+        named = data.get("class_name") if isinstance(data, Mapping) else None
+        found = {
+            conf: np.ones(count) if confidence is None else np.asarray(confidence, np.float64),
+            "class_id": np.full(count, -1) if number is None else np.asarray(number),
+            "data['class_name']": np.full(count, None, object) if named is None else np.asarray(named, object),
+        }
+        for name, values in found.items():
+            if values.shape != (count,):
+                raise InputError(f"detections.{name} must have the shape ({count},), got {values.shape}")
+        score, number, words = found.values()
+        if number.dtype.kind not in "iuf":  # classes by their names
+            number, words = np.full(count, -1), number
+        check_boxes(box_px, score, certain=False)
+        if not np.isfinite(number).all():
+            number = np.where(np.isfinite(number), number, -1)  # not known
+        label = np.array(["" if word is None else str(word) for word in words], object)
+        if named is None and (number >= 0).any():
+            label = np.array([names.get(int(k), str(int(k))) if k >= 0 else "" for k in number], object)
+        area_px = box_px[:, 2] * box_px[:, 3]
+        return cls(box_px, score, area_px, kind="given", label=label, class_id=number.astype(np.int64))
+
+
+_FOREIGN = (("xyxy", "boxes", "bboxes"), ("confidence", "conf", "scores"), ("class_id", "cls", "labels"))
+"""What supervision, ultralytics, torchvision, transformers and mmdetection call edges, scores and classes."""
+
+
+def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
+    """The first of the names that an object or mapping has, and its value, off any device; "" and None without one.
+
+    One that is None counts only where all are.
+    """
+    held = {name: given[name] for name in names if name in given} if isinstance(given, Mapping) else {}
+    held = held or {name: getattr(given, name) for name in names if hasattr(given, name)}
+    name = next((name for name in held if held[name] is not None), next(iter(held), ""))
+    value: Any = held.get(name)
+    return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
+
+
+def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
+    """Raises InputError for boxes (N, 4) and scores (N,) that no detector of pixels and probabilities gives.
+
+    certain: whether the scores do not count, so that they may have any scale.
+    """
+    if not (np.isfinite(box_px).all() and np.isfinite(score).all()):
+        raise InputError("boxes and scores must be finite; leave out detections that are unknown")
+    if len(box_px) and not (box_px[:, 2:] > 0).all():
+        row = int((box_px[:, 2:] <= 0).any(axis=1).argmax())
+        width, height = box_px[row, 2:]
+        raise InputError(f"width and height must be above 0 px, got {width:g} x {height:g} in box {row}")
+    if share_orders(box_px):
+        raise InputError(
+            "boxes that lie in [0, 1] are shares of a picture, not pixels: multiply them by its width and height"
+        )
+    if not certain and ((score < 0) | (score > 1)).any():
+        raise InputError(
+            f"scores must be probabilities in [0, 1], got {score.min():g} to {score.max():g}; divide percent by 100, "
+            "or take Tracker(certain=True)"
+        )
+
+
+def share_orders(box: np.ndarray) -> list[str]:
+    """The orders of columns in which boxes (N, 4) lie in a picture with sides of 1; none where they are pixels."""
+    first, last = box[:, :2], box[:, 2:]
+    orders = {"yolo": (first - last / 2, first + last / 2), "xyxy": (first, last), "xywh": (first, first + last)}
+    return [n for n, (low, high) in orders.items() if len(box) and ((low > -0.01) & (low < high) & (high < 1.01)).all()]
+
+
+def are_corners(box: np.ndarray, size: tuple[float, float] | None) -> bool:
+    """Whether the last two columns are right and bottom edges: they follow the first two, or sizes would not fit."""
+    first, last = box[:, :2], box[:, 2:]
+    if not len(box) or not (last > first).all():
+        return False
+    follow = len(box) > 4 and 4 * (last - first).var(axis=0).sum() < last.var(axis=0).sum()
+    is_beyond = size is not None and (first + last > 1.1 * np.array(size)).any(axis=1).mean() > 0.5
+    return bool(follow or (is_beyond and (last <= 1.01 * np.array(size)).all()))
+
+
+# How many boxes may lie beyond the extent of a table, and from how many rows on the extent is estimated.
+_STRAYS, _ENOUGH_ROWS = 3, 30
+
+
+@dataclass(frozen=True)
+class DetectionTable:
+    """Boxes of a clip, sorted by frame; rows of one frame keep the file's order.
+
+    frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, else 1.
+    line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
+    cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
+    own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
+    label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
+    kind: (N,) str, what a row is; of `dddas track` detection, bridge (nothing was seen there: a box between two
+    detections) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
+    """
+
+    path: str
+    frame: np.ndarray
+    box_px: np.ndarray
+    score: np.ndarray
+    line: np.ndarray
+    own: bool = False
+    identity: np.ndarray | None = None
+    cut: np.ndarray | None = None
+    feet_px: np.ndarray | None = None
+    ours: bool = False
+    label: np.ndarray | None = None
+    kind: np.ndarray | None = None
+    class_id: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def of_kind(self, *kinds: str) -> np.ndarray:
+        """(N,) bool, whether a row is of one of these kinds."""
+        return np.zeros(len(self), bool) if self.kind is None else np.isin(self.kind, kinds)
+
+    @property
+    def first(self) -> int:
+        """The lowest frame number; 0 for a table without rows."""
+        return int(self.frame[0]) if len(self) else 0
+
+    @property
+    def last(self) -> int:
+        """The highest frame number; 0 for a table without rows."""
+        return int(self.frame[-1]) if len(self) else 0
+
+    @cached_property
+    def probable(self) -> bool:
+        """Whether the scores can be probabilities: all in [0, 1]."""
+        return bool(((self.score >= 0) & (self.score <= 1)).all())
+
+    @property
+    def certain(self) -> bool:
+        """Whether every row counts as certain: own targets, confirmed over frames, or scores of another scale."""
+        return self.own or not self.probable
+
+    @cached_property
+    def extent(self) -> tuple[float, float] | None:
+        """(width, height) estimated from the boxes; None with too few rows.
+
+        The right and bottom edges without the _STRAYS farthest, so that a stray box does not move the picture's border.
+        Rows with a score below 0.5 are ignored.
+        """
+        likely = self.box_px if self.certain else self.box_px[self.score >= 0.5]
+        if len(likely) < _ENOUGH_ROWS:
+            return None
+        width, height = np.sort(likely[:, :2] + likely[:, 2:], axis=0)[-1 - _STRAYS]
+        return float(width), float(height)
+
+    def classes(self, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+        """Name and number of the class of each of some rows, as in Detections."""
+        label = np.full(len(self), "", object) if self.label is None else self.label
+        return label[rows], (np.full(len(self), -1) if self.class_id is None else self.class_id)[rows]
+
+    def rows(self, frame: int) -> slice:
+        """Where the rows of a frame are."""
+        return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
+
+    @cached_property
+    def targets(self) -> np.ndarray:
+        """(N,) int64 identity of each row; rows without one are numbered within the frame, above all identities.
+
+        Raises InputError if a frame has an identity twice.
+        """
+        identity = self.identity if self.identity is not None else np.full(len(self), -1)
+        order = np.lexsort((self.line, identity, self.frame))
+        before, after = order[:-1], order[1:]
+        twice = (self.frame[before] == self.frame[after]) & (identity[before] == identity[after])
+        if (twice & (identity[after] > 0)).any():
+            row = after[(twice & (identity[after] > 0)).argmax()]
+            raise InputError(
+                f"{self.path}, line {self.line[row]}: identity {identity[row]} is there already in frame "
+                f"{self.frame[row]}; wanted each once a frame, or -1 where there are none"
+            )
+        place = np.arange(len(self)) - np.searchsorted(self.frame, self.frame) + 1
+        return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
+
+    def at(self, frame: int) -> Detections:
+        """The detections of a frame, of kind `given`."""
+        here = self.rows(frame)
+        box_px, (label, class_id) = self.box_px[here], self.classes(here)
+        area_px = box_px[:, 2] * box_px[:, 3]
+        return Detections(box_px, self.score[here], area_px, kind="given", label=label, class_id=class_id)

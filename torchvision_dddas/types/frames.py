@@ -1,0 +1,186 @@
+"""Frames of a clip, their registration, adjustments, and scenes: what a detector finds."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol, overload
+
+import numpy as np
+
+from torchvision_dddas.errors import InputError
+from torchvision_dddas.types.detections import Detections
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a clip.
+
+    number: 1-based position in the clip. time_s: seconds since the clip's first frame.
+    image: uint8, (H, W) grey or (H, W, 3) BGR. skipped: frames before it that were left out on purpose.
+    taken_s: capture time by the monotonic clock; NaN for a recording. damaged: the decoder concealed errors in it or in
+    an earlier picture that it builds on.
+    """
+
+    number: int
+    time_s: float
+    image: np.ndarray
+    skipped: int = 0
+    taken_s: float = float("nan")
+    damaged: bool = False
+
+
+def as_picture(image: Any, name: str = "frame") -> np.ndarray:
+    """A picture as every part of the program takes it: uint8, (H, W) or (H, W, 3) BGR; (H, W, 1) becomes (H, W).
+
+    Raises InputError for anything else, with the code that converts it, where `frame` is what was given.
+    """
+    if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size:
+        if image.ndim == 2 or image.shape[2:] == (3,):
+            return image
+        if image.shape[2:] == (1,):
+            return image[..., 0]
+    if image is None:  # what OpenCV gives for a file that it cannot read
+        raise InputError(f"{name} is None; could its file be read? Wanted a NumPy image")
+    code, kind = "frame", type(image).__name__
+    if hasattr(image, "detach"):  # a tensor
+        image, code = image.detach().cpu().numpy(), "frame.detach().cpu().numpy()"
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{name} must be a Frame or a NumPy image, got {kind}; np.asarray or cv2.imread makes one")
+    what, shape = f"{image.dtype} of shape {image.shape}", image.shape
+    if not image.size or image.ndim not in (2, 3, 4) or image.dtype.kind not in "iufb":
+        raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}")
+    if image.ndim == 4:
+        code, shape = f"{code}[0]", shape[1:]
+    if len(shape) == 3 and shape[0] in (1, 3, 4) and shape[2] > 4:
+        code, shape = f"np.moveaxis({code}, 0, -1)", (*shape[1:], shape[0])
+        code += "[..., ::-1]" if shape[2] == 3 else ""  # colours are RGB there
+    if len(shape) == 3 and shape[2] == 4:
+        code = f"{code}[..., :3]"
+    elif len(shape) == 3 and shape[2] not in (1, 3):
+        raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}; choose its channels")
+    values = np.nan_to_num(image)
+    low, high = float(values.min()), float(values.max())
+    if image.dtype.kind in "fb" and low >= 0 and high <= 1:
+        code = f"(np.nan_to_num({code}) * 255.0).round().astype(np.uint8)"
+    elif image.dtype != np.uint8 and low >= 0 and high <= 255:
+        code = f"np.nan_to_num({code}).round().astype(np.uint8)"
+    elif image.dtype != np.uint8:  # one range for the whole clip, or it flickers
+        gain = 255 / (high - low or 1)
+        code = f"((np.clip({code}, {low:.0f}, {high:.0f}) - {low:.0f}) * {gain:.6g}).astype(np.uint8)"
+    raise InputError(f"{name} must be uint8 of shape (H, W) or (H, W, 3), got {what}; convert it: {code}")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A recoverable fault while reading a clip: the first affected frame, 1-based, and a description."""
+
+    frame: int
+    what: str
+
+    def __str__(self) -> str:
+        return self.what
+
+
+class Source(Protocol):
+    """A clip that is read frame by frame.
+
+    Iterating yields frames in order, numbered from 1, without those that cannot be decoded.
+    count: announced frames, None if unknown. exact: whether the count is reliable. size: (width, height), px.
+    last: the last frame read; after the end of the clip its last frame, decoded or not.
+    problems: filled while reading; each new iteration starts at frame 1 and clears it.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def count(self) -> int | None: ...  # noqa: D102
+    @property
+    def exact(self) -> bool: ...  # noqa: D102
+    @property
+    def rate_hz(self) -> float: ...  # noqa: D102
+    @property
+    def size(self) -> tuple[int, int]: ...  # noqa: D102
+    @property
+    def last(self) -> int: ...  # noqa: D102
+    @property
+    def problems(self) -> list[Problem]: ...  # noqa: D102
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+    def every(self, interval: int) -> Iterator[Frame]:
+        """Yield frames 1, 1 + interval, ...; the others are not decoded where that can be avoided."""
+        ...
+
+
+@overload
+def is_sampled(frame: int, interval: int) -> bool: ...
+@overload
+def is_sampled(frame: np.ndarray, interval: int) -> np.ndarray: ...
+def is_sampled(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
+    """Whether a frame number, or each of an array, is one of 1, 1 + interval, 1 + 2 interval, ..."""
+    return (frame - 1) % interval == 0
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The background's motion from one frame to a later one.
+
+    later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
+    tracked, inliers: numbers of keypoints tracked, and of those that fit the homography.
+    error_px: median error of the inliers. flow_px: median background displacement. cause: why it is not reliable.
+    """
+
+    later_from_earlier: np.ndarray
+    tracked: int
+    inliers: int
+    error_px: float
+    flow_px: float
+    reliable: bool = True
+    cause: str = ""
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A parameter changed by feedback at a frame, and the reason."""
+
+    frame: int
+    parameter: str
+    old: float
+    new: float
+    cause: str
+
+    def describe(self) -> str:
+        """The change in words, "none" for a bound that is not set."""
+        old, new = (f"{value:.5g}" if math.isfinite(value) else "none" for value in (self.old, self.new))
+        return f"{self.parameter} {old} -> {new}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The result of motion detection for one frame.
+
+    mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
+    reliable: False if registration failed: then the mask is empty and `cause` says why.
+    interval_frames: the detection interval in force. seconds: time spent per stage.
+    step: background motion since the previous frame, or None.
+    core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.
+    repeats: the number of the earlier frame whose picture this one repeats, and whose result it has; 0: none. It is no
+    look at the scene: leave it out of what follows targets.
+    """
+
+    frame: Frame
+    mask: np.ndarray
+    detections: Detections
+    interval_frames: int
+    reliable: bool = True
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+    step: Registration | None = None
+    core: np.ndarray | None = None
+    repeats: int = 0
+
+    @property
+    def camera_motion(self) -> np.ndarray | None:
+        """(3, 3) pixel homography from the frame before to this one; None where it is unknown."""
+        return self.step.later_from_earlier if self.step is not None and self.step.reliable else None

@@ -1,0 +1,75 @@
+"""People seen from the ground, and the classifier that finds them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchvision_dddas.types.frames import Adjustment, Frame
+from torchvision_dddas.types.table import Table
+
+
+@dataclass(frozen=True)
+class LinearSvm:
+    """A person classifier: score = weights . descriptor + bias.
+
+    weights: (F,) float32 in OpenCV's order: blocks and cells column by column, bins fastest. origin: file or name.
+    """
+
+    weights: np.ndarray
+    bias: float
+    origin: str = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A rectangle of a pyramid level whose windows are scored, in that level's pixels.
+
+    level: (width, height) of the resized picture. x, y: top left pixel, multiples of the window stride from -padding.
+    """
+
+    level: tuple[int, int]
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class People(Table):
+    """The people recognized in one frame, one row per person.
+
+    box_px: (N, 4) float64 of the body: x, y of the top left pixel, width, height. score: (N,) probability.
+    margin: (N,) the classifier's score. cut: (N,) bool, the border cuts the body: its height is unreliable.
+    window_px: (N, 4) the classifier's window around the body.
+    """
+
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    margin: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    cut: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    window_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+
+    def __len__(self) -> int:
+        return len(self.box_px)
+
+    @property
+    def feet_px(self) -> np.ndarray:
+        """(N, 2) u, v of the point between the feet, from the first pixel's centre: the middle of the lower edge."""
+        return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - 0.5
+
+
+@dataclass(frozen=True)
+class PeopleFrame:
+    """The result of searching one frame for people.
+
+    regions_px: (R, 4) the regions searched in addition to the scheduled pyramid levels; None: the whole picture.
+    share: windows scored, relative to a full search. cause: why there is no result. adjustments, seconds: as in Scene.
+    """
+
+    frame: Frame
+    people: People
+    regions_px: np.ndarray | None = None
+    share: float = 1.0
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,136 @@
+"""Tracks, and the results of a frame."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchvision_dddas.types.detections import Detections
+from torchvision_dddas.types.frames import Adjustment, Frame
+from torchvision_dddas.types.ground import AerialLocations, Confirmation, GroundCrowds
+from torchvision_dddas.types.table import Boxes, complete_table
+from torchvision_dddas.types.worlds import Command
+
+
+@dataclass(frozen=True)
+class AppearanceUse:
+    """Whether the association of a frame looked at the targets' appearance, and the reason.
+
+    weight: of their locations in the source's association; NaN in the default one, where appearance adds to scores.
+    location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN where not computed.
+    """
+
+    looked: bool
+    cause: str
+    weight: float = float("nan")
+    location_dispersion: float = float("nan")
+    appearance_dispersion: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Tracks(Boxes):
+    """The targets of one frame with identities, one row per target.
+
+    identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
+    row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
+    link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
+    could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
+    label, class_id: of the detection, as there; of a bridging box those of the identity before. frame: its number, of
+    a table that `concat` joins (N,).
+    appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
+    """
+
+    frame: int
+    identity: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    score: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    row: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    link: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    appearance: AppearanceUse | None = None
+    label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
+    class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __post_init__(self) -> None:
+        complete_table(self, len(self.identity), link=np.nan, label="", class_id=-1)
+
+    def __len__(self) -> int:
+        return len(self.identity)
+
+    @property
+    def id(self) -> np.ndarray:
+        """(N,) the identities."""
+        return self.identity
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """The result of tracking for one frame.
+
+    number: 1-based position in the clip. frame: the picture, or None. detections: the tracker's input.
+    tracks: those with an identity, and boxes that bridge gaps.
+    now_from_before: (3, 3) pixel homography from the frame tracked before; None: no motion, or unknown.
+    lines: (N,) int64, lines of the detections in their file; empty for own ones.
+    cause: why there is no result. adjustments, seconds, repeats: as in Scene.
+    """
+
+    number: int
+    frame: Frame | None
+    detections: Detections
+    tracks: Tracks
+    now_from_before: np.ndarray | None = None
+    lines: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    cause: str = ""
+    adjustments: tuple[Adjustment, ...] = ()
+    seconds: dict[str, float] = field(default_factory=dict)
+    repeats: int = 0
+
+    @property
+    def untracked(self) -> list[int]:
+        """The rows of the detections that have no identity."""
+        tracked = set(self.tracks.row.tolist())
+        return [row for row in range(len(self.detections)) if row not in tracked]
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The result of the whole pipeline for one frame.
+
+    tracked: its targets, without the landmarks. locations: where they are on the ground; None if nothing locates them.
+    sighted_by: (n,) how each landmark of locations.marks was seen: motion, colour or table.
+    mark_lonlat_deg: (n, 2) positions of the landmarks; None without a geographic origin.
+    confirmed: the UGVs' verdict on each row of locations.positions; None without UGV cameras.
+    crowds: by the people that the UGVs see; None without UGV cameras.
+    command: the order to the vehicles after this frame; None: no change.
+    """
+
+    tracked: TrackedFrame
+    locations: AerialLocations | None = None
+    sighted_by: tuple[str, ...] = ()
+    mark_lonlat_deg: np.ndarray | None = None
+    confirmed: Confirmation | None = None
+    command: "Command | None" = None
+    crowds: GroundCrowds | None = None
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame; None where it could not be read."""
+        return self.tracked.frame
+
+    @property
+    def number(self) -> int:
+        """1-based number of the frame."""
+        return self.tracked.number
+
+    @property
+    def repeats(self) -> int:
+        """As in Scene."""
+        return self.tracked.repeats
+
+    @property
+    def tracks(self) -> Tracks:
+        """The targets of the frame with their identities."""
+        return self.tracked.tracks
+
+    @property
+    def adjustments(self) -> tuple[Adjustment, ...]:
+        """The changes of parameters at the frame, with their causes."""
+        return self.tracked.adjustments if self.locations is None else self.locations.adjustments
