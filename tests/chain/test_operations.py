@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 import torch
 
 from tests.functional.conftest import draw_texture
-from torchvision_dddas.chain import OpenCVOperations, View
+from torchvision_dddas.chain import OpenCVOperations, Operations, View
 from torchvision_dddas.functional import TensorOperations
 
 HEIGHT, WIDTH, BATCH = 61, 87, 3
@@ -74,6 +74,7 @@ CASES = {
     "smaller": Case(lambda on, g: on.smaller(g.one, g.other)),
     "larger": Case(lambda on, g: on.larger(g.one, g.other)),
     "inside": Case(lambda on, g: on.inside(g.one, on.exceeds(g.other, 100))),
+    "outside": Case(lambda on, g: on.outside(g.one, on.exceeds(g.other, 100))),
     "exceeds": Case(lambda on, g: on.inside(g.one, on.exceeds(g.one, 130.7))),
     "stands_out": Case(lambda on, g: on.stands_out(g.one, 20, 1.3)),
     "weigh": Case(lambda on, g: on.weigh(g.one, g.weight, 200), 1, 0.01),
@@ -125,6 +126,12 @@ def tensor_given(numbers: list[int], dtype: Any = torch.float32, strided: bool =
 def as_bytes(found: Any) -> np.ndarray:
     array = found.numpy() if isinstance(found, torch.Tensor) else np.asarray(found)
     return array.astype(int)
+
+
+def test_every_operation_has_a_case() -> None:
+    named = {name for name, member in vars(Operations).items() if callable(member) and not name.startswith("_")}
+    used = {word for case in CASES.values() for word in case.call.__code__.co_names}
+    assert named - used == set()
 
 
 @each_case

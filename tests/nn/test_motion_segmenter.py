@@ -43,7 +43,7 @@ def differences(
     texture = torch.randint(0, 60, (2, 1, height, width), generator=random)
     both = torch.ones(2, 2, height, width, dtype=torch.bool)
     both[..., :2] = False
-    return Differences(least.to(torch.uint8), both, texture.to(dtype))
+    return Differences(least.to(torch.uint8), both, texture.to(dtype), torch.full_like(texture, 90).to(torch.uint8))
 
 
 def values() -> dict[str, torch.Tensor]:
@@ -127,7 +127,7 @@ def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
     none = torch.zeros(1, 1, 20, 20)
     parameters = {name: value.requires_grad_() for name, value in values().items()}
     motion = MotionSegmenter(SETTINGS, tuned=())
-    core = motion.segment(Differences(none.byte(), none.bool(), none), parameters, 0.1)
+    core = motion.segment(Differences(none.byte(), none.bool(), none, none.byte()), parameters, 0.1)
     mask = motion.outlined(core, Regions(none.long(), none.long(), 0), parameters, 0.1)
     mask.sum().backward()
     assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in parameters.values())

@@ -13,7 +13,7 @@ Engines give the operations: OpenCV on arrays, Kornia and torch on tensors. Regi
 their motion, persistence and outlines after it (`detection`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic
 
@@ -51,6 +51,14 @@ class Window(Generic[View]):
     def looks_both_ways(self) -> bool:
         """Whether there is a wide pair, and it shows what is in the reference frame alone."""
         return self.wide is not None and self.offsets[self.wide[0]] * self.offsets[self.wide[1]] < 0
+
+
+@dataclass(frozen=True)
+class Reference(Generic[Picture]):
+    """What a reference frame shows by itself: its grey levels, and its mean gradient, 4 x grey levels a pixel."""
+
+    grey: Picture
+    texture: Picture
 
 
 @dataclass(frozen=True)
@@ -103,46 +111,50 @@ class DetectionChain(Generic[View, Picture, Seen]):
 
     def find_foreground(self, window: Window[View]) -> Maps[Picture]:
         """The maps of a window, by all steps of the chain."""
-        operations = self.operations
         neighbours = self.neighbours(window)
-        texture = neighbours.texture()
-        weight = self.noise_weight(texture)
-        near = self.find_evidence(neighbours.compared(window.near[0]), neighbours.both(window.near[0]), texture, weight)
-        for pair in window.near[1:]:
-            more = self.find_evidence(neighbours.compared(pair), neighbours.both(pair), texture, weight)
-            near = operations.larger(near, more)
+        reference = neighbours.reference()
+        near = self.find_evidence(map(neighbours.compared_and_seen, window.near), reference)
         one, other = window.near[-1]
         warped = neighbours.warped(one), neighbours.warped(other)
         neighbours.keep_for(window.wide, window.small)
         wide = near
         if window.wide is not None:
-            wide = self.find_evidence(neighbours.compared(window.wide), neighbours.both(window.wide), texture, weight)
+            wide = self.find_evidence([neighbours.compared_and_seen(window.wide)], reference)
         neighbours.keep_for(window.small)
         core = self.find_core(near, window.close_px)
         small = None if window.small is None else self.find_small(neighbours, window.small)
-        return Maps(core, near, wide, texture, small, warped)
+        return Maps(core, near, wide, reference.texture, small, warped)
 
     def neighbours(self, window: Window[View]) -> "Neighbours[View, Picture, Seen]":
         """The neighbours of a window as its reference sees them."""
         return Neighbours(window, self.settings, self.operations)
 
-    def noise_weight(self, texture: Picture) -> Any:
+    def find_evidence(self, pairs: Iterable[tuple[Picture, Picture]], reference: Reference[Picture]) -> Picture:
+        """The largest evidence of pairs: their differences where both neighbours are seen, smoothed, in units of noise.
+
+        pairs: of each the difference and the mask of what both neighbours show, as `Neighbours.compared_and_seen`.
+        """
+        weight, largest = self._noise_weight(reference.texture), None
+        for difference, seen in pairs:
+            evidence = self._find_pair_evidence(difference, seen, reference.texture, weight)
+            largest = evidence if largest is None else self.operations.larger(largest, evidence)
+        if largest is None:
+            raise ValueError("a window has at least one pair")
+        return largest
+
+    def _noise_weight(self, texture: Picture) -> Any:
         """Steps of evidence a grey level; None unless differences are in units of local noise."""
         if not self.is_normalized:
             return None
         levels, share = self.value("difference.noise_levels"), self.value("difference.gradient_share")
         return self.operations.noise_weight(texture, levels, share, EVIDENCE_SCALE)
 
-    def find_evidence(self, difference: Picture, both: Picture, texture: Picture, weight: Any) -> Picture:
-        """The evidence of a pair: its difference where both neighbours are seen, smoothed, in units of noise.
-
-        weight: of `noise_weight`.
-        """
+    def _find_pair_evidence(self, difference: Picture, seen: Picture, texture: Picture, weight: Any) -> Picture:
         operations = self.operations
         if weight is None:
-            return operations.inside(self._blur(difference), both)
-        z = self._blur(operations.weigh(operations.inside(difference, both), weight, EVIDENCE_CAP))
-        textured = operations.inside(operations.exceeds(texture, _TEXTURED), both)
+            return operations.inside(self._blur(difference), seen)
+        z = self._blur(operations.weigh(operations.inside(difference, seen), weight, EVIDENCE_CAP))
+        textured = operations.inside(operations.exceeds(texture, _TEXTURED), seen)
         return operations.in_units_of_median(z, textured, EVIDENCE_SCALE)
 
     def _blur(self, difference: Picture) -> Picture:
@@ -192,11 +204,11 @@ class Neighbours(Generic[View, Picture, Seen]):
     def _parameters(self) -> DifferenceParameters:
         return self.settings.difference
 
-    def texture(self) -> Picture:
-        """The reference's texture; zeros where no step needs it."""
+    def reference(self) -> Reference[Picture]:
+        """The reference's grey levels and texture; its texture is 0 where no step needs it."""
+        view, operations = self.window.reference, self.operations
         is_needed = self._parameters.kind == "normalized" or self.settings.refine.on
-        make = self.operations.texture if is_needed else self.operations.no_texture
-        return make(self.window.reference)
+        return Reference(operations.grey(view), operations.texture(view) if is_needed else operations.no_texture(view))
 
     def warped(self, index: int) -> Picture:
         """A neighbour in the reference's frame and exposure."""
@@ -212,6 +224,10 @@ class Neighbours(Generic[View, Picture, Seen]):
         if self._parameters.kind == "between_later":  # eq. 9: a mover shows where it is in the two later frames
             return self.operations.difference(self.warped(pair[0]), self.warped(pair[1]))
         return self.least(pair)
+
+    def compared_and_seen(self, pair: Pair) -> tuple[Picture, Picture]:
+        """The difference of a pair, and the mask of what both of it show."""
+        return self.compared(pair), self.both(pair)
 
     def least(self, pair: Pair) -> Picture:
         """The smaller difference of the reference to the two of a pair: it marks a mover where the reference has it."""

@@ -68,6 +68,9 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
     def inside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # noqa: D102
         return cv2.bitwise_and(picture, mask)
 
+    def outside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # noqa: D102
+        return cv2.bitwise_and(picture, cv2.bitwise_not(mask))
+
     def exceeds(self, picture: np.ndarray, level: float) -> np.ndarray:  # noqa: D102
         return cv2.threshold(picture, int(level), 255, cv2.THRESH_BINARY)[1]
 

@@ -10,7 +10,12 @@ View = TypeVar("View", contravariant=True)
 """A frame as an engine holds it: a `detection.View`, or a (B, 1, H, W) float tensor of whole grey levels."""
 
 Picture = TypeVar("Picture")
-"""A map of whole numbers 0 to 255: (H, W) uint8 array, or (B, 1, H, W) uint8 tensor; floats where masks are soft."""
+"""A map of whole numbers 0 to 255: (H, W) uint8 array, or (B, 1, H, W) uint8 tensor.
+
+Masks that say where a picture counts (`exceeds`, `seen_by_both`) are 0 and 255 in arrays, and bool in tensors. The mask
+of movers that `above` begins is 0 and 255, or with softness a float margin in steps of evidence: above 0 where the mask
+is more than one half. `inside` and `outside` take pictures and evidence, not margins: evidence of 0 is a mask of 0.
+"""
 
 Seen = TypeVar("Seen")
 """Where a neighbour shows the reference's pixels."""
@@ -72,6 +77,10 @@ class Operations(Protocol[View, Picture, Seen]):
 
     def inside(self, picture: Picture, mask: Picture) -> Picture:
         """The picture where a mask is set, 0 elsewhere."""
+        ...
+
+    def outside(self, picture: Picture, mask: Picture) -> Picture:
+        """The picture where a mask is not set, 0 elsewhere."""
         ...
 
     def exceeds(self, picture: Picture, level: float) -> Picture:

@@ -97,7 +97,7 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         darkened = (gain * LEVEL + offset).round() < WHITE
         # A clipped pixel only says that the place was at least so bright.
         cut = None if all_true(~darkened) else (warped >= WHITE) & darkened
-        through = to_bytes(warped.to(gain.dtype).mul_(gain).add_(offset).round_().clamp_(0.0, LEVEL))
+        through = to_bytes(warped.to(gain.dtype).mul_(gain).add_(offset).round_().clamp_(0.0, float(LEVEL)))
         return through if cut is None else torch.where(cut, torch.maximum(through, to_bytes(reference)), through)
 
     def difference(self, one: Tensor, other: Tensor) -> Tensor:  # noqa: D102
@@ -111,6 +111,9 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
 
     def inside(self, picture: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
         return picture * mask
+
+    def outside(self, picture: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
+        return picture * ~mask
 
     def exceeds(self, picture: Tensor, level: float) -> Tensor:  # noqa: D102
         return is_above(picture, int(level)) if picture.dtype == torch.uint8 else picture > level

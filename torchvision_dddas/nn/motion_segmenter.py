@@ -18,6 +18,7 @@ import torchvision_dddas.functional as F
 from torchvision_dddas.chain import (
     DetectionChain,
     Pair,
+    Reference,
     Window,
     evidence_scale,
     later_pair,
@@ -64,13 +65,14 @@ class Segmentation(NamedTuple):
 class Differences:
     """A batch of windows, before any tunable parameter acts.
 
-    least: the difference that both neighbours of each near pair show, grey levels. both: where both are seen. texture:
-    4 x grey levels a pixel.
+    least: the difference of each near pair, as `difference.kind` has it, grey levels. both: where both neighbours are
+    seen. texture: of the reference, 4 x grey levels a pixel; grey: its grey levels.
     """
 
     least: UInt8[Tensor, "B P H W"]
     both: Bool[Tensor, "B P H W"]
     texture: Float[Tensor, "B 1 H W"]
+    grey: UInt8[Tensor, "B 1 H W"]
 
 
 class Core(NamedTuple):
@@ -197,12 +199,8 @@ class MotionSegmenter(nn.Module):
         """
         softness, texture = self.softness if softness is None else softness, differences.texture
         chain = self.chain(values, softness, texture.dtype)
-        weight = chain.noise_weight(texture)
-        largest: Tensor | None = None
-        for k in range(differences.least.shape[1]):
-            z = chain.find_evidence(differences.least[:, k : k + 1], differences.both[:, k : k + 1], texture, weight)
-            largest = z if largest is None else chain.operations.larger(largest, z)
-        assert largest is not None, "a window has a pair"
+        pairs = zip(differences.least.split(1, 1), differences.both.split(1, 1), strict=True)
+        largest = chain.find_evidence(pairs, Reference(differences.grey, texture))
         margin, unit = chain.find_core(largest), evidence_scale(self.settings)
         evidence = largest.to(texture.dtype) / unit
         if margin.dtype == torch.uint8:
@@ -303,7 +301,8 @@ def differences_of(chain: TensorChain, window: Window[Tensor]) -> Differences:
     """The part of a batch of windows that depends on no tunable parameter."""
     neighbours = chain.neighbours(window)
     least, both = (torch.cat([of(pair) for pair in window.near], 1) for of in (neighbours.compared, neighbours.both))
-    return Differences(least, both, neighbours.texture())
+    reference = neighbours.reference()
+    return Differences(least, both, reference.texture, reference.grey)
 
 
 def check_softness(settings: Settings) -> None:

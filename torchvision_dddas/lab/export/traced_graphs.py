@@ -90,9 +90,12 @@ PLANES: dict[str, tuple[str, nn.Module]] = {
     "homography.onnx": ("weighted least-squares homographies of sets of landmarks", PlaneHomography()),
     "homography_raw.onnx": ("the same as the source prints it: no weights, no normalisation", RawPlaneHomography()),
 }
-_DIFFERENCE = (
-    *("difference.blur_px", "difference.blur_of", "difference.border_px"),
-    *("morphology.erode_px", "morphology.dilate_px", "morphology.close_px"),
+# All parameters of the chain but the threshold, which is an input.
+_CHAIN = tuple(
+    f"{group}.{name}"
+    for group in ("difference", "morphology")
+    for name in type(getattr(Settings(), group)).model_fields
+    if name != "threshold"
 )
 _REGISTRATION = ("model", "keypoints", "cell_px", "quality", "block_px", "window_px", "levels", "epsilon_px")
 # What a graph is for, its outputs, and the parameters that are baked in.
@@ -100,12 +103,12 @@ SEGMENTATION: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "warp_difference": (
         "difference and mask of a picture and two neighbours of known motion",
         ("difference", "mask"),
-        _DIFFERENCE,
+        _CHAIN,
     ),
     "step": (
         "motions, difference and mask of a picture and its two neighbours: the whole step from pictures to mask",
         ("neighbour_from_reference", "inliers", "tracked", "difference", "mask"),
-        (*_DIFFERENCE, *(f"registration.{name}" for name in _REGISTRATION)),
+        (*_CHAIN, *(f"registration.{name}" for name in _REGISTRATION)),
     ),
 }
 

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import repeat
 from typing import Any
 
@@ -150,7 +150,7 @@ def stack_frames(frames: Sequence[LabelledFrames], device: torch.device) -> Labe
     def stack(parts: Sequence[object], *names: str) -> dict[str, Any]:
         return {name: torch.cat([getattr(part, name) for part in parts]).to(device) for name in names}
 
-    columns = stack([frame.differences for frame in frames], "least", "both", "texture")
+    columns = stack([frame.differences for frame in frames], *(field.name for field in fields(Differences)))
     columns["texture"] = columns["texture"].float()
     return LabelledFrames(Differences(**columns), **stack(frames, "truth", "known", "removed", "added"))
 
@@ -247,4 +247,4 @@ def prepare_differences(window: Window[Any], settings: Settings) -> Differences:
     views = [engine.prepare(view.grey) for view in (window.reference, *window.neighbours)]
     batch = engine.batch_of([replace(window, reference=views[0], neighbours=tuple(views[1:]))])
     found = differences_of(engine.segmenter.chain(), batch)
-    return Differences(found.least.clone(), found.both, found.texture.to(torch.uint8))
+    return replace(found, least=found.least.clone(), texture=found.texture.to(torch.uint8))
