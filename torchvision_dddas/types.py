@@ -242,7 +242,8 @@ class Telemetry:
     heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
-    start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. origin: the file. notes: remarks for the user.
+    start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. latest_utc_s: the latest that this can be where the
+    dates lack a zone. origin: the file. notes: remarks for the user.
     Raises InputError for columns of other lengths and times that decrease.
     """
 
@@ -265,6 +266,7 @@ class Telemetry:
     heading_from: str = ""
     is_nominal: bool = False
     start_utc_s: float = float("nan")
+    latest_utc_s: float = float("nan")
     origin: str = ""
     notes: tuple[str, ...] = ()
 

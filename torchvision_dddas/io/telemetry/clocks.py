@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 from zoneinfo import ZoneInfo
 
@@ -12,56 +13,110 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.tables import parse_numbers
-from torchvision_dddas.io.telemetry.fields import POSSIBLE, Known
-from torchvision_dddas.io.telemetry.record import Log
+from torchvision_dddas.io.telemetry.fields import POSSIBLE, UNITS, Known
+from torchvision_dddas.io.telemetry.record import SPLIT_S, Log, is_clock
 
 UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
 """The note on a log whose dates say no zone."""
+YEAR_LAST = "the years of two digits are taken to come last in the dates"
+UNSURE = "{} does not show whether day or month comes first, so the clock is not known"
 
 _DAY_S = 86_400.0
 _DAY_FORM = r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})"
 _CLOCK_FORM = (
     r"(\d{1,2}):(\d{1,2})(?::(\d{1,2}))?(?:[.,:](\d{1,9}))?(?:[.,:](\d{1,3}))?(?:[.,:]\d{1,3})*"
-    r"(?: ?([AaPp])\.?[Mm]\.?)?(?: ?(Z|UTC|GMT|[+-]\d{2}:?\d{2}))?"
+    r"(?: ?([AaPp])\.?[Mm]\.?)?(?: ?((?:Z|UTC|GMT)?[+-]\d{1,2}(?::?\d{2})?(?![\d.,:°])|[A-Z]{1,5}(?![A-Za-z])))?"
 )
 _DATE, _DAY = re.compile(f"{_DAY_FORM}[ T,]+{_CLOCK_FORM}"), re.compile(_DAY_FORM)
 _CLOCK = re.compile(rf"(?=\d+:\d+:|.*[AaPp]){_CLOCK_FORM}")  # 12:05.3 are minutes and seconds
-_SPAN = re.compile(
-    r"(?:(\d{1,6}) ?h\w* ?)?(?:(\d{1,6}) ?m\w* ?)?(?:(\d{1,6}(?:[.,]\d{1,9})?) ?s\w*)?"
-    r"|(?:(\d{1,6}):)?(\d{1,6}):(\d{1,6}(?:[.,]\d{1,9})?)"
+_SPAN = re.compile(r"(?:(\d{1,6}):)?(\d{1,6}):(\d{1,6}(?:[.,]\d{1,9})?)")
+_UNIT_SPAN = re.compile(r"([-+]?\d{1,9}(?:[.,]\d{1,9})?) ?([a-zµ'\"]{1,12})[ ,]{0,3}")
+_SPAN_UNITS = UNITS["time"] | {"m": 60.0, "'": 60.0, "d": 86_400.0, "day": 86_400.0, "days": 86_400.0, '"': 1.0}
+# Hours from UTC of the names of zones that mean one zone; CST, IST and BST mean several.
+_ZONES = {
+    name: hours
+    for hours, names in {
+        -8: "PST", -7: "PDT MST", -6: "MDT", -5: "EST CDT", -4: "EDT", 0: "Z UTC GMT WET", 1: "CET MEZ WEST",
+        2: "CEST MESZ EET", 3: "EEST MSK", 9: "JST KST", 10: "AEST", 11: "AEDT", 12: "NZST", 13: "NZDT",
+    }.items()
+    for name in names.split()
+}  # fmt: skip
+# Dates in other forms: of EXIF, without signs between, and with the name of the month.
+_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+_MONTH = rf"({'|'.join(_MONTHS)})[a-z]{{0,6}}\.?"
+_ODD_DATE = re.compile(
+    r"(?<![\d:.])(?:(\d{4}):(\d\d):(\d\d)(?=[ T]\d)"
+    r"|(20\d\d)([01]\d)([0-3]\d)(?=$|\.0*$|[ T_-]?[0-2]\d:?\d)(?:[ T_-]?([0-2]\d):?([0-5]\d):?([0-6]\d)\.?(\d{0,9})(?!\d))?"
+    rf"|(\d{{1,2}})[ .-]?{_MONTH}[ ,.-]{{1,2}}(\d{{4}}|\d\d)(?!\d)"
+    rf"|{_MONTH} +(\d{{1,2}}),? +(?:(\d{{1,2}}:[\d:.]{{2,15}}) +)?(\d{{4}})(?!\d))",
+    re.IGNORECASE,
 )
+# Numbers of which the digits are hours, minutes and seconds, or of a date.
+_DIGITS = re.compile(r"([01]?\d|2[0-3])([0-5]\d)([0-5]\d)(?:\.?(\d*))")
+_DAY_DIGITS = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.0*)?")
 # From 2001 to 2100: an earlier clock was never set.
 _SINCE_1970 = (1e9, 4.1e9)
 # A larger number is no time of a log, since its start or since 1970.
 _LONGEST_S = 1e10
+_DAYS = 2  # a flight goes over one midnight
 # How far the rows of a flight log may be apart.
 _STEP_S = (0.002, 10.0)
-_SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "days": _DAY_S}
+# Days at the beginning of 1970 of spreadsheets, MATLAB, Julian days and modified Julian days.
+_EPOCHS = (25_569.0, 719_529.0, 2_440_587.5, 40_587.0, 0.0)
+# Dates that leave the times by more are those of another flight.
+DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50
+# Where so many rows have the same time as the row above, and times are whole multiples of this, rows are spread.
+_REPEATED, _TICK_S = 1.1, 0.1
 
 
-def parse_date(text: str, day_first: bool = False) -> tuple[float, bool] | None:
-    """Seconds since 1970 of the first date with a time in a text, and whether it has a zone; else UTC is assumed.
+def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], bool, str]:
+    """Of each text the first date with a time: seconds since 1970, and whether it has a zone; else UTC is assumed.
 
-    None without a date. Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`. day_first: in
-    dates that end with the year; in those with dots the day always comes first.
+    None without a date. Also returns whether the order of day and month is known, and what is assumed of the years.
+    Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`. In dates with dots the day comes
+    before the month.
     """
-    found = _DATE.search(text)
+    if any(map(_ODD_DATE.search, texts[:5])):
+        texts = [_ODD_DATE.sub(_usual_date, text) for text in texts]
+    found = [_DATE.search(text) for text in texts]
+    days = {one[0] for one in (one and _DAY.match(one[0]) for one in found) if one}
+    day_first, is_sure = _day_order(days)
+    dates: list[tuple[float, bool] | None] = []
+    for one in found:
+        *parts, zone = one.groups(default="") if one else [""] * 10
+        seconds = midnight_s(*parts[:3], day_first or "." in one[0][:3]) + _clock_s(*parts[3:]) if one else math.nan
+        away_s = _zone_s(zone)
+        dates.append((seconds - (away_s or 0.0), away_s is not None) if math.isfinite(seconds) else None)
+    return dates, is_sure, YEAR_LAST * any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days)
+
+
+def _usual_date(found: re.Match[str]) -> str:
+    """The usual form of a date in another one, 2022-08-26 18:12:57; the text behind it stays."""
+    year, month, day, *_ = (part for part in found.groups() if part is not None)
+    if found[11]:
+        day, month, year = found[11], str(_MONTHS.index(found[12].lower()) + 1), found[13]
+    elif found[14]:
+        month, day, year = str(_MONTHS.index(found[14].lower()) + 1), found[15], found[17]
+    clock = f" {found[7]}:{found[8]}:{found[9]}.{found[10] or 0}" if found[7] else f" {found[16]}" if found[16] else ""
+    return f"{year if len(year) == 4 else '20' + year}-{month}-{day}{clock}"
+
+
+def _zone_s(zone: str) -> float | None:
+    """Seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for other names and for none."""
+    found = re.fullmatch(r"(?:Z|UTC|GMT)?([+-])(\d{1,2}?)(?::?(\d\d))?", zone)
     if found is None:
-        return None
-    *parts, zone = found.groups(default="")
-    seconds = midnight_s(*parts[:3], day_first or "." in found[0][:3]) + _clock_s(*parts[3:])
-    if zone[:1] in ("+", "-"):
-        away = timedelta(hours=int(zone[1:3]), minutes=int(zone[-2:])).total_seconds()
-        seconds -= math.copysign(away, float(zone[0] + "1"))
-    return (seconds, bool(zone)) if math.isfinite(seconds) else None
+        return 3600.0 * _ZONES[zone] if zone in _ZONES else None
+    return math.copysign(3600.0 * int(found[2]) + 60.0 * int(found[3] or 0), float(found[1] + "1"))
 
 
 @lru_cache(maxsize=100)
 def midnight_s(first: str, second: str, third: str, day_first: bool = False) -> float:
-    """Seconds from 1970 to a date, of which the year has four digits; NaN if it is none."""
+    """Seconds from 1970 to a date, NaN if it is none. A year of two digits comes last and is of this century."""
     last = (third, second, first) if day_first else (third, first, second)
     year, month, day = (first, second, third) if len(first) == 4 else last
     try:
+        year = "20" + year if len(year) == 2 else year
         return datetime(int(year), int(month), int(day), tzinfo=UTC).timestamp() if len(year) == 4 else math.nan
     except (ValueError, OverflowError):
         return math.nan
@@ -125,25 +180,65 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
     numbers = parse_numbers(cells)
     is_number = np.isfinite(numbers)
     if is_number.any() and 2 * is_number.sum() >= len(cells) - cells.count(""):
-        return TimeColumn(title, np.where(is_number, numbers, np.nan), "number", known.scale)
-    day_first, is_sure = _day_order({found[0] for cell in cells if (found := _DAY.match(cell))})
-    forms = {"date": _DATE.search, "day": _DAY.fullmatch, "clock": _CLOCK.fullmatch, "span": _SPAN.fullmatch}
-    kinds = (kind for cell in cells if cell for kind, parse in forms.items() if parse(cell))
-    kind = next(kinds, "span")
-    values, is_utc = np.full(len(cells), np.nan), known.is_utc
-    for place, cell in enumerate(cells):
-        if kind == "date":
-            if (date := parse_date(cell, day_first)) is not None:
-                values[place], is_utc = date[0], is_utc or date[1]
-        elif cell and (found := forms[kind](cell)) is not None:
-            if kind == "day":
-                values[place] = midnight_s(*found.groups(), day_first or "." in cell)
-            elif kind == "clock":
-                values[place] = _clock_s(*found.groups(default="")[:6])
-            else:
-                parts = zip(found.groups(default="0"), (3600.0, 60.0, 1.0) * 2, strict=True)
-                values[place] = sum(float(part.replace(",", ".")) * each_s for part, each_s in parts)
-    return TimeColumn(title, values, kind, 1.0, is_utc, is_sure)
+        spelled = _spelled(title, cells, known.is_utc) if math.isnan(known.scale) else None
+        if spelled is None:
+            values = np.where(is_number, numbers, np.nan)
+            return TimeColumn(title, values, "number", known.scale, known.is_utc)
+        cells = spelled
+    elif any(map(_ODD_DATE.search, cells[:5])):
+        cells = [_ODD_DATE.sub(_usual_date, cell) for cell in cells]
+    forms = {"date": _DATE.search, "day": _DAY.fullmatch, "clock": _CLOCK.fullmatch}
+    kind = next((kind for cell in cells if cell for kind, parse in forms.items() if parse(cell)), "span")
+    values, is_utc, is_sure, remark = np.full(len(cells), np.nan), known.is_utc, True, ""
+    if kind in ("date", "day"):
+        dates, is_sure, remark = parse_dates([f"{cell} 0:0" for cell in cells] if kind == "day" else cells)
+        values = np.array([math.nan if date is None else date[0] for date in dates])
+        is_utc |= any(date is not None and date[1] for date in dates)
+    elif kind == "clock":
+        for place, cell in enumerate(cells):
+            if found := _CLOCK.fullmatch(cell):
+                values[place], away_s = _clock_s(*found.groups(default="")[:6]), _zone_s(found[7] or "")
+                values[place], is_utc = values[place] - (away_s or 0.0), is_utc or away_s is not None
+    else:
+        values = np.array([_span_s(cell) for cell in cells])
+    return TimeColumn(title, values, kind, 1.0, is_utc, is_sure, remark)
+
+
+def _span_s(text: str) -> float:
+    """Seconds of `1:02:03.5`, `1h 2m 3.5s`, `500 ms` or `PT0.5S`; NaN for anything else."""
+    if found := _SPAN.fullmatch(text):
+        hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups())
+        return hours * 3600 + minutes * 60 + seconds
+    text = text.lower()
+    text = text[1:].replace("t", " ").lstrip() if text[:1] == "p" else text
+    place, total_s = 0, 0.0
+    while found := _UNIT_SPAN.match(text, place):
+        total_s += float(found[1].replace(",", ".")) * _SPAN_UNITS.get(found[2], math.nan)
+        place = found.end()
+    return total_s if place == len(text) > 0 else math.nan
+
+
+def _spelled(title: str, cells: Sequence[str], is_utc: bool) -> list[str] | None:
+    """Dates and times of day that are written as one number, 20220826181257 or 181257.5, with signs between the parts.
+
+    None for other numbers: where a part is too large, or the rows would be too far apart.
+    """
+    some = [cell for cell in cells if cell]
+    if all(found is not None and len(found[0]) == len(cell) for cell in some for found in [_ODD_DATE.match(cell)]):
+        dates = [_ODD_DATE.sub(_usual_date, cell) for cell in cells]
+        return dates if any(":" in date for date in dates) or len(set(dates)) <= _DAYS + ("" in dates) else None
+    if "date" in title.lower() and len(set(some)) <= _DAYS and all(map(_DAY_DIGITS.fullmatch, some)):
+        return [_DAY_DIGITS.sub(r"\1/\2/\3", cell) for cell in cells]  # the order of the three is not known
+    parts = [found.groups() for cell in some if (found := _DIGITS.fullmatch(cell)) is not None]
+    if len(parts) < len(some) or (lengths := {len(cell.partition(".")[0]) for cell in some}) - {5, 6, 9}:
+        return None
+    clock_s = np.array([int(h) * 3600 + int(m) * 60 + float(f"{s}.{part}0") for h, m, s, part in parts])
+    steps = np.abs(np.diff(clock_s))
+    is_told = is_utc or "utc" in title.lower() or any(cell[0] == "0" for cell in some)
+    is_told |= len({part[:2] for part in parts}) > 1  # the minutes went on, and no seconds were over 59
+    if not is_told or (steps > 0).sum() == 0 or np.median(steps[steps > 0]) > _STEP_S[1] or lengths == {5, 9}:
+        return None
+    return [_DIGITS.sub(r"\1:\2:\3.\g<4>0", cell) for cell in cells]
 
 
 def _day_order(dates: Iterable[str]) -> tuple[bool, bool]:
@@ -157,12 +252,12 @@ def _day_order(dates: Iterable[str]) -> tuple[bool, bool]:
 
 
 def settle_times(
-    log: Log, columns: Sequence[TimeColumn], step_m: float, zone: tzinfo | None
+    log: Log, columns: Sequence[TimeColumn], step_m: float, is_far: np.ndarray, zone: tzinfo | None
 ) -> tuple[np.ndarray, float, list[str]]:
     """Seconds since the first time, (N,), NaN where there is none; when that was since 1970; the columns that tell it.
 
     The finest times that do not run back tell the seconds, dates the clock. step_m: how far the vehicle goes in a row.
-    zone: of dates that say none. Raises InputError where the unit of all times is unknown.
+    is_far: (N,) whether it jumps before the row, as between flights. zone: of dates that say none. Raises InputError where the unit of all times is unknown.
     """
     day = next((one for one in columns if one.kind == "day"), None)
     whole = [one for one in columns if one.kind != "day"]
@@ -170,10 +265,18 @@ def settle_times(
         for place, one in enumerate(whole):
             if one.kind == "clock":
                 values, is_utc = day.values + one.values, day.is_utc or one.is_utc
-                whole[place] = one._replace(values=values, kind="date", is_utc=is_utc, is_sure=day.is_sure)
+                remark = day.remark or one.remark
+                whole[place] = one._replace(
+                    values=values, kind="date", is_utc=is_utc, is_sure=day.is_sure, remark=remark
+                )
+    whole, fractions = _with_fractions(whole)
     dated = (one.values[np.isfinite(one.values)] for one in whole if one.kind == "date")
     span_s = max((float(np.ptp(known)) for known in dated if len(known)), default=0.0)
     settled = [_in_seconds(one, step_m, span_s) for one in whole]
+    clocks = [one for one in settled if one.kind == "date" and np.isfinite(one.values).any()]
+    best = min(clocks, key=lambda one: (not one.is_utc, not one.is_sure), default=None)
+    if restarts := [one for one in settled if one.kind != "date" and len(_restarts(one.values))]:
+        settled = [_continued(log, one, best, is_far) if one in restarts else one for one in settled]
     chosen = min(settled, key=_rank) if settled else columns[0]._replace(values=columns[0].values * math.nan)
     known = np.flatnonzero(np.isfinite(chosen.values))
     if not len(known):
@@ -182,15 +285,97 @@ def settle_times(
         raise log.refuse(chosen.remark)
     if chosen.remark:
         log.note(chosen.remark)
-    if 2 * len(np.unique(chosen.values[known])) < len(known):
-        log.note(f"of the rows with the same '{chosen.title}' only the last counts")
-    time_s = chosen.values - chosen.values[known[0]]
-    clocks = [one for one in settled if one.kind == "date" and np.isfinite(one.values + time_s).any()]
+    time_s = _spread(log, chosen, chosen.values - chosen.values[known[0]])
+    sort_flights(log, time_s)
+    clocks = [one for one in clocks if np.isfinite(one.values + time_s).any()]
     if not clocks:
-        return time_s, math.nan, [chosen.title]
-    clock = min(clocks, key=lambda one: (not one.is_utc, not one.is_sure, one is not chosen))
-    titles = [chosen.title, clock.title, *([] if day is None else [day.title])]
+        return time_s, math.nan, [chosen.title, *fractions]
+    clock = min(clocks, key=lambda one: (not one.is_utc, not one.is_sure, one.title != chosen.title))
+    titles = [chosen.title, clock.title, *fractions, *([] if day is None else [day.title])]
     return time_s, _start_s(log, clock, time_s, zone), titles
+
+
+def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[list[TimeColumn], list[str]]:
+    """The columns, those of whole seconds with the column of fractions of a second beside them; and titles of these."""
+    parts = [one for one in columns if one.kind == "number" and one.scale < 1 and _are_fractions(one.values, one.scale)]
+    if not parts:
+        return list(columns), []
+    found = list[TimeColumn]()
+    for one in columns:
+        is_whole = one.kind in ("number", "date") and not one.scale < 1 and (np.nan_to_num(one.values) % 1 == 0).all()
+        values = one.values + parts[0].values * parts[0].scale
+        if is_whole and len(np.unique(one.values)) < len(np.unique(values)):
+            found.append(one._replace(values=values, scale=1.0))
+    return ([*found, *(one for one in columns if one.kind == "date")], [parts[0].title]) if found else ([*columns], [])
+
+
+def _are_fractions(values: np.ndarray, scale: float) -> bool:
+    """Whether a column counts on from 0 in each second."""
+    known = values[np.isfinite(values)] * scale
+    return len(known) > 1 and 0 <= known.min() and known.max() < 1 and bool((np.diff(known) < -0.1).any())
+
+
+def _restarts(values: np.ndarray) -> np.ndarray:
+    """Rows in which a column of times begins again, (R,): few, else it is no column of times."""
+    known = np.flatnonzero(np.isfinite(values))
+    back = known[1:][np.diff(values[known]) < -1.0]
+    if len(back) > min(1 + len(known) // 20, _MOST_FLIGHTS):
+        return np.zeros(0, int)
+    highest = np.fmax.accumulate(values)
+    # Behind a single damaged time the times go on.
+    return np.array([row for row in back if (values[row : row + 3] < highest[row - 1]).sum() == 3], int)
+
+
+def sort_flights(log: Log, time_s: np.ndarray) -> None:
+    """Let a log be sorted by time where a whole flight stands behind a later one."""
+    if len(rows := _restarts(time_s)):
+        spans = sorted((np.nanmin(part), np.nanmax(part)) for part in np.split(time_s, rows))
+        if all(before[1] < after[0] for before, after in pairwise(spans)):
+            log.jitter_s = math.inf
+
+
+def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray) -> TimeColumn:
+    """A column of which the times begin again with another flight: later by the dates, or else by a second.
+
+    is_far: (N,) whether the vehicle jumps away before the row. Without dates and a jump the times stay as they are.
+    """
+    values = one.values.copy()
+    for row in _restarts(one.values):
+        before = np.flatnonzero(np.isfinite(values[:row]))[-1]
+        jump_s = math.nan if dated is None else dated.values[row] - dated.values[before]
+        if math.isfinite(jump_s) or is_far[row]:
+            values[row:] += values[before] - values[row] + (jump_s if math.isfinite(jump_s) else 1.0)
+            log.splits.append(float(values[before] - values[np.isfinite(values)][0]) + SPLIT_S)
+    return one._replace(values=values)
+
+
+def _spread(log: Log, one: TimeColumn, time_s: np.ndarray) -> np.ndarray:
+    """Times of which several rows have the same, evenly up to the next; with a note."""
+    known = np.flatnonzero(np.isfinite(time_s))
+    ticks, first, count = np.unique(time_s[known], return_index=True, return_counts=True)
+    if len(ticks) == len(known):
+        return time_s
+    step_s = float(np.diff(ticks).min()) if len(ticks) > 1 else 0.0
+    is_coarse = step_s >= _TICK_S and np.allclose(ticks / step_s, np.round(ticks / step_s), atol=1e-3)
+    if (
+        not is_coarse
+        or len(known) < _REPEATED * len(ticks)
+        or (count > 1).sum() < 2
+        or (np.diff(time_s[known]) < 0).any()
+    ):
+        if 50 * (len(known) - len(ticks)) > len(known):
+            log.note(f"of the rows with the same '{one.title}' only the last counts")
+        return time_s
+    usual = float(np.median(count))
+    place = np.arange(len(known)) - np.repeat(first, count)
+    place[: count[0]] += max(0, round(usual) - int(count[0]))  # the log begins within a tick
+    time_s = time_s.copy()
+    time_s[known] += place * step_s / np.repeat(np.maximum(count, usual), count)
+    log.note(
+        f"'{one.title}' steps by {step_s:g} s with {len(known) / len(ticks):.2g} rows in each step: they are spread "
+        "evenly over it"
+    )
+    return time_s - time_s[known[0]]
 
 
 def _rank(one: TimeColumn) -> tuple[bool, int]:
@@ -225,6 +410,10 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
             one = one._replace(is_sure=False, remark=f"{what}; wanted a name with the unit, as time_ms")
         elif len(names) > 1 or (name != "seconds" and name not in since):
             one = one._replace(remark=f"'{one.title}' is taken to be in {name}, by its steps of {step:g}")
+    if scale == _DAY_S:
+        days = next((day for day in _EPOCHS if is_clock((middle - day) * _DAY_S)), 0.0)
+        values = (one.values - days) * _DAY_S
+        return one._replace(values=values, kind="date" if is_clock(middle * _DAY_S - days * _DAY_S) else "number")
     is_date = bool(_SINCE_1970[0] < middle * scale < _SINCE_1970[1])
     values = np.where(np.abs(one.values * scale) < _LONGEST_S, one.values * scale, math.nan)
     return one._replace(values=values, kind="date" if is_date else "number", is_utc=is_date)
@@ -232,18 +421,32 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
 
 def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | None) -> float:
     """Seconds since 1970 at time 0, NaN with a note if it is not known."""
-    apart = (clock.values - time_s)[np.isfinite(clock.values + time_s)]
+    known = np.flatnonzero(np.isfinite(clock.values + time_s))
+    apart = (clock.values - time_s)[known]
+    # A flight begins where the dates jump and stay away.
+    smooth = np.median(np.stack([np.append(apart[:1], apart[:-1]), apart, np.append(apart[1:], apart[-1:])]), axis=0)
+    jumps_s = np.abs(np.diff(smooth))
+    begins = np.flatnonzero(jumps_s > max(DATE_JUMP_S, 10 * float(np.median(jumps_s)))) if len(apart) > 1 else []
+    log.splits += [float(time_s[known[row]]) + SPLIT_S for row in begins]
+    apart = apart[: begins[0] + 1] if len(begins) else apart
     is_whole = bool((clock.values[np.isfinite(clock.values)] % 1 == 0).all())  # rounded down
     start_s = float(apart[:100].max() if is_whole else np.median(apart[:100]))
     drift_s = float(apart[-1]) - start_s
-    if abs(drift_s) > 2.0 + 0.02 * float(np.nanmax(time_s)):
+    if abs(drift_s) > 2.0 + 0.02 * float(time_s[known[len(apart) - 1]]):
         log.note(f"the dates of '{clock.title}' and the seconds of the log part by {drift_s:+.1f} s until its end")
-    if not clock.is_sure:
-        log.note(f"'{clock.title}' does not show whether day or month comes first, so the clock is not known")
-    elif not _SINCE_1970[0] < start_s < _SINCE_1970[1]:
-        log.note(f"'{clock.title}' is a clock of the year {1970 + start_s / 31_556_952:.0f}, which cannot be: not used")
-    elif clock.is_utc or zone is not None:
-        return start_s if clock.is_utc or zone is None else to_utc(start_s, zone)
-    else:
-        log.note(UNKNOWN_ZONE)
+    if clock.remark:
+        log.note(clock.remark)
+    return clock_at_start(log, start_s, clock.is_utc, clock.is_sure, zone, f"'{clock.title}'")
+
+
+def clock_at_start(log: Log, start_s: float, is_utc: bool, is_sure: bool, zone: tzinfo | None, what: str) -> float:
+    """Seconds since 1970 at time 0, NaN with a note if the dates do not tell it. start_s: what they say, as UTC."""
+    if not _SINCE_1970[0] < start_s < _SINCE_1970[1]:
+        log.note(f"{what} is a clock of the year {1970 + start_s / 31_556_952:.0f}, which cannot be: not used")
+        return math.nan
+    if is_sure and (is_utc or zone is not None):
+        return start_s if is_utc or zone is None else to_utc(start_s, zone)
+    # Another zone is at most half a day away, and another order of day and month eleven months.
+    log.latest_utc_s = start_s + (_DAY_S / 2 if is_sure else 340 * _DAY_S)
+    log.note(UNKNOWN_ZONE if is_sure else UNSURE.format(what))
     return math.nan
