@@ -233,7 +233,7 @@ def _spelled(title: str, cells: Sequence[str], is_utc: bool) -> list[str] | None
     if len(parts) < len(some) or (lengths := {len(cell.partition(".")[0]) for cell in some}) - {5, 6, 9}:
         return None
     clock_s = np.array([int(h) * 3600 + int(m) * 60 + float(f"{s}.{part}0") for h, m, s, part in parts])
-    steps = np.abs(np.diff(clock_s))
+    steps = np.abs(np.diff(clock_s)) % (_DAY_S - _STEP_S[1])
     is_told = is_utc or "utc" in title.lower() or any(cell[0] == "0" for cell in some)
     is_told |= len({part[:2] for part in parts}) > 1  # the minutes went on, and no seconds were over 59
     if not is_told or (steps > 0).sum() == 0 or np.median(steps[steps > 0]) > _STEP_S[1] or lengths == {5, 9}:
