@@ -237,7 +237,10 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
     if comma is not None:
         form = _NUMBER if comma else _THOUSANDS
         if comma == ".,":
-            comma, rows = ".", [[c.replace(".", "") if "." in c and _POINTED.fullmatch(c) else c for c in row] for row in rows]
+            comma, rows = (
+                ".",
+                [[c.replace(".", "") if "." in c and _POINTED.fullmatch(c) else c for c in row] for row in rows],
+            )
         rows = [[c.replace(",", comma) if "," in c and form.fullmatch(c) else c for c in row] for row in rows]
     if rows and _SEP_LINE.fullmatch(separator.join(rows[0])):
         del lines[0], rows[0]

@@ -345,7 +345,9 @@ def field_of_view(focal: Sequence[str], f_number: Sequence[str], zoom: Sequence[
     elif len(whole) and (times[np.isfinite(times)] >= 10).all():
         notes.append(f"the zoom of {whole[0]:g} is taken as {whole[0]:g} times, not as {whole[0] / 10:g}")
     if len(known := np.unique(times[np.isfinite(times)])) == 1 and known[0] > 1:
-        notes.append(f"the zoom is {known[0]:g} throughout: a focal length in the camera's file must be that with the zoom")
+        notes.append(
+            f"the zoom is {known[0]:g} throughout: a focal length in the camera's file must be that with the zoom"
+        )
     is_wrong = (times < POSSIBLE["zoom"][0]) | (times > POSSIBLE["zoom"][1])
     if is_wrong.any():
         notes.append(f"a zoom of {times[is_wrong][0]:g} cannot be; {is_wrong.sum()} left out")

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import tzinfo
 from pathlib import Path
 
@@ -47,10 +47,19 @@ _GROUP = re.compile(
 _IN_GROUP = re.compile(rf"\b{_ANGLES}(?=\s?[:=])", re.IGNORECASE)
 _OWNED = re.compile(rf"\b({_OWNERS}) +(?={_ANGLES}\b)", re.IGNORECASE)
 # A latitude or longitude with a side or with minutes, and two coordinates without brackets.
-_SIDED = re.compile(rf"\b(lat|lon|lng)([a-z]{{0,7}}\s*[:=]\s*)({ANGLE})(?![\w.])", re.IGNORECASE)
-_SIDES = re.compile(r"[NSEW°'′]", re.IGNORECASE)
+_SIDED = re.compile(
+    rf"\b((?:lat|lon|lng)[a-z]{{0,7}}\s*[:=]\s*)(?=[NSEW]|-?[\d.,]{{1,15}} ?[NSEWd°])({ANGLE})(?![\w.])", re.IGNORECASE
+)
+_NUMBER_2 = r"(-?\d{1,3}\.\d{2,12})"
 _TWO = re.compile(
-    r"\b(?:gps|position|location|coord[a-z]{0,8})\s*[:=]\s*(-?\d{1,3}\.\d{2,12})\s*[,;]\s*(-?\d{1,3}\.\d{2,12})", re.I
+    rf"\b(?:gps|position|location|coord[a-z]{{0,8}})\s*[:=]\s*{_NUMBER_2}\s*[,;]\s*{_NUMBER_2}", re.IGNORECASE
+)
+# Forms of few dialects, and the forms of the others.
+_USUAL: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = (
+    (_GROUP, lambda found: _IN_GROUP.sub(rf"{found[1]}.\g<0>", found[2])),
+    (_OWNED, lambda found: f"{found[1]}."),
+    (_SIDED, lambda found: f"{found[1]}{parse_angle(found[2])[0]:.9f}"),
+    (_TWO, lambda found: f"GPS({found[1]}, {found[2]})"),
 )
 _DECIMAL, _PLACES = re.compile(r"\s*-?\d{1,6},\d{1,6} ?(?:[mM]|ft)?\s*"), ("gps", "rtk", "home")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
@@ -66,7 +75,9 @@ def read_subtitles(
     """The record of subtitles; arguments and errors as `read_telemetry`."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     names = names_of_subtitles(text)
-    subtitles = _subtitles(_usual_forms(text))
+    for form, usual in _USUAL:
+        text = form.sub(usual, text) if form.search(text[:_HEAD]) else text
+    subtitles = _subtitles(text)
     dates, is_sure, remark = parse_dates([words for *_, words in subtitles])
     parted = [_tuples(words) for *_, words in subtitles]
     is_swapped = _is_latitude_first(log, names, [tuples for tuples, _ in parted], order)
@@ -124,18 +135,6 @@ def read_subtitles(
         if remark:
             log.note(remark)
     return build_record(log, clock_offset_s, start_s)
-
-
-def _usual_forms(text: str) -> str:
-    """The text with the forms of angles and places that few dialects have in the form that the others have."""
-    text = _OWNED.sub(r"\1.", _GROUP.sub(lambda group: _IN_GROUP.sub(rf"{group[1]}.\g<0>", group[2]), text))
-    if any(_SIDES.search(found[3]) for found in _SIDED.finditer(text[:_HEAD])):
-        text = _SIDED.sub(_signed, text)
-    return _TWO.sub(r"GPS(\1, \2)", text) if _TWO.search(text[:_HEAD]) else text
-
-
-def _signed(found: re.Match[str]) -> str:
-    return f"{found[1]}{found[2]}{parse_angle(found[3])[0]:.9f}" if _SIDES.search(found[3]) else found[0]
 
 
 def _subtitles(text: str) -> list[tuple[int, float, str]]:
