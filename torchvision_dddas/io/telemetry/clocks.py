@@ -33,27 +33,21 @@ _SPAN = re.compile(r"(?:(\d{1,6}):)?(\d{1,6}):(\d{1,6}(?:[.,]\d{1,9})?)")
 _UNIT_SPAN = re.compile(r"([-+]?\d{1,9}(?:[.,]\d{1,9})?) ?([a-zµ'\"]{1,12})[ ,]{0,3}")
 _SPAN_UNITS = UNITS["time"] | {"m": 60.0, "'": 60.0, "d": 86_400.0, "day": 86_400.0, "days": 86_400.0, '"': 1.0}
 # Hours from UTC of the names of zones that mean one zone; CST, IST and BST mean several.
-_ZONES = {
-    name: hours
-    for hours, names in {
-        -8: "PST", -7: "PDT MST", -6: "MDT", -5: "EST CDT", -4: "EDT", 0: "Z UTC GMT WET", 1: "CET MEZ WEST",
-        2: "CEST MESZ EET", 3: "EEST MSK", 9: "JST KST", 10: "AEST", 11: "AEDT", 12: "NZST", 13: "NZDT",
-    }.items()
-    for name in names.split()
-}  # fmt: skip
+_NAMED = "PST-8 PDT-7 MST-7 MDT-6 EST-5 EDT-4 Z+0 UTC+0 GMT+0 CET+1 CEST+2 EET+2 EEST+3 MSK+3 JST+9 KST+9 AEST+10"
+_ZONES = {re.sub(r"[-+].*", "", zone): int(re.sub(r"[A-Z]", "", zone)) for zone in _NAMED.split()}
 # Dates in other forms: of EXIF, without signs between, and with the name of the month.
-_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+_MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 _MONTH = rf"({'|'.join(_MONTHS)})[a-z]{{0,6}}\.?"
 _ODD_DATE = re.compile(
     r"(?<![\d:.])(?:(\d{4}):(\d\d):(\d\d)(?=[ T]\d)"
-    r"|(20\d\d)([01]\d)([0-3]\d)(?=$|\.0*$|[ T_-]?[0-2]\d:?\d)(?:[ T_-]?([0-2]\d):?([0-5]\d):?([0-6]\d)\.?(\d{0,9})(?!\d))?"
+    r"|(20\d\d)([01]\d)([0-3]\d)(?=$|\.0*$|[ T_-]?[0-2]\d:?\d)"
+    r"(?:[ T_-]?([0-2]\d):?([0-5]\d):?([0-6]\d)\.?(\d{0,9})(?!\d))?"
     rf"|(\d{{1,2}})[ .-]?{_MONTH}[ ,.-]{{1,2}}(\d{{4}}|\d\d)(?!\d)"
     rf"|{_MONTH} +(\d{{1,2}}),? +(?:(\d{{1,2}}:[\d:.]{{2,15}}) +)?(\d{{4}})(?!\d))",
     re.IGNORECASE,
 )
-# Numbers of which the digits are hours, minutes and seconds, or of a date.
+# Numbers of which the digits are hours, minutes and seconds.
 _DIGITS = re.compile(r"([01]?\d|2[0-3])([0-5]\d)([0-5]\d)(?:\.?(\d*))")
-_DAY_DIGITS = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.0*)?")
 # From 2001 to 2100: an earlier clock was never set.
 _SINCE_1970 = (1e9, 4.1e9)
 # A larger number is no time of a log, since its start or since 1970.
@@ -66,8 +60,8 @@ _SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseco
 _EPOCHS = (25_569.0, 719_529.0, 2_440_587.5, 40_587.0, 0.0)
 # Dates that leave the times by more are those of another flight.
 DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50
-# Where so many rows have the same time as the row above, and times are whole multiples of this, rows are spread.
-_REPEATED, _TICK_S = 1.1, 0.1
+# Where this share of rows has the time of the row above, and times are multiples of a step of this, rows are spread.
+_MORE, _TICK_S = 0.1, 0.1
 
 
 def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], bool, str]:
@@ -180,10 +174,10 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
     numbers = parse_numbers(cells)
     is_number = np.isfinite(numbers)
     if is_number.any() and 2 * is_number.sum() >= len(cells) - cells.count(""):
-        spelled = _spelled(title, cells, known.is_utc) if math.isnan(known.scale) else None
+        is_utc = known.is_utc or "utc" in title.lower()
+        spelled = _spelled(cells, is_utc) if math.isnan(known.scale) else None
         if spelled is None:
-            values = np.where(is_number, numbers, np.nan)
-            return TimeColumn(title, values, "number", known.scale, known.is_utc)
+            return TimeColumn(title, np.where(is_number, numbers, np.nan), "number", known.scale, known.is_utc)
         cells = spelled
     elif any(map(_ODD_DATE.search, cells[:5])):
         cells = [_ODD_DATE.sub(_usual_date, cell) for cell in cells]
@@ -218,7 +212,7 @@ def _span_s(text: str) -> float:
     return total_s if place == len(text) > 0 else math.nan
 
 
-def _spelled(title: str, cells: Sequence[str], is_utc: bool) -> list[str] | None:
+def _spelled(cells: Sequence[str], is_utc: bool) -> list[str] | None:
     """Dates and times of day that are written as one number, 20220826181257 or 181257.5, with signs between the parts.
 
     None for other numbers: where a part is too large, or the rows would be too far apart.
@@ -226,19 +220,17 @@ def _spelled(title: str, cells: Sequence[str], is_utc: bool) -> list[str] | None
     some = [cell for cell in cells if cell]
     if all(found is not None and len(found[0]) == len(cell) for cell in some for found in [_ODD_DATE.match(cell)]):
         dates = [_ODD_DATE.sub(_usual_date, cell) for cell in cells]
-        return dates if any(":" in date for date in dates) or len(set(dates)) <= _DAYS + ("" in dates) else None
-    if "date" in title.lower() and len(set(some)) <= _DAYS and all(map(_DAY_DIGITS.fullmatch, some)):
-        return [_DAY_DIGITS.sub(r"\1/\2/\3", cell) for cell in cells]  # the order of the three is not known
+        return dates if any(":" in date for date in dates) or len(set(dates)) <= _DAYS else None
     parts = [found.groups() for cell in some if (found := _DIGITS.fullmatch(cell)) is not None]
-    if len(parts) < len(some) or (lengths := {len(cell.partition(".")[0]) for cell in some}) - {5, 6, 9}:
+    lengths = {len(cell.partition(".")[0]) for cell in some}
+    if len(parts) < len(some) or not (lengths <= {5, 6} or lengths == {9}):
         return None
     clock_s = np.array([int(h) * 3600 + int(m) * 60 + float(f"{s}.{part}0") for h, m, s, part in parts])
     steps = np.abs(np.diff(clock_s)) % (_DAY_S - _STEP_S[1])
-    is_told = is_utc or "utc" in title.lower() or any(cell[0] == "0" for cell in some)
-    is_told |= len({part[:2] for part in parts}) > 1  # the minutes went on, and no seconds were over 59
-    if not is_told or (steps > 0).sum() == 0 or np.median(steps[steps > 0]) > _STEP_S[1] or lengths == {5, 9}:
-        return None
-    return [_DIGITS.sub(r"\1:\2:\3.\g<4>0", cell) for cell in cells]
+    # Or the minutes went on, and no seconds were over 59.
+    is_told = is_utc or any(cell[0] == "0" for cell in some) or len({part[:2] for part in parts}) > 1
+    is_near = bool((steps > 0).any()) and np.median(steps[steps > 0]) <= _STEP_S[1]
+    return [_DIGITS.sub(r"\1:\2:\3.\g<4>0", cell) for cell in cells] if is_told and is_near else None
 
 
 def _day_order(dates: Iterable[str]) -> tuple[bool, bool]:
@@ -257,26 +249,21 @@ def settle_times(
     """Seconds since the first time, (N,), NaN where there is none; when that was since 1970; the columns that tell it.
 
     The finest times that do not run back tell the seconds, dates the clock. step_m: how far the vehicle goes in a row.
-    is_far: (N,) whether it jumps before the row, as between flights. zone: of dates that say none. Raises InputError where the unit of all times is unknown.
+    is_far: (N,) whether it jumps before the row, as between flights. zone: of dates that say none. Raises InputError
+    where the unit of all times is unknown.
     """
     day = next((one for one in columns if one.kind == "day"), None)
     whole = [one for one in columns if one.kind != "day"]
-    if day is not None:
-        for place, one in enumerate(whole):
-            if one.kind == "clock":
-                values, is_utc = day.values + one.values, day.is_utc or one.is_utc
-                remark = day.remark or one.remark
-                whole[place] = one._replace(
-                    values=values, kind="date", is_utc=is_utc, is_sure=day.is_sure, remark=remark
-                )
-    whole, fractions = _with_fractions(whole)
-    dated = (one.values[np.isfinite(one.values)] for one in whole if one.kind == "date")
+    for place, one in enumerate(whole):
+        if one.kind == "clock" and day is not None:
+            both = {"is_utc": day.is_utc or one.is_utc, "is_sure": day.is_sure, "remark": day.remark}
+            whole[place] = one._replace(values=day.values + one.values, kind="date", **both)
+    parts, fractions = _with_fractions(whole)
+    dated = (one.values[np.isfinite(one.values)] for one in parts if one.kind == "date")
     span_s = max((float(np.ptp(known)) for known in dated if len(known)), default=0.0)
-    settled = [_in_seconds(one, step_m, span_s) for one in whole]
+    settled = [_in_seconds(one, step_m, span_s) for one in parts]
     clocks = [one for one in settled if one.kind == "date" and np.isfinite(one.values).any()]
-    best = min(clocks, key=lambda one: (not one.is_utc, not one.is_sure), default=None)
-    if restarts := [one for one in settled if one.kind != "date" and len(_restarts(one.values))]:
-        settled = [_continued(log, one, best, is_far) if one in restarts else one for one in settled]
+    settled = [_continued(log, one, min(clocks, key=_trust, default=None), is_far) for one in settled]
     chosen = min(settled, key=_rank) if settled else columns[0]._replace(values=columns[0].values * math.nan)
     known = np.flatnonzero(np.isfinite(chosen.values))
     if not len(known):
@@ -285,53 +272,48 @@ def settle_times(
         raise log.refuse(chosen.remark)
     if chosen.remark:
         log.note(chosen.remark)
-    time_s = _spread(log, chosen, chosen.values - chosen.values[known[0]])
+    time_s = _spread(log, chosen.title, chosen.values - chosen.values[known[0]])
     sort_flights(log, time_s)
     clocks = [one for one in clocks if np.isfinite(one.values + time_s).any()]
     if not clocks:
         return time_s, math.nan, [chosen.title, *fractions]
-    clock = min(clocks, key=lambda one: (not one.is_utc, not one.is_sure, one.title != chosen.title))
+    clock = min(clocks, key=lambda one: (_trust(one), one.title != chosen.title))
     titles = [chosen.title, clock.title, *fractions, *([] if day is None else [day.title])]
     return time_s, _start_s(log, clock, time_s, zone), titles
 
 
-def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[list[TimeColumn], list[str]]:
-    """The columns, those of whole seconds with the column of fractions of a second beside them; and titles of these."""
-    parts = [one for one in columns if one.kind == "number" and one.scale < 1 and _are_fractions(one.values, one.scale)]
-    if not parts:
-        return list(columns), []
-    found = list[TimeColumn]()
+def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[Sequence[TimeColumn], list[str]]:
+    """The columns, those of whole seconds with a column of fractions of a second added; and the title of this one."""
     for one in columns:
-        is_whole = one.kind in ("number", "date") and not one.scale < 1 and (np.nan_to_num(one.values) % 1 == 0).all()
-        values = one.values + parts[0].values * parts[0].scale
-        if is_whole and len(np.unique(one.values)) < len(np.unique(values)):
-            found.append(one._replace(values=values, scale=1.0))
-    return ([*found, *(one for one in columns if one.kind == "date")], [parts[0].title]) if found else ([*columns], [])
+        known = one.values[np.isfinite(one.values)] * one.scale
+        if (
+            one.kind == "number"
+            and one.scale < 1
+            and (np.diff(known) < -0.1).any()
+            and 0 <= known.min() <= known.max() < 1
+        ):
+            seconds = [other for other in columns if not other.scale < 1 and (other.values % 1 == 0).all()]
+            seconds = [other for other in seconds if len(np.unique(other.values)) < len(other.values)]
+            sums = [other._replace(values=other.values + one.values * one.scale, scale=1.0) for other in seconds]
+            return sums or columns, [one.title] * bool(sums)
+    return columns, []
 
 
-def _are_fractions(values: np.ndarray, scale: float) -> bool:
-    """Whether a column counts on from 0 in each second."""
-    known = values[np.isfinite(values)] * scale
-    return len(known) > 1 and 0 <= known.min() and known.max() < 1 and bool((np.diff(known) < -0.1).any())
-
-
-def _restarts(values: np.ndarray) -> np.ndarray:
-    """Rows in which a column of times begins again, (R,): few, else it is no column of times."""
+def _restarts(values: np.ndarray) -> list[int]:
+    """Rows in which a column of times begins again; none if there are many, as it is no column of times."""
     known = np.flatnonzero(np.isfinite(values))
     back = known[1:][np.diff(values[known]) < -1.0]
-    if len(back) > min(1 + len(known) // 20, _MOST_FLIGHTS):
-        return np.zeros(0, int)
     highest = np.fmax.accumulate(values)
     # Behind a single damaged time the times go on.
-    return np.array([row for row in back if (values[row : row + 3] < highest[row - 1]).sum() == 3], int)
+    few = back if len(back) <= min(1 + len(known) // 20, _MOST_FLIGHTS) else []
+    return [int(row) for row in few if (values[row : row + 3] < highest[row - 1]).sum() == 3]
 
 
 def sort_flights(log: Log, time_s: np.ndarray) -> None:
     """Let a log be sorted by time where a whole flight stands behind a later one."""
-    if len(rows := _restarts(time_s)):
+    if rows := _restarts(time_s):
         spans = sorted((np.nanmin(part), np.nanmax(part)) for part in np.split(time_s, rows))
-        if all(before[1] < after[0] for before, after in pairwise(spans)):
-            log.jitter_s = math.inf
+        log.jitter_s = math.inf if all(before[1] < after[0] for before, after in pairwise(spans)) else log.jitter_s
 
 
 def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray) -> TimeColumn:
@@ -340,7 +322,7 @@ def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.n
     is_far: (N,) whether the vehicle jumps away before the row. Without dates and a jump the times stay as they are.
     """
     values = one.values.copy()
-    for row in _restarts(one.values):
+    for row in _restarts(one.values) if one.kind != "date" else ():
         before = np.flatnonzero(np.isfinite(values[:row]))[-1]
         jump_s = math.nan if dated is None else dated.values[row] - dated.values[before]
         if math.isfinite(jump_s) or is_far[row]:
@@ -349,33 +331,26 @@ def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.n
     return one._replace(values=values)
 
 
-def _spread(log: Log, one: TimeColumn, time_s: np.ndarray) -> np.ndarray:
+def _spread(log: Log, title: str, time_s: np.ndarray) -> np.ndarray:
     """Times of which several rows have the same, evenly up to the next; with a note."""
     known = np.flatnonzero(np.isfinite(time_s))
     ticks, first, count = np.unique(time_s[known], return_index=True, return_counts=True)
-    if len(ticks) == len(known):
-        return time_s
+    more = len(known) - len(ticks)
     step_s = float(np.diff(ticks).min()) if len(ticks) > 1 else 0.0
     is_coarse = step_s >= _TICK_S and np.allclose(ticks / step_s, np.round(ticks / step_s), atol=1e-3)
-    if (
-        not is_coarse
-        or len(known) < _REPEATED * len(ticks)
-        or (count > 1).sum() < 2
-        or (np.diff(time_s[known]) < 0).any()
-    ):
-        if 50 * (len(known) - len(ticks)) > len(known):
-            log.note(f"of the rows with the same '{one.title}' only the last counts")
-        return time_s
-    usual = float(np.median(count))
-    place = np.arange(len(known)) - np.repeat(first, count)
-    place[: count[0]] += max(0, round(usual) - int(count[0]))  # the log begins within a tick
-    time_s = time_s.copy()
-    time_s[known] += place * step_s / np.repeat(np.maximum(count, usual), count)
-    log.note(
-        f"'{one.title}' steps by {step_s:g} s with {len(known) / len(ticks):.2g} rows in each step: they are spread "
-        "evenly over it"
-    )
-    return time_s - time_s[known[0]]
+    if is_coarse and more >= _MORE * len(ticks) and (count > 1).sum() > 1 and (np.diff(time_s[known]) >= 0).all():
+        usual = float(np.median(count))
+        place = np.arange(len(known)) - np.repeat(first, count)
+        place[: count[0]] += max(0, round(usual) - int(count[0]))  # the log begins within a tick
+        log.note(f"'{title}' steps by {step_s:g} s with {usual:g} rows in each step: they are spread evenly over it")
+        time_s[known] += (place - place[0]) * step_s / np.repeat(np.maximum(count, usual), count)
+    elif 50 * more > len(known):
+        log.note(f"of the rows with the same '{title}' only the last counts")
+    return time_s
+
+
+def _trust(clock: TimeColumn) -> tuple[bool, bool]:
+    return not clock.is_utc, not clock.is_sure
 
 
 def _rank(one: TimeColumn) -> tuple[bool, int]:
@@ -413,7 +388,7 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
     if scale == _DAY_S:
         days = next((day for day in _EPOCHS if is_clock((middle - day) * _DAY_S)), 0.0)
         values = (one.values - days) * _DAY_S
-        return one._replace(values=values, kind="date" if is_clock(middle * _DAY_S - days * _DAY_S) else "number")
+        return one._replace(values=values, kind="date" if is_clock((middle - days) * _DAY_S) else "number")
     is_date = bool(_SINCE_1970[0] < middle * scale < _SINCE_1970[1])
     values = np.where(np.abs(one.values * scale) < _LONGEST_S, one.values * scale, math.nan)
     return one._replace(values=values, kind="date" if is_date else "number", is_utc=is_date)
@@ -424,11 +399,11 @@ def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | Non
     known = np.flatnonzero(np.isfinite(clock.values + time_s))
     apart = (clock.values - time_s)[known]
     # A flight begins where the dates jump and stay away.
-    smooth = np.median(np.stack([np.append(apart[:1], apart[:-1]), apart, np.append(apart[1:], apart[-1:])]), axis=0)
-    jumps_s = np.abs(np.diff(smooth))
-    begins = np.flatnonzero(jumps_s > max(DATE_JUMP_S, 10 * float(np.median(jumps_s)))) if len(apart) > 1 else []
+    smooth = np.median([np.append(apart[:1], apart[:-1]), apart, np.append(apart[1:], apart[-1:])], axis=0)
+    jumps_s = np.abs(np.diff(smooth, append=smooth[-1]))
+    begins = np.flatnonzero(jumps_s > max(DATE_JUMP_S, 10 * float(np.median(jumps_s))))
     log.splits += [float(time_s[known[row]]) + SPLIT_S for row in begins]
-    apart = apart[: begins[0] + 1] if len(begins) else apart
+    apart = apart[: [*begins, len(apart)][0] + 1]
     is_whole = bool((clock.values[np.isfinite(clock.values)] % 1 == 0).all())  # rounded down
     start_s = float(apart[:100].max() if is_whole else np.median(apart[:100]))
     drift_s = float(apart[-1]) - start_s

@@ -35,7 +35,8 @@ FIELDS = (
           "longitudehemisphere lonhemisphere lonhemi longitudeew lonew"),
     Field("latitude_side", "text", *_ANY, "N or S", "n/s ns latitudedirection latdir latituderef latref "
           "latitudehemisphere lathemisphere lathemi latitudens latns"),
-    Field("place", "text", *_ANY, "both in one cell", "gps latlon latlong latlng lonlat lnglat coordinates position location"),
+    Field("place", "text", *_ANY, "both in one cell", "gps latlon latlong latlng lonlat lnglat "
+          "coordinates position location"),
     Field("east_m", "length", -1e7, 1e7, "an origin, to the east", "east"),
     Field("north_m", "length", -1e7, 1e7, "an origin, to the north", "north"),
     Field("above_takeoff_m", *_HEIGHT, "the take-off point",
@@ -79,13 +80,16 @@ _SCALES: dict[str, dict[float, str]] = {
     "speed": {1: "m/s mps ms", 1 / 3.6: "km/h kmh kph", 0.44704: "mph", 1852 / 3600: "kn kt kts knot knots",
               0.3048: "ft/s fps", 0.01: "cm/s", 1e-3: "mm/s"},
     "angle": {_DEG: "deg degree degrees ° º @ 360 180", 1: "rad radian radians", _DEG / 10: "ddeg", _DEG / 100: "cdeg"},
-    "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians", 1e-7: "dege7 1e7 e7", 1e-6: "dege6 1e6 e6 microdeg"},
+    "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians",
+                1e-7: "dege7 1e7 e7", 1e-6: "dege6 1e6 e6"},
     "time": {1: "s sec secs second seconds", 1e-3: "ms msec millis millisecond milliseconds",
-             1e-6: "us µs usec micros microsecond microseconds", 1e-9: "ns nsec nsecs nanosec nanosecs nanosecond nanoseconds",
-             60: "min mins minute minutes", 3600: "hr hrs hour hours h", math.nan: "utc gmt local epoch"},
+             1e-6: "us µs usec micros microsecond microseconds",
+             1e-9: "ns nsec nsecs nanosec nanosecs nanosecond nanoseconds", 60: "min mins minute minutes",
+             3600: "hr hrs hour hours h", math.nan: "utc gmt local epoch"},
 }  # fmt: skip
 UNITS = {kind: {w: scale for scale, words in scales.items() for w in words.split()} for kind, scales in _SCALES.items()}
 """Of each kind of field: unit -> factor to the record's unit, NaN where only the values tell it."""
+_ANY_UNIT = {unit for units in UNITS.values() for unit in units}
 
 
 class Dialect(NamedTuple):
@@ -135,15 +139,10 @@ SUBTITLES = (
     Dialect("DJI with SrtCnt (Air 2S, Mini 2)", "srtcnt", "altitude=above_takeoff_m"),
     Dialect("DJI with FrameCnt (Mavic 2)", "framecnt", "altitude=above_sea_m"),
     Dialect("GPS(48.1, 11.5, 52.5M)", r"gps ?\([^()]{3,60}[,;] ?-?[\d.]{1,12} ?m\)", "", "lat-lon"),
-    Dialect(
-        "GPS(48.1, 11.5, 569.8)",
-        r"gps ?\((([^(),;]{3,20}[,;]){2} ?-?\d{1,6}\.\d{1,6}|([^();]{3,20};){2} ?-?\d{1,6},"
-        r"\d{1,6}|(-?\d{1,3},\d{1,12},){2}-?\d{1,6},\d{1,6}|([^(),;]{3,20}[,;]){2} ?-?\d{3,5})\)",
-        "",
-        "lat-lon",
-    ),
+    Dialect("GPS(48.1, 11.5, 569.8)", r"gps ?\((([^(),;]{3,20}[,;]){2} ?-?(\d{3,5}|\d{1,6}\.\d{1,6})|"
+            r"([^();]{3,20};){2} ?-?\d{1,6},\d{1,6}|(-?\d{1,3},\d{1,12},){2}-?\d{1,6},\d{1,6})\)", "", "lat-lon"),
     Dialect("GPS(11.5, 48.1, 16)", r"(gps|rtk) ?\([^()]{3,60}[,;] ?\d{1,2}\)", "", "lon-lat"),
-)
+)  # fmt: skip
 
 _BY_QUANTITY = {field.quantity: field for field in (*FIELDS, Field("", "text", *_ANY, "", ""))}
 # What a name means: quantity, unit, rank. A column may have the name of its unit, `seconds`.
@@ -232,15 +231,12 @@ class Names:
             return self._known[title]
 
     def _find(self, name: str, words: list[str]) -> Known | None:
-        rest = _plain(
-            "".join(word for word in words if word in _ZERO_OF or not any(word in units for units in UNITS.values()))
-        )
+        rest = _plain("".join(word for word in words if word in _ZERO_OF or word not in _ANY_UNIT))
         for key in dict.fromkeys((name + rest, name)):  # altitude (m AMSL) is altitudeamsl
             if (known := self._named(key)) is not None:
                 with_unit = next((found for word in words if (found := known.in_unit(word))), None)
                 # A unit that is not known may be any. The letter h means the height only with a unit.
-                is_length = known.field.kind == "length"
-                if key == name and is_length and not _NOTHING.fullmatch(rest):
+                if key == name and known.field.kind == "length" and not _NOTHING.fullmatch(rest):
                     continue  # what it counts from is not known
                 if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
                     return with_unit or known
@@ -331,23 +327,19 @@ def field_of_view(focal: Sequence[str], f_number: Sequence[str], zoom: Sequence[
     mm, aperture, times = (np.array([float(t) if _NUMBER.fullmatch(t) else np.nan for t in text]) for text in texts)
     is_tenths = np.array(["." not in text for text in focal]) & (mm >= 100) & ~(aperture < 100)
     notes = ["the field of view is that of a focal length as for a picture with a longer side of 36 mm"]
-    whole = times[(times >= 10) & np.array(["." not in text for text in zoom], bool)]
     if (times >= 100).any():
         first = times[times >= 100][0]
         # The smallest zoom of a log is one or more.
         lowest = times[times >= 100].min()
         scale = next(scale for scale in (10_000, 1000, 100) if scale <= lowest)
         times = np.where(times >= 100, times / scale, times)
-        or_more = f"; the log does not say the scale, in 1/{scale // 10} it were {first / scale * 10:g}" * (
-            scale not in (100, lowest)
-        )
-        notes.append(f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}{or_more}")
-    elif len(whole) and (times[np.isfinite(times)] >= 10).all():
-        notes.append(f"the zoom of {whole[0]:g} is taken as {whole[0]:g} times, not as {whole[0] / 10:g}")
-    if len(known := np.unique(times[np.isfinite(times)])) == 1 and known[0] > 1:
+        or_more = f"; the log does not say the scale, in 1/{scale // 10} it were {first / scale * 10:g}"
         notes.append(
-            f"the zoom is {known[0]:g} throughout: a focal length in the camera's file must be that with the zoom"
+            f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}{or_more * int(scale != lowest)}"
         )
+    known = np.unique(times[np.isfinite(times)])
+    if len(known) == 1 and known[0] > 1:
+        notes.append(f"the zoom is {known[0]:g} throughout, which a focal length in the camera's file must hold")
     is_wrong = (times < POSSIBLE["zoom"][0]) | (times > POSSIBLE["zoom"][1])
     if is_wrong.any():
         notes.append(f"a zoom of {times[is_wrong][0]:g} cannot be; {is_wrong.sum()} left out")

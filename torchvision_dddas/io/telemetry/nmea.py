@@ -75,8 +75,8 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         raise log.refuse(f"no NMEA sentence gives a place or a heading together with a time{found}{hint}")
     if elsewhere:
         log.note(
-            f"line {elsewhere[0]}: the log has two receivers, more than {_APART_M:g} m from each other; the first of each "
-            f"time counts, {len(elsewhere)} sentences are left out"
+            f"line {elsewhere[0]}: the log has two receivers over {_APART_M:g} m from each other: of each time the first "
+            f"counts, {len(elsewhere)} sentences are left out"
         )
     if {apart for apart in separations if math.isfinite(apart)} == {0.0}:
         log.note("the receiver gives the geoid as 0 throughout: its heights above the sea may be above the ellipsoid")

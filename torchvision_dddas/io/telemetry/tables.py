@@ -114,12 +114,8 @@ class _Table:
 
     def __init__(self, path: Path, text: CsvText) -> None:
         self.header, self.lines, self.rows = text
-        is_degrees = [(known := Names().find(title)) and known.field.kind == "degrees" for title in self.header]
-        if any(
-            is_it and _GROUPED.fullmatch(cell)
-            for row in self.rows[:2]
-            for is_it, cell in zip(is_degrees, row, strict=False)
-        ):
+        places = [k for k, name in enumerate(self.header) if re.match(r"\W*lat|\W*lon|\W*lng", name, re.IGNORECASE)]
+        if any(k < len(row) and _GROUPED.fullmatch(row[k]) for row in self.rows[:2] for k in places):
             # Three digits behind each comma: that of a latitude is no mark of thousands.
             self.rows = [[c.replace(",", ".") if _GROUPED.fullmatch(c) else c for c in row] for row in self.rows]
         self.names = names_of_table(self.header)
@@ -177,22 +173,13 @@ class _Table:
 
     def _note_radians(self, place: int, values: np.ndarray, known: Known) -> None:
         """Note angles that are taken for degrees, as nothing says their unit, and that could all be radians."""
-        is_told = "deg" in self.header[place].lower() or "°" in self.header[place] or bool(self.units)
-        finite, quantity = values[np.isfinite(values)], known.field.quantity
-        most = {"longitude_deg": math.pi, "latitude_deg": math.pi / 2, "pitch_rad": math.pi / 2}.get(
-            quantity, 2 * math.pi
-        )
-        is_degrees = abs(known.scale) == (1.0 if known.field.kind == "degrees" else math.pi / 180)
-        if (
-            not is_told
-            and is_degrees
-            and np.abs(finite).max() <= most + 1e-3
-            and not np.allclose(finite, finite.round(1))
-        ):
-            self.log.note(
-                f"'{self.header[place]}' is {finite.min():g} to {finite.max():g}, which may be radians: degrees are "
-                "assumed; wanted a name with the unit, as gimbal_yaw_rad or latitude_rad"
-            )
+        title, finite, quantity = self.header[place], values[np.isfinite(values)], known.field.quantity
+        turn = 1 / 4 if quantity in ("pitch_rad", "latitude_deg") else 1 / 2 if quantity == "longitude_deg" else 1
+        is_told = re.search(r"deg|°", title.lower()) or self.units
+        is_told = is_told or abs(known.scale) != (1.0 if known.field.kind == "degrees" else math.pi / 180)
+        if not is_told and np.abs(finite).max() < 6.284 * turn and not np.allclose(finite, finite.round(1)):
+            span = f"'{title}' is {finite.min():g} to {finite.max():g}, which may be radians: degrees are assumed"
+            self.log.note(f"{span}; wanted a name with the unit, as gimbal_yaw_rad or latitude_rad")
 
     def read(self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str) -> Telemetry:
         """The record of the table."""
@@ -255,29 +242,23 @@ class _Table:
 
     def _scale_places(self, values: dict[str, np.ndarray]) -> None:
         """Make degrees of whole numbers of ten-millionths, as autopilots write them, or of millionths."""
-        known = [values[name][np.isfinite(values[name])] for name in _PLACE]
-        both = np.concatenate(known)
+        known = {name: column[np.isfinite(column)] for name, column in values.items()}
+        both = np.concatenate([known[name] for name in _PLACE])
         if not len(both) or np.abs(both).max() <= 1000 or (both != np.round(both)).any():
             return
-        fits = all(np.abs(part).max(initial=0) <= most * 1e6 for part, most in zip(known, (180, 90), strict=True))
-        scale = 1e-6 if fits and not self.names.program else 1e-7
-        values |= {name: values[name] * scale for name in _PLACE}
-        if scale == 1e-6:
+        is_e7 = self.names.program or any(
+            (np.abs(known[k]) > m).any() for k, m in zip(_PLACE, (18e7, 9e7), strict=True)
+        )
+        values |= {name: values[name] * (1e-7 if is_e7 else 1e-6) for name in _PLACE}
+        if not is_e7:
             self.log.note(
-                "whole numbers as places are taken for millionths of degrees; names such as lat_e7 tell others"
+                "whole numbers as places are taken for millionths of degrees; a name such as lat_e7 tells more"
             )
-        heights = {"bare_altitude_m", "above_sea_m", "above_takeoff_m", "above_ellipsoid_m"} & values.keys()
-        for name in sorted(heights):
-            finite = values[name][np.isfinite(values[name])]
-            if (
-                not self.names.program
-                and len(finite)
-                and (finite == np.round(finite)).all()
-                and np.abs(finite).max() > 1000
-            ):
-                self.log.note(
-                    f"{name} of {finite[0]:g} beside whole numbers as places may be in millimetres: metres are assumed"
-                )
+        tall = [
+            name for name in values if name.startswith(("above", "bare")) and np.abs(known[name]).max(initial=0) > 1000
+        ]
+        if tall and not self.names.program:
+            self.log.note(f"{', '.join(tall)} beside whole numbers as places may be in millimetres: metres are assumed")
 
     def _pairs(self, order: str) -> dict[str, np.ndarray]:
         """Longitudes and latitudes of a column with both."""
@@ -287,13 +268,12 @@ class _Table:
             for cell in self.texts("place")
         ]
         if any(two and len(two[0]) == 3 for two in parts):
-            self.log.note("of three numbers in a cell the third, a height of unknown zero, is not used")
+            self.log.note("of three numbers in a cell the third is not used")
         angles = [[parse_angle(part) for part in (two[0][:2] if two else ("", ""))] for two in parts]
         pairs = np.array([[value for value, _ in two] for two in angles])
         sides = {side for (_, side), _ in angles if side}
-        title = next(self.header[place].lower() for place, _ in self.columns["place"])
-        first = re.search(r"lat|lon|lng", title)
-        told = self.names.order or (first is not None and ("lat-lon" if first[0] == "lat" else "lon-lat")) or ""
+        first = re.search(r"lat|lon|lng", self.header[self.columns["place"][0][0]].lower())
+        told = self.names.order or (("lat-lon" if first[0] == "lat" else "lon-lat") if first else "")
         is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, told, order, "a cell")
         return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
 
