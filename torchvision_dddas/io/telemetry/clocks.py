@@ -18,8 +18,6 @@ from torchvision_dddas.io.telemetry.record import SPLIT_S, Log, is_clock
 
 UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
 """The note on a log whose dates say no zone."""
-YEAR_LAST = "the years of two digits are taken to come last in the dates"
-UNSURE = "{} does not show whether day or month comes first, so the clock is not known"
 
 _DAY_S = 86_400.0
 _DAY_FORM = r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})"
@@ -46,20 +44,17 @@ _ODD_DATE = re.compile(
     rf"|{_MONTH} +(\d{{1,2}}),? +(?:(\d{{1,2}}:[\d:.]{{2,15}}) +)?(\d{{4}})(?!\d))",
     re.IGNORECASE,
 )
-# Numbers of which the digits are hours, minutes and seconds.
-_DIGITS = re.compile(r"([01]?\d|2[0-3])([0-5]\d)([0-5]\d)(?:\.?(\d*))")
+_DIGITS = re.compile(r"([01]?\d|2[0-3])([0-5]\d)([0-5]\d)(?:\.?(\d*))")  # hours, minutes and seconds in one number
 # From 2001 to 2100: an earlier clock was never set.
 _SINCE_1970 = (1e9, 4.1e9)
 # A larger number is no time of a log, since its start or since 1970.
 _LONGEST_S = 1e10
-_DAYS = 2  # a flight goes over one midnight
-# How far the rows of a flight log may be apart.
-_STEP_S = (0.002, 10.0)
+# How far the rows of a flight log may be apart, and on how many days they may be.
+_STEP_S, _DAYS = (0.002, 10.0), 2
 _SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "days": _DAY_S}
 # Days at the beginning of 1970 of spreadsheets, MATLAB, Julian days and modified Julian days.
 _EPOCHS = (25_569.0, 719_529.0, 2_440_587.5, 40_587.0, 0.0)
-# Dates that leave the times by more are those of another flight.
-DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50
+DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50  # dates that leave the times by more are those of another flight
 # Where this share of rows has the time of the row above, and times are multiples of a step of this, rows are spread.
 _MORE, _TICK_S = 0.1, 0.1
 
@@ -82,26 +77,29 @@ def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], 
         seconds = midnight_s(*parts[:3], day_first or "." in one[0][:3]) + _clock_s(*parts[3:]) if one else math.nan
         away_s = _zone_s(zone)
         dates.append((seconds - (away_s or 0.0), away_s is not None) if math.isfinite(seconds) else None)
-    return dates, is_sure, YEAR_LAST * any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days)
+    return (
+        dates,
+        is_sure,
+        "the years of two digits are taken to come last"
+        * any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days),
+    )
 
 
 def _usual_date(found: re.Match[str]) -> str:
     """The usual form of a date in another one, 2022-08-26 18:12:57; the text behind it stays."""
-    year, month, day, *_ = (part for part in found.groups() if part is not None)
-    if found[11]:
-        day, month, year = found[11], str(_MONTHS.index(found[12].lower()) + 1), found[13]
-    elif found[14]:
-        month, day, year = str(_MONTHS.index(found[14].lower()) + 1), found[15], found[17]
-    clock = f" {found[7]}:{found[8]}:{found[9]}.{found[10] or 0}" if found[7] else f" {found[16]}" if found[16] else ""
-    return f"{year if len(year) == 4 else '20' + year}-{month}-{day}{clock}"
+    part = found.groups(default="")
+    forms = ([part[k] for k in places] for places in ((0, 1, 2), (3, 4, 5), (12, 11, 10), (16, 13, 14)))
+    year, month, day = next(filter(all, forms))
+    month = f"{_MONTHS.index(month.lower()) + 1}" if month.lower() in _MONTHS else month
+    clock = f"{part[6]}:{part[7]}:{part[8]}.{part[9]}0" if part[6] else part[15]
+    return f"{'20' * (len(year) == 2)}{year}-{month}-{day} {clock}".rstrip()
 
 
 def _zone_s(zone: str) -> float | None:
     """Seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for other names and for none."""
-    found = re.fullmatch(r"(?:Z|UTC|GMT)?([+-])(\d{1,2}?)(?::?(\d\d))?", zone)
-    if found is None:
-        return 3600.0 * _ZONES[zone] if zone in _ZONES else None
-    return math.copysign(3600.0 * int(found[2]) + 60.0 * int(found[3] or 0), float(found[1] + "1"))
+    if found := re.fullmatch(r"(?:Z|UTC|GMT)?([+-])([01]?\d)(?::?([0-5]\d))?", zone):
+        return float(f"{found[1]}{int(found[2]) * 3600 + int(found[3] or 0) * 60}")
+    return 3600.0 * _ZONES[zone] if zone in _ZONES else None
 
 
 @lru_cache(maxsize=100)
@@ -130,10 +128,8 @@ def parse_time_zone(text: str) -> tzinfo | None:
     text = text.strip()
     if not text:
         return None
-    if found := re.fullmatch(r"([+-])(\d{1,2})(?::?([0-5]\d))?", text):
-        away = timedelta(hours=int(found[2]), minutes=int(found[3] or 0))
-        if away < timedelta(hours=24):
-            return timezone(-away if found[1] == "-" else away)
+    if (away_s := _zone_s(text)) is not None:
+        return timezone(timedelta(seconds=away_s))
     try:
         return ZoneInfo(text)
     except (KeyError, ValueError, OSError):
@@ -183,19 +179,22 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
         cells = [_ODD_DATE.sub(_usual_date, cell) for cell in cells]
     forms = {"date": _DATE.search, "day": _DAY.fullmatch, "clock": _CLOCK.fullmatch}
     kind = next((kind for cell in cells if cell for kind, parse in forms.items() if parse(cell)), "span")
-    values, is_utc, is_sure, remark = np.full(len(cells), np.nan), known.is_utc, True, ""
+    is_utc, is_sure, remark = known.is_utc, True, ""
     if kind in ("date", "day"):
         dates, is_sure, remark = parse_dates([f"{cell} 0:0" for cell in cells] if kind == "day" else cells)
-        values = np.array([math.nan if date is None else date[0] for date in dates])
+        values = [math.nan if date is None else date[0] for date in dates]
         is_utc |= any(date is not None and date[1] for date in dates)
     elif kind == "clock":
-        for place, cell in enumerate(cells):
-            if found := _CLOCK.fullmatch(cell):
-                values[place], away_s = _clock_s(*found.groups(default="")[:6]), _zone_s(found[7] or "")
-                values[place], is_utc = values[place] - (away_s or 0.0), is_utc or away_s is not None
+        found = [_CLOCK.fullmatch(cell) for cell in cells]
+        away_s = [_zone_s(one[7] or "") if one else None for one in found]
+        clock_s = (_clock_s(*one.groups(default="")[:6]) if one else math.nan for one in found)
+        values, is_utc = (
+            [s - (away or 0.0) for s, away in zip(clock_s, away_s, strict=True)],
+            is_utc or {*away_s} != {None},
+        )
     else:
-        values = np.array([_span_s(cell) for cell in cells])
-    return TimeColumn(title, values, kind, 1.0, is_utc, is_sure, remark)
+        values = [_span_s(cell) for cell in cells]
+    return TimeColumn(title, np.array(values, float), kind, 1.0, is_utc, is_sure, remark)
 
 
 def _span_s(text: str) -> float:
@@ -409,13 +408,17 @@ def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | Non
     drift_s = float(apart[-1]) - start_s
     if abs(drift_s) > 2.0 + 0.02 * float(time_s[known[len(apart) - 1]]):
         log.note(f"the dates of '{clock.title}' and the seconds of the log part by {drift_s:+.1f} s until its end")
-    if clock.remark:
-        log.note(clock.remark)
-    return clock_at_start(log, start_s, clock.is_utc, clock.is_sure, zone, f"'{clock.title}'")
+    return clock_at_start(log, start_s, clock.is_utc, clock.is_sure, zone, f"'{clock.title}'", clock.remark)
 
 
-def clock_at_start(log: Log, start_s: float, is_utc: bool, is_sure: bool, zone: tzinfo | None, what: str) -> float:
+def clock_at_start(
+    log: Log, start_s: float, is_utc: bool, is_sure: bool, zone: tzinfo | None, what: str, remark: str
+) -> float:
     """Seconds since 1970 at time 0, NaN with a note if the dates do not tell it. start_s: what they say, as UTC."""
+    if remark:
+        log.note(remark)
+    if math.isnan(start_s):
+        return start_s
     if not _SINCE_1970[0] < start_s < _SINCE_1970[1]:
         log.note(f"{what} is a clock of the year {1970 + start_s / 31_556_952:.0f}, which cannot be: not used")
         return math.nan
@@ -423,5 +426,6 @@ def clock_at_start(log: Log, start_s: float, is_utc: bool, is_sure: bool, zone: 
         return start_s if is_utc or zone is None else to_utc(start_s, zone)
     # Another zone is at most half a day away, and another order of day and month eleven months.
     log.latest_utc_s = start_s + (_DAY_S / 2 if is_sure else 340 * _DAY_S)
-    log.note(UNKNOWN_ZONE if is_sure else UNSURE.format(what))
+    unsure = f"{what} does not show whether day or month comes first, so the clock is not known"
+    log.note(UNKNOWN_ZONE if is_sure else unsure)
     return math.nan

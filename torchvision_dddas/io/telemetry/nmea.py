@@ -74,10 +74,8 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         hint = "; remove the checksums (*hh) to read them unchecked" if "wrong checksum" in said else ""
         raise log.refuse(f"no NMEA sentence gives a place or a heading together with a time{found}{hint}")
     if elsewhere:
-        log.note(
-            f"line {elsewhere[0]}: the log has two receivers over {_APART_M:g} m from each other: of each time the first "
-            f"counts, {len(elsewhere)} sentences are left out"
-        )
+        what = f"line {elsewhere[0]}: the log has two receivers over {_APART_M:g} m from each other"
+        log.note(f"{what}: of each time the first counts, {len(elsewhere)} sentences are left out")
     if {apart for apart in separations if math.isfinite(apart)} == {0.0}:
         log.note("the receiver gives the geoid as 0 throughout: its heights above the sea may be above the ellipsoid")
     return build_record(log, clock_offset_s, next((s for s in clocks if is_clock(s)), [*clocks, math.nan][0]))

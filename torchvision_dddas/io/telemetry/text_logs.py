@@ -10,14 +10,7 @@ import numpy as np
 
 from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.telemetry.clocks import DATE_JUMP_S, clock_at_start, parse_dates, sort_flights
-from torchvision_dddas.io.telemetry.fields import (
-    ANGLE,
-    UNITS,
-    Names,
-    field_of_view,
-    names_of_subtitles,
-    parse_angle,
-)
+from torchvision_dddas.io.telemetry.fields import ANGLE, UNITS, Names, field_of_view, names_of_subtitles, parse_angle
 from torchvision_dddas.io.telemetry.record import JUMP_M, SPLIT_S, Log, build_record
 from torchvision_dddas.types import Telemetry
 
@@ -33,9 +26,7 @@ _NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
 _TUPLE = re.compile(r"[A-Za-z][A-Za-z.]*"), re.compile(r"\s*(?::\s*)?\(([^)]*)\)?")
 _PAIR = (
     re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
-    re.compile(
-        rf"\s*(?:[:=]\s*)?x?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°|x)?(?![A-Za-z])", re.IGNORECASE
-    ),
+    re.compile(rf"\s*(?:[:=]\s*)?x?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|[cm]?m|°|x)?(?![a-z])", re.IGNORECASE),
 )
 # [Gimbal: Yaw:1.0, Pitch:-30.0] and Gimbal(Yaw:1.0), also over several lines: the angles get the name of the group.
 _OWNERS, _ANGLES = "gimbal|gb|camera|mount|payload|drone|aircraft|uav|vehicle|flight", "(?:yaw|pitch|roll|heading)"
@@ -50,23 +41,21 @@ _OWNED = re.compile(rf"\b({_OWNERS}) +(?={_ANGLES}\b)", re.IGNORECASE)
 _SIDED = re.compile(
     rf"\b((?:lat|lon|lng)[a-z]{{0,7}}\s*[:=]\s*)(?=[NSEW]|-?[\d.,]{{1,15}} ?[NSEWd°])({ANGLE})(?![\w.])", re.IGNORECASE
 )
-_NUMBER_2 = r"(-?\d{1,3}\.\d{2,12})"
 _TWO = re.compile(
-    rf"\b(?:gps|position|location|coord[a-z]{{0,8}})\s*[:=]\s*{_NUMBER_2}\s*[,;]\s*{_NUMBER_2}", re.IGNORECASE
+    r"\b(?:gps|position|location|coord[a-z]{0,8})\s*[:=]\s*(-?\d+\.\d+\s*[,;]\s*-?\d+\.\d+)", re.IGNORECASE
 )
 # Forms of few dialects, and the forms of the others.
 _USUAL: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = (
     (_GROUP, lambda found: _IN_GROUP.sub(rf"{found[1]}.\g<0>", found[2])),
     (_OWNED, lambda found: f"{found[1]}."),
     (_SIDED, lambda found: f"{found[1]}{parse_angle(found[2])[0]:.9f}"),
-    (_TWO, lambda found: f"GPS({found[1]}, {found[2]})"),
+    (_TWO, lambda found: f"GPS({found[1]})"),
 )
 _DECIMAL, _PLACES = re.compile(r"\s*-?\d{1,6},\d{1,6} ?(?:[mM]|ft)?\s*"), ("gps", "rtk", "home")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 _OPTICS = ("focal_mm", "f_number", "zoom")
-_SATELLITES = 60
 _POINT = re.compile(r"\d[.,]\d")
-_WORST, _HEAD = 1000, 20_000
+_WORST, _SAMPLE, _SATELLITES = 1000, 10_000, 60
 
 
 def read_subtitles(
@@ -75,8 +64,9 @@ def read_subtitles(
     """The record of subtitles; arguments and errors as `read_telemetry`."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     names = names_of_subtitles(text)
+    some = "\n\n".join(text[k * len(text) // 4 :][:_SAMPLE] for k in range(4))
     for form, usual in _USUAL:
-        text = form.sub(usual, text) if form.search(text[:_HEAD]) else text
+        text = form.sub(usual, text) if form.search(some) else text
     subtitles = _subtitles(text)
     dates, is_sure, remark = parse_dates([words for *_, words in subtitles])
     parted = [_tuples(words) for *_, words in subtitles]
@@ -100,9 +90,7 @@ def read_subtitles(
         jump_s = date[0] - last_date_s - (time_s - last_s) if date is not None else math.nan
         if math.isfinite(jump_s):
             jumps.append((last_s, jump_s))
-        if (
-            time_s < last_s
-        ):  # where times begin again, the dates tell how much later, or a jump that it is another flight
+        if time_s < last_s:  # the dates tell how much later another flight was; else a jump tells that there is one
             if math.isnan(jump_s) and math.dist(place, last_place) * DEGREE_M > JUMP_M:
                 jump_s = last_s - time_s + 1.0
                 log.splits.append(last_s + SPLIT_S)
@@ -129,11 +117,8 @@ def read_subtitles(
         log.add_all(times, lines, {"hfov_rad": hfov})
         log.is_nominal = True
         log.notes += notes
-    start_s = math.nan
-    if math.isfinite(first_s) and log.moments:
-        start_s = clock_at_start(log, first_s - log.moments[0][0], is_zoned, is_sure, zone, "the date")
-        if remark:
-            log.note(remark)
+    start_s = first_s - log.moments[0][0] if log.moments else math.nan
+    start_s = clock_at_start(log, start_s, is_zoned, is_sure, zone, "the date", remark)
     return build_record(log, clock_offset_s, start_s)
 
 
@@ -207,11 +192,8 @@ def _is_latitude_first(log: Log, names: Names, tuples: list[dict[str, Numbers]],
 
 def _quantities(names: Names, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> tuple[Values, dict[str, str]]:
     """Values of one subtitle by quantity, and those of the lens as text. text: without the tuples."""
-    values, lens, ranks = (
-        _place(tuples.get("gps", []), is_swapped, names.order == "lat-lon"),
-        dict[str, str](),
-        dict[str, int](),
-    )
+    values = _place(tuples.get("gps", []), is_swapped, names.order == "lat-lon")
+    lens, ranks = dict[str, str](), dict[str, int]()
     found = [
         (f"{key} ({letters})" if letters in ("M", "FT") else key, str(value))
         for name, numbers in tuples.items()
@@ -242,14 +224,10 @@ def _place(gps: Numbers, is_swapped: bool, has_height: bool) -> dict[str, float]
     if not values and len(gps) > 1:
         names = ("latitude_deg", "longitude_deg") if is_swapped else ("longitude_deg", "latitude_deg")
         values = {name: value for name, (value, _) in zip(names, gps, strict=False)}
-    # A third number with a unit or decimals is a height, else the number of satellites; 0.0 m stands for none. Some
-    # dialects have whole numbers as heights.
-    if (
-        len(gps) > 2
-        and (gps[2][1] in ("M", ".") or (has_height and not gps[2][1] and gps[2][0] > _SATELLITES))
-        and gps[2][0] != 0
-    ):
-        values["bare_altitude_m"] = gps[2][0]
+    # A third number with a unit or decimals is a height, else the number of satellites; 0.0 m stands for none.
+    third, unit = gps[2] if len(gps) > 2 else (0.0, "")
+    if third != 0 and (unit in ("M", ".") or (has_height and third > _SATELLITES)):
+        values["bare_altitude_m"] = third
     return values
 
 
