@@ -54,7 +54,13 @@ def zeros() -> list[str]:
     return ["| quantity | words |", "| --- | --- |", *(f"| {name} | {names(words)} |" for name, words in ZEROS.items())]
 
 
-BLOCKS = {"fields": fields(), "zeros": zeros(), "units": units(), "programs": programs(TABLES), "subtitles": subtitles()}
+BLOCKS = {
+    "fields": fields(),
+    "zeros": zeros(),
+    "units": units(),
+    "programs": programs(TABLES),
+    "subtitles": subtitles(),
+}
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -208,7 +208,7 @@ PROGRAMS = {
         {"altitude": 30, "zero": "ground", "sea": 500, "ellipsoid": 547, "hfov": 69},
     ),
     "MAVLink's GPS_RAW_INT": (
-        table("time_usec,fix_type,lat,lon,alt,eph,epv,vel,cog", "12{i}00000,3,481371000,115753000,12000,80,90,200,4500"),
+        table("time_usec,fix_type,lat,lon,alt,eph,epv,vel,cog", "12{i}00000,3,481371000,115753000,12000,80,90,200,45"),
         {"sea": 12, "speed": 2, "latitude": 48.1371, "longitude": 11.5753, "times": [0, 0.1]},
     ),
     "MAVLink's GPS_RAW_INT with prefixes": (
@@ -529,7 +529,7 @@ def test_flights_one_after_the_other_whose_times_run_back_are_told_apart_by_date
 @pytest.mark.parametrize("away", [0, 1])
 def test_flights_in_one_table_are_split_where_the_dates_jump(fly, count, is_restarted, away):
     rows = "".join(
-        f"{(k if is_restarted else k + h * count) * 100},2022-08-26 {12 + h}:00:{k // 10:02d},{48.1 + h * away},11.5,{k}\n"
+        f"{k + h * count * (not is_restarted)}00,2022-08-26 {12 + h}:00:{k // 10:02d},{48.1 + h * away},11.5,{k}\n"
         for h in (0, 1)
         for k in range(count)
     )

@@ -263,8 +263,9 @@ def _find_format(head: str) -> tuple[str, str | None]:
         return max(counts.values(), default=0), sum(map(bool, map(_NUMBER.fullmatch, cells))) / max(len(cells), 1)
 
     separator = told[1] if told is not None else max(",;\t|", key=rank)
-    if told is None and not rank(separator)[0] and len({len(line.split()) for line in bare}) == 1:
-        separator = " "
+    last = bare[-1].split() if bare else []
+    if told is None and not rank(separator)[0] and all(len(line.split()) == len(last) for line in bare):
+        separator = " " if len(last) > 1 and _NUMBER.fullmatch(last[-1]) else separator
     try:
         cells = [cell.strip() for row in csv.reader(lines, delimiter=separator, skipinitialspace=True) for cell in row]
     except csv.Error:

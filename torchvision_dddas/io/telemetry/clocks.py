@@ -77,12 +77,8 @@ def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], 
         seconds = midnight_s(*parts[:3], day_first or "." in one[0][:3]) + _clock_s(*parts[3:]) if one else math.nan
         away_s = _zone_s(zone)
         dates.append((seconds - (away_s or 0.0), away_s is not None) if math.isfinite(seconds) else None)
-    return (
-        dates,
-        is_sure,
-        "the years of two digits are taken to come last"
-        * any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days),
-    )
+    is_short = any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days)
+    return dates, is_sure, "the years of two digits are taken to come last" * is_short
 
 
 def _usual_date(found: re.Match[str]) -> str:
@@ -255,8 +251,8 @@ def settle_times(
     whole = [one for one in columns if one.kind != "day"]
     for place, one in enumerate(whole):
         if one.kind == "clock" and day is not None:
-            both = {"is_utc": day.is_utc or one.is_utc, "is_sure": day.is_sure, "remark": day.remark}
-            whole[place] = one._replace(values=day.values + one.values, kind="date", **both)
+            values, is_utc = day.values + one.values, day.is_utc or one.is_utc
+            whole[place] = TimeColumn(one.title, values, "date", 1.0, is_utc, day.is_sure, day.remark)
     parts, fractions = _with_fractions(whole)
     dated = (one.values[np.isfinite(one.values)] for one in parts if one.kind == "date")
     span_s = max((float(np.ptp(known)) for known in dated if len(known)), default=0.0)
@@ -304,8 +300,8 @@ def _restarts(values: np.ndarray) -> list[int]:
     back = known[1:][np.diff(values[known]) < -1.0]
     highest = np.fmax.accumulate(values)
     # Behind a single damaged time the times go on.
-    few = back if len(back) <= min(1 + len(known) // 20, _MOST_FLIGHTS) else []
-    return [int(row) for row in few if (values[row : row + 3] < highest[row - 1]).sum() == 3]
+    is_few = len(back) <= min(1 + len(known) // 20, _MOST_FLIGHTS)
+    return [int(row) for row in back[: len(back) * is_few] if (values[row : row + 3] < highest[row - 1]).sum() == 3]
 
 
 def sort_flights(log: Log, time_s: np.ndarray) -> None:
@@ -382,7 +378,7 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
         if len(names) > 1 and name != "seconds":
             what = f"'{one.title}' steps by {step:g}, which may be {' or '.join(names)}"
             one = one._replace(is_sure=False, remark=f"{what}; wanted a name with the unit, as time_ms")
-        elif len(names) > 1 or (name != "seconds" and name not in since):
+        elif len(names) > 1 or (name != "seconds" and name not in since) or name == "days":
             one = one._replace(remark=f"'{one.title}' is taken to be in {name}, by its steps of {step:g}")
     if scale == _DAY_S:
         days = next((day for day in _EPOCHS if is_clock((middle - day) * _DAY_S)), 0.0)
@@ -418,7 +414,7 @@ def clock_at_start(
     if remark:
         log.note(remark)
     if math.isnan(start_s):
-        return start_s
+        return math.nan
     if not _SINCE_1970[0] < start_s < _SINCE_1970[1]:
         log.note(f"{what} is a clock of the year {1970 + start_s / 31_556_952:.0f}, which cannot be: not used")
         return math.nan

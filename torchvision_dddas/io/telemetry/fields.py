@@ -81,7 +81,7 @@ _SCALES: dict[str, dict[float, str]] = {
               0.3048: "ft/s fps", 0.01: "cm/s", 1e-3: "mm/s"},
     "angle": {_DEG: "deg degree degrees ° º @ 360 180", 1: "rad radian radians", _DEG / 10: "ddeg", _DEG / 100: "cdeg"},
     "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians",
-                1e-7: "dege7 1e7 e7", 1e-6: "dege6 1e6 e6"},
+                1e-7: "dege7 1e7 e7", 1e-6: "dege6 1e6 e6 microdegrees"},
     "time": {1: "s sec secs second seconds", 1e-3: "ms msec millis millisecond milliseconds",
              1e-6: "us µs usec micros microsecond microseconds",
              1e-9: "ns nsec nsecs nanosec nanosecs nanosecond nanoseconds", 60: "min mins minute minutes",
@@ -162,9 +162,10 @@ ZEROS = {
     "above_takeoff_m": "relativetohome relativetotakeoff relative rel abovetakeoffpoint abovetakeoff overtakeoff "
     "fromtakeoff abovehomepoint abovehome fromhome abovelaunch abovestart ato",
     "above_ground_m": "abovegroundlevel aboveground overground aboveterrain abovesurface agl",
-    "above_sea_m": "abovemeansealevel abovesealevel abovesea sealevel amsl msl asl absolute abs orthometric abovegeoid "
-    "egm96 egm2008 egm84",
-    "above_ellipsoid_m": "abovewgs84ellipsoid aboveellipsoid wgs84ellipsoid ellipsoidal ellipsoid abovewgs84 wgs84 hae",
+    "above_sea_m": "abovemeansealevel abovesealevel abovesea sealevel amsl msl asl absolute abs orthometric orth "
+    "abovegeoid egm96 egm2008 egm84",
+    "above_ellipsoid_m": "abovewgs84ellipsoid aboveellipsoid wgs84ellipsoid ellipsoidal ellipsoid ell abovewgs84 "
+    "wgs84 hae",
 }
 _ZERO_OF = {word: quantity for quantity, words in ZEROS.items() for word in words.split()}
 _ALONE = {"agl", "amsl", "msl", "asl", "hae", "ato", "abovesealevel", "abovesea", "aboveground"}
@@ -176,7 +177,7 @@ _OPENING = re.compile(r"[(\[](?!\d{1,2}[)\]])| / (?=\S+$)")
 _BLANKS, _WORDS = re.compile(r"[\s_-]|:[cd]$"), re.compile(r"[^\s,;()\[\]]+")
 _VEHICLE = re.compile(
     r"(?:globalpositionint|gpsrawint|gps2raw|mountorientation|\.?(?:header\.?)?stamp\.|tv|osd|gps|custom|clock|general"
-    r"|aircraft|drone|uav|vehicle|flight|product(?:gps)?|location|imuatti|fused)(?:\(\d\))?[.:]?"
+    r"|aircraft|drone|uav|vehicle|flight|product(?:gps)?|location|imuatti|fused|field)(?:\(\d\))?[.:]?"
 )
 _CAMERA = re.compile(r"(?:gimbal|gb|camera|cam|mount|payload)(?:\(\d\))?[.:]?")
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")

@@ -175,9 +175,14 @@ class _Table:
         """Note angles that are taken for degrees, as nothing says their unit, and that could all be radians."""
         title, finite, quantity = self.header[place], values[np.isfinite(values)], known.field.quantity
         turn = 1 / 4 if quantity in ("pitch_rad", "latitude_deg") else 1 / 2 if quantity == "longitude_deg" else 1
-        is_told = re.search(r"deg|°", title.lower()) or self.units
-        is_told = is_told or abs(known.scale) != (1.0 if known.field.kind == "degrees" else math.pi / 180)
-        if not is_told and np.abs(finite).max() < 6.284 * turn and not np.allclose(finite, finite.round(1)):
+        is_told = bool(re.search(r"deg|°", title.lower()) or self.units)
+        is_degrees = abs(known.scale) == (1.0 if known.field.kind == "degrees" else math.pi / 180)
+        if (
+            is_degrees
+            and not is_told
+            and np.abs(finite).max() < 6.284 * turn
+            and not np.allclose(finite, finite.round(1))
+        ):
             span = f"'{title}' is {finite.min():g} to {finite.max():g}, which may be radians: degrees are assumed"
             self.log.note(f"{span}; wanted a name with the unit, as gimbal_yaw_rad or latitude_rad")
 
