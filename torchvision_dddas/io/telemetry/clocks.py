@@ -184,10 +184,8 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
         found = [_CLOCK.fullmatch(cell) for cell in cells]
         away_s = [_zone_s(one[7] or "") if one else None for one in found]
         clock_s = (_clock_s(*one.groups(default="")[:6]) if one else math.nan for one in found)
-        values, is_utc = (
-            [s - (away or 0.0) for s, away in zip(clock_s, away_s, strict=True)],
-            is_utc or {*away_s} != {None},
-        )
+        values = [clock - (away or 0.0) for clock, away in zip(clock_s, away_s, strict=True)]
+        is_utc |= {*away_s} != {None}
     else:
         values = [_span_s(cell) for cell in cells]
     return TimeColumn(title, np.array(values, float), kind, 1.0, is_utc, is_sure, remark)
@@ -258,7 +256,8 @@ def settle_times(
     span_s = max((float(np.ptp(known)) for known in dated if len(known)), default=0.0)
     settled = [_in_seconds(one, step_m, span_s) for one in parts]
     clocks = [one for one in settled if one.kind == "date" and np.isfinite(one.values).any()]
-    settled = [_continued(log, one, min(clocks, key=_trust, default=None), is_far) for one in settled]
+    splits: dict[str, list[float]] = {}
+    settled = [_continued(splits, one, min(clocks, key=_trust, default=None), is_far) for one in settled]
     chosen = min(settled, key=_rank) if settled else columns[0]._replace(values=columns[0].values * math.nan)
     known = np.flatnonzero(np.isfinite(chosen.values))
     if not len(known):
@@ -268,6 +267,7 @@ def settle_times(
     if chosen.remark:
         log.note(chosen.remark)
     time_s = _spread(log, chosen.title, chosen.values - chosen.values[known[0]])
+    log.splits += splits.get(chosen.title, [])
     sort_flights(log, time_s)
     clocks = [one for one in clocks if np.isfinite(one.values + time_s).any()]
     if not clocks:
@@ -281,14 +281,10 @@ def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[Sequence[TimeColumn]
     """The columns, those of whole seconds with a column of fractions of a second added; and the title of this one."""
     for one in columns:
         known = one.values[np.isfinite(one.values)] * one.scale
-        if (
-            one.kind == "number"
-            and one.scale < 1
-            and (np.diff(known) < -0.1).any()
-            and 0 <= known.min() <= known.max() < 1
-        ):
-            seconds = [other for other in columns if not other.scale < 1 and (other.values % 1 == 0).all()]
-            seconds = [other for other in seconds if len(np.unique(other.values)) < len(other.values)]
+        is_back = one.kind == "number" and one.scale < 1 and (np.diff(known) < -0.1).any()
+        if is_back and 0 <= known.min() <= known.max() < 1:
+            whole = (other for other in columns if not other.scale < 1 and (other.values % 1 == 0).all())
+            seconds = [other for other in whole if len(np.unique(other.values)) < len(other.values)]
             sums = [other._replace(values=other.values + one.values * one.scale, scale=1.0) for other in seconds]
             return sums or columns, [one.title] * bool(sums)
     return columns, []
@@ -311,10 +307,13 @@ def sort_flights(log: Log, time_s: np.ndarray) -> None:
         log.jitter_s = math.inf if all(before[1] < after[0] for before, after in pairwise(spans)) else log.jitter_s
 
 
-def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray) -> TimeColumn:
+def _continued(
+    splits: dict[str, list[float]], one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray
+) -> TimeColumn:
     """A column of which the times begin again with another flight: later by the dates, or else by a second.
 
     is_far: (N,) whether the vehicle jumps away before the row. Without dates and a jump the times stay as they are.
+    splits: title -> times at which the flights part, added to.
     """
     values = one.values.copy()
     for row in _restarts(one.values) if one.kind != "date" else ():
@@ -322,7 +321,8 @@ def _continued(log: Log, one: TimeColumn, dated: TimeColumn | None, is_far: np.n
         jump_s = math.nan if dated is None else dated.values[row] - dated.values[before]
         if math.isfinite(jump_s) or is_far[row]:
             values[row:] += values[before] - values[row] + (jump_s if math.isfinite(jump_s) else 1.0)
-            log.splits.append(float(values[before] - values[np.isfinite(values)][0]) + SPLIT_S)
+            first = values[np.isfinite(values)][0]
+            splits.setdefault(one.title, []).append(float(values[before] - first) + SPLIT_S)
     return one._replace(values=values)
 
 
