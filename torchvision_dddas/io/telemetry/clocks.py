@@ -75,7 +75,7 @@ def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], 
     for one in found:
         *parts, zone = one.groups(default="") if one else [""] * 10
         seconds = midnight_s(*parts[:3], day_first or "." in one[0][:3]) + _clock_s(*parts[3:]) if one else math.nan
-        away_s = _zone_s(zone)
+        away_s = _zone_s(zone) if zone else None
         dates.append((seconds - (away_s or 0.0), away_s is not None) if math.isfinite(seconds) else None)
     is_short = any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days)
     return dates, is_sure, "the years of two digits are taken to come last" * is_short

@@ -59,11 +59,11 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         if math.isfinite(first_s):
             separations.add(separation)
             place = values.get("latitude_deg", math.nan), values.get("longitude_deg", math.nan)
-            if now_s == seen[0] and math.dist(place, seen[1]) * DEGREE_M > _APART_M:
+            if now_s != seen[0] or math.isnan(seen[1][0]):
+                seen = now_s, place
+            elif math.dist(place, seen[1]) * DEGREE_M > _APART_M:
                 elsewhere.append(number)
                 continue
-            if math.isfinite(sum(place)) and now_s != seen[0]:
-                seen = now_s, place
             for name, value in values.items():
                 log.add(name, last_s + days * _DAY_S - first_s, value, number)
     said = ", ".join(f"{count} {fault}" for fault, count in Counter(fault for _, fault in faults).items())

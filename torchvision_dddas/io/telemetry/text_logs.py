@@ -76,7 +76,7 @@ def read_subtitles(
     timeless: list[int] = []
     lenses: list[dict[str, str]] = []
     last_s = last_date_s = math.nan  # of the subtitle before
-    last_place = [math.nan, math.nan]
+    last: Values = {}
     jumps, shift_s = list[tuple[float, float]](), 0.0
     for (line, time_s, _), (tuples, rest), date in zip(subtitles, parted, dates, strict=True):
         if math.isnan(time_s):
@@ -86,17 +86,17 @@ def read_subtitles(
             continue
         time_s += shift_s
         values, lens = _quantities(names, rest, tuples, is_swapped)
-        place = [values.get(name, math.nan) for name in ("longitude_deg", "latitude_deg")]
         jump_s = date[0] - last_date_s - (time_s - last_s) if date is not None else math.nan
         if math.isfinite(jump_s):
             jumps.append((last_s, jump_s))
         if time_s < last_s:  # the dates tell how much later another flight was; else a jump tells that there is one
-            if math.isnan(jump_s) and math.dist(place, last_place) * DEGREE_M > JUMP_M:
+            here, there = ([at.get(f"{name}itude_deg", math.nan) for name in ("long", "lat")] for at in (values, last))
+            if math.isnan(jump_s) and math.dist(here, there) * DEGREE_M > JUMP_M:
                 jump_s = last_s - time_s + 1.0
                 log.splits.append(last_s + SPLIT_S)
             if abs(jump_s) > DATE_JUMP_S or jump_s > 0:
                 time_s, shift_s = time_s + jump_s, shift_s + jump_s
-        last_s, last_place = time_s, place
+        last_s, last = time_s, values
         last_date_s = date[0] if date is not None else math.nan
         log.moments.append((time_s, 0.0, line))
         lenses.append(lens)
