@@ -332,6 +332,13 @@ def test_a_date_whose_day_and_month_may_be_swapped_tells_no_clock_even_in_a_zone
     assert np.isfinite(found.latest_utc_s) == (start is None)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_two_jumps_at_the_same_time_are_one(fly):
+    place = "[latitude: {}] [longitude: {}]".format
+    parts = [timed(place(53, 6), first_s=1), timed(place(-48, -180)), timed(place(48, 12)), timed(place(-48, 6))]
+    assert np.isfinite(fly("\n".join(parts), "flight.SRT").place).any()
+
+
 def test_a_time_lapse_whose_dates_run_fast_is_one_flight(read):
     bodies = [f"2024-05-27 13:{k:02d}:00.000\n[latitude: 53] [longitude: 6.4] [rel_alt: {k}.0]" for k in range(20)]
     found = read(*bodies)

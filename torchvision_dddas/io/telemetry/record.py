@@ -325,7 +325,7 @@ def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
         gaps = np.column_stack([log.splits, np.full((len(log.splits), 2), np.nan)])
         for name, rows in samples.items():
             rows = np.concatenate([rows, gaps])
-            samples[name] = rows[np.argsort(rows[:, 0], kind="stable")]
+            samples[name] = rows[np.unique(rows[:, 0], return_index=True)[1]]
 
 
 def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
