@@ -333,10 +333,10 @@ def test_a_date_whose_day_and_month_may_be_swapped_tells_no_clock_even_in_a_zone
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_two_jumps_at_the_same_time_are_one(fly):
-    place = "[latitude: {}] [longitude: {}]".format
-    parts = [timed(place(53, 6), first_s=1), timed(place(-48, -180)), timed(place(48, 12)), timed(place(-48, 6))]
-    assert np.isfinite(fly("\n".join(parts), "flight.SRT").place).any()
+def test_what_begins_with_the_second_flight_is_unknown_before(fly):
+    first, second = ("[latitude: 53] [longitude: 6]",) * 3, ("[latitude: 54] [longitude: 6] [rel_alt: 5]",) * 3
+    found = fly(timed(*first) + "\n" + timed(*second), "flight.SRT")
+    assert found.at(3.0).altitude_m == 5 and math.isnan(found.at(2.0).altitude_m)
 
 
 def test_a_time_lapse_whose_dates_run_fast_is_one_flight(read):
