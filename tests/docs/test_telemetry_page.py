@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from torchvision_dddas.io.telemetry.fields import FIELDS, SUBTITLES, TABLES, UNITS
+from torchvision_dddas.io.telemetry.fields import FIELDS, SUBTITLES, TABLES, UNITS, ZEROS
 
 PAGE = Path(__file__).parents[2] / "docs" / "telemetry.md"
 RECORD = {"degrees": "°", "angle": "°", "length": "m", "speed": "m/s", "time": "s"}
@@ -50,7 +50,17 @@ def subtitles() -> list[str]:
     return rows
 
 
-BLOCKS = {"fields": fields(), "units": units(), "programs": programs(TABLES), "subtitles": subtitles()}
+def zeros() -> list[str]:
+    return ["| quantity | words |", "| --- | --- |", *(f"| {name} | {names(words)} |" for name, words in ZEROS.items())]
+
+
+BLOCKS = {
+    "fields": fields(),
+    "zeros": zeros(),
+    "units": units(),
+    "programs": programs(TABLES),
+    "subtitles": subtitles(),
+}
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -321,6 +321,12 @@ def test_an_elevation_in_another_unit_is_refused_and_the_ratio_is_named(zero, ti
     assert "300 m apart" in note
 
 
+@pytest.mark.parametrize(("log_m", "raster_m"), [(0.5, 70.0), (0.7, 70.0), (548.0, 0.0), (500.0, 0.5), (5.0, 500.0)])
+def test_where_one_height_is_near_zero_no_unit_is_told_and_the_offset_is_named(log_m, raster_m):
+    (note,) = about_ground(over(lambda east: log_m + 0 * east, raster_m=lambda east: raster_m + 0 * east))
+    assert f"{abs(log_m - raster_m):.0f} m apart" in note
+
+
 @pytest.mark.parametrize(("offset_m", "notes"), [(8.0, 0), (-8.0, 0), (12.0, 1), (-47.0, 1)])
 def test_an_offset_of_more_than_ten_metres_is_named(offset_m, notes):
     found = about_ground(over(hillside, raster_m=lambda east: hillside(east) + offset_m))

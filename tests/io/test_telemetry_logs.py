@@ -228,6 +228,10 @@ def test_one_gimbal_is_used_and_named(fly, gimbals, pitch, words):
     flown = fly(together(tlog(eastward()), *gimbals), "flight.tlog")
     assert camera_deg(flown.at(1.0))[:2] == pytest.approx([140, pitch], abs=1e-4)
     assert words is None or any("several gimbals report" in note and words in note for note in flown.notes)
+    is_other = any(
+        "the gimbal is component 154 of system 9, another than the vehicle's" in note for note in flown.notes
+    )
+    assert is_other == (words is None and b"\x09\x9a" in gimbals[0])
     assert not any("drift" in note for note in flown.notes)
 
 

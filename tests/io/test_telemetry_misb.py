@@ -1,5 +1,6 @@
 """MISB ST 0601 in transport streams: packets, times, and where a camera looks that turns in a vehicle that turns."""
 
+import binascii
 import math
 
 import numpy as np
@@ -174,6 +175,11 @@ PACKETS = [packet(i, {56: bytes([10 + i])} | ({5: spread(i, 0, 360, 2)} if i % 2
         lambda c: sum_of(c[:-2]) + 77,
         lambda c: int.from_bytes(sum_of(c[:-2]).to_bytes(2, "big"), "little"),
         lambda c: sum(c[:-2]),
+        lambda c: sum_of(c[:-2]) ^ 0xFFFF,
+        lambda c: -sum_of(c[:-2]) & 0xFFFF,
+        lambda c: sum_of(c[16:-4]) ^ 0xFFFF,
+        lambda c: binascii.crc_hqx(c[:-2], 0xFFFF),
+        lambda c: binascii.crc_hqx(c[:-4], 0),
         lambda c: 0,
         lambda c: 0xFFFF,
     ],
@@ -191,6 +197,15 @@ def test_packets_whose_checksums_are_all_wrong_in_the_same_way_are_read(fly, che
     if checksum(PACKETS[0]) not in (0, 0xFFFF):
         flown = fly(b"".join(damaged), "a.klv")
         assert len(flown) == 10 and any("2 of 12 packets are damaged" in note for note in flown.notes)
+
+
+@pytest.mark.parametrize(("unit", "per_s"), [("milliseconds", 1e3), ("seconds", 1.0), ("nanoseconds", 1e9)])
+def test_stamps_in_another_unit_than_the_standards_are_read_with_a_note(fly, unit, per_s):
+    stamps = [int((START_US / 1e6 // 1 + i) * per_s) for i in range(5)]
+    flown = fly(b"".join(local_set({2: stamp.to_bytes(8, "big"), **PLACE}) for stamp in stamps), "a.klv")
+    np.testing.assert_allclose(flown.time_s, range(5))
+    assert flown.start_utc_s == START_US // 10**6
+    assert [note for note in flown.notes if f"count {unit}, not microseconds" in note]
 
 
 def test_packets_whose_checksums_are_wrong_in_different_ways_are_refused(refused):

@@ -12,8 +12,8 @@ PLACE = [-(11 + 31 / 60), 48 + 7.038 / 60]
 TIMES = [f"12351{i}.50" for i in range(5)]
 
 
-def gga(clock: str, quality: int = 1, talker: str = "GP", separation: str = "46.9") -> str:
-    return sentence(f"{talker}GGA,{clock},4807.0380,N,01131.0000,W,{quality},08,0.9,545.4,M,{separation},M,,")
+def gga(clock: str, quality: int = 1, talker: str = "GP", separation: str = "46.9", latitude: str = "4807.0380") -> str:
+    return sentence(f"{talker}GGA,{clock},{latitude},N,01131.0000,W,{quality},08,0.9,545.4,M,{separation},M,,")
 
 
 def rmc(clock: str, date: str = "230321") -> str:
@@ -164,6 +164,14 @@ def test_a_clock_that_cannot_be_is_none(fly, dates, start_utc_s):
     flown = fly("\n".join(rmc(clock, date) for clock, date in zip(TIMES, dates, strict=True)), "track.nmea")
     np.testing.assert_equal(flown.start_utc_s, start_utc_s)
     assert any("which cannot be" in note for note in flown.notes) == (dates[-1] not in ("230321", "000000"))
+
+
+@pytest.mark.parametrize("talker", ["GN", "GP"])
+def test_of_two_receivers_at_two_places_the_first_counts_with_a_note(fly, talker):
+    lines = [one for k in range(4) for one in (gga(f"12000{k}"), gga(f"12000{k}", talker=talker, latitude="4907.038"))]
+    flown = fly("\n".join(lines) + "\n", "a.nmea")
+    assert len(flown) == 4 and flown.place[:, 1] == pytest.approx(48.1173)
+    assert [note for note in flown.notes if "line 2: the log has two receivers" in note and "4 sentences" in note]
 
 
 def test_the_date_of_zda_sets_the_clock(fly):

@@ -169,6 +169,12 @@ def test_the_kind_of_a_file_goes_by_its_content_not_its_name(fly):
         "[drone : yaw = 2.0, pitch = -3.1] [Gimbal : yaw = 10.0, pitch = -45.0, roll = 1.0]",
         "[drone_yaw: 2.0 drone_pitch: -3.1 drone_roll: 1.5] [gb_yaw: 10.0 gb_pitch: -45.0 gb_roll: 1.0]",
         "[gimbal_pitch: -45.0 gimbal_yaw: 10.0 gimbal_roll: 1.0] yaw: 2.0",
+        "[Gimbal:\n Yaw: 10.0, Pitch: -45.0,\n Roll: 1.0]\n[Drone: Yaw: 2.0]",
+        "Gimbal(Yaw:10.0, Pitch:-45.0, Roll:1.0) Drone(Yaw:2.0, Pitch:-3.1)",
+        "Gimbal {yaw: 10.0, pitch: -45.0, roll: 1.0}, UAV {yaw: 2.0}",
+        "Gimbal: Yaw: 10.0, Pitch: -45.0, Roll: 1.0; Aircraft: Yaw: 2.0",
+        "Gimbal Yaw: 10.0 Gimbal Pitch: -45.0 Gimbal Roll: 1.0 Drone Yaw: 2.0",
+        "[Gimbal attitude: yaw: 10.0, pitch: -45.0, roll: 1.0] [yaw: 2.0]",
     ],
 )
 def test_the_angles_of_camera_and_aircraft_are_told_apart_in_any_order(read, groups):
@@ -184,6 +190,13 @@ def test_the_angles_of_camera_and_aircraft_are_told_apart_in_any_order(read, gro
         (["179"], 21.89, "counted in 1/100: 179 is 1.79"),
         (["1790"], 21.89, "counted in 1/1000"),
         (["17871"], 21.92, "counted in 1/10000: 17871 is 1.7871"),
+        (["1.79x"], 21.89, None),
+        (["x1.79"], 21.89, None),
+        (["2X"], 19.64, None),
+        (["140000"], 2.83, "counted in 1/10000: 140000 is 14"),
+        (["1500"], 25.99, "counted in 1/1000: 1500 is 1.5; the log does not say the scale, in 1/100 it were 15"),
+        (["2.00", "2.00"], 19.64, "the zoom is 2 throughout, which a focal length in the camera's file must hold"),
+        (["15"], 2.64, "the zoom is 15 throughout"),
         (["10000", "120000"], 3.31, "counted in 1/10000"),
         (["0"], 38.19, "a zoom of 0 cannot be"),
     ],
@@ -222,10 +235,21 @@ def test_a_height_counts_from_where_its_dialect_has_it(read, body, altitude_m, a
         ("GPS(48.1371,11.5753,52.5M) BAROMETER:9.2", [11.5753, 48.1371]),
         ("GPS(11.5753,48.1371,16) BAROMETER:9.2", [11.5753, 48.1371]),
         ("GPS(48.1371,111.5753) BAROMETER:9.2", [111.5753, 48.1371]),
+        ("GPS(48.1371,11.5753,569) BAROMETER(91.2)", [11.5753, 48.1371]),
+        ("GPS(48,1371;11,5753;569,8) BAROMETER(91,2)", [11.5753, 48.1371]),
+        ("GPS(48,1371,11,5753,569,8) BAROMETER(91,2)", [11.5753, 48.1371]),
+        ("[latitude: 48.1371 N] [longitude: 11.5753 W]", [-11.5753, 48.1371]),
+        ("[latitude: S48.1371] [longitude: E11.5753]", [11.5753, -48.1371]),
+        ("[latitude: 48,1371° S] [longitude: 11,5753° W]", [-11.5753, -48.1371]),
+        ("[latitude: 48°08'13.56\"S] [longitude: 11°34'31.08\"E]", [11.5753, -48.1371]),
+        ("lat: 48.1371N, lon: 11.5753W, rel_alt: 5", [-11.5753, 48.1371]),
+        ("GPS: 48.1371, 111.5753, Alt: 40m", [111.5753, 48.1371]),
     ],
 )
 def test_the_dialect_tells_which_coordinate_comes_first(read, body, place):
-    assert read(body, body).place.tolist() == [place] * 2
+    found = read(body, body)
+    np.testing.assert_allclose(found.place, [place] * 2, atol=1e-7)
+    assert "BAROMETER(91" not in body or (found.altitude_m[0], found.above_sea_m[0] // 1) == (91.2, 569)
 
 
 def test_two_coordinates_alone_need_an_order(fly):
@@ -248,6 +272,7 @@ def test_two_coordinates_alone_need_an_order(fly):
             [0, 0.033, 0.1],
         ),
         (["00:00:00,000000 --> 00:00:00,500000", "00:00:00,500000 --> 00:00:01,000000"], [0, 0.5]),
+        (["00:00,000 --> 00:00,333", "00:00,333 --> 01:00,000", "01:00,500 --> 01:01,000"], [0, 0.333, 60.5]),
         (["00:00:00.5 --> 00:00:01.0", "00:00:01.0 --> 00:00:01.5"], [0.5, 1]),
     ],
 )
@@ -282,6 +307,36 @@ def test_times_that_begin_again_go_on_by_their_dates(fly):
     found = fly(timed(*flight(13, 53.0)) + "\n" + timed(*flight(15, 53.5)), "flight.SRT")
     assert found.at(3600.0) is None or math.isnan(found.at(3600.0).altitude_m)
     assert found.at(7203.0).place == pytest.approx((6.4, 53.5)) and found.at(3.0).place == pytest.approx((6.4, 53.0))
+
+
+def test_a_later_flight_that_comes_first_counts_from_its_beginning_and_the_earlier_one_lies_before_it(fly):
+    found = fly(timed(*flight(15, 53.5)) + "\n" + timed(*flight(13, 53.0)), "flight.SRT")
+    assert found.at(-7198.0).place == pytest.approx((6.4, 53.0)) and found.at(2.0).place == pytest.approx((6.4, 53.5))
+
+
+def test_times_that_begin_again_elsewhere_without_dates_go_on(fly):
+    first, second = ([body.split("\n")[1] for body in flight(13, latitude)] for latitude in (53.0, 54.0))
+    found = fly(timed(*first) + "\n" + timed(*second), "flight.SRT")
+    assert found.at(5.0).place == pytest.approx((6.4, 54.0)) and math.isnan(found.at(4.5).place[0])
+    assert [note for note in found.notes if "these are several flights" in note]
+
+
+@pytest.mark.parametrize(
+    ("date", "start"), [("03/05/2023", None), ("13/05/2023", 1683968132.0), ("05.03.2023", 1678006532.0)]
+)
+def test_a_date_whose_day_and_month_may_be_swapped_tells_no_clock_even_in_a_zone(fly, date, start):
+    text = timed(*[f"{date} 10:55:3{k}\n[latitude: 53] [longitude: 6.4] [rel_alt: 5]" for k in (2, 3)])
+    found = fly(text, "flight.SRT", time_zone="+02:00")
+    assert found.start_utc_s == pytest.approx(start or math.nan, nan_ok=True)
+    assert bool([note for note in found.notes if "whether day or month comes first" in note]) == (start is None)
+    assert np.isfinite(found.latest_utc_s) == (start is None)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_what_begins_with_the_second_flight_is_unknown_before(fly):
+    first, second = ("[latitude: 53] [longitude: 6]",) * 3, ("[latitude: 54] [longitude: 6] [rel_alt: 5]",) * 3
+    found = fly(timed(*first) + "\n" + timed(*second), "flight.SRT")
+    assert found.at(3.0).altitude_m == 5 and math.isnan(found.at(2.0).altitude_m)
 
 
 def test_a_time_lapse_whose_dates_run_fast_is_one_flight(read):

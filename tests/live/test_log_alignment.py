@@ -1,5 +1,6 @@
 """A stored log is aligned with live pictures by the clock, or refused."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,17 @@ def test_a_log_that_ended_a_minute_before_the_first_picture_is_refused_beside_a_
         assert "aligned by the clock" in note
         assert ("nothing is located by it" in note) == (not begins_s + offset_s <= 0 <= ends_s + offset_s)
     assert "this is a recording" in describe_log(given, True, NOW_S, offset_s)
+
+
+@pytest.mark.parametrize(("days", "is_refused"), [(365.0, True), (1.0, True), (0.4, False), (-1.0, False)])
+def test_a_log_whose_dates_lack_a_zone_is_refused_beside_a_camera_where_no_zone_makes_it_current(days, is_refused):
+    given = replace(log(-1500, 60, has_clock=False), latest_utc_s=NOW_S - 86_400 * days + 43_200)
+    if is_refused:
+        with pytest.raises(InputError, match="by its dates, which lack a time zone: its places are not those of now"):
+            describe_log(given, False, NOW_S, 0.0)
+    else:
+        assert "says no time of day" in describe_log(given, False, NOW_S, 0.0)
+    assert "this is a recording" in describe_log(given, True, NOW_S, 0.0)
 
 
 def test_a_log_without_a_clock_is_said_to_count_from_the_first_picture_of_a_camera():

@@ -26,7 +26,9 @@ _OTHER = 0.02
 _ON_GROUND_M = 3.0
 # Log and elevation agree on the ground within this; a geoid alone seldom puts them further apart than the second one.
 _SAME_M, _DATUMS_M = 10.0, 60.0
-# In these units an elevation has the ground so many times higher. Then it is so many times nearer in metres.
+# In these units an elevation has the ground so many times higher. Then it is so many times nearer in metres. The ratio
+# to a height near zero tells no unit.
+_LOW_M = 20.0
 _UNITS, _NEARER = {"feet": 1 / 0.3048, "decimetres": 10.0, "centimetres": 100.0, "millimetres": 1000.0}, 10.0
 
 
@@ -164,7 +166,7 @@ def _match_ground(telemetry: Telemetry, elevation: Elevation, camera: Camera | N
     found = f"the ground {where} is {logged:.0f} m above the sea by the log and {raster:.0f} m by the elevation"
     whose, more, less = ("elevation", raster, logged) if raster > logged else ("log", logged, raster)
     off, unit = min((abs(more / factor - less), unit) for unit, factor in _UNITS.items())
-    if _NEARER * off < apart > _DATUMS_M:
+    if _NEARER * off < apart > _DATUMS_M and less > _LOW_M:
         found += f", {raster / logged:.3g} times as much"
         raise InputError(f"{found}: is the {whose} in {unit}, {_UNITS[unit]:.3g} to the metre? Give both in metres")
     if apart > _SAME_M:

@@ -198,6 +198,7 @@ _QUOTED, _SEP_LINE = re.compile(r'"[^"]*"'), re.compile(r'"?sep=([,;|\t])"?')
 # Digits after a mark only: two runs of digits side by side would try each way to part a long one, its length squared.
 _NUMBER = re.compile(r"[-+]?\d*(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d+)?")
+_POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(?:\.\d{3})+(?:,\d+)?")  # 1.540,25
 
 
 def _from_windows(error: UnicodeError) -> tuple[str, int]:
@@ -235,6 +236,11 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
         raise InputError(f"{name} is no CSV text: {error}") from None
     if comma is not None:
         form = _NUMBER if comma else _THOUSANDS
+        if comma == ".,":
+            comma, rows = (
+                ".",
+                [[c.replace(".", "") if "." in c and _POINTED.fullmatch(c) else c for c in row] for row in rows],
+            )
         rows = [[c.replace(",", comma) if "," in c and form.fullmatch(c) else c for c in row] for row in rows]
     if rows and _SEP_LINE.fullmatch(separator.join(rows[0])):
         del lines[0], rows[0]
@@ -242,7 +248,10 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
 
 
 def _find_format(head: str) -> tuple[str, str | None]:
-    """The sign between cells, and what stands for a comma in a number: "." for a decimal one, "" between thousands."""
+    """The sign between cells, and what stands for a comma in a number: "." for a decimal one, "" between thousands.
+
+    ".," where it is decimal and points part thousands.
+    """
     lines = [line for line in head.splitlines() if line.strip()][:_HEAD_LINES]
     told = _SEP_LINE.fullmatch(lines[0]) if lines else None
     bare = [_QUOTED.sub("", line) for line in lines]
@@ -254,14 +263,21 @@ def _find_format(head: str) -> tuple[str, str | None]:
         return max(counts.values(), default=0), sum(map(bool, map(_NUMBER.fullmatch, cells))) / max(len(cells), 1)
 
     separator = told[1] if told is not None else max(",;\t|", key=rank)
+    last = bare[-1].split() if bare else []
+    if told is None and not rank(separator)[0] and all(len(line.split()) == len(last) for line in bare):
+        separator = " " if len(last) > 1 and _NUMBER.fullmatch(last[-1]) else separator
     try:
         cells = [cell.strip() for row in csv.reader(lines, delimiter=separator, skipinitialspace=True) for cell in row]
     except csv.Error:
         return separator, None
     numbers = [cell for cell in cells if _NUMBER.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
     commas = [cell for cell in numbers if "," in cell]
+    pointed = [cell for cell in cells if "." in cell and _POINTED.fullmatch(cell)]
     points = sum("." in cell for cell in numbers if "," not in cell)
     is_thousands = all(map(_THOUSANDS.fullmatch, commas))
+    # Where commas are decimal for sure, all points may part thousands.
+    if not is_thousands and pointed and points <= len(pointed) <= len(commas):
+        return separator, ".,"
     if 10 * points > len(commas):
         return separator, "" if commas and is_thousands else None
     # Where each comma may part thousands, only the semicolon tells: it is there because commas are decimal.

@@ -32,6 +32,12 @@ def describe_log(log: Telemetry, is_recording: bool, now_utc_s: float, clock_off
     if is_recording:
         return f"times of day are those of {'its telemetry' if has_clock else 'playing it'}: this is a recording"
     if not has_clock:
+        if log.latest_utc_s + log.time_s[-1] < now_utc_s - _OLD_S:
+            (first,) = iso_utc(np.array([log.latest_utc_s + log.time_s[0]]))
+            raise InputError(
+                f"the telemetry {log.origin} is of {first[:10]} or before, by its dates, which lack a time zone: its "
+                "places are not those of now. Give a log of the time of the pictures, or leave --telemetry out"
+            )
         return (
             f"the telemetry {log.origin} says no time of day: its time 0 counts as the first picture's, as it is right "
             "for a camera that stands still; else give a log with times of day"

@@ -199,7 +199,8 @@ class MotionSegmenter(nn.Module):
         """
         softness, texture = self.softness if softness is None else softness, differences.texture
         chain = self.chain(values, softness, texture.dtype)
-        pairs = zip(differences.least.split(1, 1), differences.both.split(1, 1), strict=True)
+        least, both = differences.least, differences.both
+        pairs = [(least[:, k : k + 1], both[:, k : k + 1]) for k in range(least.shape[1])]  # a graph has no split
         largest = chain.find_evidence(pairs, Reference(differences.grey, texture))
         margin, unit = chain.find_core(largest), evidence_scale(self.settings)
         evidence = largest.to(texture.dtype) / unit

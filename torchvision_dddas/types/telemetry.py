@@ -23,7 +23,8 @@ class Telemetry:
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. start_local_s: the same by a clock of unknown zone.
-    origin: the file. notes: remarks for the user.
+    latest_utc_s: the latest that start_utc_s can be where the dates lack a zone. origin: the file.
+    notes: remarks for the user.
     Raises InputError for columns of other lengths and times that decrease.
     """
 
@@ -46,6 +47,7 @@ class Telemetry:
     heading_from: str = ""
     is_nominal: bool = False
     start_utc_s: float = float("nan")
+    latest_utc_s: float = float("nan")
     start_local_s: float = float("nan")
     origin: str = ""
     notes: tuple[str, ...] = ()

@@ -69,7 +69,10 @@ def read_telemetry(
         return read_nmea(path, _text(path.read_bytes()) or "", clock_offset_s)
     if text is not None and re.search(r"-->" if suffix == ".csv" else r"-->|\bGPS\s*\(|\[\s*latitude", text):
         return read_subtitles(path, _text(path.read_bytes()) or "", clock_offset_s, zone, order)
-    if suffix == ".csv" or (text is not None and re.search(r"[,;\t|]", text)):
+    if text is not None and re.search(r"mavlink_\w{1,60}_t,|^[\d :.-]{10,30}: \w{1,60} \{", text):
+        advice = "give the .tlog or .bin itself, or tables by mavlogdump.py --format csv --types GPS"
+        raise InputError(f"telemetry {path} holds the messages of an autopilot as text; {advice}")
+    if suffix == ".csv" or (text is not None and re.search(r"[,;\t|]|^\W{0,9}\w{0,20}time\w{0,20} ", text)):
         return read_telemetry_table(path, clock_offset_s, clip, zone, order)
     if suffix == ".ulg":
         raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")

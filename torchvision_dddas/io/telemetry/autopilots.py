@@ -180,6 +180,8 @@ def _pick(log: Log, what: str, values: Mapping[str, np.ndarray]) -> str | None:
     known = {sender: count for sender, one in values.items() if (count := np.isfinite(one).sum())}
     chosen = next((sender for sender, count in known.items() if count > max(known.values()) / 2), None)
     others = [sender for sender in values if sender != chosen]
+    if chosen is not None and " of system " in chosen:
+        log.note(f"the {what} is {chosen}, another than the vehicle's")
     if chosen is not None and others:
         log.note(f"several {what}s report: {chosen} is taken, left out are {', '.join(others[:9])}")
     return chosen

@@ -6,6 +6,7 @@ The readers of tables and of subtitles know no other names. docs/telemetry.md sh
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,28 +31,24 @@ _ANY, _HEIGHT = (-math.inf, math.inf), ("length", -1000.0, 30_000.0)
 FIELDS = (
     Field("longitude_deg", "degrees", -180, 180, "Greenwich", "longitude longtitude lon lng long gpscoord[1]"),
     Field("latitude_deg", "degrees", -90, 90, "the equator", "latitude lat gpscoord[0]"),
-    Field("longitude_side", "text", *_ANY, "E or W", "e/w ew longitudedirection londir"),
-    Field("latitude_side", "text", *_ANY, "N or S", "n/s ns latitudedirection latdir"),
-    Field("place", "text", *_ANY, "both in one cell", "gps latlon latlong lonlat coordinates position location"),
-    Field("east_m", "length", -1e7, 1e7, "an origin, to the east", ""),
-    Field("north_m", "length", -1e7, 1e7, "an origin, to the north", ""),
+    Field("longitude_side", "text", *_ANY, "E or W", "e/w ew longitudedirection londir longituderef lonref lngref "
+          "longitudehemisphere lonhemisphere lonhemi longitudeew lonew"),
+    Field("latitude_side", "text", *_ANY, "N or S", "n/s ns latitudedirection latdir latituderef latref "
+          "latitudehemisphere lathemisphere lathemi latitudens latns"),
+    Field("place", "text", *_ANY, "both in one cell", "gps latlon latlong latlng lonlat lnglat "
+          "coordinates position location"),
+    Field("east_m", "length", -1e7, 1e7, "an origin, to the east", "east"),
+    Field("north_m", "length", -1e7, 1e7, "an origin, to the north", "north"),
     Field("above_takeoff_m", *_HEIGHT, "the take-off point",
-          "relalt relativealtitude altituderelative relativeheight heightabovetakeoff altitudeabovetakeoff relhomealt "
-          "heightabovehome altitudeabovehome ascent barometricaltitude barometer baroaltitude baroalt baro hb h"),
+          "relhomealt ascent barometricaltitude barometer baroaltitude baroalt baro hb h"),
     Field("above_ground_m", *_HEIGHT, "the ground below the vehicle",
-          "heightagl altitudeagl altagl agl heightaboveground altitudeaboveground heightabovegroundatdronelocation "
-          "radaraltitude radaralt grounddistance distbottom cheight"),
-    Field("above_sea_m", *_HEIGHT, "the sea",
-          "absalt absolutealtitude altitudeabsolute altitudeabovesealevel altitudeabovesea altitudeabovemeansealevel "
-          "heightabovesealevel abovesealevel abovesea amsl altitudeamsl altamsl msl altitudemsl altmsl heightmsl "
-          "mslaltitude altitudeegm96amsl gpsaltitude gpsalt galt"),
-    Field("above_ellipsoid_m", *_HEIGHT, "the ellipsoid WGS 84",
-          "hae altitudehae heightaboveellipsoid altitudeaboveellipsoid ellipsoidheight ellipsoidalheight "
-          "altitudeellipsoid altitudeellipsoidal altellipsoid altitudewgs84 wgs84altitude altitudewgs84ellipsoid"),
+          "heightabovegroundatdronelocation radaraltitude radaralt grounddistance distbottom cheight"),
+    Field("above_sea_m", *_HEIGHT, "the sea", "gpsaltitude gpsalt galt"),
+    Field("above_ellipsoid_m", *_HEIGHT, "the ellipsoid WGS 84", ""),
     Field("geoid_m", "length", -120, 100, "the ellipsoid, up to the sea",
           "undulation geoidundulation geoidheight geoidseparation geoidsep"),
     Field("bare_height_m", *_HEIGHT, "not said: the take-off point is assumed", "height"),
-    Field("bare_altitude_m", *_HEIGHT, "not said: the sea is assumed", "altitude alt gpsheight"),
+    Field("bare_altitude_m", *_HEIGHT, "not said: the sea is assumed", "altitude alt gpsheight ele"),
     Field("speed_m_s", "speed", 0, 300, "the ground",
           "h.s speed groundspeed gndspeed gspd hspeed horizontalspeed velocity horizontalvelocity vel velh spd"),
     Field("heading_rad", "angle", -360, 360, "true north, clockwise, of the camera",
@@ -68,7 +65,8 @@ FIELDS = (
     Field("f_number", "number", *_ANY, "", "fnum"),
     Field("zoom", "number", 1, 200, "1; 179 and 17900 are 1.79", "dzoomratio dzoom zoomratio zoom"),
     Field("filming", "text", *_ANY, "whether the camera records",
-          "isvideo istakingvideo isrecording recording gimbalisvideo gimbalrecording gimbalrecordstate recordstate"),
+          "isvideo istakingvideo isrecording recording gimbalisvideo gimbalrecording gimbalrecordstate recordstate "
+          "isrecordingvideo videorecording recordingvideo takingvideo isvideorecording isfilming filming videostate"),
     Field("fix", "number", *_ANY, "2 or more where the place is known", "fixtype"),
     Field("frame", "number", *_ANY, "the clip's first frame", "frame framenumber framecnt framecount"),
     Field("time", "time", *_ANY, "the first row, midnight or 1970",
@@ -80,14 +78,18 @@ _DEG = math.pi / 180
 _SCALES: dict[str, dict[float, str]] = {
     "length": {1: "m meter meters metre metres", 0.3048: "ft feet foot", 0.01: "cm", 1e-3: "mm", 1e3: "km", -1: "-m"},
     "speed": {1: "m/s mps ms", 1 / 3.6: "km/h kmh kph", 0.44704: "mph", 1852 / 3600: "kn kt kts knot knots",
-              0.3048: "ft/s fps", 0.01: "cm/s"},
+              0.3048: "ft/s fps", 0.01: "cm/s", 1e-3: "mm/s"},
     "angle": {_DEG: "deg degree degrees ° º @ 360 180", 1: "rad radian radians", _DEG / 10: "ddeg", _DEG / 100: "cdeg"},
-    "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians", 1e-7: "dege7 1e7"},
+    "degrees": {1: "deg degree degrees ° º @ wgs84", 1 / _DEG: "rad radian radians",
+                1e-7: "dege7 1e7 e7", 1e-6: "dege6 1e6 e6 microdegrees"},
     "time": {1: "s sec secs second seconds", 1e-3: "ms msec millis millisecond milliseconds",
-             1e-6: "us µs usec micros microsecond microseconds", 1e-9: "ns", math.nan: "utc gmt local epoch"},
+             1e-6: "us µs usec micros microsecond microseconds",
+             1e-9: "ns nsec nsecs nanosec nanosecs nanosecond nanoseconds", 60: "min mins minute minutes",
+             3600: "hr hrs hour hours h", math.nan: "utc gmt local epoch"},
 }  # fmt: skip
 UNITS = {kind: {w: scale for scale, words in scales.items() for w in words.split()} for kind, scales in _SCALES.items()}
 """Of each kind of field: unit -> factor to the record's unit, NaN where only the values tell it."""
+_ANY_UNIT = {unit for units in UNITS.values() for unit in units}
 
 
 class Dialect(NamedTuple):
@@ -119,6 +121,12 @@ TABLES = (
     Dialect("mavlogdump, MNT", "timeus desyawe", "pitch=pitch_rad roll=roll_rad yawe=heading_rad"),
     Dialect("mavlogdump, with a place", "timeus lat lng", "alt=above_sea_m status=fix relalt=above_takeoff_m"),
     Dialect("mavlogdump, without a place", "timeus", "alt=above_takeoff_m"),
+    Dialect("MAVLink GPS_RAW_INT", "timeusec fixtype lat lon alt eph|gpsrawint.|gps2raw.", "alt=above_sea_m,mm "
+            "altellipsoid=above_ellipsoid_m,mm vel=speed_m_s,cm/s cog=course"),
+    Dialect("MAVLink MOUNT_ORIENTATION", "timebootms roll pitch yaw yawabsolute|mountorientation.", "roll=roll_rad "
+            "pitch=pitch_rad yaw= yawabsolute=heading_rad"),
+    Dialect("u-blox NAV-PVT", "itow lon lat height hmsl", "itow=time,ms lon=longitude_deg,e7 lat=latitude_deg,e7 "
+            "height=above_ellipsoid_m,mm hmsl=above_sea_m,mm gspeed=speed_m_s,mm/s headmot=course"),
     Dialect("mavlogdump of a .tlog", "timebootms lat lon alt relativealt|globalpositionint.", "alt=above_sea_m,mm "
             "relativealt=above_takeoff_m,mm hdg=vehicle_heading_rad,cdeg vfrhud.alt=above_sea_m "
             "attitude.yaw=vehicle_heading_rad,rad"),
@@ -131,14 +139,15 @@ SUBTITLES = (
     Dialect("DJI with SrtCnt (Air 2S, Mini 2)", "srtcnt", "altitude=above_takeoff_m"),
     Dialect("DJI with FrameCnt (Mavic 2)", "framecnt", "altitude=above_sea_m"),
     Dialect("GPS(48.1, 11.5, 52.5M)", r"gps ?\([^()]{3,60}[,;] ?-?[\d.]{1,12} ?m\)", "", "lat-lon"),
-    Dialect("GPS(48.1, 11.5, 569.8)", r"gps ?\(([^(),;]{3,20}[,;]){2} ?-?\d{1,6}\.\d{1,6}\)", "", "lat-lon"),
-    Dialect("GPS(11.5, 48.1, 16)", r"(gps|rtk) ?\([^()]{3,60}[,;] ?\d{1,3}\)", "", "lon-lat"),
-)
+    Dialect("GPS(48.1, 11.5, 569.8)", r"gps ?\((([^(),;]{3,20}[,;]){2} ?-?(\d{3,5}|\d{1,6}\.\d{1,6})|"
+            r"([^();]{3,20};){2} ?-?\d{1,6},\d{1,6}|(-?\d{1,3},\d{1,12},){2}-?\d{1,6},\d{1,6})\)", "", "lat-lon"),
+    Dialect("GPS(11.5, 48.1, 16)", r"(gps|rtk) ?\([^()]{3,60}[,;] ?\d{1,2}\)", "", "lon-lat"),
+)  # fmt: skip
 
 _BY_QUANTITY = {field.quantity: field for field in (*FIELDS, Field("", "text", *_ANY, "", ""))}
 # What a name means: quantity, unit, rank. A column may have the name of its unit, `seconds`.
-_MEANT = {unit: ("time", unit, 0) for unit in UNITS["time"]}
-_MEANT |= {name: (field.quantity, "", rank) for field in FIELDS for rank, name in enumerate(field.names.split())}
+_MEANT = {unit: ("time", unit, 0) for unit, scale in UNITS["time"].items() if not scale >= 60}
+_MEANT |= {name: (field.quantity, "", rank) for field in FIELDS for rank, name in enumerate(field.names.split(), 1)}
 POSSIBLE = {
     field.quantity: (field.low * scale, field.high * scale)
     for field in FIELDS
@@ -148,19 +157,35 @@ POSSIBLE = {
 HEIGHTS = ("above_takeoff_m", "above_ground_m", "bare_height_m", "bare_altitude_m", "geoid_m")
 """What the record's altitude_m and above_sea_m are made of."""
 
+# What a height counts from, in any order with the words for a height and those that say nothing: `GPS altitude (AMSL)`.
+ZEROS = {
+    "above_takeoff_m": "relativetohome relativetotakeoff relative rel abovetakeoffpoint abovetakeoff overtakeoff "
+    "fromtakeoff abovehomepoint abovehome fromhome abovelaunch abovestart ato",
+    "above_ground_m": "abovegroundlevel aboveground overground aboveterrain abovesurface agl",
+    "above_sea_m": "abovemeansealevel abovesealevel abovesea sealevel amsl msl asl absolute abs orthometric orth "
+    "abovegeoid egm96 egm2008 egm84",
+    "above_ellipsoid_m": "abovewgs84ellipsoid aboveellipsoid wgs84ellipsoid ellipsoidal ellipsoid ell abovewgs84 "
+    "wgs84 hae",
+}
+_ZERO_OF = {word: quantity for quantity, words in ZEROS.items() for word in words.split()}
+_ALONE = {"agl", "amsl", "msl", "asl", "hae", "ato", "abovesealevel", "abovesea", "aboveground"}
+_FILL = "gps|gnss|rtk|drone|uav|aircraft|vehicle|point"
+_IN_HEIGHT = re.compile(rf"({'|'.join(_ZERO_OF)})|(altitude|alt|height|elevation|elev|ele|hgt|h)|{_FILL}")
+_NOTHING = re.compile(f"(?:{_FILL})*")
 # The first bracket is looked for alone: an expression for all of it would try each one in a name full of them.
-_OPENING = re.compile(r"[(\[](?!\d{1,2}[)\]])")
+_OPENING = re.compile(r"[(\[](?!\d{1,2}[)\]])| / (?=\S+$)")
 _BLANKS, _WORDS = re.compile(r"[\s_-]|:[cd]$"), re.compile(r"[^\s,;()\[\]]+")
 _VEHICLE = re.compile(
-    r"(?:osd|gps|custom|clock|general|aircraft|drone|uav|vehicle|flight|product(?:gps)?|location|imuatti"
-    r"|globalpositionint|gpsrawint)(?:\(\d\))?[.:]?"
+    r"(?:globalpositionint|gpsrawint|gps2raw|mountorientation|\.?(?:header\.?)?stamp\.|tv|osd|gps|custom|clock|general"
+    r"|aircraft|drone|uav|vehicle|flight|product(?:gps)?|location|imuatti|fused|field)(?:\(\d\))?[.:]?"
 )
 _CAMERA = re.compile(r"(?:gimbal|gb|camera|cam|mount|payload)(?:\(\d\))?[.:]?")
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
-_UNLIKE = re.compile("batt|max|min|remain|rate|speed|veloc|dist", re.IGNORECASE)
+_UNLIKE = re.compile(r"batt|max|min|remain|rate|speed|veloc|(?<!finder[_ .])dist|acc|gyr|mag_", re.IGNORECASE)
 _ALIKE = re.compile(
     r"lat(itude)?|lon(gitude)?|lng|alt(itude)?|height|elevation|heading|hdg|course|yaw|pitch|roll|azimuth|tilt|pan"
-    r"|[hv]?fov|zoom|focal|time|timestamp|date|position|agl|msl|hae"
+    r"|[hv]?fov|zoom|focal|time|timestamp|date|position|agl|msl|hae|hagl|ato|elev?|z|angle|rangefinder"
+    r"|east(ing)?|north(ing)?|video|recording|filming|film"
 )
 _HEAD, _LONGEST_UNIT, _LAST = 20_000, 13, 99
 # Half the longer side of the picture for which focal lengths are given.
@@ -207,11 +232,13 @@ class Names:
             return self._known[title]
 
     def _find(self, name: str, words: list[str]) -> Known | None:
-        rest = _plain("".join(word for word in words if not any(word in units for units in UNITS.values())))
+        rest = _plain("".join(word for word in words if word in _ZERO_OF or word not in _ANY_UNIT))
         for key in dict.fromkeys((name + rest, name)):  # altitude (m AMSL) is altitudeamsl
             if (known := self._named(key)) is not None:
                 with_unit = next((found for word in words if (found := known.in_unit(word))), None)
                 # A unit that is not known may be any. The letter h means the height only with a unit.
+                if key == name and known.field.kind == "length" and not _NOTHING.fullmatch(rest):
+                    continue  # what it counts from is not known
                 if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
                     return with_unit or known
         return None
@@ -225,6 +252,8 @@ class Names:
             for cut in range(len(form), max(len(form) - _LONGEST_UNIT, 0), -1):
                 stem, end = form[:cut], form[cut:]
                 quantity, unit, rank = self._meant.get(stem, (None, "", 0))
+                if quantity is None and (quantity := _height(stem)):
+                    rank = 0
                 if quantity is not None:
                     field = _BY_QUANTITY[quantity]
                     known = Known(field, math.nan if field.kind == "time" else 1.0, rank)
@@ -232,6 +261,17 @@ class Names:
                     if found or not end:
                         return (found or known) if quantity else None
         return None
+
+
+@lru_cache(maxsize=10_000)
+def _height(name: str) -> str | None:
+    """The height that words of `ZEROS` and those for a height make; None for other names and for two zero points."""
+    place, zeros, count = 0, set[str](), 0
+    while place < len(name) and (found := _IN_HEIGHT.match(name, place)) is not None:
+        zeros |= {_ZERO_OF[found[1]]} if found[1] else set()
+        count += found[1] in _ALONE or found[2] is not None
+        place = found.end()
+    return zeros.pop() if place == len(name) and count and len(zeros) == 1 else None
 
 
 def _plain(name: str) -> str:
@@ -242,7 +282,7 @@ def _parted(title: str) -> tuple[str, list[str]]:
     """The plain name of a column, and the words in the brackets behind it."""
     opening = _OPENING.search(title)
     end = opening.start() if opening is not None else len(title)
-    return _plain(title[:end]), _WORDS.findall(title[end:].lower())
+    return _plain(title[:end]), _WORDS.findall(title[opening.end() :].lower()) if opening else []
 
 
 def names_of_table(header: Sequence[str]) -> Names:
@@ -263,21 +303,44 @@ def looks_alike(title: str) -> bool:
     return any(_ALIKE.fullmatch(word.lower()) for word in _PARTS.findall(title)) and not _UNLIKE.search(title)
 
 
+_PART = r"(\d{1,3}(?:[.,]\d{1,12})?)"
+ANGLE = rf"([NSEW-])? ?{_PART} ?(?:[°d:]|deg)? ?(?:{_PART} ?['′m:]? ?)?(?:{_PART} ?(?:[\"″s]|'')? ?)?([NSEW])?"
+"""Degrees with a side, minutes and seconds: five groups."""
+_ANGLE = re.compile(ANGLE, re.IGNORECASE)
+
+
+def parse_angle(text: str) -> tuple[float, str]:
+    """Degrees of `48.1371 N`, `48°08'13.6"N` or `48,1371`, and the side that it names; NaN for anything else."""
+    if (found := _ANGLE.fullmatch(text.strip())) is None:
+        return math.nan, ""
+    degrees, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups()[1:4])
+    side = (found[1] or found[5] or "").upper()
+    return (degrees + minutes / 60 + seconds / 3600) * (-1 if side in ("S", "W", "-") else 1), side.strip("-")
+
+
 def field_of_view(focal: Sequence[str], f_number: Sequence[str], zoom: Sequence[str]) -> tuple[np.ndarray, list[str]]:
     """Widths of the field of view, rad, (N,), NaN where unknown; and notes. Each argument: (N,) as the log writes it.
 
     The focal length is that of a picture with a longer side of 36 mm. Some write it and the aperture times ten and a
     hundred: 240 beside 280 is 24 mm at f/2.8. The zoom may be 1.79, or a whole number of hundredths to ten thousandths.
     """
-    texts = (focal, f_number, zoom)
+    texts = (focal, f_number, [text.strip("xX× ") for text in zoom])
     mm, aperture, times = (np.array([float(t) if _NUMBER.fullmatch(t) else np.nan for t in text]) for text in texts)
     is_tenths = np.array(["." not in text for text in focal]) & (mm >= 100) & ~(aperture < 100)
     notes = ["the field of view is that of a focal length as for a picture with a longer side of 36 mm"]
     if (times >= 100).any():
         first = times[times >= 100][0]
-        scale = 10 ** math.floor(math.log10(times[times >= 100].min()))  # the smallest zoom of a log is below ten
+        # The smallest zoom of a log is one or more.
+        lowest = times[times >= 100].min()
+        scale = next(scale for scale in (10_000, 1000, 100) if scale <= lowest)
         times = np.where(times >= 100, times / scale, times)
-        notes.append(f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}")
+        or_more = f"; the log does not say the scale, in 1/{scale // 10} it were {first / scale * 10:g}"
+        notes.append(
+            f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}{or_more * int(scale != lowest)}"
+        )
+    known = np.unique(times[np.isfinite(times)])
+    if len(known) == 1 and known[0] > 1:
+        notes.append(f"the zoom is {known[0]:g} throughout, which a focal length in the camera's file must hold")
     is_wrong = (times < POSSIBLE["zoom"][0]) | (times > POSSIBLE["zoom"][1])
     if is_wrong.any():
         notes.append(f"a zoom of {times[is_wrong][0]:g} cannot be; {is_wrong.sum()} left out")

@@ -1,5 +1,6 @@
 """MISB ST 0601 metadata beside a video in an MPEG transport stream, or alone, as telemetry."""
 
+import binascii
 import bisect
 import math
 import re
@@ -12,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchvision_dddas.io.telemetry.attitude import angles, axes
-from torchvision_dddas.io.telemetry.record import Log, build_record
+from torchvision_dddas.io.telemetry.record import Log, build_record, is_clock
 from torchvision_dddas.types import Telemetry
 
 KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -79,6 +80,11 @@ def _times(log: Log, whole: list[LocalSet], pieces: list[Piece]) -> tuple[np.nda
     stream_s = np.array([piece.time_s for piece in pieces])
     stamps = np.array([stamp_s(one.tags.get(_STAMP)) for one in whole])
     clocked = np.isfinite(stamps)
+    middle = float(np.median(stamps[clocked])) if clocked.any() else math.nan
+    for unit, scale in (("milliseconds", 1e3), ("seconds", 1e6), ("nanoseconds", 1e-3)):
+        if not is_clock(middle) and is_clock(middle * scale):
+            log.note(f"the stamps of the packets count {unit}, not microseconds as the standard has it")
+            stamps, middle = stamps * scale, middle * scale
     if np.isfinite(stream_s).mean() > 0.5:
         apart = (stamps - stream_s)[clocked & np.isfinite(stream_s)]
         return stream_s, float(np.median(apart)) if len(apart) else math.nan
@@ -166,8 +172,12 @@ def _summed_otherwise(log: Log, content: bytes) -> list[LocalSet]:
     begins, ends, places = np.array([(begin, end, one.place) for begin, end, one in framed]).T
     given = np.array([int.from_bytes(content[end - 2 : end], "big") for end in ends])
     sums = _Sums(content)
-    pairs = [sums.by_turns(start, ends - tail) for start in (places, places + len(KEY), begins) for tail in (2, 4)]
+    spans = [(start, ends - tail) for start in (places, places + len(KEY), begins) for tail in (2, 4)]
+    pairs = [sums.by_turns(*span) for span in spans]
     rules = [rule for a, b in pairs for rule in ((a << 8) + b, (b << 8) + a, a + b)]
+    rules += [-rule for rule in rules]  # complements
+    for seed in (0xFFFF, 0):
+        rules += [np.array([binascii.crc_hqx(content[a:b], seed) for a, b in np.stack(span, 1)]) for span in spans]
     alike, right = np.zeros(len(given), bool), rules[0] & 0xFFFF
     for total in (*rules, 0 * given):
         for written in (given, given >> 8 | (given & 0xFF) << 8):

@@ -8,12 +8,14 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.telemetry.clocks import midnight_s
 from torchvision_dddas.io.telemetry.record import Log, build_record, is_clock
 from torchvision_dddas.types import Telemetry
 
 _KNOT = 1852 / 3600
 _DAY_S = 86_400.0
+_APART_M = 30.0  # no receiver moves so far within a time
 # The numbers of the fields in each kind of sentence. A place takes four fields: latitude, N or S, longitude, E or W.
 # A status is empty, 0, V or only N where nothing is known. A sentence that ends before the field `least` is too short.
 _FIELDS: dict[str, dict[str, int]] = {
@@ -41,6 +43,7 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
     days = 0
     clocks: list[float] = []  # the clock at the first sentence, as each date tells it
     faults: list[tuple[int, str]] = []
+    seen, elsewhere = (math.nan, (math.nan, math.nan)), list[int]()  # time and place of the latest sentence
     separations: set[float] = set()
     for number, body in _whole_sentences(log, text, faults):
         try:
@@ -55,6 +58,12 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
             clocks += [date_s + first_s - days * _DAY_S] if math.isfinite(date_s) else []
         if math.isfinite(first_s):
             separations.add(separation)
+            place = values.get("latitude_deg", math.nan), values.get("longitude_deg", math.nan)
+            if now_s != seen[0] or math.isnan(seen[1][0]):
+                seen = now_s, place
+            elif math.dist(place, seen[1]) * DEGREE_M > _APART_M:
+                elsewhere.append(number)
+                continue
             for name, value in values.items():
                 log.add(name, last_s + days * _DAY_S - first_s, value, number)
     said = ", ".join(f"{count} {fault}" for fault, count in Counter(fault for _, fault in faults).items())
@@ -64,6 +73,9 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         found = f"; found are sentences {said}" if faults else ""
         hint = "; remove the checksums (*hh) to read them unchecked" if "wrong checksum" in said else ""
         raise log.refuse(f"no NMEA sentence gives a place or a heading together with a time{found}{hint}")
+    if elsewhere:
+        what = f"line {elsewhere[0]}: the log has two receivers over {_APART_M:g} m from each other"
+        log.note(f"{what}: of each time the first counts, {len(elsewhere)} sentences are left out")
     if {apart for apart in separations if math.isfinite(apart)} == {0.0}:
         log.note("the receiver gives the geoid as 0 throughout: its heights above the sea may be above the ellipsoid")
     return build_record(log, clock_offset_s, next((s for s in clocks if is_clock(s)), [*clocks, math.nan][0]))

@@ -26,7 +26,7 @@ _DEEP_M = -5.0
 # Samples this near are of the same time: between them a split would have the time of one of them.
 _SAME_S = 1e-6
 # A vehicle does not go further between two samples, unless they are of two flights.
-_JUMP_M, _SPLIT_S, _STRAY = 200.0, 1e-3, 2
+JUMP_M, SPLIT_S, _STRAY = 200.0, 1e-3, 2
 # Two heights that differ by less everywhere are the same.
 _ALIKE_M = 0.5
 # A pause of this many median sample intervals, and of this many seconds, is a gap: nothing is known within it.
@@ -49,8 +49,10 @@ class Log:
     """The samples of a log. path: of the file. kind: in words, for messages. where: unit of places in the file.
 
     bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
-    jitter_s: how far time may run back; more is another recording, or damage. is_nominal, height_zero,
-    start_local_s: as in Telemetry. splits: times at which another flight begins.
+    jitter_s: how far time may run back; more is another recording, or damage. is_nominal: as in Telemetry.
+    height_zero: what altitude_m counts from, as in Telemetry. splits: times at which another flight begins.
+    latest_utc_s: the latest that time 0 can be, in seconds since 1970, where the dates do not tell their zone.
+    start_local_s: as in Telemetry.
     samples: column of the record, or another quantity of `fields` -> rows (N, 3) of time, value (NaN where unknown) and
     place in the file. Positions are longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any
     value, of each row of a log whose rows hold all quantities, also of empty rows.
@@ -64,6 +66,7 @@ class Log:
     height_zero: Literal["ground", "takeoff", "unknown"] = "takeoff"
     is_nominal: bool = False
     start_local_s: float = float("nan")
+    latest_utc_s: float = math.nan
     splits: list[float] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     samples: dict[str, Any] = field(default_factory=dict)
@@ -163,6 +166,7 @@ def build_record(
         is_nominal=log.is_nominal,
         start_utc_s=float(clock_s - clock_offset_s),
         start_local_s=log.start_local_s + start - clock_offset_s,
+        latest_utc_s=float(log.latest_utc_s - clock_offset_s),
         origin=f"{log.path.name} ({log.kind})",
         notes=tuple(log.notes),
     )
@@ -311,20 +315,20 @@ def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
             if scale == DEGREE_M:
                 place[:, 0] = np.unwrap(place[:, 0], period=360 * scale) * np.cos(np.radians(north[known[0], 1]))
             steps_s, away_m = np.diff(times), np.linalg.norm(np.diff(place, axis=0), axis=1)
-            is_jump = away_m > np.maximum(_JUMP_M, POSSIBLE["speed_m_s"][1] * steps_s)
-            log.splits += (times[:-1] + np.minimum(steps_s / 2, _SPLIT_S))[is_jump].tolist()
+            is_jump = away_m > np.maximum(JUMP_M, POSSIBLE["speed_m_s"][1] * steps_s)
+            log.splits += (times[:-1] + np.minimum(steps_s / 2, SPLIT_S))[is_jump].tolist()
             flight = np.append(0, np.cumsum(is_jump))
             count = np.bincount(flight)[flight]
             east[known[(count <= _STRAY) & (count.max() > 2 * _STRAY)], 1] = np.nan
     if log.splits:
-        times_s = ", ".join(f"{time_s:.1f}" for time_s in sorted(log.splits)[:5])
+        times_s = ", ".join(f"{time_s:.1f}" for time_s in sorted(set(log.splits))[:5])
         log.note(
             f"the date or the place jumps after {times_s} s: these are several flights, with nothing known between"
         )
         gaps = np.column_stack([log.splits, np.full((len(log.splits), 2), np.nan)])
         for name, rows in samples.items():
             rows = np.concatenate([rows, gaps])
-            samples[name] = rows[np.argsort(rows[:, 0], kind="stable")]
+            samples[name] = rows[np.unique(rows[:, 0], return_index=True)[1]]
 
 
 def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:

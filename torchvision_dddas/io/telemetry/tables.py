@@ -20,8 +20,9 @@ from torchvision_dddas.io.telemetry.fields import (
     field_of_view,
     looks_alike,
     names_of_table,
+    parse_angle,
 )
-from torchvision_dddas.io.telemetry.record import KINDS, OWN, Log, build_record
+from torchvision_dddas.io.telemetry.record import JUMP_M, KINDS, OWN, Log, build_record
 from torchvision_dddas.types import Telemetry
 
 _PLACE = PLACES[0]
@@ -47,9 +48,8 @@ _PREAMBLE, _CELLS = 60, 1000
 # So many columns of a quantity are tried for one that is not empty, read for times, and named in a note.
 _TRIED, _CLOCKS, _LISTED = 4, 8, 12
 _UNKNOWN = {"nan", "na", "n/a", "null", "none", "no data", "inf", "-inf", "-", "--", "---"}
-_ON = {"1", "1.0", "true", "yes", "on", "video", "recording", "started"}
-_PART = r"(\d{1,3}(?:[.,]\d{1,12})?)"
-_ANGLE = re.compile(rf"([NSEW-])? ?{_PART} ?[°d:]? ?(?:{_PART} ?['′m:]? ?)?(?:{_PART} ?[\"″s]? ?)?([NSEW])?", re.I)
+_ON = {"1", "1.0", "true", "yes", "y", "rec", "on", "video", "recording", "started"}
+_GROUPED = re.compile(r"[-+]?\d{1,3},\d{3}")
 
 
 def read_telemetry_table(
@@ -68,7 +68,8 @@ def read_telemetry_table(
     if rows and rows[place] in text.rows:  # the names may come again
         kept = [k for k, row in enumerate(text.rows) if row != rows[place]]
         text = CsvText(header, [text.line[k] for k in kept], [text.rows[k] for k in kept])
-    if set(header) <= set(SCHEMA.names):
+    # A comma at the end of the lines, or the numbers of the rows that pandas writes.
+    if {name for name in header if name not in ("", "Unnamed: 0")} <= set(SCHEMA.names):
         return _read_own(path, text, clock_offset_s)
     return _Table(path, text).read(clock_offset_s, clip, zone, order)
 
@@ -113,9 +114,13 @@ class _Table:
 
     def __init__(self, path: Path, text: CsvText) -> None:
         self.header, self.lines, self.rows = text
+        places = [k for k, name in enumerate(self.header) if re.match(r"\W*lat|\W*lon|\W*lng", name, re.IGNORECASE)]
+        if any(k < len(row) and _GROUPED.fullmatch(row[k]) for row in self.rows[:2] for k in places):
+            # Three digits behind each comma: that of a latitude is no mark of thousands.
+            self.rows = [[c.replace(",", ".") if _GROUPED.fullmatch(c) else c for c in row] for row in self.rows]
         self.names = names_of_table(self.header)
         self.log = Log(path, f"table of {self.names.program or 'another program'}")
-        units = self._take_units()
+        units = self.units = self._take_units()
         self.columns: dict[str, list[tuple[int, Known]]] = {}
         for place, title in enumerate(self.header):
             if (known := self.names.find(title)) is not None:
@@ -146,21 +151,40 @@ class _Table:
 
     def numbers(self, quantity: str) -> np.ndarray | None:
         """The same in the record's unit and sign, (N,), NaN where there is no number; None if there is none at all."""
-        for place, known in self.columns.get(quantity, ())[:_TRIED]:
+        columns = self.columns.get(quantity, [])[:_TRIED]
+        for place, known in columns:
             cells = self.cells(place)
             values = parse_numbers(cells)
             rows = [row for row in np.flatnonzero(np.isinf(values)).tolist() if cells[row].lower() not in _UNKNOWN]
             if known.field.kind == "degrees":
-                values[rows] = [_angle(cells[row])[0] for row in rows]
+                values[rows] = [parse_angle(cells[row])[0] for row in rows]
                 rows = [row for row in rows if math.isnan(values[row])]
             values[np.isinf(values)] = np.nan
-            if np.isfinite(values).any():
+            is_fixed = known.field.kind != "degrees" or (values != 0).any() or place == columns[-1][0]
+            if np.isfinite(values).any() and is_fixed:  # a receiver without a fix says 0, another may have one
                 if rows:
                     what = f"{self.header[place]} is '{cells[rows[0]][:40]}', which is no number"
                     self.log.note(f"line {self.lines[rows[0]]}: {what}; {len(rows)} left out")
+                if known.field.kind in ("angle", "degrees"):
+                    self._note_radians(place, values, known)
                 return values * known.scale
             self.used.discard(place)
         return None
+
+    def _note_radians(self, place: int, values: np.ndarray, known: Known) -> None:
+        """Note angles that are taken for degrees, as nothing says their unit, and that could all be radians."""
+        title, finite, quantity = self.header[place], values[np.isfinite(values)], known.field.quantity
+        turn = 1 / 4 if quantity in ("pitch_rad", "latitude_deg") else 1 / 2 if quantity == "longitude_deg" else 1
+        is_told = bool(re.search(r"deg|°", title.lower()) or self.units)
+        is_degrees = abs(known.scale) == (1.0 if known.field.kind == "degrees" else math.pi / 180)
+        if (
+            is_degrees
+            and not is_told
+            and np.abs(finite).max() < 6.284 * turn
+            and not np.allclose(finite, finite.round(1))
+        ):
+            span = f"'{title}' is {finite.min():g} to {finite.max():g}, which may be radians: degrees are assumed"
+            self.log.note(f"{span}; wanted a name with the unit, as gimbal_yaw_rad or latitude_rad")
 
     def read(self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str) -> Telemetry:
         """The record of the table."""
@@ -209,10 +233,9 @@ class _Table:
         if values.keys() >= set(_PLACE):
             for name, negative in zip(_PLACE, "WS", strict=True):
                 sides = self.texts(name.replace("_deg", "_side"))
-                values[name] *= [-1 if side[:1].upper() == negative else 1 for side in sides]
-            known = np.concatenate([values[name][np.isfinite(values[name])] for name in _PLACE])
-            if len(known) and np.abs(known).max() > 1000 and (known == np.round(known)).all():
-                values |= {name: values[name] * 1e-7 for name in _PLACE}  # autopilots write degrees times 1e7
+                is_negative = [side[:1].upper() == negative for side in sides]
+                values[name] = np.where(is_negative, -np.abs(values[name]), values[name])
+            self._scale_places(values)
             if (fix := self.numbers("fix")) is not None:
                 fixed = {*_PLACE, "above_sea_m"} & values.keys()
                 values |= {name: np.where(fix < 2, np.nan, values[name]) for name in fixed}
@@ -222,16 +245,41 @@ class _Table:
             self.log.notes += notes
         return values
 
+    def _scale_places(self, values: dict[str, np.ndarray]) -> None:
+        """Make degrees of whole numbers of ten-millionths, as autopilots write them, or of millionths."""
+        known = {name: column[np.isfinite(column)] for name, column in values.items()}
+        both = np.concatenate([known[name] for name in _PLACE])
+        if not len(both) or np.abs(both).max() <= 1000 or (both != np.round(both)).any():
+            return
+        is_e7 = self.names.program or any(
+            (np.abs(known[k]) > m).any() for k, m in zip(_PLACE, (18e7, 9e7), strict=True)
+        )
+        values |= {name: values[name] * (1e-7 if is_e7 else 1e-6) for name in _PLACE}
+        if not is_e7:
+            self.log.note(
+                "whole numbers as places are taken for millionths of degrees; a name such as lat_e7 tells more"
+            )
+        tall = [
+            name for name in values if name.startswith(("above", "bare")) and np.abs(known[name]).max(initial=0) > 1000
+        ]
+        if tall and not self.names.program:
+            self.log.note(f"{', '.join(tall)} beside whole numbers as places may be in millimetres: metres are assumed")
+
     def _pairs(self, order: str) -> dict[str, np.ndarray]:
         """Longitudes and latitudes of a column with both."""
         signs = (";", "/", ", ", None, ",")
         parts = [
-            [two for sign in signs if len(two := cell.strip("()[]").split(sign)) == 2] for cell in self.texts("place")
+            [two for sign in signs if len(two := cell.strip("()[]").split(sign)) in (2, 3)]
+            for cell in self.texts("place")
         ]
-        angles = [[_angle(part) for part in (two[0] if two else ("", ""))] for two in parts]
+        if any(two and len(two[0]) == 3 for two in parts):
+            self.log.note("of three numbers in a cell the third is not used")
+        angles = [[parse_angle(part) for part in (two[0][:2] if two else ("", ""))] for two in parts]
         pairs = np.array([[value for value, _ in two] for two in angles])
         sides = {side for (_, side), _ in angles if side}
-        is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, self.names.order, order, "a cell")
+        first = re.search(r"lat|lon|lng", self.header[self.columns["place"][0][0]].lower())
+        told = self.names.order or (("lat-lon" if first[0] == "lat" else "lon-lat") if first else "")
+        is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, told, order, "a cell")
         return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
 
     @np.errstate(over="ignore", invalid="ignore")  # numbers may be any
@@ -239,12 +287,13 @@ class _Table:
         """Seconds since the first row, (N,), and when that was since 1970."""
         columns = self.columns["time"][:_CLOCKS]
         read = [read_times(self.header[place], self.cells(place), known) for place, known in columns]
-        step_m = math.nan
+        step_m, is_far = math.nan, np.zeros(len(self.rows), bool)
         if values.keys() >= set(_PLACE):
             east, north = (np.diff(values[name]) * DEGREE_M for name in _PLACE)
             steps_m = np.hypot(east * np.cos(np.radians(values["latitude_deg"][1:])), north)
+            is_far[1:] = steps_m > JUMP_M
             step_m = float(np.median(steps_m[np.isfinite(steps_m)])) if np.isfinite(steps_m).any() else math.nan
-        time_s, start_utc_s, titles = settle_times(self.log, read, step_m, zone)
+        time_s, start_utc_s, titles = settle_times(self.log, read, step_m, is_far, zone)
         self.used -= {place for place, _ in columns if self.header[place] not in titles}
         return time_s, start_utc_s
 
@@ -266,12 +315,3 @@ class _Table:
                 f"the log says that the camera began to film {begins[0]:.1f} s after its first row{more}, and times "
                 f"count from that row: aerial.clock_offset_s={-begins[0]:.1f} counts them from where the film begins"
             )
-
-
-def _angle(text: str) -> tuple[float, str]:
-    """Degrees of `48.1371 N`, `48°08'13.6"N` or `48,1371`, and the side that it names; NaN for anything else."""
-    if (found := _ANGLE.fullmatch(text.strip())) is None:
-        return math.nan, ""
-    degrees, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups()[1:4])
-    side = (found[1] or found[5] or "").upper()
-    return (degrees + minutes / 60 + seconds / 3600) * (-1 if side in ("S", "W", "-") else 1), side.strip("-")

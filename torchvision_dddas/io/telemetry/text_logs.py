@@ -2,22 +2,23 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import tzinfo
 from pathlib import Path
 
 import numpy as np
 
-from torchvision_dddas.io.telemetry.clocks import UNKNOWN_ZONE, parse_date, to_utc
-from torchvision_dddas.io.telemetry.fields import UNITS, Names, field_of_view, names_of_subtitles
-from torchvision_dddas.io.telemetry.record import Log, build_record
+from torchvision_dddas.geometry import DEGREE_M
+from torchvision_dddas.io.telemetry.clocks import DATE_JUMP_S, clock_at_start, parse_dates, sort_flights
+from torchvision_dddas.io.telemetry.fields import ANGLE, UNITS, Names, field_of_view, names_of_subtitles, parse_angle
+from torchvision_dddas.io.telemetry.record import JUMP_M, SPLIT_S, Log, build_record
 from torchvision_dddas.types import Telemetry
 
 Values = dict[str, float]
 Numbers = list[tuple[float, str]]
 """The numbers in a pair of brackets, each with the letters beside it."""
 
-_TIMING = re.compile(r"(\d{1,6}):(\d{1,2}):(\d{1,2})[.,](\d{1,9})\s*-+>(?:\s*[\d:]{5,12}[.,](\d{1,9}))?")
+_TIMING = re.compile(r"(?:(\d{1,6}):)?(\d{1,2}):(\d{1,2})[.,](\d{1,9})\s*-+>(?:\s*[\d:]{5,12}[.,](\d{1,9}))?")
 _MARKUP = re.compile(r"<[^<>]*>")
 _NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
 _NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
@@ -25,16 +26,36 @@ _NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
 _TUPLE = re.compile(r"[A-Za-z][A-Za-z.]*"), re.compile(r"\s*(?::\s*)?\(([^)]*)\)?")
 _PAIR = (
     re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
-    re.compile(rf"\s*(?:[:=]\s*)?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|cm|mm|m|°)?(?![A-Za-z])", re.IGNORECASE),
+    re.compile(rf"\s*(?:[:=]\s*)?x?({_NUMBER})(?![\d:.])\s*(m/s|km/h|kmh|mph|ft|[cm]?m|°|x)?(?![a-z])", re.IGNORECASE),
 )
-# [Gimbal: Yaw:1.0, Pitch:-30.0]: the names in the group get its name.
-_GROUP = re.compile(r"\[\s?(gimbal|camera|drone|aircraft)\s?:\s?(?=[A-Za-z])([^\[\]\n]{1,200})", re.IGNORECASE)
-_WORD = re.compile(r"[A-Za-z]+")
+# [Gimbal: Yaw:1.0, Pitch:-30.0] and Gimbal(Yaw:1.0), also over several lines: the angles get the name of the group.
+_OWNERS, _ANGLES = "gimbal|gb|camera|mount|payload|drone|aircraft|uav|vehicle|flight", "(?:yaw|pitch|roll|heading)"
+_GROUP = re.compile(
+    rf"\b({_OWNERS})(?: ?(?:attitude|angles?))?\s?(?:[:=]\s?[\[({{]?|[\[({{])\s*(?={_ANGLES}\s?[:=])"
+    rf"((?:(?!\b(?:{_OWNERS})\b|\n\s*\n)[^\[\](){{}}]){{1,200}})",
+    re.IGNORECASE,
+)
+_IN_GROUP = re.compile(rf"\b{_ANGLES}(?=\s?[:=])", re.IGNORECASE)
+_OWNED = re.compile(rf"\b({_OWNERS}) +(?={_ANGLES}\b)", re.IGNORECASE)
+# A latitude or longitude with a side or with minutes, and two coordinates without brackets.
+_SIDED = re.compile(
+    rf"\b((?:lat|lon|lng)[a-z]{{0,7}}\s*[:=]\s*)(?=[NSEW]|-?[\d.,]{{1,15}} ?[NSEWd°])({ANGLE})(?![\w.])", re.IGNORECASE
+)
+_TWO = re.compile(
+    r"\b(?:gps|position|location|coord[a-z]{0,8})\s*[:=]\s*(-?\d+\.\d+\s*[,;]\s*-?\d+\.\d+)", re.IGNORECASE
+)
+# Forms of few dialects, and the forms of the others.
+_USUAL: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = (
+    (_GROUP, lambda found: _IN_GROUP.sub(rf"{found[1]}.\g<0>", found[2])),
+    (_OWNED, lambda found: f"{found[1]}."),
+    (_SIDED, lambda found: f"{found[1]}{parse_angle(found[2])[0]:.9f}"),
+    (_TWO, lambda found: f"GPS({found[1]})"),
+)
+_DECIMAL, _PLACES = re.compile(r"\s*-?\d{1,6},\d{1,6} ?(?:[mM]|ft)?\s*"), ("gps", "rtk", "home")
 _AXES = {"g.pry": ("gimbalpitch", "gimbalroll", "gimbalyaw"), "f.pry": ("", "", "yaw")}
 _OPTICS = ("focal_mm", "f_number", "zoom")
-# Dates that leave the times of the subtitles by more are those of another flight, which begins so much later.
-_DATE_JUMP_S, _SPLIT_S = 10.0, 1e-3
-_WORST = 1000
+_POINT = re.compile(r"\d[.,]\d")
+_WORST, _SAMPLE, _SATELLITES = 1000, 10_000, 60
 
 
 def read_subtitles(
@@ -43,15 +64,19 @@ def read_subtitles(
     """The record of subtitles; arguments and errors as `read_telemetry`."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     names = names_of_subtitles(text)
-    subtitles = _subtitles(_GROUP.sub(_with_group, text))
-    dates = [parse_date(words) for *_, words in subtitles]
+    some = "\n\n".join(text[k * len(text) // 4 :][:_SAMPLE] for k in range(4))
+    for form, usual in _USUAL:
+        text = form.sub(usual, text) if form.search(some) else text
+    subtitles = _subtitles(text)
+    dates, is_sure, remark = parse_dates([words for *_, words in subtitles])
     parted = [_tuples(words) for *_, words in subtitles]
     is_swapped = _is_latitude_first(log, names, [tuples for tuples, _ in parted], order)
     first_s, is_zoned = next((date for date in dates if date), (math.nan, False))
     lacking: dict[str, list[int]] = {}
     timeless: list[int] = []
     lenses: list[dict[str, str]] = []
-    last: tuple[float, float] | None = None  # time and date of the subtitle before
+    last_s = last_date_s = math.nan  # of the subtitle before
+    last: Values = {}
     jumps, shift_s = list[tuple[float, float]](), 0.0
     for (line, time_s, _), (tuples, rest), date in zip(subtitles, parted, dates, strict=True):
         if math.isnan(time_s):
@@ -60,13 +85,19 @@ def read_subtitles(
             timeless.append(line)
             continue
         time_s += shift_s
-        if date is not None:
-            if last is not None:
-                jumps.append((last[0], date[0] - last[1] - (time_s - last[0])))
-                if time_s < last[0] < last[0] + jumps[-1][1]:  # where times begin again, dates tell how much later
-                    time_s, shift_s = time_s + jumps[-1][1], shift_s + jumps[-1][1]
-            last = time_s, date[0]
         values, lens = _quantities(names, rest, tuples, is_swapped)
+        jump_s = date[0] - last_date_s - (time_s - last_s) if date is not None else math.nan
+        if math.isfinite(jump_s):
+            jumps.append((last_s, jump_s))
+        if time_s < last_s:  # the dates tell how much later another flight was; else a jump tells that there is one
+            here, there = ([at.get(f"{name}itude_deg", math.nan) for name in ("long", "lat")] for at in (values, last))
+            if math.isnan(jump_s) and math.dist(here, there) * DEGREE_M > JUMP_M:
+                jump_s = last_s - time_s + 1.0
+                log.splits.append(last_s + SPLIT_S)
+            if abs(jump_s) > DATE_JUMP_S or jump_s > 0:
+                time_s, shift_s = time_s + jump_s, shift_s + jump_s
+        last_s, last = time_s, values
+        last_date_s = date[0] if date is not None else math.nan
         log.moments.append((time_s, 0.0, line))
         lenses.append(lens)
         for name in [name for name in log.samples if name not in values]:
@@ -78,19 +109,17 @@ def read_subtitles(
         log.note(f"line {timeless[0]}: a subtitle without time is left out, {len(timeless)} in all")
     _note_lacking(log, lacking, subtitles[-1][0] if subtitles else 0, len(subtitles))
     usual_s = float(np.median([abs(jump_s) for _, jump_s in jumps] or [0.0]))
-    log.splits += [time_s + _SPLIT_S for time_s, jump_s in jumps if abs(jump_s) > max(_DATE_JUMP_S, 10 * usual_s)]
+    log.splits += [time_s + SPLIT_S for time_s, jump_s in jumps if abs(jump_s) > max(DATE_JUMP_S, 10 * usual_s)]
+    sort_flights(log, np.array([moment[0] for moment in log.moments]))
     if any("focal_mm" in lens for lens in lenses):
         hfov, notes = field_of_view(*([lens.get(name, "") for lens in lenses] for name in _OPTICS))
         times, _, lines = np.array(log.moments).T
         log.add_all(times, lines, {"hfov_rad": hfov})
         log.is_nominal = True
         log.notes += notes
-    if not is_zoned and zone is not None and math.isfinite(first_s):
-        first_s, is_zoned = to_utc(first_s, zone), True
-    elif not is_zoned and math.isfinite(first_s):
-        log.start_local_s = first_s - (log.moments[0][0] if log.moments else 0.0)
-        log.note(UNKNOWN_ZONE)
-    return build_record(log, clock_offset_s, first_s - log.moments[0][0] if is_zoned and log.moments else math.nan)
+    start_s = first_s - log.moments[0][0] if log.moments else math.nan
+    start_s = clock_at_start(log, start_s, is_zoned, is_sure, zone, "the date", remark)
+    return build_record(log, clock_offset_s, start_s)
 
 
 def _subtitles(text: str) -> list[tuple[int, float, str]]:
@@ -109,7 +138,7 @@ def _subtitles(text: str) -> list[tuple[int, float, str]]:
         if timing is not None:
             hours, minutes, seconds, fraction, _ = timing.groups()
             part_s = float(f"0.{fraction}") if len(sizes) == 1 else int(fraction) / 1000
-            blocks.append((number, int(hours) * 3600 + int(minutes) * 60 + int(seconds) + part_s, []))
+            blocks.append((number, int(hours or 0) * 3600 + int(minutes) * 60 + int(seconds) + part_s, []))
         elif not line or line.isdigit():
             is_between = not is_timed
         elif is_between or blocks:
@@ -142,10 +171,12 @@ def _tuples(text: str) -> tuple[dict[str, Numbers], str]:
         cells = re.split(r"[;,]\s+|;", inside) if re.search(r"[;,]\s|;", inside) else inside.split(",")
         if "." not in inside and len(cells) >= 4 and len(cells) == inside.count(",") + 1:
             cells = [",".join(cells[i : i + 2]) for i in range(0, len(cells), 2)]  # decimal commas
+        elif name.lower() not in _PLACES and _DECIMAL.fullmatch(inside):
+            cells = [inside]
         matches = [_NUMERAL.search(cell) for cell in cells]
         values = [float(match[0].replace(",", ".")) if match else math.nan for match in matches]
         # Decimals without a unit count as the letter "."
-        letters = [_NO_LETTERS.sub("", cell).upper() or "." * ("." in cell) for cell in cells]
+        letters = [_NO_LETTERS.sub("", cell).upper() or "." * bool(_POINT.search(cell)) for cell in cells]
         found["gps" if name.lower() == "rtk" else name.lower()] = list(zip(values, letters, strict=True))
         parts.append(text[place:begin])
         place = brackets.end()
@@ -161,7 +192,8 @@ def _is_latitude_first(log: Log, names: Names, tuples: list[dict[str, Numbers]],
 
 def _quantities(names: Names, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> tuple[Values, dict[str, str]]:
     """Values of one subtitle by quantity, and those of the lens as text. text: without the tuples."""
-    values, lens, ranks = _place(tuples.get("gps", []), is_swapped), dict[str, str](), dict[str, int]()
+    values = _place(tuples.get("gps", []), is_swapped, names.order == "lat-lon")
+    lens, ranks = dict[str, str](), dict[str, int]()
     found = [
         (f"{key} ({letters})" if letters in ("M", "FT") else key, str(value))
         for name, numbers in tuples.items()
@@ -183,12 +215,7 @@ def _quantities(names: Names, text: str, tuples: dict[str, Numbers], is_swapped:
     return values, lens
 
 
-def _with_group(group: re.Match[str]) -> str:
-    """The names of a group, each with that of the group before it."""
-    return _WORD.sub(rf"{group[1]}.\g<0>", group[2])
-
-
-def _place(gps: Numbers, is_swapped: bool) -> dict[str, float]:
+def _place(gps: Numbers, is_swapped: bool, has_height: bool) -> dict[str, float]:
     values: dict[str, float] = {}
     for value, letter in gps[:2]:
         if letter in ("N", "S", "E", "W"):
@@ -198,8 +225,9 @@ def _place(gps: Numbers, is_swapped: bool) -> dict[str, float]:
         names = ("latitude_deg", "longitude_deg") if is_swapped else ("longitude_deg", "latitude_deg")
         values = {name: value for name, (value, _) in zip(names, gps, strict=False)}
     # A third number with a unit or decimals is a height, else the number of satellites; 0.0 m stands for none.
-    if len(gps) > 2 and gps[2][1] in ("M", ".") and gps[2][0] != 0:
-        values["bare_altitude_m"] = gps[2][0]
+    third, unit = gps[2] if len(gps) > 2 else (0.0, "")
+    if third != 0 and (unit in ("M", ".") or (has_height and third > _SATELLITES)):
+        values["bare_altitude_m"] = third
     return values
 
 
