@@ -1,6 +1,7 @@
 """Records: rows, columns, and the boxes of other libraries."""
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,16 @@ import pytest
 
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types import Adjustment, Detections, Positions, Telemetry, Tracks, as_picture, share_orders
+from torchvision_dddas.types import (
+    Adjustment,
+    Camera,
+    Detections,
+    Positions,
+    Telemetry,
+    Tracks,
+    as_picture,
+    share_orders,
+)
 
 CORNERS = np.array([[10.0, 20, 40, 80], [0, 0, 5, 5]])
 
@@ -266,3 +276,18 @@ def test_the_name_of_a_configuration_is_no_settings():
     assert check_settings(None) == Settings()
     with pytest.raises(InputError, match=r"type Settings, got str: td\.load_settings\('fast'\) makes them"):
         check_settings("fast")
+
+
+def test_a_camera_knows_what_it_was_given_also_a_heading_of_zero():
+    camera = Camera("uav", (640, 480), (500.0, 500.0), (319.5, 239.5), heading_rad=0.0, height_m=float("nan"))
+    assert camera.knows("heading_rad") and not camera.knows("pitch_rad") and not camera.knows("height_m")
+    turned = replace(camera, pitch_rad=1.0)
+    assert turned.knows("pitch_rad") and turned.knows("heading_rad") and not turned.knows("roll_rad")
+
+
+def test_a_log_is_asked_for_one_time():
+    log = Telemetry(np.arange(3.0), np.full(3, 40.0), np.zeros(3))
+    flight = log.at(1.5)
+    assert flight is not None and flight.altitude_m == 40.0
+    with pytest.raises(InputError, match="one number, got"):
+        log.at(np.array([0.5, 1.5]))  # type: ignore[arg-type]

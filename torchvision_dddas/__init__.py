@@ -36,6 +36,7 @@ _HOME = {
     "read_telemetry": ("io.telemetry", "read_telemetry"),
     "PersonDetector": ("people", "PersonDetector"),
     "Tracker": ("tracking", "Tracker"),
+    "Tracks": ("types", "Tracks"),
 }
 
 __all__ = ["open_source", "open_video", *_HOME]

@@ -227,11 +227,19 @@ def test_a_clip_and_a_log_alone_give_places_maps_and_a_picture_without_a_bar_of_
     assert {"tracks.geojson", "map.png", "report.html"} <= set(names(tmp_path))
     assert "0 of 0" not in result.stdout and "located with a warning" not in result.stdout
     kept = record(tmp_path)
+    assert not any("are assumed" in note for note in kept["notes"])
     identities = len({row["identity"] for row in rows(tmp_path / "tracks.csv") if row["kind"] != "untracked"})
     assert f"24 frames, {kept['targets']} detections of {identities} identities\n" in result.stdout
     assert "identities located" in (tmp_path / "report.html").read_text()
     assert kept["positions"] == len(found) > 20 and kept["by"]["telemetry"] == FLIGHT.frames
     assert kept["telemetry"].endswith("telemetry.csv") and kept["landmarks_file"] is None
+
+
+def test_a_rate_that_nothing_tells_is_named(dddas, flown, tmp_path):
+    words = [word for word in alone(flown, "--camera", flown / "camera.toml", "--config", "fast") if word != "--rate"]
+    result = dddas(*[word for word in words if word != RATE_HZ], "--save", "none", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert any("10 frames a second are assumed" in note and "--rate" in note for note in record(tmp_path)["notes"])
 
 
 def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_record(dddas, flown, tmp_path):

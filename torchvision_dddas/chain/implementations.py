@@ -24,8 +24,8 @@ _NAN = float("nan")
 IMPLEMENTATIONS = (
     Implementation("grey conversion", "cpu", "Kornia", _NAN, "OpenCV's where a frame comes as an array of bytes"),
     Implementation("HSV conversion", "cpu", "Kornia", 0.65),
-    Implementation("warp", "cpu", "Kornia", 1.9, "remap with maps made by broadcasting; warp_perspective takes 4 to 6"),
-    Implementation("Gaussian", "cpu", "Kornia", 1.2, "of kernel 7; 3 times for kernels of 3 and 5"),
+    Implementation("warp", "cpu", "Kornia", 1.9, "by remap; its warp_perspective takes 4 to 6 times our time"),
+    Implementation("Gaussian", "cpu", "Kornia", 1.2, "kernel 7; for kernels of 3 and 5 it is 3"),
     Implementation("points transformed", "cpu", "Kornia", 1.01),
     Implementation("transfer error", "cpu", "Kornia", _NAN),
     Implementation(
@@ -52,7 +52,7 @@ IMPLEMENTATIONS = (
     Implementation("gradient", "cuda", "Kornia", 1.1),
     Implementation("corners", "cuda", "Kornia", 1.1),
     Implementation("pyramid", "cuda", "ours", 3.3),
-    Implementation("morphology", "cuda", "ours", 2.1, "of the erosion; 20 of the closing"),
+    Implementation("morphology", "cuda", "ours", 2.1, "the erosion; for the closing it is 20"),
     Implementation("RANSAC", "cuda", "ours", 5.3),
     Implementation("histograms", "cuda", "ours", 6.7),
     Implementation("connected components", "cuda", "Kornia", 0.67),

@@ -61,7 +61,7 @@ def _print_backends() -> None:
 
     from torchvision_dddas.chain import IMPLEMENTATIONS
 
-    table = Table("operation", "device", "form", "Kornia's time by ours", "reason")
+    table = Table("operation", "device", "form", "Kornia's time / ours", "reason")
     for line in IMPLEMENTATIONS:
         ratio = "" if line.ratio != line.ratio else f"{line.ratio:.2g}"
         reason = line.reason or ("more than twice the time" if line.ratio > 2 else "")

@@ -79,7 +79,7 @@ def open_source(
         files = images_of_glob(text)
     else:
         raise InputError(f"{path} does not exist; wanted {_WANTED}")
-    return ImageSource(files, text, rate_hz or 10.0, scale)
+    return ImageSource(files, text, rate_hz, scale)
 
 
 # Pictures in a row of another size, after which a tolerant reader goes on with that size.
@@ -159,18 +159,19 @@ _SAMPLES = 9
 class ImageSource(_Clip):
     """The files of a folder or glob in natural order (frame2 before frame10), one a frame.
 
-    rate_hz: images carry no frame rate, so the caller gives one.
+    rate_hz: images carry no frame rate, so the caller gives one; 10 is assumed otherwise (`assumes_rate`).
     scale: of 16-bit images the values that become black and white; by default nine images spread over the clip give
     them. A picture of which much lies beyond saturates, which is recorded once.
     The first image decides whether the clip is grey or colour; the others follow it.
     Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
     """
 
-    def __init__(self, files: Sequence[Path], name: str, rate_hz: float = 10.0, scale: Scale = None) -> None:
+    def __init__(self, files: Sequence[Path], name: str, rate_hz: float | None = None, scale: Scale = None) -> None:
         super().__init__(name)
         if not files:
             raise InputError(f"{name} holds no images")
-        self.files, self.count, self.rate_hz = list(files), len(files), rate_hz
+        self.files, self.count, self.rate_hz = list(files), len(files), rate_hz or 10.0
+        self.assumes_rate = rate_hz is None
         # All pictures together are the input: a few hundred photos are no small one.
         sizes = accumulate(file.stat().st_size for file in files if file.is_file())
         size = next((size for size in sizes if size >= SMALL_FILE), None)
@@ -318,7 +319,7 @@ class VideoSource(_Clip):
         if true_hz and (own_hz is None or abs(true_hz / own_hz - 1) > _OFF):
             own_hz, count = true_hz, 0  # the count may be by the announced rate
         self._own_hz, self._given_hz = own_hz or 10.0, rate_hz
-        self.rate_hz = rate_hz or self._own_hz
+        self.rate_hz, self.assumes_rate = rate_hz or self._own_hz, not (rate_hz or own_hz)
         self.count = int(count) if not self._live and 0 < count < 1e8 else None
         self.exact = self.count is not None and is_counted
         self._announced = int(count) if self._live and is_counted and 0 < count < 1e8 else 0

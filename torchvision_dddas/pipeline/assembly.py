@@ -143,6 +143,11 @@ def assemble_files(
             check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
         if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
             notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
+        if getattr(source, "assumes_rate", False):
+            notes.append(
+                f"no frame rate is known: {source.rate_hz:g} frames a second are assumed, by which frames meet the log "
+                "and speeds are measured; --rate tells another"
+            )
         return _with_locator(locator, colours, settings, backend, notes)
     if flight is None and telemetry is not None:
         flight = _read_telemetry(telemetry, settings, of)

@@ -45,7 +45,9 @@ class Camera:
         if self.given is not None:
             return name in self.given
         value, default = getattr(self, name), type(self).__dataclass_fields__[name].default
-        return not (value == default or (value != value and default != default))
+        if isinstance(value, float):  # a heading of 0 that was given is another object than the default
+            return value == value and value is not default
+        return bool(value != default)
 
 
 @dataclass(frozen=True)

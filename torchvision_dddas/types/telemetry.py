@@ -81,8 +81,11 @@ class Telemetry:
         """The state at a time by linear interpolation, angles and longitudes the short way round.
 
         A field is NaN if it is in either neighbour. Up to tolerance_s outside the span the nearest sample is used;
-        beyond that the result is None.
+        beyond that the result is None. Raises InputError for several times.
         """
+        if np.ndim(time_s):
+            got = np.shape(time_s)
+            raise InputError(f"time_s must be one number, got an array {got}; ask for each: [log.at(t) for t in times]")
         times, time_s = self.time_s, float(time_s)
         count = len(times)
         if count == 0 or not times.item(0) - tolerance_s <= time_s <= times.item(count - 1) + tolerance_s:
