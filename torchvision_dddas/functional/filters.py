@@ -56,7 +56,7 @@ def gaussian_blur2d(
         padded = pad_reflect(levels, across, across, down, down)
         around = filters.gaussian_blur2d(padded, sides, sigma, "constant")
         blurred = around[..., down : down + levels.shape[-2], across : across + levels.shape[-1]]
-    return to_bytes(blurred + 0.5) if input.dtype == torch.uint8 else blurred
+    return to_bytes(blurred.add_(0.5)) if input.dtype == torch.uint8 else blurred
 
 
 def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B C H W"]:

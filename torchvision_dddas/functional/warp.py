@@ -18,6 +18,9 @@ from torchvision_dddas.functional.filters import strip_rows, to_bytes
 from torchvision_dddas.functional.plane_maps import invert_map
 from torchvision_dddas.functional.soft import is_traced
 
+# Strips of fewer rows are made of too many calls.
+_LEAST_ROWS = 64
+
 
 def warp_perspective(
     src: Float[Tensor, "B C H W"],
@@ -54,20 +57,24 @@ def warp_perspective(
     rows, columns = dsize
     matrix = M.double() if inverse_map else invert_map(M.double())
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
-    # Row y is the first of these rows plus y times the second.
-    start = (matrix[:, :, 0, None] * u + matrix[:, :, 2:]).to(src.dtype)
-    slope = matrix[:, :, 1, None].to(src.dtype)
+    # Row y is the first of these rows plus y times the second; u and v in steps of the rounding.
+    scale = matrix.new_tensor([max(subpixels, 1), max(subpixels, 1), 1])[:, None]
+    start = ((matrix[:, :, 0, None] * u + matrix[:, :, 2:]) * scale).to(src.dtype)[:, :, None]
+    slope = (matrix[:, :, 1, None] * scale).to(src.dtype)[:, :, None]
+    # Kornia's normalised places are -1 and 1 at the centres of the first and the last pixel.
+    units = [2.0 / (max(subpixels, 1) * max(side - 1, 1e-9)) for side in (src.shape[-1], src.shape[-2])]
     y = torch.arange(rows, dtype=src.dtype, device=src.device)[:, None]
 
     def sample(y: Tensor) -> Tensor:
-        along_u, along_v, depth = (start[:, k, None] + y * slope[:, k, None] for k in range(3))
+        along_u, along_v, depth = (torch.addcmul(start[:, k], y, slope[:, k]) for k in range(3))
         places = [along_u / depth, along_v / depth]
         if subpixels:
-            places = [place.mul(subpixels).round_().div_(subpixels) for place in places]
-        found = remap(src, places[0], places[1], mode=mode, padding_mode=padding_mode, align_corners=True)
+            places = [place.round_() for place in places]
+        map_x, map_y = (place * unit - 1.0 for place, unit in zip(places, units, strict=True))
+        found = remap(src, map_x, map_y, mode, padding_mode, align_corners=True, normalized_coordinates=True)
         return to_bytes(found.add_(0.5)) if whole else found
 
-    step = strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns)
+    step = max(strip_rows(src if src.requires_grad else M, rows, 2 * len(src) * columns), _LEAST_ROWS)
     return torch.cat([sample(y[top : top + step]) for top in range(0, rows, step)], -2)
 
 
