@@ -80,7 +80,7 @@ def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, C
     components = each(lambda picture: cv2.connectedComponentsWithStats(picture, ltype=cv2.CV_32S), is_set)
     labelled = components if device == "cpu" else lambda: label_components(masks > 0, masks)
     return {
-        "warp": (
+        "warp (ours: Kornia's remap)": (
             each(lambda picture: cv2.warpPerspective(picture, matrix, size)),
             lambda: F.warp_perspective(levels, matrices, (height, width)),
             lambda: kornia.geometry.warp_perspective(levels, matrices, (height, width)),
@@ -90,12 +90,12 @@ def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, C
             lambda: F.resize(levels, smaller, rounded=True),
             lambda: kornia.geometry.resize(levels, smaller),
         ),
-        "Gaussian 7, floats": (
+        "Gaussian 7, floats (ours: Kornia's)": (
             each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0), grey.astype(np.float32)),
             lambda: F.gaussian_blur2d(levels, 7),
             lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),
         ),
-        "Gaussian 7, bytes (Kornia: floats)": (
+        "Gaussian 7, bytes (ours: Kornia's and conversions)": (
             each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0)),
             lambda: F.gaussian_blur2d(bytes_, 7),
             lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),

@@ -171,7 +171,7 @@ def write_with_cover(path: Path, marked: bool, is_first: bool = True) -> Path:
         streams = [add(*kind) for kind in (kinds if is_first else kinds[::-1])]
         cover, film = streams if is_first else streams[::-1]
         if marked:
-            cover.disposition = av.stream.Disposition.attached_pic
+            cover.disposition = av.stream.Disposition.attached_pic.value
         for stream, numbers in ((cover, [40]), (film, range(1, 13))):
             for number in numbers:
                 image = picture(number, stream.width, stream.height)

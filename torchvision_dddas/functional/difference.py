@@ -118,7 +118,9 @@ def fit_quantiles(
 
 def _middle(values: Float[Tensor, "B N"], kept: Bool[Tensor, "B N"]) -> Float[Tensor, "B"]:
     """The median of the values that are kept, the mean of two in the middle; 0 where there are none."""
-    ordered, count = values.masked_fill(~kept, torch.inf).sort(1).values, kept.sum(1, keepdim=True)
+    # By topk of a fixed number: the sort of torch 2.6 is in no graph.
+    size, count = int(values.shape[1]), kept.sum(1, keepdim=True)
+    ordered = values.masked_fill(~kept, torch.inf).topk(size, dim=1, largest=False).values
     pair = ordered.gather(1, torch.cat([(count - 1).clamp(min=0) // 2, count // 2], 1).clamp(max=values.shape[1] - 1))
     return torch.where(count[:, 0] > 0, pair.mean(1), torch.zeros_like(values[:, 0]))
 

@@ -247,7 +247,8 @@ def _check_size(target: str | int, name: str, width: int, height: int) -> None:
 
 
 def _is_cover(video: Any) -> bool:
-    is_marked = int(getattr(video, "disposition", 0)) & _COVER_MARKS
+    marks = getattr(video, "disposition", 0)
+    is_marked = int(getattr(marks, "value", marks)) & _COVER_MARKS  # a flag before PyAV 16, then a number
     return bool(is_marked) or (video.codec_context.name in _COVER_CODECS and video.frames <= 1)
 
 
