@@ -72,6 +72,14 @@ def test_the_backend_of_a_pipeline_is_that_of_its_tracker_too(frames, monkeypatc
         assert len(made) == count
 
 
+def test_the_pipeline_of_the_front_door_opens_what_the_front_door_opens():
+    import torchvision_dddas as td
+
+    assert td.Pipeline.open_clip is td.open_video
+    with pytest.raises(InputError, match="no_such"):
+        next(iter(td.Pipeline("fast")("sim:no_such")))
+
+
 def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))

@@ -69,6 +69,8 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, inside = _HOME[name]
     value = getattr(import_module(f"{__name__}.{module}"), inside)
+    if name == "Pipeline":
+        value.open_clip = staticmethod(open_video)
     globals()[name] = value
     return value
 

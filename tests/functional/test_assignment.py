@@ -1,4 +1,4 @@
-"""Soft assignment beside all assignments counted one by one; soft dispersion beside the tree of clusters."""
+"""Soft assignment beside all assignments counted one by one."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchvision_dddas.functional import dispersion, log_partition
+from torchvision_dddas.functional import log_partition
 from torchvision_dddas.geometry import best_pairs
 
 
@@ -87,31 +87,3 @@ def test_large_scores_overflow_nothing_and_no_pairs_are_worth_nothing():
     torch.testing.assert_close(slope, torch.eye(2, dtype=torch.float64))
     assert log_partition(torch.zeros(0, 3), 1.0).item() == log_partition(torch.zeros(3, 0), 1.0).item() == 0
     assert log_partition(torch.zeros(1, 1, dtype=torch.float64), 1.0).item() == pytest.approx(math.log(2))
-
-
-def grouped(*sizes: int, within: float = 0.1, between: float = 0.7) -> Tensor:
-    """Dissimilarities of targets in groups."""
-    name = np.repeat(np.arange(len(sizes)), sizes)
-    apart = np.where(name[:, None] == name, within, between)
-    np.fill_diagonal(apart, 0.0)
-    return torch.as_tensor(apart)
-
-
-def test_a_wider_cut_tells_fewer_targets_apart_and_the_slope_says_so():
-    apart, everybody = grouped(3, 2, within=0.2, between=0.4), torch.ones(5, dtype=torch.bool)
-    cut = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(dispersion(apart, everybody, cut, 0.05), cut)
-    assert slope < 0
-    assert torch.autograd.gradcheck(lambda c: dispersion(apart, everybody, c, 0.05), cut)
-
-
-def test_who_is_not_there_does_not_count_and_one_or_none_count_as_apart():
-    apart, there = grouped(3, 2), torch.tensor([True, True, False, True, False])
-    wanted = dispersion(apart[there][:, there], torch.ones(3, dtype=torch.bool), 0.25, 0.1).item()
-    assert dispersion(apart, there, 0.25, 0.1).item() == pytest.approx(wanted, abs=1e-12)
-    for few in (0, 1):
-        cut = torch.tensor(0.25, dtype=torch.float64, requires_grad=True)
-        value = dispersion(apart, torch.arange(5) < few, cut, 0.1)
-        value.backward()
-        assert value.item() == 1
-        assert cut.grad is not None and cut.grad.item() == 0

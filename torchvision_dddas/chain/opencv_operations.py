@@ -30,83 +30,79 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
         """See `Operations`, as of every other method."""
         return view.grey
 
-    def texture(self, view: View) -> np.ndarray:  # noqa: D102
+    def texture(self, view: View) -> np.ndarray:
         return measure_texture(view.grey)
 
-    def no_texture(self, view: View) -> np.ndarray:  # noqa: D102
+    def no_texture(self, view: View) -> np.ndarray:
         return no_texture(view.grey.shape)
 
-    def warp(self, view: View, reference: View, view_from_reference: np.ndarray) -> np.ndarray:  # noqa: D102
+    def warp(self, view: View, reference: View, view_from_reference: np.ndarray) -> np.ndarray:
         return warp(view.grey, view_from_reference)
 
-    def seen(  # noqa: D102
-        self, view: View, reference: View, view_from_reference: np.ndarray, border_px: int
-    ) -> np.ndarray:
+    def seen(self, view: View, reference: View, view_from_reference: np.ndarray, border_px: int) -> np.ndarray:
         return find_seen(view_from_reference, reference.size, border_px)
 
-    def seen_by_both(self, one: np.ndarray, other: np.ndarray, reference: View) -> np.ndarray:  # noqa: D102
+    def seen_by_both(self, one: np.ndarray, other: np.ndarray, reference: View) -> np.ndarray:
         return cv2.bitwise_and(one, other)
 
-    def fit_light(self, reference: View, warped: np.ndarray, seen: np.ndarray) -> Light:  # noqa: D102
+    def fit_light(self, reference: View, warped: np.ndarray, seen: np.ndarray) -> Light:
         return fit_light(reference.grey, warped, seen)
 
-    def fit_level_shares(self, reference: View, other: View) -> Light:  # noqa: D102
+    def fit_level_shares(self, reference: View, other: View) -> Light:
         return exposure_between(reference, other)
 
-    def apply_light(self, reference: View, warped: np.ndarray, light: Light) -> np.ndarray:  # noqa: D102
+    def apply_light(self, reference: View, warped: np.ndarray, light: Light) -> np.ndarray:
         return apply_light(reference.grey, warped, *light)
 
-    def difference(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+    def difference(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return cv2.absdiff(one, other)
 
-    def smaller(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+    def smaller(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return cv2.min(one, other)
 
-    def larger(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:  # noqa: D102
+    def larger(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return cv2.max(one, other)
 
-    def inside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # noqa: D102
+    def inside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return cv2.bitwise_and(picture, mask)
 
-    def outside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:  # noqa: D102
+    def outside(self, picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
         return cv2.bitwise_and(picture, cv2.bitwise_not(mask))
 
-    def exceeds(self, picture: np.ndarray, level: float) -> np.ndarray:  # noqa: D102
+    def exceeds(self, picture: np.ndarray, level: float) -> np.ndarray:
         return cv2.threshold(picture, int(level), 255, cv2.THRESH_BINARY)[1]
 
-    def stands_out(self, picture: np.ndarray, least: float, ratio: float) -> np.ndarray:  # noqa: D102
+    def stands_out(self, picture: np.ndarray, least: float, ratio: float) -> np.ndarray:
         return self.exceeds(picture, max(least, ratio * cv2.mean(picture)[0]))
 
-    def noise_weight(  # noqa: D102
-        self, texture: np.ndarray, noise_levels: float, gradient_share: float, scale: float
-    ) -> np.ndarray:
+    def noise_weight(self, texture: np.ndarray, noise_levels: float, gradient_share: float, scale: float) -> np.ndarray:
         noise = np.sqrt((_LEVELS * gradient_share / 4) ** 2 + noise_levels**2)
         return cv2.LUT(texture, (scale / noise).astype(np.float32))
 
-    def weigh(self, picture: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:  # noqa: D102
+    def weigh(self, picture: np.ndarray, weight: np.ndarray, most: float) -> np.ndarray:
         z = cv2.multiply(picture, weight, dtype=cv2.CV_8U)
         return cv2.threshold(z, most, most, cv2.THRESH_TRUNC)[1]
 
-    def blur(self, picture: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+    def blur(self, picture: np.ndarray, side: int) -> np.ndarray:
         return picture if side == 1 else cv2.GaussianBlur(picture, (side, side), 0)
 
-    def in_units_of_median(self, picture: np.ndarray, mask: np.ndarray, least: float) -> np.ndarray:  # noqa: D102
+    def in_units_of_median(self, picture: np.ndarray, mask: np.ndarray, least: float) -> np.ndarray:
         unit = median_above(picture, mask, least) / least
         return picture if unit == 1.0 else cv2.convertScaleAbs(picture, alpha=1 / unit)
 
-    def above(self, evidence: np.ndarray, limit: float) -> np.ndarray:  # noqa: D102
+    def above(self, evidence: np.ndarray, limit: float) -> np.ndarray:
         return self.exceeds(evidence, limit)
 
-    def erode(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+    def erode(self, mask: np.ndarray, side: int) -> np.ndarray:
         return cv2.erode(mask, ellipse(side))
 
-    def dilate(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+    def dilate(self, mask: np.ndarray, side: int) -> np.ndarray:
         return mask if side == 1 else cv2.dilate(mask, ellipse(side))
 
-    def close(self, mask: np.ndarray, side: int) -> np.ndarray:  # noqa: D102
+    def close(self, mask: np.ndarray, side: int) -> np.ndarray:
         return close_mask(mask, side)
 
-    def halve(self, picture: np.ndarray) -> np.ndarray:  # noqa: D102
+    def halve(self, picture: np.ndarray) -> np.ndarray:
         height, width = (side // 2 for side in picture.shape)
         return cv2.resize(picture[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
 

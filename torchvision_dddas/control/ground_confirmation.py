@@ -137,7 +137,7 @@ def expected_regions(
     unsure = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance_m2)[:, -1], 0) + camera.position_sigma_m**2)
     tall = parameters.body_height_m + _SIGMAS * parameters.body_height_sigma_m * np.array([-1.0, 1.0])
     eye = camera.height_m if math.isfinite(camera.height_m) else float(tall[1])
-    nearest_m = focal_v * tall[0] / camera.size_px[1]  # nobody is whole in the picture from nearer
+    nearest_m = focal_v * tall[0] / camera.size_px[1]  # a person nearer than this does not fit into the picture
     horizon = middle_v - focal_v * math.tan(camera.pitch_rad)
     for apart, reach in zip(place_m - camera_m, radius_m + unsure + _MARGIN_M, strict=True):
         away = float(np.hypot(*apart))

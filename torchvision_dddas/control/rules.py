@@ -16,15 +16,15 @@ SHED = ("registration.keypoints", "people.look_share", SAMPLING)
 _MOVED_SHARE = 0.5
 # How wide a person shows with a shadow: who comes into the picture is at least that.
 _WALKER_M = 1.0
-# Frames that take so many times what they may are made as cheap as can be at once.
+# If a frame takes this many times its budget, the load is lowered to the minimum at once.
 _FAR_OVER = 2.0
-# More is processed again where it is expected to take this share of what it may at most: else it would flutter.
+# The load is raised again only if the expected time is at most this share of the budget. Otherwise it would oscillate.
 _SPARE = 0.9
-# Twice the keypoints, or a wider search, is expected to cost so many times as much.
+# Expected cost of twice the keypoints, or of a wider search, as a multiple of the present cost.
 _DEARER = 1.4
-# A search for people takes this share of the windows at the least.
+# Smallest share of the windows that a search for people takes.
 _LEAST_SHARE = 0.002
-# The longest wait before more is processed again, in calm_s.
+# The longest wait before the load is raised again, in units of calm_s.
 _MOST_PATIENCE = 16.0
 
 

@@ -190,7 +190,7 @@ class MotionDetector:
         return Frame(self._last.number + 1, self._last.number / self.rate_hz, image)
 
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
-        """As `update`, one scene at a time."""
+        """Do the work of `update`, and yield one scene at a time."""
         start = time.perf_counter()
         if not self._total:
             self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1::-1])[0])
@@ -214,8 +214,8 @@ class MotionDetector:
         self._buffer.append(Slot(frame, view, look, passed, self._controller.distance, adjustments, seconds))
 
     def _settle_rest(self, last_number: int = 0) -> Iterator[Scene]:
-        """As `flush`, one scene at a time."""
-        if 0 < self._total < _MIN_FRAMES:  # nothing changes: its copies are looks all the same
+        """Do the work of `flush`, and yield one scene at a time."""
+        if 0 < self._total < _MIN_FRAMES:  # a clip of repeated frames: each copy counts as a look
             last, few = self._buffer[self._total - 1], _MIN_FRAMES - self._total
             repeats, last.repeats, self._passed = last.repeats, [], 0
             for frame in repeats[:few]:
@@ -318,7 +318,7 @@ class MotionDetector:
         )
 
     def _motion_between(self, index: int, other: int) -> np.ndarray:
-        """(3, 3) the background's motion from a frame to another one that reliable steps link to it."""
+        """Return the homography (3, 3) of the background between two frames: registered directly, or chained."""
         if self.settings.registration.direct:
             (step,) = self.engine.register([(self._buffer[index].view, self._buffer[other].view)])
             if step.reliable:

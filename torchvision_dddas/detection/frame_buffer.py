@@ -85,7 +85,7 @@ class FrameBuffer:
         return first, last
 
     def motion(self, index: int, other: int) -> np.ndarray:
-        """(3, 3) the background's motion from a frame to another one that reliable steps link to it."""
+        """Return the homography (3, 3) of the background from a frame to another one, chained over reliable steps."""
         steps = [slot.step for slot in self.span(min(index, other), max(index, other))]
         last_from_first = chain([step.later_from_earlier for step in steps if step is not None])
         return last_from_first if other > index else np.linalg.inv(last_from_first)

@@ -45,7 +45,6 @@ _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
 # Inliers of the refits, in RANSAC's tolerance. On half pictures 0.08 px at the corners with or without the rest.
 _TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
-LAST_TOLERANCE = _TOLERANCES[-1]
 
 
 @dataclass(frozen=True)

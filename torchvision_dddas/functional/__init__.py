@@ -16,7 +16,7 @@ that another choice there is a switch inside the function that it concerns.
 from kornia.geometry import oneway_transfer_error, transform_points
 
 from torchvision_dddas.functional.affinity import pair_affinity, triplet_affinity
-from torchvision_dddas.functional.assignment import dispersion, log_partition
+from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.functional.chain_operations import TensorOperations, close_masks
 from torchvision_dddas.functional.color import bgr_to_hsv, rgb_histogram, within_ranges
 from torchvision_dddas.functional.difference import (
@@ -86,7 +86,6 @@ __all__ = [
     "columns_between",
     "corner_min_eigenvalue",
     "dilation",
-    "dispersion",
     "draw_samples",
     "erosion",
     "find_affine",

@@ -8,11 +8,9 @@ the least of a convex function).
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
-
-from torchvision_dddas.functional.soft import step
 
 _CLOSE = 1e-6  # change of any share that ends the rounds
 
@@ -61,30 +59,3 @@ def _log_sum_of_others(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "
     # The largest is summed around, not subtracted: what is left may be smaller than what is lost in the difference.
     rest = x.scatter(axis, at, -torch.inf)
     return others.scatter(axis, at, torch.logaddexp(rest.logsumexp(axis, keepdim=True), torch.zeros_like(most)))
-
-
-def dispersion(
-    apart: Float[Tensor, "*B N N"],
-    there: Bool[Tensor, "*B N"],
-    cut: Float[Tensor, ""] | float,
-    softness: float = 0.0,
-) -> Float[Tensor, "*B"]:
-    """How far apart a frame's targets are, in [0, 1]: 1 when every target is alone within the cut, 0 when none is.
-
-    The cluster entropy of appendix C (III-D, eq. 9) with a slope. The source cuts a tree of clusters at a dissimilarity
-    G. Here every target has a neighbourhood, all targets within the cut, itself among them, each by a soft step. The
-    mean of log2(N / neighbours) is the source's entropy where clusters are further apart than the cut is wide; where a
-    chain joins distant targets it is larger. It is 1 for one target or none.
-
-    apart: dissimilarities in [0, 1], 0 of a target to itself. there: which targets are there. softness: of the step at
-    the cut, in the dissimilarity's own unit.
-    """
-    both = there[..., :, None] & there[..., None, :]
-    same = torch.eye(apart.shape[-1], dtype=torch.bool, device=apart.device)
-    near = torch.where(both, torch.where(same, 1.0, step(cut - apart, softness)), 0.0).sum(-1)
-    count = there.sum(-1).to(apart.dtype)
-    several = count > 1
-    # The inner `where` keeps log 0 and 0 / 0 out of the gradient.
-    share = torch.where(there, near, 1.0).log2() / torch.where(several, count, 2.0).log2()[..., None]
-    mean = torch.where(there, share, 0.0).sum(-1) / count.clamp(min=1)
-    return torch.where(several, 1 - mean, 1.0)

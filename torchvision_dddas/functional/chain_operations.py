@@ -55,28 +55,26 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         """See `Operations`, as of every other method."""
         return to_bytes(view)
 
-    def texture(self, view: Tensor) -> Tensor:  # noqa: D102
+    def texture(self, view: Tensor) -> Tensor:
         return mean_gradient(view)
 
-    def no_texture(self, view: Tensor) -> Tensor:  # noqa: D102
+    def no_texture(self, view: Tensor) -> Tensor:
         return torch.zeros_like(view)
 
-    def warp(self, view: Tensor, reference: Tensor, view_from_reference: Tensor) -> Tensor:  # noqa: D102
+    def warp(self, view: Tensor, reference: Tensor, view_from_reference: Tensor) -> Tensor:
         size = (reference.shape[-2], reference.shape[-1])
         return warp_perspective(
             view, view_from_reference, size, padding_mode="border", inverse_map=True, subpixels=32, whole=True
         )
 
-    def seen(  # noqa: D102
-        self, view: Tensor, reference: Tensor, view_from_reference: Tensor, border_px: int
-    ) -> Columns:
+    def seen(self, view: Tensor, reference: Tensor, view_from_reference: Tensor, border_px: int) -> Columns:
         size, frame_size = ((picture.shape[-2], picture.shape[-1]) for picture in (reference, view))
         return seen_columns(view_from_reference, size, frame_size, border_px)
 
-    def seen_by_both(self, one: Columns, other: Columns, reference: Tensor) -> Tensor:  # noqa: D102
+    def seen_by_both(self, one: Columns, other: Columns, reference: Tensor) -> Tensor:
         return seen_by_both(one, other, reference.shape[-1])
 
-    def fit_light(self, reference: Tensor, warped: Tensor, seen: Columns) -> Light:  # noqa: D102
+    def fit_light(self, reference: Tensor, warped: Tensor, seen: Columns) -> Light:
         pitch = exposure_step(reference.shape[-2:])
         first, last = (edge[:, ::pitch, None] for edge in seen)
         columns = torch.arange(0, reference.shape[-1], pitch, device=reference.device)
@@ -86,10 +84,10 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         enough = inside.sum((1, 2, 3)) >= _EXPOSURE_LEAST
         return torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
 
-    def fit_level_shares(self, reference: Tensor, other: Tensor) -> Light:  # noqa: D102
+    def fit_level_shares(self, reference: Tensor, other: Tensor) -> Light:
         return fit_quantiles(level_quantiles(reference), level_quantiles(other))
 
-    def apply_light(self, reference: Tensor, warped: Tensor, light: Light) -> Tensor:  # noqa: D102
+    def apply_light(self, reference: Tensor, warped: Tensor, light: Light) -> Tensor:
         gain, offset = (part.to(reference).reshape(-1, 1, 1, 1) for part in light)
         levels = torch.arange(LEVEL + 1, dtype=gain.dtype, device=gain.device)
         if all_true((gain * levels + offset).round() == levels):
@@ -100,37 +98,35 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         through = to_bytes(warped.to(gain.dtype).mul_(gain).add_(offset).round_().clamp_(0.0, float(LEVEL)))
         return through if cut is None else torch.where(cut, torch.maximum(through, to_bytes(reference)), through)
 
-    def difference(self, one: Tensor, other: Tensor) -> Tensor:  # noqa: D102
+    def difference(self, one: Tensor, other: Tensor) -> Tensor:
         return absolute_difference(one, other)
 
-    def smaller(self, one: Tensor, other: Tensor) -> Tensor:  # noqa: D102
+    def smaller(self, one: Tensor, other: Tensor) -> Tensor:
         return torch.minimum(one, other)
 
-    def larger(self, one: Tensor, other: Tensor) -> Tensor:  # noqa: D102
+    def larger(self, one: Tensor, other: Tensor) -> Tensor:
         return torch.maximum(one, other)
 
-    def inside(self, picture: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
+    def inside(self, picture: Tensor, mask: Tensor) -> Tensor:
         return picture * mask
 
-    def outside(self, picture: Tensor, mask: Tensor) -> Tensor:  # noqa: D102
+    def outside(self, picture: Tensor, mask: Tensor) -> Tensor:
         return picture * ~mask
 
-    def exceeds(self, picture: Tensor, level: float) -> Tensor:  # noqa: D102
+    def exceeds(self, picture: Tensor, level: float) -> Tensor:
         return is_above(picture, int(level)) if picture.dtype == torch.uint8 else picture > level
 
-    def stands_out(self, picture: Tensor, least: float, ratio: float) -> Tensor:  # noqa: D102
+    def stands_out(self, picture: Tensor, least: float, ratio: float) -> Tensor:
         mean = picture.to(torch.float64).mean(dim=(1, 2, 3), keepdim=True)
         return (picture > (ratio * mean).clamp(min=least).floor()).to(torch.uint8) * LEVEL
 
-    def noise_weight(  # noqa: D102
-        self, texture: Tensor, noise_levels: Number, gradient_share: Number, scale: float
-    ) -> Tensor:
+    def noise_weight(self, texture: Tensor, noise_levels: Number, gradient_share: Number, scale: float) -> Tensor:
         return noise_weight(texture, noise_levels, gradient_share) * scale
 
-    def weigh(self, picture: Tensor, weight: Tensor, most: float) -> Tensor:  # noqa: D102
+    def weigh(self, picture: Tensor, weight: Tensor, most: float) -> Tensor:
         return self._rounded((picture * weight).clamp_(max=most))
 
-    def blur(self, picture: Tensor, side: Number) -> Tensor:  # noqa: D102
+    def blur(self, picture: Tensor, side: Number) -> Tensor:
         levels = picture if self.is_hard or picture.is_floating_point() else picture.to(self.dtype)
 
         def of_size(side: int) -> Tensor:
@@ -141,7 +137,7 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
 
         return blend_sizes(side, of_size, pitch=2)
 
-    def in_units_of_median(self, picture: Tensor, mask: Tensor, least: float) -> Tensor:  # noqa: D102
+    def in_units_of_median(self, picture: Tensor, mask: Tensor, least: float) -> Tensor:
         bytes_of = picture if picture.dtype == torch.uint8 else picture.detach().round().to(torch.uint8)
         units = noise_units(bytes_of, mask, least)
         if all_true(units == 1.0):
@@ -154,23 +150,23 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
             per_unit = straight_through(per_unit, slope) if self.whole else slope
         return self._rounded(picture * per_unit.reshape(-1, 1, 1, 1))
 
-    def above(self, evidence: Tensor, limit: Number) -> Tensor:  # noqa: D102
+    def above(self, evidence: Tensor, limit: Number) -> Tensor:
         if evidence.dtype != torch.uint8:
             margin: Tensor = evidence - limit
             return margin
         mask = evidence > limit if isinstance(limit, Tensor) else is_above(evidence, int(limit))
         return mask.to(torch.uint8) * LEVEL
 
-    def erode(self, mask: Tensor, side: Number) -> Tensor:  # noqa: D102
+    def erode(self, mask: Tensor, side: Number) -> Tensor:
         return blend_sizes(side, lambda side: erosion(mask, kernel_array("ellipse", side)))
 
-    def dilate(self, mask: Tensor, side: Number) -> Tensor:  # noqa: D102
+    def dilate(self, mask: Tensor, side: Number) -> Tensor:
         return blend_sizes(side, lambda side: mask if side == 1 else dilation(mask, kernel_array("ellipse", side)))
 
-    def close(self, mask: Tensor, side: Number) -> Tensor:  # noqa: D102
+    def close(self, mask: Tensor, side: Number) -> Tensor:
         return blend_sizes(side, lambda side: close_masks(mask, side))
 
-    def halve(self, picture: Tensor) -> Tensor:  # noqa: D102
+    def halve(self, picture: Tensor) -> Tensor:
         return functional.avg_pool2d(picture.float(), 2).add_(0.5).to(torch.uint8)
 
     def _rounded(self, x: Tensor) -> Tensor:

@@ -284,7 +284,7 @@ class Georeferencer:
         if cause:
             return no_fix(frame, marks, cause)
         if prior is None:
-            # By landmarks alone a tilt and its mirror are hard to tell apart: in the filter a wrong one would persist.
+            # Landmarks alone hardly tell a tilt from its mirror. A wrong one would persist in the filter, so clear it.
             before = before.forget(np.arange(len(before.mean)))
         check, before = self._check(before, prior or bare, marks, None if prior is None else bare)
         solution, cause = check.solution, check.cause

@@ -208,7 +208,7 @@ def cut_out_landmarks(
     rows, boxes, areas = [], [], []
     numbered = np.zeros_like(mask)
     for row, (x, y, width, height) in enumerate(found.box_px.astype(int).tolist()):
-        # Boxes of blobs lie within the picture; a vehicle that no disc is known for goes whole.
+        # Boxes of blobs lie within the picture. The whole blob of a vehicle without a known disc is removed.
         left, top = max(x, 0), max(y, 0)
         window = np.s_[top : y + height, left : x + width]
         rest, whole = outside[window] == row + 1, mask[window] == row + 1

@@ -21,8 +21,8 @@ from torchvision_dddas.memory import VIDEO, check_memory
 
 # FFmpeg draws any text file as an old terminal would, which is never wanted.
 _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
-# A stream is the cover of the file if it is marked so (attached picture, thumbnails, still image), or if it holds one
-# picture in one of these codecs.
+# A stream is the cover of a file if it is marked as an attached picture, a thumbnail or a still image, or if it holds a
+# single picture in one of the codecs of pictures.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
 # FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"

@@ -61,15 +61,15 @@ class Receiver:
         self._health, self._clock = health, clock
         self._failure: InputError | None = None
         self._ready = False
-        self._turn = 0  # of the current thread
+        self._turn = 0  # number of the current thread
         self._call: tuple[float, float] | None = None  # since when it is in the driver, and for how long it may be
         self._pause_s = parameters.retry_s
         self._lost_s: float | None = None
-        self._why = ""  # it was lost, or could not be opened again
+        self._why = ""  # why the camera was lost, or could not be opened again
         self._tries = 0
         self._start_s = float("nan")
-        self._odd_s: float | None = None  # since when pictures have another size
-        self._off = False  # the rate was reported to differ from the announced one
+        self._odd_s: float | None = None  # since when pictures differ from `size`; None: they do not
+        self._off = False  # whether a wrong announced rate was reported
         self.threads: list[threading.Thread] = []
         self._at_work: threading.Thread | None = None  # the current thread; None if all hang
         self._spawn()

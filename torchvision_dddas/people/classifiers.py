@@ -44,7 +44,7 @@ _MOST_NUMBERS = 1_000_000  # of an array; descriptors have thousands
 _LONGEST_HEADER = 10_000  # of an array, bytes; NumPy reads no longer ones, after it has made room
 _MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # begins a part of what OpenCV saves: a key, a list, an item, a tag
 _MOST_MARKS = 10_000  # OpenCV crashes on parts that lie deeper in each other than twice that
-_DIGITS = 1e-6  # a clip of 0.2 is not the same number in every file
+_DIGITS = 1e-6  # files store a clip of 0.2 with different rounding
 
 
 def read_classifier(name: str | Path, features: int, wanted: Layout | None = None) -> LinearSvm:

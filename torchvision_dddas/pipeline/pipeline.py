@@ -28,6 +28,7 @@ from torchvision_dddas.geo import (
 )
 from torchvision_dddas.geo.aerial_targets import tracked_targets
 from torchvision_dddas.geo.clock_offset import describe_clock_offset
+from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.pipeline.assembly import Assembly, assemble
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture
 from torchvision_dddas.types import (
@@ -73,6 +74,9 @@ class Pipeline:
     result is settled some frames later. Targets are located where landmarks are given, or telemetry with places.
     notes: what the user should know of what was given, and after the last frame whether log and clip are synchronised.
     """
+
+    open_clip: Callable[..., Any] = staticmethod(open_source)
+    """Opens a path. The package's front door puts `open_video` in its place, which opens `sim:` too."""
 
     def __init__(
         self,
@@ -160,9 +164,7 @@ class Pipeline:
         Raises InputError for another source, for frames of a wrong shape or type, and for fewer than three frames.
         """
         if isinstance(source, str | Path):
-            import torchvision_dddas  # the front door, which also opens sim:
-
-            source = torchvision_dddas.open_video(str(source), full_scale=self.settings.levels.given)
+            source = self.open_clip(str(source), full_scale=self.settings.levels.given)
         if not hasattr(source, "__iter__"):
             raise InputError(f"a pipeline wants a path or frames, got {type(source).__name__}")
         self._detector = None

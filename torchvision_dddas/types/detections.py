@@ -228,7 +228,7 @@ class DetectionTable:
 
     @cached_property
     def targets(self) -> np.ndarray:
-        """(N,) int64 identity of each row; rows without one are numbered within the frame, above all identities.
+        """(N,) int64 identity of each row. Rows without identity get numbers above all identities, counted by frame.
 
         Raises InputError if a frame has an identity twice.
         """

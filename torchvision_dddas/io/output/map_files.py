@@ -60,7 +60,7 @@ class AerialMaps(Part[AerialLocations]):
     record: RunRecord
 
     def __init__(self, folder: Path, save: Sequence[str], site: Site, story: RunStory | None = None) -> None:
-        """story: has the timeline, and adds events and key frames to the report."""
+        """story: the timeline, events and key frames of the run, which the report shows; None without them."""
         self._folder, self._save, self._site, self._story = folder, save, site, story
         self._timeline = Timeline() if story is None else story.timeline
         self._targets, self._landmarks = Gathered(), Gathered()

@@ -238,7 +238,7 @@ class Names:
                 with_unit = next((found for word in words if (found := known.in_unit(word))), None)
                 # A unit that is not known may be any. The letter h means the height only with a unit.
                 if key == name and known.field.kind == "length" and not _NOTHING.fullmatch(rest):
-                    continue  # what it counts from is not known
+                    continue  # the zero point of this height is not known
                 if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
                     return with_unit or known
         return None

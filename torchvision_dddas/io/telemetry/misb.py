@@ -137,7 +137,7 @@ def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
 
 
 def local_sets(content: bytes) -> Iterator[LocalSet]:
-    """All that begin with the universal key, in order; one that is cut off or garbled is not whole and has no tags."""
+    """Yield every local set that begins with the universal key, in order. A damaged set is marked and has no tags."""
     place = content.find(KEY)
     sums = _Sums(content)
     while place >= 0:

@@ -21,10 +21,11 @@ Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Stil
 
 
 class Metric(NamedTuple):
-    """What is known of a measure.
+    """The description of a measure for tables and reports.
 
-    title: in reports; short: the heading of a narrow column. better: 1 where more is better, -1 where less is, 0 where
-    neither. digits: decimals. unit: empty for shares and counts. is_share: whether it lies between 0 and 1.
+    title: the heading in reports. short: the heading of a narrow column. better: 1 if larger values are better, -1 if
+    smaller values are better, 0 if neither is. digits: the number of decimals. unit: empty for shares and counts.
+    is_share: whether the values lie between 0 and 1.
     """
 
     title: str

@@ -213,7 +213,7 @@ def whose_places(
     if truth.ignored is not None:
         row_of += [_NOT_ASKED] * len(truth.ignored.frame)
         labelled = TrackTable(*(np.concatenate(pair) for pair in zip(labelled, truth.ignored, strict=True)))
-    of_place = np.array([*row_of, _NOBODY], np.int64)  # the last is for boxes that are none of them: -1
+    of_place = np.array([*row_of, _NOBODY], np.int64)  # index -1, the last entry, stands for boxes that match no truth
     return of_place[metres.by_boxes(frame, box_px, labelled)], np.unique(of_place[of_place >= 0])
 
 
