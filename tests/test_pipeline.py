@@ -75,9 +75,10 @@ def test_the_backend_of_a_pipeline_is_that_of_its_tracker_too(frames, monkeypatc
 def test_the_pipeline_of_the_front_door_opens_what_the_front_door_opens():
     import torchvision_dddas as td
 
-    assert td.Pipeline.open_clip is td.open_video
+    front: Any = td.Pipeline
+    assert front.open_clip is td.open_video
     with pytest.raises(InputError, match="no_such"):
-        next(iter(td.Pipeline("fast")("sim:no_such")))
+        next(iter(front("fast")("sim:no_such")))
 
 
 def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
