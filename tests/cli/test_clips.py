@@ -496,19 +496,3 @@ def test_clips_of_one_flight_are_one_run_and_clips_to_detect_in_are_several(ddda
     assert record(tmp_path / "run")["input"] == [str(film) for film in films]
     result = dddas("detect", *films, "--out", tmp_path / "found", "--save", "none")
     assert result.exit_code == 0 and sorted(path.name for path in (tmp_path / "found").iterdir()) == ["part0", "part1"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["clip.mp4", "clip.mp4", "--live"], "2 clips were given; wanted one with --live"),
-        (["clip.mp4", "sim:four"], "one sim:SCENARIO"),
-        (["clip.mp4", "--telemetry", "a.csv", "--telemetry", "b.csv"], "one clip and 2 logs"),
-        (["clip.mp4", "clip.mp4", *["--telemetry", "a.csv"] * 3], "2 clips and 3 logs"),
-    ],
-)
-def test_clips_and_logs_that_do_not_go_together_are_one_line(dddas, engine, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    film_of(tmp_path / "clip.mp4", textured_frames(5))
-    result = dddas("run", *words, "--out", "out")
-    assert result.exit_code == 2 and message in bad(result)

@@ -29,7 +29,7 @@ from tests.cli.conftest import bad
 from tests.live.streams import FakeStream
 from tests.synthetic_clip import render
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-from torchvision_dddas.errors import InputError, without_secrets
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams.stream import Stream
 from torchvision_dddas.pipeline import assemble_files
 
@@ -360,12 +360,6 @@ def test_a_place_that_cannot_be_written_is_one_line(dddas, frames, tmp_path):
     (tmp_path / "file").write_text("mine")
     assert "Choose another folder with --out" in bad(dddas("run", frames, *FAST, "--out", tmp_path / "file"))
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_a_password_in_an_address_is_written_nowhere():
-    assert without_secrets("rtsp://me:secret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
-    assert without_secrets("rtsp://me:s@cret@10.0.0.1/live") == "rtsp://10.0.0.1/live"
-    assert without_secrets("frames/a@b") == "frames/a@b"
 
 
 def test_no_sink_of_a_live_run_shows_the_password_of_its_camera(dddas, tmp_path, monkeypatch, capfd):

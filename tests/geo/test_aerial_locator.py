@@ -9,7 +9,7 @@ from tests.overflight import COLOURS_TOML, Overflight, pictures
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import with_logged_focal
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, check_table, resolve_camera
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, build_site, resolve_camera
 from torchvision_dddas.geo.aerial_targets import Targets, reference_points
 from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_aerial_camera, read_camera
@@ -110,14 +110,6 @@ def test_without_a_cameras_file_the_field_of_view_is_the_telemetrys_or_a_guess()
     assert not known and "using 70 degrees" in note and camera.centre_px == (499.5, 299.5)
 
 
-def test_a_table_whose_landmarks_cannot_place_it_is_refused_before_any_work(prepared):
-    locator, table = prepared(Overflight(landmarks=3, geographic=False), telemetry=False)
-    with pytest.raises(InputError, match="frame 1 has 3, none more: 1 missing"):
-        check_table(table, locator)
-    helped, table = prepared(Overflight(landmarks=3, geographic=False))
-    check_table(table, helped)
-
-
 def test_the_rule_of_the_source_uses_four_of_six_and_says_when_more(prepared):
     flight, source = Overflight(landmarks=6, geographic=False), {"landmarks.rule": "source"}
     locator, table = prepared(flight, **source)
@@ -171,24 +163,6 @@ def test_a_tables_pixels_remove_the_smallest_box_about_each_landmark_from_the_ta
     found = LandmarkWatch(locator, None, "onboard").update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
     assert found.sighted_by == ("table",) * len(truth)
     assert found.scene.detections.box_px.tolist() == [[300, 30, 20, 20]]
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"telemetry": None, "landmarks": None}, "got neither"),
-        ({"altitude_m": np.full(9, -1.0)}, "at or below ground throughout"),
-        ({"pitch_rad": np.full(9, -1.0)}, "looks into the sky"),
-        ({"geographic": True}, "the landmarks are in local metres, the telemetry in longitude and latitude"),
-        ({"place": np.full((9, 2), 3e5)}, "km or more from the landmarks"),
-    ],
-)
-def test_a_site_whose_parts_contradict_each_other_is_refused(prepared, change, words):
-    locator, _ = prepared(Overflight(frames=9, geographic=False))
-    site = locator.site
-    telemetry = None if "telemetry" in change else replace(site.telemetry, **change)
-    with pytest.raises(InputError, match=words):
-        build_site(change.get("landmarks", site.landmarks), telemetry)
 
 
 # -- Lenses ------------------------------------------------------------------------------------------------------------

@@ -246,13 +246,6 @@ def test_capitals_prefixes_and_the_names_of_yolov5_are_known(write, header, orde
         assert (unique(table.class_id), unique(table.label)) == ({3}, {"car"})
 
 
-@pytest.mark.parametrize("names", ["x_px,y_px,width_px,height_px", "x,y,w,h", "x1,y1,x2,y2"])
-def test_names_tell_the_order_of_shares_too(write, names):
-    box = in_order("xyxy" if "x1" in names else "xywh", True)
-    text = "".join(",".join(map(str, (k, *row))) + "\n" for k, row in enumerate(box, 1))
-    np.testing.assert_allclose(read_detections(write(f"frame,{names}\n{text}"), None, SHAPE).box_px, PLACES)
-
-
 def test_shares_and_percent_without_names_are_refused_where_their_order_is_not_known(write):
     for order in ("yolo", "xywh"):
         with pytest.raises(InputError, match=r"boxes in \[0, 1\] may be yolo or xywh; pass --box-format"):

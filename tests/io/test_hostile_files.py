@@ -8,6 +8,7 @@ import sys
 import tracemalloc
 import zipfile
 import zlib
+from functools import partial
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ from torchvision_dddas.io.tables import read_csv
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.misb import KEY, local_sets
 from torchvision_dddas.lab.evaluation.evaluate import Result, load_result
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_rows, read_seqinfo
+from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, load_truth, read_mask, read_seqinfo
 from torchvision_dddas.memory import check_memory
 from torchvision_dddas.people.classifiers import read_classifier
 
@@ -55,55 +56,75 @@ def hang_ends():
     signal.signal(signal.SIGVTALRM, before)
 
 
-def read(path, content):
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_telemetry(path)
+def mavlink(magic, period):
+    """A log of four messages, before the last of which lie megabytes of beginnings of messages."""
+    dialect = pytest.importorskip("pymavlink.dialects.v20.all")
+
+    def message(second):
+        place = dialect.MAVLink_global_position_int_message(second * 1000, 10**8, 10**8, 5000, 5000, 0, 0, 0, 0)
+        return struct.pack(">Q", 1_700_000_000_000_000 + second * 10**6) + place.pack(
+            dialect.MAVLink(None), force_mavlink1=True
+        )
+
+    rest = magic.ljust(period, b"\x01") * ((6_000_000 if period > len(magic) else 1_000_000) // period)
+    return message(0) + message(1) + message(2) + rest + b"\0" * 300 + message(3) + b"\0" * 9
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["a" * 60_000 + " " * 60_000, "a." * 60_000, "<" * 120_000, "a:" + " " * 120_000, "a(" * 60_000, "-" * 120_000],
-)
-def test_subtitles_with_endless_words_are_read(tmp_path, words):
-    found = read(tmp_path / "a.srt", SUBTITLES.format(words))
-    assert len(found.time_s) == 3 and found.altitude_m[2] == 5
+def px4(rubbish):
+    """A log of 40 messages with megabytes of rubbish among them."""
+    pytest.importorskip("pyulog")
+    fields, rows = ("double lat", "double lon", "float alt"), [(i * 100_000, 63.4, 10.4, 60 + i) for i in range(40)]
+    content = ulog({"vehicle_global_position": (fields, rows)})
+    half = len(content) - 20 * 33  # messages of 3 + 2 + 28 bytes
+    return content[:half] + rubbish * (5_000_000 // len(rubbish)) + content[half:]
 
 
-def test_many_subtitles_without_a_time_are_noted_once(tmp_path):
-    timeless = "Latitude: 1.5 Longitude: 2.5\n\n" * 40_000
-    with pytest.raises(InputError, match="nothing in it"):
-        read(tmp_path / "b.srt", "GPS (1,2,3)\n\n" + timeless)
-    dated = "2024-01-01 00:00:00\nGPS (1,2,3) H:5m\n\n"
-    found = read(tmp_path / "c.srt", dated + timeless)
-    assert sum("without time" in note for note in found.notes) == 1
-    assert any("line 4: a subtitle without time is left out, 40000 in all" in note for note in found.notes)
+def programme_tables():
+    header = b"\x02\xb0\xb0\0\x01\xc1\0\0\xe1\x01\xf0\0"
+    table = b"G\x41\x00\x10\x00" + header + b"\x1b\xe1\x01\xf0\0" * 34 + b"\0"
+    return b"G\x40\x00\x10\x00" + b"\0\xb0\x0d\0\x01\xc1\0\0\0\x01\xe1\0" + b"\0" * 171 + table * 12_000
 
 
-@pytest.mark.parametrize("line", ["$GPGGA," + " " * 100_000 + "*X\n", "$GPGGA," + " *" * 50_000 + "\n"])
-def test_an_endless_nmea_sentence_is_left_out(tmp_path, line):
-    found = read(tmp_path / "a.nmea", line.join(f"{sentence(RMC.format(k))}\n" for k in range(3)))
-    assert len(found.time_s) == 3
-    assert any("line 2: sentences are left out" in note for note in found.notes)
+def timed(clock, digits):
+    return "time,latitude,longitude,altitude\n" + f"{clock.format('9' * digits)},48,11,50\n" * 2
 
 
-@pytest.mark.parametrize("name", ["(" * 120_000, "a" + " " * 120_000 + "b", "[ " * 60_000, "(" * 60_000 + "m"])
-def test_a_table_with_an_endless_name_is_read(tmp_path, name):
-    found = read(tmp_path / "a.csv", f"latitude [deg],longitude,time (ms),{name}\n1,2,0,\n1,2,1000,\n1,2,2000,\n")
-    np.testing.assert_allclose(found.time_s, [0, 1, 2])
+TIMELESS = "Latitude: 1.5 Longitude: 2.5\n\n" * 40_000
+WORDS = ("a" * 60_000 + " " * 60_000, "a." * 60_000, "<" * 120_000, "a:" + " " * 120_000, "a(" * 60_000, "-" * 120_000)
+NAMES = ("(" * 120_000, "a" + " " * 120_000 + "b", "[ " * 60_000, "(" * 60_000 + "m")
+SENTENCES = ("$GPGGA," + " " * 100_000 + "*X\n", "$GPGGA," + " *" * 50_000 + "\n")
+CLOCKS = ("{}:00:00", "00:{}:00", "00:00:{}", "{}", "2024-01-01 {}:00:00")
+# The file's name, its content, how many samples it has, 0 where it is refused, and what is said.
+LOGS = [
+    *(("a.srt", SUBTITLES.format(word), 3, "") for word in WORDS),
+    ("b.srt", "GPS (1,2,3)\n\n" + TIMELESS, 0, "nothing in it"),
+    ("c.srt", f"2024-01-01 00:00:00\nGPS (1,2,3) H:5m\n\n{TIMELESS}", 1, "without time is left out, 40000 in all"),
+    *(
+        ("a.nmea", line.join(f"{sentence(RMC.format(k))}\n" for k in range(3)), 3, "line 2: sentences are left out")
+        for line in SENTENCES
+    ),
+    *(("a.csv", f"latitude [deg],longitude,time (ms),{n}\n1,2,0,\n1,2,1000,\n1,2,2000,\n", 3, "") for n in NAMES),
+    # More digits than a float holds, and than Python makes a number of.
+    *(("a.csv", timed(clock, n), 0, "is no time; wanted a date with a time") for clock in CLOCKS for n in (400, 5000)),
+    ("a.csv", "height,seconds" + ",a" * 150_000 + "\n" + "".join(f"1,{k}\n" for k in range(150_000)), 150_000, ""),
+    ("a.ts", programme_tables, 0, "carries no KLV metadata; its streams are of the types 0x1b"),
+    *(("a.tlog", partial(mavlink, *given), 4, "are no MAVLink messages") for given in ((b"\xfe", 12), (b"\xfd", 12))),
+    ("a.tlog", partial(mavlink, b"\xfe\x81", 2), 4, "are no MAVLink messages"),
+    *(("a.ulg", partial(px4, rubbish), 40, "the log is damaged") for rubbish in (b"\xff", b"a.", b"0")),
+]
 
 
-@pytest.mark.parametrize("clock", ["{}:00:00", "00:{}:00", "00:00:{}", "{}", "2024-01-01 {}:00:00"])
-@pytest.mark.parametrize("digits", [400, 5000])  # more than a float holds, and than Python makes a number of
-def test_a_time_of_endless_digits_is_refused(tmp_path, clock, digits):
-    cells = f"{clock.format('9' * digits)},48,11,50\n"
-    with pytest.raises(InputError, match=r"line 2: '.* is no time; wanted a date with a time, or seconds"):
-        read(tmp_path / "a.csv", f"time,latitude,longitude,altitude\n{cells}{cells}")
-
-
-def test_a_table_of_many_columns_and_many_short_rows_is_read(tmp_path):
-    rows = "".join(f"1,{k}\n" for k in range(150_000))
-    found = read(tmp_path / "a.csv", "height,seconds" + ",a" * 150_000 + "\n" + rows)
-    assert len(found.time_s) == 150_000
+@pytest.mark.parametrize(("name", "content", "samples", "words"), LOGS, ids=range(len(LOGS)))
+def test_a_log_made_to_keep_a_reader_busy_is_read_on_or_refused_in_seconds(tmp_path, name, content, samples, words):
+    content = content() if callable(content) else content
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    try:
+        found = read_telemetry(tmp_path / name)
+    except InputError as error:
+        count, said = 0, [str(error)]
+    else:
+        count, said = len(found.time_s), found.notes
+    assert count == samples and sum(words in text for text in said) == (1 if words else len(said)), said
 
 
 def nested(count, length, tail=b""):
@@ -119,43 +140,6 @@ def test_sets_that_lie_in_each_other_are_found_one_by_one(tail):
     found = list(local_sets(nested(10_000, 0x757F, tail) + packet(0, {5: b"\0\1"})))
     assert len(found) > 5000 and sum(one.whole for one in found) == 1
     assert found[-1].whole and found[-1].tags[5] == b"\0\1"
-
-
-def test_programme_tables_without_end_are_read(tmp_path):
-    header = b"\x02\xb0\xb0\0\x01\xc1\0\0\xe1\x01\xf0\0"
-    table = b"G\x41\x00\x10\x00" + header + b"\x1b\xe1\x01\xf0\0" * 34 + b"\0"
-    start = b"G\x40\x00\x10\x00" + b"\0\xb0\x0d\0\x01\xc1\0\0\0\x01\xe1\0" + b"\0" * 171
-    with pytest.raises(InputError, match="carries no KLV metadata; its streams are of the types 0x1b"):
-        read(tmp_path / "a.ts", start + table * 12_000)
-
-
-@pytest.mark.parametrize(("magic", "period"), [(b"\xfe", 12), (b"\xfd", 12), (b"\xfe\x81", 2)])
-def test_a_log_full_of_beginnings_of_messages_is_read(tmp_path, magic, period):
-    mavlink = pytest.importorskip("pymavlink.dialects.v20.all")
-    sender = mavlink.MAVLink(None)
-
-    def message(second):
-        place = mavlink.MAVLink_global_position_int_message(second * 1000, 10**8, 10**8, 5000, 5000, 0, 0, 0, 0)
-        return struct.pack(">Q", 1_700_000_000_000_000 + second * 10**6) + place.pack(sender, force_mavlink1=True)
-
-    size = 6_000_000 if period > len(magic) else 1_000_000
-    rest = magic.ljust(period, b"\x01") * (size // period)
-    found = read(
-        tmp_path / "a.tlog", message(0) + message(1) + message(2) + rest + b"\0" * 300 + message(3) + b"\0" * 9
-    )
-    assert len(found.time_s) >= 3 and found.place[0, 0] == pytest.approx(10)
-    assert any("are no MAVLink messages" in note for note in found.notes)
-
-
-@pytest.mark.parametrize("rubbish", [b"\xff", b"a.", b"0"])
-def test_a_px4_log_is_read_on_behind_megabytes_of_rubbish(tmp_path, rubbish):
-    pytest.importorskip("pyulog")
-    fields, rows = ("double lat", "double lon", "float alt"), [(i * 100_000, 63.4, 10.4, 60 + i) for i in range(40)]
-    content = ulog({"vehicle_global_position": (fields, rows)})
-    half = len(content) - 20 * 33  # messages of 3 + 2 + 28 bytes
-    flown = read(tmp_path / "a.ulg", content[:half] + rubbish * (5_000_000 // len(rubbish)) + content[half:])
-    np.testing.assert_array_equal(flown.above_sea_m, np.arange(60, 100))
-    assert any("the log is damaged" in note for note in flown.notes)
 
 
 @pytest.mark.parametrize("key", ["a." * 200_000 + "a = 1", "[" + "a . " * 100_000 + "a]", "x = {" + "'a'." * 100_000])
@@ -202,20 +186,6 @@ def test_the_boxes_of_many_frames_are_found_by_frame(tmp_path):
     tracks = TrackTable(number, np.ones(count, np.int64), number[:, None] * np.ones(4))
     result = Result(tmp_path, 0, None, False, "complete", tracks)
     assert all(result.boxes_at(k)[0, 0] == k for k in range(1, count + 1)) and not len(result.boxes_at(count + 1))
-
-
-@pytest.mark.parametrize("score", [",0.5", ""])
-@pytest.mark.parametrize("separator", [",", " "])
-def test_rows_are_the_same_read_fast_and_cell_by_cell(tmp_path, monkeypatch, score, separator):
-    path = tmp_path / "a.txt"
-    text = "".join(f"{k},2,{k}.25,-1e1,3,4{score}\n\n" for k in range(1, 9)).replace(",", separator)
-    path.write_text(text)
-    fast = read_rows(path, "truth")
-    monkeypatch.setattr("torchvision_dddas.lab.evaluation.metrics.text_rows._read_fast", lambda *_: None)
-    slow = read_rows(path, "truth")
-    for one, other in zip((*fast.table, *fast[1:]), (*slow.table, *slow[1:]), strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert fast.line.tolist() == list(range(1, 17, 2)) and fast.mark[0] == (0.5 if score else 1)
 
 
 def test_lines_are_not_all_filled_up_to_the_longest(tmp_path):

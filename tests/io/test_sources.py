@@ -233,14 +233,6 @@ def test_without_pyav_a_film_whose_size_may_change_is_noted(tmp_path, monkeypatc
         assert sum("without PyAV" in note for note in source.notes) == count  # type: ignore[attr-defined]
 
 
-def test_a_tolerant_reader_goes_on_with_a_size_that_lasts(tmp_path):
-    source = open_source(write_changing(tmp_path, "mjpeg", [(64, 48), (96, 72), (64, 48)], each=30))
-    source.tolerant = True  # type: ignore[attr-defined]
-    widths = [frame.image.shape[1] for frame in source]
-    assert widths == [64] * 30 + [96] * 21 + [64] * 21 and source.size == (64, 48)
-    assert len(source.problems) == 18 and all("left out" in str(problem) for problem in source.problems)
-
-
 def test_time_stamps_that_begin_anew_in_the_middle_go_on(tmp_path):
     frames = list(open_source(write_changing(tmp_path, "mpg2.ts", [(64, 48)] * 2, each=40)))
     assert [frame.number for frame in frames] == list(range(1, len(frames) + 1)) and len(frames) >= 78

@@ -165,47 +165,6 @@ def test_whether_telemetry_covers_a_clip_is_said_with_both_spans(from_s, to_s, g
 # -- Tables of other programs ------------------------------------------------------------------------------------------
 
 
-def test_a_flight_log_of_dated_rows_is_read_by_its_columns_names(fly):
-    text = (
-        "frame,timestamp,fnum,focal_len,latitude,longitude,rel_alt,abs_alt\n"
-        "0,2022-10-07 17:52:13.500,2.8,24.0,37.38892,126.66295,146.0,94.465\n"
-        "1,2022-10-07 17:52:14.000,2.8,24.0,37.38893,126.66295,147.0,95.465\n"
-    )
-    flown = fly(text)
-    np.testing.assert_allclose(flown.time_s, [0, 0.5])
-    assert flown.altitude_m.tolist() == [146, 147] and flown.above_sea_m.tolist() == [94.465, 95.465]
-    assert flown.place[0].tolist() == [126.66295, 37.38892]
-    assert degrees(flown, "hfov") == pytest.approx([73.74], abs=0.01)
-    assert math.isnan(flown.start_utc_s) and any("aerial.time_zone tells it" in note for note in flown.notes)
-
-
-@pytest.mark.parametrize(
-    ("header", "row"),
-    [
-        (
-            (
-                "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),speed(mph),altitude(feet),"
-                "compass_heading(degrees),gimbal_heading(degrees),gimbal_pitch(degrees),altitude_above_seaLevel(feet)"
-            ),
-            "{ms},2021-05-01 10:00:00,48.1,11.5,164.042,10,9,90,350,-60,1640.42",
-        ),
-        (
-            (
-                "OSD.flyTime [s],OSD.latitude,OSD.longitude,OSD.height [ft],OSD.hSpeed [MPH],OSD.yaw [360],"
-                "GIMBAL.pitch,GIMBAL.yaw [360],amsl"
-            ),
-            "{s},48.1,11.5,164.042,10,90,-60,350,500",
-        ),
-    ],
-)
-def test_units_and_groups_in_the_names_of_columns_are_known(fly, header, row):
-    flown = fly("\n".join([header, *(row.format(ms=ms, s=ms / 1000) for ms in (100, 600))]))
-    np.testing.assert_allclose(flown.time_s, [0, 0.5])
-    values = [flown.altitude_m[0], flown.above_sea_m[0], flown.speed_m_s[0]]
-    np.testing.assert_allclose(values, [50, 500, 4.4704], atol=1e-3)
-    np.testing.assert_allclose(degrees(flown, "vehicle_heading", "heading", "pitch"), [90, 350, 60])
-
-
 @pytest.mark.parametrize(("first", "second"), [("10:00:00Z", "10:00:01Z"), ("12:00:00+02:00", "12:00:01+0200")])
 def test_a_table_in_utc_tells_the_clock(fly, first, second):
     rows = f"2021-05-01T{first},48.1,11.5,500\n2021-05-01T{second},48.1,11.5,500\n"

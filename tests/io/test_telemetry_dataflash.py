@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.io.flights import dataflash, dataflash_text
-from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.io.telemetry.dataflash import _PER_UNIT, _TYPES
 
 KINDS = {
@@ -181,9 +180,3 @@ def test_columns_that_are_damaged_on_the_way_spoil_no_other_row(fly, columns):
     damaged = [f"FMT, 130, 50, POS, QLLfff, {columns}", f"POS, {', '.join('1' * len(columns.split(',')))}", layout]
     flown = fly("\n".join([*lines[:40], *damaged, *lines[40:], last]), "a.log")
     assert np.isfinite(flown.altitude_m).sum() >= 11 and np.nanmax(flown.altitude_m) == pytest.approx(9.74)
-
-
-@pytest.mark.parametrize("rows", [[], [("IMU", 1, 0, 0.1, 0.2)] * 9])
-def test_a_log_without_a_position_is_refused(refused, rows):
-    for name, content in forms(KINDS, rows):
-        assert "has no position, height or attitude" in refused(read_telemetry, content, name)

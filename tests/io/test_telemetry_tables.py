@@ -250,15 +250,6 @@ def test_the_columns_of_a_program_have_its_units_and_zero_points(fly, program):
     check(fly(text), **cast(dict[str, Any], wanted))
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-@pytest.mark.parametrize(("separator", "comma"), [(",", "."), (";", "."), (";", ","), ("\t", ","), ("|", ".")])
-def test_separators_decimal_commas_and_encodings_of_a_table_are_known(fly, encoding, separator, comma):
-    cells = ["{i}.0", "48.1", "11.5", "50.5", "10.5"]
-    names = ["time_s", "lat", "lon", "relative height [m]", "yaw [°]"]
-    text = table(separator.join(names), separator.join(cell.replace(".", comma) for cell in cells))
-    check(fly(text.encode(encoding)), times=[0, 1, 2, 3], latitude=48.1, altitude=50.5, nose=10.5)
-
-
 @pytest.mark.parametrize(
     ("lines", "place"),
     [

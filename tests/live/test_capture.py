@@ -410,16 +410,6 @@ def test_an_input_that_is_not_there_is_one_line(spec) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_a_password_in_an_address_is_never_shown() -> None:
-    with pytest.raises(InputError) as error:
-        LiveSource("rtsp://pilot:s3cret@127.0.0.1:9/a", LiveParameters(stall_s=1.0))
-    assert "rtsp://127.0.0.1:9/a" in str(error.value)
-    opener = Streams(FakeStream(itertools.repeat(1)))
-    source = LiveSource("rtsp://pilot:s3cret@drone/a", opener=opener, clock=FakeClock())
-    source.close()
-    assert source.name == "rtsp://drone/a"
-
-
 def test_stop_ends_an_iteration_that_waits_for_a_picture(camera) -> None:
     some = camera([1])
     some.take(1)

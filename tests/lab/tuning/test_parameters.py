@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters, expand_names
 
 
@@ -61,13 +60,6 @@ def test_a_group_stands_for_its_tunable_parameters() -> None:
         "morphology.dilate_px",
         "morphology.close_px",
     ]
-
-
-@pytest.mark.parametrize("name", ["difference.kind", "difference.treshold", "nonsense", "registration.levels"])
-def test_a_parameter_that_cannot_be_tuned_is_refused_with_those_that_can(name: str) -> None:
-    with pytest.raises(InputError, match=r"difference\.threshold \(0\.1 to 255\)") as caught:
-        Parameters(Settings(), [name])
-    assert "\n" not in str(caught.value) and f"'{name}'" in str(caught.value)
 
 
 def test_whole_sizes_have_no_gradient_and_the_others_have() -> None:

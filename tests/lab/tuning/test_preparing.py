@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from tests.lab.evaluation.studies.world import filmed, followed, study
-from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.studies.runner import read_spec
 from torchvision_dddas.lab.tuning.family import prepare
 
@@ -28,15 +27,3 @@ def test_examples_are_of_the_clips_that_are_not_held_out(clips) -> None:
     assert frames == sorted(frames)
     assert ready.spec.tasks == ("motion",) and ready.goal.name == "motion.pixels.f"
     assert set(ready.parameters.names) >= {"difference.threshold", "difference.noise_levels"}
-
-
-@pytest.mark.parametrize(
-    ("names", "chosen", "line"),
-    [
-        (["difference.threshold"], ["boxes"], "boxes"),
-        (["difference.threshold", "track.wander"], (), r"motion: difference\.threshold; tracking: track\.wander"),
-    ],
-)
-def test_clips_without_truth_and_parameters_of_several_families_are_refused(clips, names, chosen, line) -> None:
-    with pytest.raises(InputError, match=line):
-        prepare(read_spec(clips), clips.parent, names, (), chosen)
