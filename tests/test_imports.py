@@ -1,6 +1,7 @@
 """Who may import whom: each room imports only rooms below it, and only the torch rooms need torch."""
 
 import ast
+import re
 import subprocess
 import sys
 import textwrap
@@ -33,6 +34,26 @@ ORDER = (
 FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 # Rooms that are made of torch; elsewhere only modules whose name begins with `torch_` import it.
 TORCH_ROOMS = ("functional", "nn", "lab.tuning", "lab.export")
+# Rooms that load a file at a time, for the start of a command: these modules are what other rooms may name.
+OPEN = {
+    "io": "atomic_files camera_files colour_files detection_tables elevation ground_tables images interrupts "
+    "joined_clips live_streams maps.formats maps.ground_tracks output overlay overlay_video report report.charts "
+    "sources streams tables telemetry",
+    "lab.evaluation": "datasets.record evaluate metrics.matching metrics.registry metrics.truth simulated_run "
+    "studies.cache studies.comparison studies.jobs studies.records studies.runner studies.scoring studies.stages "
+    "studies.summary studies.sweep",
+}
+# Tuning and export take the inside of the engines apart; what needs torch is not loaded with a room that does not.
+PAST = {
+    ("cli", "lab.export.graph_files"),
+    ("detection", "functional.filters"),
+    *(("lab.export", name) for name in ("functional.hog_svm", "people.onnx_scorer", "people.torch_scorer")),
+    ("lab.tuning", "detection.opencv_engine"),
+    *(
+        ("lab.tuning", f"tracking.{n}")
+        for n in ("appearance", "kalman", "scene", "score_tracker", "scores", "smoother")
+    ),
+}
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
@@ -83,6 +104,24 @@ def upward(module: str, source: str, is_package: bool = False) -> list[str]:
     return sorted(set(found))
 
 
+def listed(name: str) -> set[str]:
+    """What the `__init__` of a room lists for other rooms."""
+    text = PACKAGE.joinpath(*name.split("."), "__init__.py").read_text(encoding="utf-8")
+    names = re.search(r"^__all__ = (\[.*?\])", text, re.MULTILINE | re.DOTALL)
+    return set(ast.literal_eval(names[1])) if names else set()
+
+
+def past(module: str, source: str, is_package: bool = False) -> set[tuple[str, str]]:
+    """The file's room and each module of another room that it names past the `__init__` of that room."""
+    here, found = room(module), set()
+    for name, _ in imports(module, source, is_package):
+        there = room(name)
+        if there in FLOOR and name != there and there != here != "__init__":
+            may = OPEN[there].split() if there in OPEN else listed(there)
+            found |= set() if name.removeprefix(f"{there}.") in may else {(here, name)}
+    return found
+
+
 def needs_torch(module: str) -> bool:
     return room(module) in TORCH_ROOMS or module.rpartition(".")[2].startswith("torch_")
 
@@ -119,6 +158,24 @@ def test_only_torch_modules_import_torch_at_the_top(module: str) -> None:
 )
 def test_an_import_upward_is_noticed(monkeypatch, module: str, source: str, wrong: list[str]) -> None:
     assert upward(module, source) == wrong
+
+
+def test_rooms_are_entered_by_their_init_but_for_stated_exceptions() -> None:
+    found = (past(m, path.read_text(encoding="utf-8"), path.name == "__init__.py") for m, path in MODULES.items())
+    assert set().union(*found) == PAST
+
+
+@pytest.mark.parametrize(
+    ("source", "wrong"),
+    [
+        (f"from {OWN}.geo.site import Site", {("control", "geo.site")}),
+        (f"def f():\n    from {OWN}.people import detector", {("control", "people.detector")}),
+        (f"import {OWN}.io.captures", {("control", "io.captures")}),
+        (f"from {OWN}.geo import Site\nfrom {OWN}.io.images import Masks\nfrom {OWN}.control.rules import shed", set()),
+    ],
+)
+def test_an_import_past_the_init_of_a_room_is_noticed(source: str, wrong: set[tuple[str, str]]) -> None:
+    assert past("control.mission", source) == wrong
 
 
 def test_everything_but_torch_modules_imports_without_torch() -> None:

@@ -123,7 +123,7 @@ def scorer(monkeypatch):
             loaded.append(backend)
             return StubScorer(parameters, found)
 
-        monkeypatch.setattr("torchvision_dddas.people.detector.load_scorer", load)
+        monkeypatch.setattr("torchvision_dddas.people.load_scorer", load)
         return loaded
 
     install()

@@ -123,7 +123,7 @@ def test_a_log_made_to_keep_a_reader_busy_is_read_on_or_refused_in_seconds(tmp_p
     except InputError as error:
         count, said = 0, [str(error)]
     else:
-        count, said = len(found.time_s), found.notes
+        count, said = len(found.time_s), [*found.notes]
     assert count == samples and sum(words in text for text in said) == (1 if words else len(said)), said
 
 

@@ -125,7 +125,7 @@ def _read_heights(table: Path) -> "np.ndarray":
 
 
 def _find_focal_length(distances_m: "np.ndarray", heights_px: "np.ndarray", body_height_m: float) -> Found:
-    from torchvision_dddas.geo.camera_calibration import calibrate_focal_length
+    from torchvision_dddas.geo import calibrate_focal_length
 
     found, n = calibrate_focal_length(distances_m, heights_px, body_height_m), len(heights_px)
     spread = "" if math.isnan(found.spread_px) else f", one measurement ± {found.spread_px:.1f} px"
@@ -141,8 +141,7 @@ def _find_focal_length(distances_m: "np.ndarray", heights_px: "np.ndarray", body
 
 
 def _find_pose(table: Path, camera: Path | None, body_height_m: float, settings: "Settings") -> Found:
-    from torchvision_dddas.geo.camera_calibration import calibrate_pose
-    from torchvision_dddas.geo.ranging import touches_border
+    from torchvision_dddas.geo import calibrate_pose, touches_border
     from torchvision_dddas.io.camera_files import read_camera
     from torchvision_dddas.io.detection_tables import read_detections
 

@@ -9,7 +9,7 @@ from torchvision_dddas.cli.options import Config, Overrides, Quiet, print_lines,
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.geo.colours import CalibratedColours
+    from torchvision_dddas.geo import CalibratedColours
 
 MOST = 12  # colours that can be distinguished by their hue
 Box = tuple[int, int, int, int]
@@ -43,7 +43,7 @@ def colours(
     Writes a TOML for `dddas run --colours`, and beside it a picture of all that the ranges mark: look at it.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.geo.colours import calibrate_colours, draw_calibration
+    from torchvision_dddas.geo import calibrate_colours, draw_calibration
     from torchvision_dddas.io.atomic_files import refuse_folder, refuse_own_input, save_file
     from torchvision_dddas.io.colour_files import format_colours
     from torchvision_dddas.io.images import read_colour_image

@@ -29,7 +29,7 @@ def compare(
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
     from torchvision_dddas.io.atomic_files import refuse_folder, save_file
-    from torchvision_dddas.io.output.run_record import finite, read_run_record
+    from torchvision_dddas.io.output import finite, read_run_record
     from torchvision_dddas.lab.evaluation.studies.cache import read_scores
     from torchvision_dddas.lab.evaluation.studies.comparison import (
         MEANING,

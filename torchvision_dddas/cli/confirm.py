@@ -23,7 +23,7 @@ from torchvision_dddas.cli.progress import closing_lines, record_results
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.control.confirmation import Vehicle
+    from torchvision_dddas.control import Vehicle
 
 KINDS = {True: "positions (east_m, north_m)", False: "boxes"}
 
@@ -66,7 +66,7 @@ def confirm(
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
     from torchvision_dddas.config import load_config
-    from torchvision_dddas.control.confirmation import confirm_pictures, confirm_positions
+    from torchvision_dddas.control import confirm_pictures, confirm_positions
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import read_detections, read_rows
     from torchvision_dddas.io.ground_tables import read_positions
@@ -134,7 +134,7 @@ def _read_vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
     """The tables with their cameras: one each, or all of them for a single table. Raises InputError otherwise."""
-    from torchvision_dddas.control.confirmation import Vehicle
+    from torchvision_dddas.control import Vehicle
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.ground_tables import read_positions
 

@@ -56,8 +56,7 @@ def people(
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_within_clip, read_for_clip
     from torchvision_dddas.io.output import PeopleRecorder, clip_facts, parse_save
-    from torchvision_dddas.people import detector
-    from torchvision_dddas.people.pyramid import levels
+    from torchvision_dddas.people import detect_in_clip, levels, load_scorer
 
     settings, names = load_config(config, set_ or []), parse_save(save, PeopleRecorder.saved)
     if around is not None and len(inputs) > 1:
@@ -77,7 +76,7 @@ def people(
                     levels(source.size, settings.people)  # refuse what is too small before the engine loads
                 except InputError as error:
                     raise InputError(f"{source.name}: {error}") from None
-                scorer = scorer or detector.load_scorer(settings.people, backend.value)
+                scorer = scorer or load_scorer(settings.people, backend.value)
                 facts = {
                     "input": clip,
                     "around": around,
@@ -88,7 +87,7 @@ def people(
                 is_single = source.exact and source.count == 1
                 overlay = "overlay.png" if is_single else "overlay.mp4"
                 record = output.begin(facts, source.rate_hz, is_single)
-                frames = detector.detect_in_clip(source, scorer, settings, table)
+                frames = detect_in_clip(source, scorer, settings, table)
                 record_results(output, record, frames, source.name, source.count, quiet, source)
                 record.notes += [] if table is None else [*table.notes, *_notes(record, str(around), table, source)]
             files = ["detections.csv", "detections.txt", *(overlay for _ in names), "run.json"]

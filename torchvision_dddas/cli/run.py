@@ -144,7 +144,7 @@ def run(
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
     settings = load_config(config, set_ or [])
     if live:
-        from torchvision_dddas.live.session import run_live
+        from torchvision_dddas.live import run_live
 
         code = run_live(
             out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet, wait

@@ -27,8 +27,7 @@ from torchvision_dddas.cli.progress import EVERY_S, open_console, print_now, pro
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.lab.tuning.descent import Step
-    from torchvision_dddas.lab.tuning.tuner import Tuned
+    from torchvision_dddas.lab.tuning import Step, Tuned
 
 
 @report_errors
@@ -90,8 +89,7 @@ def tune(
     if missing := [name for name in ("torch", "kornia") if find_spec(name) is None]:
         raise InputError(f"dddas tune needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]'")
     from torchvision_dddas.io.atomic_files import refuse_own_input
-    from torchvision_dddas.lab.tuning.descent import Plan
-    from torchvision_dddas.lab.tuning.tuner import FILES, Display, Tuner
+    from torchvision_dddas.lab.tuning import FILES, Display, Plan, Tuner
 
     check_jobs(jobs)
     if minutes is not None and not minutes > 0:
@@ -140,7 +138,7 @@ def _show(tuned: "Tuned", folder: Path) -> None:
     """Print the parameters, what tuning was worth, and where the rest is."""
     from rich.table import Table
 
-    from torchvision_dddas.lab.tuning.tuner import REPORT, RUN, TUNED
+    from torchvision_dddas.lab.tuning import REPORT, RUN, TUNED
 
     verdict = tuned.verdict
     console = open_console()

@@ -24,10 +24,9 @@ from torchvision_dddas.detection import (
     look_cost,
     pixels_per_metre,
 )
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, to_local
-from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.geometry.projection import shift_origin
-from torchvision_dddas.people.detector import load_scorer
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, load_solver, to_local
+from torchvision_dddas.geometry import shift_origin
+from torchvision_dddas.people import load_scorer
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

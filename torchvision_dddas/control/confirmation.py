@@ -16,7 +16,7 @@ import numpy as np
 from torchvision_dddas.config import ConfirmParameters, GroundParameters, PeopleParameters, Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import east_north, poses_at, shared_px
-from torchvision_dddas.people.pyramid import smallest_body_px
+from torchvision_dddas.people import smallest_body_px
 from torchvision_dddas.types import Bool, Camera, Confirmation, DetectionTable, Float, PoseTable, Positions
 
 HUMAN, NOT_HUMAN, UNSEEN = "human", "not_human", "unseen"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchvision_dddas.geometry.projection import axes_of
+from torchvision_dddas.geometry import axes_of
 from torchvision_dddas.types import Camera, CameraPose, Fix, Flight
 
 # A camera that looks down more steeply counts as looking straight down.

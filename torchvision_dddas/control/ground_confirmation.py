@@ -10,8 +10,8 @@ from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.control.confirmation import Beliefs, GroundObservation, field_of_view, observe_ground, summarize
 from torchvision_dddas.control.ground_crowds import CrowdLooks
 from torchvision_dddas.control.prediction import Prediction
-from torchvision_dddas.geo.ranging import range_people
-from torchvision_dddas.people.detector import WindowScorer, detect_people
+from torchvision_dddas.geo import range_people
+from torchvision_dddas.people import WindowScorer, detect_people
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundCrowds, GroundPicture, Poses
 
 # Nobody runs faster.

@@ -18,7 +18,7 @@ from kornia.geometry import oneway_transfer_error, transform_points
 from torchvision_dddas.functional.affinity import pair_affinity, triplet_affinity
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.functional.chain_operations import TensorOperations, close_masks
-from torchvision_dddas.functional.color import bgr_to_hsv, rgb_histogram, within_ranges
+from torchvision_dddas.functional.color import FULL, TURN, bgr_to_hsv, rgb_histogram, within_ranges
 from torchvision_dddas.functional.difference import (
     fit_exposure,
     fit_quantiles,
@@ -72,7 +72,9 @@ from torchvision_dddas.functional.soft import (
 from torchvision_dddas.functional.warp import columns_between, resize, seen_by_both, seen_columns, warp_perspective
 
 __all__ = [
+    "FULL",
     "MODELS",
+    "TURN",
     "Layout",
     "TensorOperations",
     "all_true",

@@ -1,8 +1,13 @@
 """From the picture to the ground: aerial cameras with telemetry and landmarks, and ranging by cameras on the ground."""
 
 from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix, check_table, frames_to_locate, is_outside
-from torchvision_dddas.geo.aerial_targets import Targets
+from torchvision_dddas.geo.aerial_targets import Targets, tracked_targets
+from torchvision_dddas.geo.camera_calibration import calibrate_focal_length, calibrate_pose
+from torchvision_dddas.geo.clock_offset import describe_clock_offset
+from torchvision_dddas.geo.colours import CalibratedColours, calibrate_colours, draw_calibration
 from torchvision_dddas.geo.ground_locator import GroundLocator
+from torchvision_dddas.geo.landmark_faults import passes
+from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
 from torchvision_dddas.geo.landmark_watch import (
     LandmarkWatch,
     WatchedScene,
@@ -10,6 +15,17 @@ from torchvision_dddas.geo.landmark_watch import (
     group_crowds,
     without_pixels,
 )
+from torchvision_dddas.geo.plane_homography import load_solver
+from torchvision_dddas.geo.pose_estimation import (
+    EXACT_M,
+    Prior,
+    find_pose,
+    focal_prior,
+    independent_expectation,
+    linearize_pose,
+    pose_prior,
+)
+from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.geo.site import (
     Site,
     build_site,
@@ -22,24 +38,43 @@ from torchvision_dddas.geo.site import (
 )
 
 __all__ = [
+    "EXACT_M",
     "AerialLocator",
+    "CalibratedColours",
     "FrameFix",
     "GroundLocator",
+    "LandmarkTrajectories",
     "LandmarkWatch",
+    "Prior",
     "Site",
     "Targets",
     "WatchedScene",
     "build_site",
+    "calibrate_colours",
+    "calibrate_focal_length",
+    "calibrate_pose",
     "check_colours",
     "check_table",
     "complete_site",
+    "describe_clock_offset",
     "describe_no_place",
     "describe_unknown_heights",
+    "draw_calibration",
+    "find_pose",
+    "focal_prior",
     "frames_to_locate",
     "group_crowds",
     "has_places",
+    "independent_expectation",
     "is_outside",
+    "linearize_pose",
+    "load_solver",
+    "passes",
+    "pose_prior",
+    "range_people",
     "resolve_camera",
     "to_local",
+    "touches_border",
+    "tracked_targets",
     "without_pixels",
 ]

@@ -32,7 +32,7 @@ from torchvision_dddas.geo.plane_homography import (
     relative_width,
 )
 from torchvision_dddas.geo.site import Site, build_site, complete_site, fit_lens, resolve_camera
-from torchvision_dddas.geometry.projection import ground_height, surface_of
+from torchvision_dddas.geometry import ground_height, surface_of
 from torchvision_dddas.types import (
     Adjustment,
     AerialLocations,

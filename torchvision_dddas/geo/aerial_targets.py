@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas.config import AerialParameters
-from torchvision_dddas.geometry import transfer
-from torchvision_dddas.geometry.projection import project
+from torchvision_dddas.geometry import project, transfer
 from torchvision_dddas.types import Camera, CameraPose, Float, Int, TrackedFrame, Tracks
 
 # Width of a person from straight above, where no height shows.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchvision_dddas.geo.aerial_locator import AerialLocator
-from torchvision_dddas.geometry.projection import axes_of
+from torchvision_dddas.geometry import axes_of
 from torchvision_dddas.types import Elevation, Float, Telemetry
 
 # The offsets that are tried first, their steps, and how many of the best are refined, in so many steps of Gauss-Newton.

@@ -32,7 +32,7 @@ from torchvision_dddas.geo.pose_estimation import (
     independent_expectation,
     pose_prior,
 )
-from torchvision_dddas.geometry.projection import undistort_pixels
+from torchvision_dddas.geometry import undistort_pixels
 from torchvision_dddas.types import Camera, Fix, Flight, LandmarkObservations
 
 # A landmark not seen for so many time constants is forgotten.

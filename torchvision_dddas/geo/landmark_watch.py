@@ -16,8 +16,7 @@ from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix
 from torchvision_dddas.geo.colours import ColourFinder, load_colours
 from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
 from torchvision_dddas.geo.plane_homography import LEAST
-from torchvision_dddas.geometry import connected_parts, inside, middles_of, transfer
-from torchvision_dddas.geometry.projection import distort_pixels, project
+from torchvision_dddas.geometry import connected_parts, distort_pixels, inside, middles_of, project, transfer
 from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, Int, LandmarkObservations, Landmarks, Scene
 
 # A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.geometry import lonlat, transfer
-from torchvision_dddas.geometry.projection import Surface, ground_with_slopes, inverse_2x2, undistort_pixels
+from torchvision_dddas.geometry import Surface, ground_with_slopes, inverse_2x2, lonlat, transfer, undistort_pixels
 from torchvision_dddas.runtime import SHIPPED, opened, wants_torch
 from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 

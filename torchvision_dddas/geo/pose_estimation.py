@@ -12,8 +12,16 @@ import numpy as np
 
 from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.geometry import about_up, slope_of_turn, turn_of, turned
-from torchvision_dddas.geometry.projection import axes_of, normalize, project_with_slopes, rays
+from torchvision_dddas.geometry import (
+    about_up,
+    axes_of,
+    normalize,
+    project_with_slopes,
+    rays,
+    slope_of_turn,
+    turn_of,
+    turned,
+)
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
 # Least standard deviation of a landmark's place: below, the curvature could not be inverted.

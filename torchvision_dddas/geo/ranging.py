@@ -18,7 +18,7 @@ import numpy as np
 
 from torchvision_dddas.config import GroundParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geometry.projection import normalize
+from torchvision_dddas.geometry import normalize
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
 # Least standard deviation of a box's edges, in pixels.

@@ -10,7 +10,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, is_set
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.flight_gaps import fill_gaps, known_keys
-from torchvision_dddas.geometry.projection import ground_height
+from torchvision_dddas.geometry import ground_height
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from torchvision_dddas.geometry import cross
+from torchvision_dddas.geometry.rotations import cross
 from torchvision_dddas.types import Camera, CameraPose, Elevation, Float
 
 # A point whose depth is a smaller share of its distance is beside or behind the camera.

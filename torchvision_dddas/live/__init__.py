@@ -3,5 +3,12 @@
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health, Snapshot
 from torchvision_dddas.live.runner import LoadShedding
+from torchvision_dddas.live.session import run_live
 
-__all__ = ["Health", "LiveSource", "LoadShedding", "Snapshot"]
+__all__ = [
+    "Health",
+    "LiveSource",
+    "LoadShedding",
+    "Snapshot",
+    "run_live",
+]

@@ -9,8 +9,8 @@ from math import isfinite, nan
 
 import numpy as np
 
+from torchvision_dddas import control
 from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.control import rules as control
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.live.capture import LiveSource

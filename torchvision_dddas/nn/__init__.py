@@ -9,6 +9,7 @@ from torchvision_dddas.nn.motion_segmenter import (
     Segmentation,
     TensorChain,
     Values,
+    check_softness,
     differences_of,
 )
 from torchvision_dddas.nn.people import HOGDescriptor, PersonScorer
@@ -31,5 +32,6 @@ __all__ = [
     "Segmentation",
     "TensorChain",
     "Values",
+    "check_softness",
     "differences_of",
 ]

@@ -8,5 +8,15 @@ from torchvision_dddas.people.detector import (
     detect_people,
     load_scorer,
 )
+from torchvision_dddas.people.pyramid import levels, smallest_body_px
 
-__all__ = ["PersonDetector", "PersonTracker", "WindowScorer", "detect_in_clip", "detect_people", "load_scorer"]
+__all__ = [
+    "PersonDetector",
+    "PersonTracker",
+    "WindowScorer",
+    "detect_in_clip",
+    "detect_people",
+    "levels",
+    "load_scorer",
+    "smallest_body_px",
+]

@@ -27,10 +27,10 @@ from torchvision_dddas.geo import (
     describe_no_place,
     describe_unknown_heights,
     has_places,
+    load_solver,
     resolve_camera,
     without_pixels,
 )
-from torchvision_dddas.geo.plane_homography import load_solver
 from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho

@@ -22,12 +22,12 @@ from torchvision_dddas.geo import (
     AerialLocator,
     LandmarkWatch,
     WatchedScene,
+    describe_clock_offset,
     describe_no_place,
     group_crowds,
     has_places,
+    tracked_targets,
 )
-from torchvision_dddas.geo.aerial_targets import tracked_targets
-from torchvision_dddas.geo.clock_offset import describe_clock_offset
 from torchvision_dddas.io.sources import open_source
 from torchvision_dddas.pipeline.assembly import Assembly, assemble
 from torchvision_dddas.tracking import CrowdIdentities, SceneTracker, without_picture

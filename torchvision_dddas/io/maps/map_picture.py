@@ -8,7 +8,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from torchvision_dddas.geometry.projection import rays, undistort_pixels
+from torchvision_dddas.geometry import rays, undistort_pixels
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks, ring_m, semi_axes
 from torchvision_dddas.io.overlay import LETTERS, Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho

@@ -2,7 +2,7 @@
 
 from torchvision_dddas.io.atomic_files import Part
 from torchvision_dddas.io.output.map_files import Site
-from torchvision_dddas.io.output.recorder import RunRecorder, parse_save
+from torchvision_dddas.io.output.recorder import PartOf, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
     AerialRecorder,
     ConfirmationRecorder,
@@ -25,6 +25,8 @@ from torchvision_dddas.io.output.run_record import (
     describe_nothing_located,
     finite,
     make_session_folder,
+    read_run_record,
+    versions,
     without_numbers,
 )
 from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
@@ -45,6 +47,7 @@ __all__ = [
     "Event",
     "GroundRecorder",
     "Part",
+    "PartOf",
     "PeopleRecorder",
     "PipelineRecorder",
     "RunRecord",
@@ -57,5 +60,7 @@ __all__ = [
     "finite",
     "make_session_folder",
     "parse_save",
+    "read_run_record",
+    "versions",
     "without_numbers",
 ]

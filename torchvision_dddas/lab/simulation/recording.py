@@ -16,8 +16,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.colour_files import format_colours
-from torchvision_dddas.io.output import RUN_JSON, Part, RunRecord, RunRecorder
-from torchvision_dddas.io.output.recorder import PartOf
+from torchvision_dddas.io.output import RUN_JSON, Part, PartOf, RunRecord, RunRecorder
 from torchvision_dddas.io.overlay_video import OverlayVideo
 from torchvision_dddas.io.tables import TextFiles
 from torchvision_dddas.lab.simulation.scenario import Scenario, load_scenario, scenario_settings, scenario_toml

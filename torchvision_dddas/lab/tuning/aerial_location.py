@@ -20,19 +20,20 @@ from torch import Tensor
 from torchvision_dddas import geometry
 from torchvision_dddas.config import AerialParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo import AerialLocator, Targets
-from torchvision_dddas.geo.landmark_faults import passes
-from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
-from torchvision_dddas.geo.pose_estimation import (
+from torchvision_dddas.geo import (
     EXACT_M,
+    AerialLocator,
+    LandmarkTrajectories,
     Prior,
+    Targets,
     find_pose,
     focal_prior,
     independent_expectation,
     linearize_pose,
+    passes,
     pose_prior,
 )
-from torchvision_dddas.geometry.projection import Surface, ground_with_slopes, surface_of
+from torchvision_dddas.geometry import Surface, ground_with_slopes, surface_of
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.studies.scoring import whose_places
 from torchvision_dddas.lab.evaluation.studies.stages import open_pipeline, open_table

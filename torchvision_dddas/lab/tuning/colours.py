@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.functional.color import FULL, TURN, bgr_to_hsv, within_ranges
+from torchvision_dddas.functional import FULL, TURN, bgr_to_hsv, within_ranges
 from torchvision_dddas.io.colour_files import find_overlaps
 from torchvision_dddas.types import Colours
 

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from torchvision_dddas.config import GroundParameters, Settings
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.ground_locator import GroundLocator
-from torchvision_dddas.geo.ranging import range_people
+from torchvision_dddas.geo import GroundLocator, range_people
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.detection_tables import read_detections
 from torchvision_dddas.lab.evaluation.datasets.record import Clip

@@ -16,19 +16,18 @@ from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import (
     Foreground,
     MotionDetector,
+    TorchEngine,
     Window,
     fill_hull,
 )
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine, OpenCVView
-from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.studies.records import Task
 from torchvision_dddas.lab.evaluation.studies.stages import open_clip
 from torchvision_dddas.lab.tuning.examples import check_masks, labels_at
 from torchvision_dddas.lab.tuning.family import Example, Family
-from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values, differences_of
-from torchvision_dddas.nn.motion_segmenter import check_softness
+from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values, check_softness, differences_of
 from torchvision_dddas.types import Scene
 
 # Soft masks reach this many softnesses below the threshold, where they are 0.05.

@@ -14,7 +14,7 @@ from torchvision_dddas.config import all_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import claimed, save_file
 from torchvision_dddas.io.interrupts import is_stop
-from torchvision_dddas.io.output.run_record import finite, versions
+from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.lab.evaluation.studies.records import Spec
 from torchvision_dddas.lab.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.lab.tuning.checkpoint import set_aside

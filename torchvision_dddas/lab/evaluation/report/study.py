@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from torchvision_dddas.io.output.run_record import finite, versions
+from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.io.report import (
     Cell,
     Column,

@@ -21,7 +21,7 @@ from torchvision_dddas.detection import load_engine
 from torchvision_dddas.errors import InputError, readable
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.interrupts import is_stop
-from torchvision_dddas.io.output.run_record import finite, versions
+from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.lab.evaluation.datasets import kinds
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS

@@ -16,14 +16,14 @@ from torchvision_dddas import geo
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.ground_locator import GroundLocator
+from torchvision_dddas.geo import GroundLocator
 from torchvision_dddas.io.camera_files import read_camera
 from torchvision_dddas.io.detection_tables import check_table, read_detections
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.studies.records import Found, Task, round_as_written
-from torchvision_dddas.people.detector import detect_in_clip, load_scorer
+from torchvision_dddas.people import detect_in_clip, load_scorer
 from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
