@@ -48,38 +48,6 @@ PROGRAM = textwrap.dedent("""
 """)
 
 
-@pytest.mark.parametrize(
-    ("line", "table"),
-    [
-        pytest.param("detect {clip} --config fast", "detections.txt", marks=pytest.mark.slow),
-        ("track {clip} --detections {folder}/det.txt", "tracks.txt"),
-        pytest.param("people {clip} --set people.enlarge=4", "detections.txt", marks=pytest.mark.slow),
-    ],
-)
-def test_ctrl_c_exits_with_130_and_leaves_valid_outputs(clip, tmp_path, line, table):
-    (tmp_path / "det.txt").write_text("".join(f"{n},-1,{4 + n},10,8,24,0.95,-1,-1,-1\n" for n in range(1, 6)))
-    out = tmp_path / "out"
-    words = shlex.split(line.format(clip=clip, folder=tmp_path))
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *words, "--out", str(out), "--quiet"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "now\n", process.communicate(timeout=60)[1]
-    process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert error == "dddas: interrupted; results up to here are kept\n"
-    kept = record(out)
-    assert (kept["interrupted"], kept["frames"]["written"]) == (True, 3)
-    assert {row.split(",")[0] for row in (out / table).read_text().splitlines()} <= {"1", "2", "3"}
-    assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
-    assert not list(out.rglob("*.part*"))
-
-
 MAIN = "from torchvision_dddas.cli import main; main()"
 TABLE = "".join(f"{n},-1,{4 + n},10,8,24,0.95,-1,-1,-1\n" for n in range(1, 6))
 
@@ -97,24 +65,44 @@ def tracking(clip, tmp_path, *more, program=PROGRAM):
         process.kill()
 
 
+def stopped(clip, tmp_path, *numbers, program=PROGRAM):
+    """The exit code and the words of such a run that gets signals in its third frame."""
+    with tracking(clip, tmp_path, "--quiet", program=program) as process:
+        for number in numbers:
+            process.send_signal(number)
+        error = process.communicate(timeout=60)[1]
+    return process.returncode, error
+
+
+def run_program(program, *words, **options):
+    call = [sys.executable, "-c", textwrap.dedent(program), *map(str, words)]
+    return subprocess.run(call, cwd=ROOT, capture_output=True, text=True, timeout=60, **options)
+
+
+KEPT = (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+
+
 @pytest.mark.parametrize(
     ("numbers", "codes"),
     [
         ([signal.SIGTERM], {143}),
         ([signal.SIGHUP], {129}),
+        ([signal.SIGINT], {130}),
         ([signal.SIGTERM, signal.SIGHUP, signal.SIGTERM], {143, 129}),  # as systemd sends them
         ([signal.SIGINT, signal.SIGINT], {130}),
     ],
 )
 def test_signals_leave_whole_outputs_also_several_at_once(clip, tmp_path, numbers, codes):
-    with tracking(clip, tmp_path, "--quiet") as process:
-        for number in numbers:
-            process.send_signal(number)
-        _, error = process.communicate(timeout=60)
-    assert process.returncode in codes
+    code, error = stopped(clip, tmp_path, *numbers)
+    assert code in codes
     assert error.endswith("; results up to here are kept\n") and error.count("\n") == 1
-    assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
-    assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
+    assert error.startswith("dddas: interrupted; " if codes == {130} else "dddas: ended by SIG")
+    out = tmp_path / "out"
+    kept = record(out)
+    assert (kept["state"], kept["interrupted"], kept["frames"]["written"]) == ("interrupted", True, 3)
+    assert {row.split(",")[0] for row in (out / "tracks.txt").read_text().splitlines()} <= {"1", "2", "3"}
+    assert cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
+    assert not [path for path in out.rglob("*") if path.name.startswith(".") or ".part" in path.name]
 
 
 @pytest.mark.parametrize("lost", ["SystemError('an exception set') from error", "ImportError('no luck') from None"])
@@ -122,10 +110,8 @@ def test_a_signal_that_a_library_turns_into_another_exception_leaves_whole_outpu
     turning = "def turn():\n    try:\n        time.sleep(60)\n    except KeyboardInterrupt as error:\n"
     turning += f"        raise {lost}\n"
     program = PROGRAM.replace("time.sleep(60)", "turn()").replace("@contextmanager", f"{turning}@contextmanager")
-    with tracking(clip, tmp_path, "--quiet", program=program) as process:
-        process.send_signal(signal.SIGHUP)
-        _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (129, "dddas: ended by SIGHUP; results up to here are kept\n")
+    code, error = stopped(clip, tmp_path, signal.SIGHUP, program=program)
+    assert (code, error) == (129, "dddas: ended by SIGHUP; results up to here are kept\n")
     assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("interrupted", 3)
     assert (tmp_path / "out" / "tracks.txt").exists()
 
@@ -145,10 +131,10 @@ def test_a_signal_is_found_behind_the_exception_of_a_library_and_not_behind_bad_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 @pytest.mark.parametrize("times", [1, 2])
 @pytest.mark.parametrize("line", ["detect {clip} --config fast", "people {clip} --set people.enlarge=4", "evaluate"])
-def test_sigterm_and_sighup_end_each_command_with_whole_outputs(clip, tmp_path, line, number, times):
+def test_a_signal_ends_each_command_with_whole_outputs(clip, tmp_path, line, number, times):
     out = tmp_path / "out"
     if line == "evaluate":
         words = ["evaluate", "--dataset", str(world.three(tmp_path / "clips")), "--cache", str(tmp_path / "cache")]
@@ -165,7 +151,8 @@ def test_sigterm_and_sighup_end_each_command_with_whole_outputs(clip, tmp_path, 
             process.send_signal(number)
         error = process.communicate(timeout=120)[1]
     assert process.returncode == 128 + number, error
-    assert " kept" in error and error.startswith("dddas: ended by ") and error.count("\n") == 1
+    said = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    assert " kept" in error and error.startswith(f"dddas: {said}") and error.count("\n") == 1
     assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
     assert not [path for path in out.rglob("*") if path.name.startswith(".") or ".part" in path.name]
     if line != "evaluate":
@@ -189,51 +176,46 @@ def test_a_second_signal_after_python_has_ended_changes_no_exit_code(clip, tmp_p
             time.sleep(0.01)
         process.send_signal(signal.SIGHUP)
         _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    assert (process.returncode, error) == KEPT
 
 
-@pytest.mark.parametrize("lost", ["raise", "raise ImportError('initialization failed') from None"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_before_the_command_begins_is_one_line(number, lost):
-    early = textwrap.dedent(f"""
-        import os
-        from torchvision_dddas import cli
+BEGUN = """
+    import os
+    from torchvision_dddas import cli
 
-        def begin():
-            try:
-                os.kill(os.getpid(), {number:d})
-            except KeyboardInterrupt:  # as while a library is loaded, which makes another error of it
-                {lost}
+    def begin():
+        try:
+            os.kill(os.getpid(), {})
+        except KeyboardInterrupt:  # as while a library is loaded, which makes another error of it
+            {}
 
-        cli.app.registered_callback.callback = begin
-        cli.main()
-    """)
-    result = subprocess.run([sys.executable, "-c", early, "settings"], cwd=ROOT, capture_output=True, text=True)
-    name = "interrupted" if number == signal.SIGINT else "ended by SIGTERM"
-    assert (result.returncode, result.stderr) == (128 + number, f"dddas: {name}; nothing was kept\n")
+    cli.app.registered_callback.callback = begin
+    cli.main()
+"""
+LOADING = """
+    import os, sys
+    from torchvision_dddas.cli import main
+
+    class Loading:
+        def find_spec(self, name, *_):
+            if name == "typer":
+                os.kill(os.getpid(), {})
+
+    sys.meta_path.insert(0, Loading())
+    main()
+"""
 
 
+@pytest.mark.parametrize("lost", ["raise", "raise ImportError('initialization failed') from None", None])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_while_the_commands_are_loaded_is_one_line(number):
-    early = textwrap.dedent(f"""
-        import os, sys
-        from torchvision_dddas.cli import main
-
-        class Loading:
-            def find_spec(self, name, *_):
-                if name == "typer":
-                    os.kill(os.getpid(), {number:d})
-
-        sys.meta_path.insert(0, Loading())
-        main()
-    """)
-    result = subprocess.run([sys.executable, "-c", early, "settings"], cwd=ROOT, capture_output=True, text=True)
+def test_a_signal_before_the_command_begins_or_while_it_is_loaded_is_one_line(number, lost):
+    result = run_program((BEGUN if lost else LOADING).format(int(number), lost), "settings")
     name = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
     assert (result.returncode, result.stderr) == (128 + number, f"dddas: {name}; nothing was kept\n")
 
 
 def test_a_signal_after_the_command_has_ended_is_one_line():
-    late = textwrap.dedent("""
+    late = """
         import os, signal
         from torchvision_dddas.cli import commands, main
 
@@ -242,9 +224,9 @@ def test_a_signal_after_the_command_has_ended_is_one_line():
 
         commands.close_output = close
         main()
-    """)
-    result = subprocess.run([sys.executable, "-c", late, "settings"], cwd=ROOT, capture_output=True, text=True)
-    assert (result.returncode, result.stderr) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    """
+    result = run_program(late, "settings")
+    assert (result.returncode, result.stderr) == KEPT
 
 
 def _handles(process, number):
@@ -271,7 +253,7 @@ def test_a_signal_that_is_ignored_takes_no_other_with_it():
 
 
 def test_a_signal_at_any_step_of_the_handling_of_another_one_does_not_hang():
-    together = textwrap.dedent("""
+    together = """
         import os, signal, sys
         from torchvision_dddas.io.interrupts import Stopped, raising_signals, uninterrupted
 
@@ -298,8 +280,8 @@ def test_a_signal_at_any_step_of_the_handling_of_another_one_does_not_hang():
                         raise SystemExit("no signal came")
                     except Stopped:
                         sys.settrace(None)
-    """)
-    result = subprocess.run([sys.executable, "-c", together], cwd=ROOT, capture_output=True, text=True, timeout=30)
+    """
+    result = run_program(together)
     assert (result.returncode, result.stderr) == (0, "")
 
 
@@ -308,10 +290,7 @@ def test_a_main_thread_that_no_signal_reaches_does_not_hold_up_whole_outputs(cli
     deafly = "library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(64)"
     deafly += "; [library.pthread_mutex_lock(mutex) for _ in range(2)]"
     deaf = PROGRAM.replace("import time", "import ctypes, time").replace("time.sleep(60)", deafly)
-    with tracking(clip, tmp_path, "--quiet", program=deaf) as process:
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    assert stopped(clip, tmp_path, signal.SIGTERM, program=deaf) == KEPT
     assert record(tmp_path / "out")["state"] == "interrupted"
     assert not [path for path in (tmp_path / "out").iterdir() if path.name.startswith(".")]
 
@@ -321,10 +300,7 @@ def test_a_signal_while_whole_outputs_are_closed_leaves_them_and_says_so(clip, t
     closing += "def slow(*words):\n    print('now', flush=True)\n    time.sleep(3)\n    close(*words)\n"
     closing += "RunRecord.close = slow\n"
     program = PROGRAM.replace("count == 3", "False").replace("progress.progress", closing + "progress.progress", 1)
-    with tracking(clip, tmp_path, "--quiet", program=program) as process:
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; results up to here are kept\n")
+    assert stopped(clip, tmp_path, signal.SIGTERM, program=program) == KEPT
     assert (record(tmp_path / "out")["state"], record(tmp_path / "out")["frames"]["written"]) == ("complete", 5)
 
 
@@ -345,10 +321,8 @@ def test_nothing_was_kept_is_said_where_nothing_was(clip, tmp_path):
     early = PROGRAM.replace("count == 3", "False").replace(
         "def stopping(*_):", "def stopping(*_):\n    print('now', flush=True)\n    time.sleep(60)"
     )
-    with tracking(clip, tmp_path, "--quiet", program=early) as process:
-        process.send_signal(signal.SIGTERM)
-        _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (143, "dddas: ended by SIGTERM; nothing was kept\n")
+    code, error = stopped(clip, tmp_path, signal.SIGTERM, program=early)
+    assert (code, error) == (143, "dddas: ended by SIGTERM; nothing was kept\n")
     assert not (tmp_path / "out").exists()
 
 

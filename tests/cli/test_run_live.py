@@ -133,37 +133,25 @@ def test_work_that_fails_with_every_frame_ends_the_run_with_code_70(dddas, frame
 
 
 @pytest.mark.slow
-def test_sigterm_ends_it_with_valid_outputs(frames, tmp_path):
+@pytest.mark.parametrize("waits", [False, True])
+def test_sigterm_ends_a_run_and_one_that_waits_for_its_camera_with_valid_outputs(frames, tmp_path, waits):
     # At a hundredth of its speed the clip would take minutes.
+    clip = ["tcp://127.0.0.1:9", "--wait"] if waits else [str(frames), "--set", "live.pace=0.01"]
     main = "from torchvision_dddas.cli import main; main()"
-    words = [sys.executable, "-c", main, "run", str(frames), "--live", "--set", "live.pace=0.01"]
-    ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    ready.bind(str(tmp_path / "notify"))
-    ready.settimeout(120)
-    environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-    with ready, subprocess.Popen([*words, "--out", str(tmp_path / "out")], env=environ, stderr=subprocess.PIPE) as run:
-        assert ready.recv(100).splitlines()[0] == b"READY=1"
-        run.send_signal(signal.SIGTERM)
-        assert ready.recv(100) == b"STOPPING=1"
-        run.communicate(timeout=120)
-    assert run.returncode == 0
-    assert session(tmp_path / "out")[1]["state"] == "stopped"
-
-
-@pytest.mark.slow
-def test_sigterm_ends_a_run_that_waits_for_its_camera_as_any_other(tmp_path):
-    main = "from torchvision_dddas.cli import main; main()"
-    words = [sys.executable, "-c", main, "run", "tcp://127.0.0.1:9", "--live", "--wait", "--out", str(tmp_path / "out")]
+    words = [sys.executable, "-c", main, "run", *clip, "--live", "--out", str(tmp_path / "out")]
     ready = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     ready.bind(str(tmp_path / "notify"))
     ready.settimeout(120)
     environ = os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")}
     with ready, subprocess.Popen(words, env=environ, stderr=subprocess.PIPE) as run:
-        assert ready.recv(100) == b"READY=1\nSTATUS=waiting for the camera"
-        time.sleep(0.5)
+        first = ready.recv(100).splitlines()
+        assert first[0] == b"READY=1" and (not waits or first[1:] == [b"STATUS=waiting for the camera"])
+        time.sleep(0.5 * waits)
         run.send_signal(signal.SIGTERM)
+        assert waits or ready.recv(100) == b"STOPPING=1"
         run.communicate(timeout=120)
-    assert run.returncode == 0 and not (tmp_path / "out").exists()
+    assert run.returncode == 0
+    assert not (tmp_path / "out").exists() if waits else session(tmp_path / "out")[1]["state"] == "stopped"
 
 
 def test_a_port_in_use_is_one_line_and_leaves_nothing(dddas, frames, tmp_path):

@@ -112,9 +112,8 @@ def test_every_parameter_has_a_finite_gradient(made: Made) -> None:
 
 def test_a_clip_without_truth_is_refused_by_name(made: Made) -> None:
     case, family, clip, _ = made
-    with pytest.raises(InputError, match=f"bare has {case.lacks}") as caught:
+    with pytest.raises(InputError, match=f"bare has {case.lacks}"):
         family.examples([replace(clip, name="bare", truth=None)], case.settings)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
