@@ -158,6 +158,7 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         lambda a, b: torch.stack(F.fit_exposure(a, b, INSIDE, floor=9.0)),
         (double(1, 1, 4, 5), double(1, 1, 4, 5, seed=1)),
     ),
+    "F.log_partition": (lambda x: F.log_partition(x, 1.0), (2 * double(4, 5) - 1,)),
     "F.gaussian_blur2d": (lambda x: F.gaussian_blur2d(x, 3), (double(1, 1, 5, 6),)),
     "F.solve_linear": (
         lambda a, b: F.solve_linear(a, b)[0],
