@@ -145,37 +145,23 @@ def together(*parts: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("system", "component", "heartbeat"),
+    ("system", "component", "said", "left_out"),
     [
-        (255, 190, None),
-        (255, 1, None),
-        (252, 0, None),
-        (1, 190, None),
-        (7, 1, STATION),
-        (2, 1, TRACKER),
-        (245, 190, STATION),
+        (255, 190, ELSEWHERE, "255 (ground station)"),
+        (255, 1, ELSEWHERE, "255 (ground station)"),
+        (252, 0, ELSEWHERE, "252 (ground station)"),
+        (1, 190, ELSEWHERE, "its component 190 (ground station)"),
+        (7, 1, [(CLOCK_S, "HEARTBEAT", STATION), *ELSEWHERE], "7 (ground station)"),
+        (2, 1, [(CLOCK_S, "HEARTBEAT", TRACKER), *ELSEWHERE], "2 (ground station)"),
+        (245, 190, [(CLOCK_S, "HEARTBEAT", STATION), *ELSEWHERE], "245 (ground station)"),
+        (42, 1, [row for row in ELSEWHERE if "lat" in row[2]], "42"),  # it says nothing but its place
+        (1, 191, ELSEWHERE, "its component 191"),  # another part of the vehicle than the autopilot
     ],
 )
-def test_a_ground_station_is_never_the_vehicle_though_it_reports_more_often(fly, system, component, heartbeat):
-    calls = [(CLOCK_S, "HEARTBEAT", heartbeat)] if heartbeat else []
-    station = tlog([*calls, *ELSEWHERE], system, component=component)
-    flown = fly(together(tlog(eastward()), station), "flight.tlog")
+def test_another_sender_is_never_the_vehicle_though_it_reports_more_often(fly, system, component, said, left_out):
+    flown = fly(together(tlog(eastward()), tlog(said, system, component=component)), "flight.tlog")
     assert flown.place[:, 1].tolist() == [-35.0] * len(flown) and np.nanmax(flown.altitude_m) == 69
-    left_out = f"its component {component}" if system == 1 else f"{system}"
-    assert any(f"system 1 is taken, left out are {left_out} (ground station)" in note for note in flown.notes)
-
-
-def test_a_sender_of_nothing_but_its_place_is_not_taken_for_a_vehicle_that_says_more(fly):
-    flown = fly(
-        together(tlog(eastward()), tlog([row for row in ELSEWHERE if "lat" in row[2]], system=42)), "flight.tlog"
-    )
-    assert flown.place[:, 1].tolist() == [-35.0] * len(flown)
-    assert any("system 1 is taken, left out are 42" in note for note in flown.notes)
-
-
-def test_a_log_of_ground_stations_alone_is_refused(refused):
-    said = refused(read_telemetry, tlog(ELSEWHERE, system=255, component=190), "a.tlog")
-    assert "only ground stations" in said
+    assert any(f"system 1 is taken, left out are {left_out}" in note for note in flown.notes)
 
 
 def test_a_vehicle_without_a_fix_has_no_place_though_a_station_has_one(fly):
@@ -185,12 +171,6 @@ def test_a_vehicle_without_a_fix_has_no_place_though_a_station_has_one(fly):
     flown = fly(together(tlog(nowhere), tlog(ELSEWHERE, 255, component=190)), "flight.tlog")
     assert np.isnan(flown.place).all() and np.nanmax(flown.altitude_m) == 69
     assert any("nothing in the log has a fix" in note for note in flown.notes)
-
-
-def test_the_autopilot_is_taken_rather_than_another_part_of_the_vehicle(fly):
-    flown = fly(together(tlog(eastward()), tlog(ELSEWHERE, component=191)), "flight.tlog")
-    assert flown.place[:, 1].tolist() == [-35.0] * len(flown)
-    assert any("left out are its component 191" in note for note in flown.notes)
 
 
 def turns(pitch_up: float, count: int = 20, boot_ms: int = 5000, **more) -> list:
