@@ -9,18 +9,15 @@ from torchvision_dddas.control.closed_loop import (
     fit_settings,
 )
 from torchvision_dddas.control.confirmation import Vehicle, confirm_pictures, confirm_positions
-from torchvision_dddas.control.ground_confirmation import GroundConfirmation
 from torchvision_dddas.control.rules import SAMPLING, SHED, Load, rungs, shed
-from torchvision_dddas.control.sensor_monitor import Notice, SensorMonitor
+from torchvision_dddas.control.sensor_monitor import SensorMonitor
 
 __all__ = [
     "SAMPLING",
     "SHED",
-    "GroundConfirmation",
     "Instrument",
     "Load",
     "Mission",
-    "Notice",
     "SensorMonitor",
     "StartedSource",
     "Steering",

@@ -19,33 +19,12 @@ from torchvision_dddas.functional.affinity import pair_affinity, triplet_affinit
 from torchvision_dddas.functional.assignment import log_partition
 from torchvision_dddas.functional.chain_operations import TensorOperations, close_masks
 from torchvision_dddas.functional.color import FULL, TURN, bgr_to_hsv, rgb_histogram, within_ranges
-from torchvision_dddas.functional.difference import (
-    fit_exposure,
-    fit_quantiles,
-    level_quantiles,
-    masked_median,
-    match_exposure,
-    noise_units,
-    noise_weight,
-)
-from torchvision_dddas.functional.filters import (
-    box_sum,
-    gaussian_blur2d,
-    mean_gradient,
-    pad_reflect,
-    reflect_index,
-)
+from torchvision_dddas.functional.difference import fit_exposure, masked_median, match_exposure, noise_weight
+from torchvision_dddas.functional.filters import box_sum, gaussian_blur2d, mean_gradient, pad_reflect, reflect_index
 from torchvision_dddas.functional.flow import build_pyramid, forward_backward, lucas_kanade
 from torchvision_dddas.functional.hog_svm import Layout, arrange_weights, hog, svm_scores
 from torchvision_dddas.functional.keypoints import corner_min_eigenvalue, frame_features, grid_features
-from torchvision_dddas.functional.morphology import (
-    closing,
-    dilation,
-    erosion,
-    kernel_array,
-    opening,
-    structuring_element,
-)
+from torchvision_dddas.functional.morphology import closing, dilation, erosion, opening, structuring_element
 from torchvision_dddas.functional.plane_maps import (
     MODELS,
     draw_samples,
@@ -59,7 +38,6 @@ from torchvision_dddas.functional.plane_maps import (
     spread_ranks,
 )
 from torchvision_dddas.functional.soft import (
-    all_true,
     blend_sizes,
     gate_regions,
     gates_of_pixels,
@@ -77,7 +55,6 @@ __all__ = [
     "TURN",
     "Layout",
     "TensorOperations",
-    "all_true",
     "arrange_weights",
     "bgr_to_hsv",
     "blend_sizes",
@@ -94,7 +71,6 @@ __all__ = [
     "find_homography",
     "find_homography_raw",
     "fit_exposure",
-    "fit_quantiles",
     "forward_backward",
     "frame_features",
     "gate_regions",
@@ -104,15 +80,12 @@ __all__ = [
     "hog",
     "invert_map",
     "is_traced",
-    "kernel_array",
-    "level_quantiles",
     "log_partition",
     "lucas_kanade",
     "masked_median",
     "match_exposure",
     "may_branch",
     "mean_gradient",
-    "noise_units",
     "noise_weight",
     "oneway_transfer_error",
     "opening",

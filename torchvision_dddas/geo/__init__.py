@@ -1,6 +1,6 @@
 """From the picture to the ground: aerial cameras with telemetry and landmarks, and ranging by cameras on the ground."""
 
-from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix, check_table, frames_to_locate, is_outside
+from torchvision_dddas.geo.aerial_locator import AerialLocator, check_table, frames_to_locate, is_outside
 from torchvision_dddas.geo.aerial_targets import Targets, tracked_targets
 from torchvision_dddas.geo.camera_calibration import calibrate_focal_length, calibrate_pose
 from torchvision_dddas.geo.clock_offset import describe_clock_offset
@@ -41,7 +41,6 @@ __all__ = [
     "EXACT_M",
     "AerialLocator",
     "CalibratedColours",
-    "FrameFix",
     "GroundLocator",
     "LandmarkTrajectories",
     "LandmarkWatch",

@@ -1,7 +1,7 @@
 """Live runs: capture in a thread of its own, load shedding, health, and serving its state."""
 
 from torchvision_dddas.live.capture import LiveSource
-from torchvision_dddas.live.health import Health, Snapshot
+from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.runner import LoadShedding
 from torchvision_dddas.live.session import run_live
 
@@ -9,6 +9,5 @@ __all__ = [
     "Health",
     "LiveSource",
     "LoadShedding",
-    "Snapshot",
     "run_live",
 ]

@@ -6,21 +6,18 @@ from torchvision_dddas.nn.motion_segmenter import (
     Differences,
     MotionSegmenter,
     Regions,
-    Segmentation,
-    TensorChain,
     Values,
     check_softness,
     differences_of,
 )
 from torchvision_dddas.nn.people import HOGDescriptor, PersonScorer
 from torchvision_dddas.nn.plane_homography import PlaneHomography
-from torchvision_dddas.nn.registration import GRAPH_EFFORT, Effort, Motion, Registration
+from torchvision_dddas.nn.registration import GRAPH_EFFORT, Motion, Registration
 
 __all__ = [
     "GRAPH_EFFORT",
     "Core",
     "Differences",
-    "Effort",
     "HOGDescriptor",
     "HistogramAffinity",
     "Motion",
@@ -29,8 +26,6 @@ __all__ = [
     "PlaneHomography",
     "Regions",
     "Registration",
-    "Segmentation",
-    "TensorChain",
     "Values",
     "check_softness",
     "differences_of",
