@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from functools import cache
 from typing import Any, Self
 
 import numpy as np
@@ -94,8 +95,13 @@ class Boxes(Table):
 
 def columns_of(table: Any) -> dict[str, np.ndarray]:
     """The columns of a table by name."""
-    values = {column.name: getattr(table, column.name) for column in fields(table)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    values = ((name, getattr(table, name)) for name in _names(table.__class__))
+    return {name: value for name, value in values if isinstance(value, np.ndarray)}
+
+
+@cache
+def _names(table: type) -> tuple[str, ...]:
+    return tuple(column.name for column in fields(table))
 
 
 def complete_table(table: Any, count: int, **unknown: Any) -> None:
