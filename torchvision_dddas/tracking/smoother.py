@@ -2,7 +2,6 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import reduce
 
@@ -150,7 +149,7 @@ class FixedLagSmoother:
 
     def _smoothed(self, confirmed: dict[int, _Observation], at: _Pending) -> np.ndarray:
         """(K, 4) the boxes of confirmed tracks in a frame, those with a score below 1 smoothed along their tracks."""
-        given = _boxes_of(confirmed.values())
+        given = np.array([seen.box_px for seen in confirmed.values()], float).reshape(-1, 4)
         oldest = self.count - len(self.steps)
         near: list[_Observation] = []
         starts, smoothed = [], []
@@ -163,7 +162,10 @@ class FixedLagSmoother:
                 near += of_track
         if not near:
             return given
-        box, index = _boxes_of(near), np.array([s.index for s in near])
+        box, index = (
+            np.concatenate([s.box_px for s in near], dtype=float).reshape(-1, 4),
+            np.array([s.index for s in near]),
+        )
         if self.has_moved:
             for there in np.unique(index).tolist():
                 box[index == there] = self._boxes_at(box[index == there], there, at.index)
@@ -182,12 +184,6 @@ class FixedLagSmoother:
         high_from_low = reduce(lambda before, step: step @ before, steps)
         here_from_there = high_from_low if there < here else np.linalg.inv(high_from_low)
         return transform_boxes(box_px, here_from_there)
-
-
-def _boxes_of(observations: Iterable[_Observation]) -> np.ndarray:
-    """(N, 4) the boxes, copied."""
-    boxes = [seen.box_px for seen in observations]
-    return np.concatenate(boxes).astype(float).reshape(-1, 4) if boxes else np.zeros((0, 4))
 
 
 def smooth_boxes(box_px: np.ndarray, since: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Tables: records of columns of one length, and boxes."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from functools import cache
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -95,13 +94,8 @@ class Boxes(Table):
 
 def columns_of(table: Any) -> dict[str, np.ndarray]:
     """The columns of a table by name."""
-    values = ((name, getattr(table, name)) for name in _names(table.__class__))
+    values = ((name, getattr(table, name)) for name in table.__dataclass_fields__)  # `fields` takes much longer
     return {name: value for name, value in values if isinstance(value, np.ndarray)}
-
-
-@cache
-def _names(table: type) -> tuple[str, ...]:
-    return tuple(column.name for column in fields(table))
 
 
 def complete_table(table: Any, count: int, **unknown: Any) -> None:

@@ -161,8 +161,8 @@ def test_a_batch_of_tensors_is_scored_as_arrays_are(scores: Any):
     wanted = [scores(Look.of(*row, parameters), parameters, *(part[:, 0] for part in more)) for row in rows]
     together = {name: torch.tensor([[getattr(scene, name)] for scene in scenes]).double() for name in LEARNED}
     size: Any = torch.tensor([scene.size for scene in scenes]).double().T[..., None].unbind()
-    tensors = (torch.as_tensor(part) for part in (state, missed, box[:, 2]))
-    look = Look.of(*tensors, SceneState(**together, size=size), parameters)
+    tensors: Any = [torch.as_tensor(part) for part in (state, missed, box[:, 2])]
+    look = Look.of(tensors[0], tensors[1], tensors[2], SceneState(**together, size=size), parameters)
     found = scores(look, parameters, *(torch.as_tensor(part) for part in more))
     near = np.isfinite(wanted)
     assert near.mean() > 0.5 and (found.numpy()[~near] < -4).all()
