@@ -67,6 +67,10 @@ TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
     "paper, K = 2, weight 0.7": (True, (*PAPER, "paper.window=2", "paper.rule=fixed")),
     "paper, K = 3": (True, PAPER),
     "paper, K = 3, weight 0.7": (True, (*PAPER, "paper.rule=fixed")),
+    "as printed, dummies by real pairs": (
+        True,
+        (*PAPER, "paper.dummy=real_pair", "paper.histogram_scale=1", "paper.appearance_cut=0.25"),
+    ),
 }
 """Whether the tracker has the clip's pictures, and its settings."""
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
