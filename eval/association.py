@@ -7,6 +7,7 @@ python eval/association.py weight DATA       AR_K against the weight of location
 python eval/association.py threshold DATA    AR_2 against threshold × weight (Fig. 6)
 python eval/association.py dispersion DATA   the dispersions of all windows and the weight that they choose
 python eval/association.py scale DATA        AR_2 and AR_3 by the scale of the histograms' dissimilarity
+python eval/association.py readings DATA     AR_3 by the reading of the dummy: the rule, fixed weights, the dispersions
 python eval/association.py cuts DATA         AR_2 by the dispersions, with clusters that end earlier or later
 
 DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Except for `ratio` and `clusters`,
@@ -24,6 +25,7 @@ import clips
 import cv2
 import numpy as np
 from association_windows import (
+    Sequence,
     Windows,
     build_windows,
     choose_weights,
@@ -65,6 +67,10 @@ TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
     "paper, K = 2, weight 0.7": (True, (*PAPER, "paper.window=2", "paper.rule=fixed")),
     "paper, K = 3": (True, PAPER),
     "paper, K = 3, weight 0.7": (True, (*PAPER, "paper.rule=fixed")),
+    "as printed, dummies by real pairs": (
+        True,
+        (*PAPER, "paper.dummy=real_pair", "paper.histogram_scale=1", "paper.appearance_cut=0.25"),
+    ),
 }
 """Whether the tracker has the clip's pictures, and its settings."""
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
@@ -72,6 +78,10 @@ LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.125, 0.17, 0.25, 0.
 """About the shipped ones, `paper.location_cut` and `paper.appearance_cut`."""
 SCALES = (1.0, 0.75, 0.57, 0.5, 0.4, 0.33)
 """Values of `paper.histogram_scale`; 1 is the source's formula as printed."""
+READINGS = (("formula", 0.4, 0.296), ("formula", 1.0, 0.25), ("real_pair", 1.0, 0.25), ("real_pair", 0.4, 0.296))
+"""Of a dummy's entry: `paper.dummy`, `paper.histogram_scale`, `paper.appearance_cut`; the first is shipped."""
+SMOOTHED = 4
+"""So many looks a dispersion is smoothed over."""
 SHOWN = (0.0, 0.3, 0.5, 0.7, 1.0)
 """The weights in the table of examples."""
 WORST = 9
@@ -418,6 +428,54 @@ def measure_scale(options: bench.Options) -> tuple[str, Any]:
     return bench.format_table([*head, "best fixed weight"], rows, words=2), found
 
 
+def measure_readings(options: bench.Options) -> tuple[str, Any]:
+    """AR_3 by how a dummy's entry is read: by the rule and by fixed weights, with what the rule decides by.
+
+    formula: the gate raises an entry with one dummy where no real alternative passes. real_pair: only where its two
+    real targets are alike enough themselves. By the shipped scale and cut of the histograms, and as printed (scale 1,
+    cut 0.25). smoothed: the rule decides by means of a frame's dispersions and those of the three looks before it.
+    """
+    rows, quoted, found = [], [], {}
+    for name, sequence in open_sequences(options):
+        for dummy, scale, cut in READINGS:
+            parameters = PaperParameters.model_validate(
+                {"dummy": dummy, "histogram_scale": scale, "appearance_cut": cut}
+            )
+            windows = build_windows(sequence, 3, options.interval, options.every, parameters)
+            fixed = {weight: window_ratios(windows, parameters, weight) for weight in SHOWN}
+            for looks in (1, SMOOTHED) if (dummy, scale) == ("real_pair", 1) else (1,):
+                words = f"{dummy}{f', smoothed over {looks} looks' * (looks > 1)}"
+                spread = smooth_dispersions(sequence, windows.frames, options.interval, looks, parameters)
+                smoothed = replace(windows, dispersions=spread)
+                known = np.array([considered_dispersions(smoothed, row, parameters) for row in range(len(spread))])
+                chosen = choose_weights(smoothed, parameters)
+                ruled = np.array([fixed[weight][row] for row, weight in enumerate(chosen.tolist())])
+                ranges = [f"{v.mean():.2f} ({v.min():.2f} to {v.max():.2f})" for v in known.T]
+                shares = " / ".join(f"{100 * (chosen == w).mean():.0f}" for w in (1.0, 0.5, 0.0))
+                cells = [f"{100 * v.mean():.1f}" for v in fixed.values()] if looks == 1 else ["–"] * len(SHOWN)
+                rows.append([name, words, f"{scale:g}, {cut:g}", *ranges, shares, f"{100 * ruled.mean():.1f}", *cells])
+                means = [float(ruled.mean()), *(float(v.mean()) for v in fixed.values())]
+                found[f"{name}, {words}, scale {scale:g}"] = means
+                bench.log(*rows[-1])
+                of = [one for one in QUOTED if one.sequence == name and dummy == "real_pair" and scale == 1]
+                quoted += [_quote(one, f"{looks}", known[_as_many(smoothed, one.targets)]) for one in of]
+    head = ["sequence", "dummy", "scale, cut", "Ndm of locations", "of histograms", "windows at w = 1 / 0.5 / 0, %"]
+    text = bench.format_table([*head, "AR_3 by the rule", *(f"w = {w:g}" for w in SHOWN)], rows, words=3)
+    head = ["Fig.", "sequence", "targets", "quoted: locations", "histograms", "weight", "looks", "windows here"]
+    table = bench.format_table([*head, "locations", "histograms"], quoted, words=3)
+    return f"{text}\n\nQuoted by the source, and as printed here:\n\n{table}", found
+
+
+def smooth_dispersions(
+    sequence: Sequence, frames: np.ndarray, interval: int, looks: int, parameters: PaperParameters
+) -> np.ndarray:
+    """(W, K, 2) means of the dispersions of each frame of the windows and of the looks before it, if there are any."""
+    before = np.maximum(frames[:, :, None] - interval * np.arange(looks), (frames - 1)[:, :, None] % interval + 1)
+    flat = before.reshape(len(frames), -1)
+    spread = measure_dispersions(sequence, flat, parameters.location_cut, histogram_cut(parameters))
+    return spread.reshape(*before.shape, 2).mean(axis=2)
+
+
 def _cut_links(windows: Windows, scale: float) -> float:
     """The share of true links whose histograms are more dissimilar than the threshold."""
     threshold, apart = PaperParameters().threshold, []
@@ -475,6 +533,7 @@ if __name__ == "__main__":
         "threshold": (measure_threshold, common | {"--plot": None}),
         "dispersion": (measure_dispersion, common | {"--plot": None}),
         "scale": (measure_scale, common | {"--every": 1}),
+        "readings": (measure_readings, common | {"--every": 1}),
         "cuts": (measure_cuts, common),
     }
     bench.main(__doc__, studies)

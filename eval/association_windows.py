@@ -9,13 +9,13 @@ import bench
 import clips
 import cv2
 import numpy as np
-import torch
 
 from torchvision_dddas.config import PaperParameters
 from torchvision_dddas.lab.evaluation.metrics import tracking
-from torchvision_dddas.nn import HistogramAffinity
 from torchvision_dddas.tracking import rgb_histograms
 from torchvision_dddas.tracking.source_tracker import (
+    Feature,
+    affinity,
     assign,
     centres,
     dispersion,
@@ -23,7 +23,10 @@ from torchvision_dddas.tracking.source_tracker import (
     histogram_cut,
     location_weight,
     normalize_channels,
+    real_pairs,
 )
+
+ZERO = PaperParameters(dummy="zero")
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class Windows:
     """All windows of a sequence: frames (W, K), newest first, and per window what the association needs.
 
     location, appearance: affinities with a dummy at index 0. dispersions: (W, K, 2), of locations and histograms.
+    pairs: what `assign` asks for with `paper.dummy` = real_pair; empty by feature for others.
     """
 
     frames: np.ndarray
@@ -53,6 +57,7 @@ class Windows:
     location: list[np.ndarray]
     appearance: list[np.ndarray]
     dispersions: np.ndarray
+    pairs: list[dict[Feature, list[np.ndarray]]]
 
 
 def read_sequence(place: Path) -> Sequence:
@@ -66,8 +71,13 @@ def read_sequence(place: Path) -> Sequence:
     return Sequence(table.frame, table.identity, table.box_px, normalize_channels(histogram), frozenset(seen))
 
 
-def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1) -> Windows:
-    """The windows of `count` frames, one ending at each frame that has its older ones; one window in `every`."""
+def build_windows(
+    sequence: Sequence, count: int, interval: int, every: int = 1, readings: PaperParameters = ZERO
+) -> Windows:
+    """The windows of `count` frames, one ending at each frame that has its older ones; one window in `every`.
+
+    readings: of what a dummy is worth; the affinities of real targets are the same by all.
+    """
     last = int(sequence.frame.max())
     rows = {number: sequence.rows(number) for number in range(1, last + 1)}
     ends = [[t - interval * n for n in range(count)] for t in range(1 + interval * (count - 1), last + 1)]
@@ -75,22 +85,13 @@ def build_windows(sequence: Sequence, count: int, interval: int, every: int = 1)
     if not whole:
         raise SystemExit(f"no {count} frames {interval} apart with boxes; give a shorter --interval")
     frames = np.array(whole[::every], int)
-    most = max(len(r) for r in rows.values())
-    valid = np.arange(most) < np.array([0, *(len(rows[t]) for t in range(1, last + 1))])[:, None]
-    sizes, parts = [tuple(len(rows[t]) for t in f) for f in frames], []
-    for feature in (centres(sequence.box_px), sequence.histogram):
-        padded = np.zeros((last + 1, most, feature.shape[1]))
-        for number, which in rows.items():
-            padded[number, : len(which)] = feature[which]
-        tables = [torch.from_numpy(table) for table in (padded, valid, frames)]
-        found = HistogramAffinity().affinity(*tables).numpy()
-        parts.append(
-            [np.pad(one[tuple(map(slice, size))], ((1, 0),) * count) for one, size in zip(found, sizes, strict=True)]
-        )
-    identities = [[sequence.identity[rows[t]] for t in f] for f in frames]
-    parameters = PaperParameters()
-    spread = measure_dispersions(sequence, frames, parameters.location_cut, histogram_cut(parameters))
-    return Windows(frames, identities, parts[0], parts[1], spread)
+    values: dict[Feature, np.ndarray] = {"location": centres(sequence.box_px), "appearance": sequence.histogram}
+    tables = [{name: [of[rows[t]] for t in f] for name, of in values.items()} for f in frames.tolist()]
+    location, appearance = ([affinity(of[name], readings) for of in tables] for name in values)
+    pairs = [{name: real_pairs(of[name], readings, name) for name in values} for of in tables]
+    identities = [[sequence.identity[rows[t]] for t in f] for f in frames.tolist()]
+    spread = measure_dispersions(sequence, frames, readings.location_cut, histogram_cut(readings))
+    return Windows(frames, identities, location, appearance, spread, pairs)
 
 
 def measure_dispersions(
@@ -110,13 +111,12 @@ def measure_dispersions(
 def window_ratios(windows: Windows, parameters: PaperParameters, weight: float | None) -> np.ndarray:
     """AR_K of every window; weight None: as the dispersions choose it."""
     chosen = choose_weights(windows, parameters) if weight is None else np.full(len(windows.frames), weight)
-    parts = zip(windows.location, windows.appearance, windows.identities, chosen, strict=True)
-    return np.array(
-        [
-            tracking.accuracy_ratio(assign(location, appearance, float(w), parameters), identities)
-            for location, appearance, identities, w in parts
-        ]
-    )
+    parts = zip(windows.location, windows.appearance, windows.pairs, windows.identities, chosen, strict=True)
+    found = []
+    for location, appearance, pairs, identities, w in parts:
+        used = location if w > 0 else None, appearance if w < 1 else None
+        found.append(tracking.accuracy_ratio(assign(*used, float(w), parameters, pairs), identities))
+    return np.array(found)
 
 
 def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
@@ -137,14 +137,14 @@ def considered_dispersions(windows: Windows, row: int, parameters: PaperParamete
 
 def select_windows(windows: Windows, rows: list[int]) -> Windows:
     """Some of the windows."""
-    lists = [[of[row] for row in rows] for of in (windows.identities, windows.location, windows.appearance)]
-    return Windows(windows.frames[rows], *lists, windows.dispersions[rows])
+    lists = (windows.identities, windows.location, windows.appearance, windows.pairs)
+    identities, location, appearance, pairs = ([of[row] for row in rows] for of in lists)
+    return Windows(windows.frames[rows], identities, location, appearance, windows.dispersions[rows], pairs)
 
 
 def open_sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
     """The sequences of the data whose names hold `--only` and that have pictures."""
     cv2.setNumThreads(1)
-    torch.set_num_threads(1)
     places = [place for place in clips.sequences(options.data) if options.only in place.name]
     places = [place for place in places if clips.has_pictures(place, "video")]
     if not places:

@@ -96,12 +96,18 @@ def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
     engine, interval = load_engine("onboard", settings), settings.interval.frames
     views = [engine.prepare(frame.image) for frame in open_source(place / "frames")]
     steps = [step.later_from_earlier for step in engine.register(list(pairwise(views)))]
+
+    def ahead_of(at: int, gap: int) -> np.ndarray:
+        """Map frame `at` to the one `gap` after it: registered directly, or chained where that fails."""
+        (step,) = engine.register([(views[at], views[at + gap])])
+        return step.later_from_earlier if step.reliable else chain(steps[at : at + gap])
+
     truth = truths.load_truth(place)
     for number, path in sorted(truth.masks.items()):
         for where, at in (("reference", number - 1), ("middle", number - 1 - interval)):
             if at < 0 or at + 2 * interval >= len(views):
                 continue
-            ahead = [chain(steps[at : at + gap]) for gap in (interval, 2 * interval)]
+            ahead = [ahead_of(at, gap) for gap in (interval, 2 * interval)]
             later = (views[at + interval], views[at + 2 * interval])
             offsets = (interval, 2 * interval)
             found = engine.foreground([Window(views[at], later, np.array(ahead), offsets, ((0, 1),))])[0]

@@ -5,10 +5,10 @@ import pytest
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.tracking import kalman
-from torchvision_dddas.tracking.box_motion import candidate_shifts, likelier_shift
+from torchvision_dddas.tracking.box_motion import candidate_shifts, likelier_shift, medians
 from torchvision_dddas.tracking.kalman import HEIGHT, X, Y
 from torchvision_dddas.tracking.scene import SceneState
-from torchvision_dddas.tracking.scores import association_scores, newborn_scores
+from torchvision_dddas.tracking.scores import Look, association_scores, newborn_scores
 
 KNOBS = Settings().track
 SCENE = SceneState(time=1, step=0.1, density=1e-5, missing=0.1, turnover=0.02)
@@ -33,9 +33,8 @@ def found(before: np.ndarray, now: np.ndarray, newborn: bool = False) -> np.ndar
     def scores(shift: np.ndarray) -> np.ndarray:
         moved = state.copy()
         moved[:, : Y + 1] += shift
-        if newborn:
-            return newborn_scores(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS, at_rest)
-        return association_scores(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS)
+        look = Look.of(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS)
+        return newborn_scores(look, KNOBS, at_rest) if newborn else association_scores(look, KNOBS)
 
     shifts = candidate_shifts(state[:, [X, Y]], state[:, HEIGHT], now, np.full(len(now), 80.0))
     chosen = likelier_shift(scores(np.zeros(2)), [scores(shift) for shift in shifts], newborn) if shifts else None
@@ -73,3 +72,9 @@ def test_a_row_of_equally_spaced_vehicles_that_moves_on_is_not_shifted_to_the_ne
 def test_too_few_targets_show_no_shift():
     few = crowd(0, 2)
     assert found(few, few + 100) is None and found(few[:0], few) is None and found(crowd(0), few[:0]) is None
+
+
+@pytest.mark.parametrize("shape", [(1, 2), (2, 2), (7, 2), (8,)])
+def test_medians_are_numpys(shape):
+    values = np.random.default_rng(len(shape)).normal(0, 5, shape)
+    np.testing.assert_array_equal(medians(values), np.median(values, axis=0))

@@ -13,6 +13,7 @@ from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import HEIGHT, VX, VY, WIDTH, X, Y
 from torchvision_dddas.tracking.scene import SceneState
 from torchvision_dddas.tracking.scores import (
+    Look,
     association_scores,
     common_velocity,
     is_near_border,
@@ -38,14 +39,16 @@ def track(box: np.ndarray = PERSON, velocity: tuple[float, float] = (0, 0), seen
 def scored(boxes, state=None, scene=SCENE, missed=0) -> list[float]:
     """The scores of one track's links."""
     state = track() if state is None else state
-    return association_scores(state, np.full(len(state), missed), np.asarray(boxes, float), scene, KNOBS)[0].tolist()
+    look = Look.of(state, np.full(len(state), missed), np.asarray(boxes, float), scene, KNOBS)
+    return association_scores(look, KNOBS)[0].tolist()
 
 
 def first(boxes, flow=None, scene=SCENE, missed=0, box=PERSON) -> list[float]:
     """The scores of links of a track with one detection."""
     state = kalman.start(box[None], scene.time - 1 - missed, KNOBS.scatter, scene.step)
     velocities = ways(state, np.zeros((0, kalman.COLUMNS)) if flow is None else flow)
-    return newborn_scores(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS, velocities)[0].tolist()
+    look = Look.of(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS)
+    return newborn_scores(look, KNOBS, velocities)[0].tolist()
 
 
 def ways(state: np.ndarray, flow: np.ndarray) -> np.ndarray:
@@ -98,9 +101,9 @@ def test_scores_do_not_depend_on_the_scale_or_place_of_the_scene(seed, scale, x,
 @pytest.mark.parametrize(("tracks", "boxes"), [(0, 0), (0, 2), (2, 0)])
 def test_no_tracks_or_no_boxes_give_an_empty_table(tracks, boxes):
     state, boxes_px = np.repeat(track(), tracks, axis=0), np.tile(PERSON, (boxes, 1))
-    none = np.zeros(tracks)
-    assert association_scores(state, none, boxes_px, SCENE, KNOBS).shape == (tracks, boxes)
-    assert newborn_scores(state, none, boxes_px, SCENE, KNOBS, ways(state, track())).shape == (tracks, boxes)
+    look = Look.of(state, np.zeros(tracks), boxes_px, SCENE, KNOBS)
+    assert association_scores(look, KNOBS).shape == (tracks, boxes)
+    assert newborn_scores(look, KNOBS, ways(state, track())).shape == (tracks, boxes)
 
 
 def test_a_walker_may_have_stopped_only_during_a_gap():
@@ -165,3 +168,13 @@ def test_a_box_where_it_is_expected_is_worth_less_for_a_nearer_target_which_has_
     unbounded = replace(SCENE, size=None)
     lead = scored([PERSON], scene=unbounded)[0] - scored(large, near, unbounded)[0]
     assert lead == pytest.approx(np.log(4))
+
+
+@pytest.mark.parametrize("score_of", [scored, first])
+def test_scores_do_not_depend_on_how_many_boxes_are_compared(score_of):
+    # Few pairs are all compared with the reach, many by their order in x.
+    boxes = moved(*np.random.default_rng(0).uniform(-300, 300, (5000, 2)))
+    together, some = np.array(score_of(boxes)), np.array(score_of(boxes[:100]))
+    finite = np.isfinite(some)
+    np.testing.assert_allclose(together[:100][finite], some[finite])
+    assert 0 < finite.sum() < 100 and (together[:100][~finite] < -4).all()

@@ -15,6 +15,7 @@ from torchvision_dddas.config import PaperParameters, Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.tracking import source_tracker
 from torchvision_dddas.tracking.source_tracker import (
+    Feature,
     Features,
     SourceTracker,
     assign,
@@ -65,7 +66,10 @@ LEAVING = [at((100, 100), (400, 300)), at((105, 100), (410, 300)), at((110, 100)
 SHUFFLED = [at((100, 100), (400, 300)), at((410, 300), (105, 100)), at((110, 100), (420, 300))]
 
 
-@pytest.mark.parametrize(("values", "linked"), [({"window": 2}, True), ({}, True), ({"dummy": "zero"}, False)])
+@pytest.mark.parametrize(
+    ("values", "linked"),
+    [({"window": 2}, True), ({}, True), ({"dummy": "zero"}, False), ({"dummy": "real_pair"}, True)],
+)
 def test_a_target_that_enters_in_the_middle_frame_is_linked_unless_a_dummy_is_worth_nothing(values, linked):
     # Its true link with the dummy before is worth 0 then, and false ones, at least 0.6, keep the gate from raising it.
     entering = [at((300, 200)), at((310, 200), (500, 300)), at((320, 200), (510, 300))]
@@ -84,6 +88,7 @@ def test_a_target_that_enters_in_the_middle_frame_is_linked_unless_a_dummy_is_wo
         (LEAVING, {"dummy": "zero"}, [3]),
         (LEAVING, {"dummy": "zero", "gate": "off"}, [1]),
         (LEAVING, {}, [1]),
+        (LEAVING, {"dummy": "real_pair"}, [1]),
         (LEAVING, {"window": 2}, [1]),
     ],
 )
@@ -188,6 +193,35 @@ def test_the_dummy_by_words_and_by_formula():
     assert formula[0, 1, 1] == pytest.approx((1 + 3) / (5 + 2 + 5))
     assert formula[1, 0, 1] == formula[0, 0, 0] == formula[0, 0, 1] == formula[0, 1, 0] == 0
     assert not source_tracker.affinity([a, b], PaperParameters())[0].any()
+
+
+@pytest.mark.parametrize("gated", ["features", "affinity"])
+def test_false_pairs_do_not_win_where_the_gate_raises_only_real_ones(gated: str):
+    # Two true triplets are worth 2 · 0.85; three false pairs with a dummy, 3 · 0.6.
+    score = np.zeros((3, 3, 3))
+    score[1:, 1:, 1:] = 0.1
+    score[1, 1, 1] = score[2, 2, 2] = 0.85
+    true, knobs = np.full((2, 2), 0.1) + 0.75 * np.eye(2), parameters(histogram_scale=1.0, gated=gated)
+    assert (assign(None, score, 0.0, knobs) == 0).any()
+    for location, weight in ((None, 0.0), (score, 0.5)):
+        pairs: dict[Feature, list[np.ndarray]] = {"location": [true, true], "appearance": [true, true]}
+        found = assign(location, score, weight, knobs, pairs)
+        assert found.tolist() == [[1, 1, 1], [2, 2, 2]]
+    # The second target is in the two newest frames only: its real pair is raised.
+    score[2, 2, 2] = 0.1
+    pairs = {"appearance": [true, np.array([[0.85, 0.1], [0.1, 0.1]])]}
+    assert assign(None, score, 0.0, knobs, pairs).tolist() == [[0, 0, 2], [1, 1, 1], [2, 2, 0]]
+
+
+def test_real_pairs_are_those_of_three_frames_and_scaled_as_histograms_are():
+    a, b, c = (np.array([row], float) for row in ([4, 1], [2, 3], [1, 5]))
+    knobs = parameters(dummy="real_pair", histogram_scale=0.5)
+    newer, older = source_tracker.real_pairs([a, b, c], knobs, "location")
+    assert (newer.item(), older.item()) == pytest.approx((3 / 7, 4 / 7))
+    newer, older = source_tracker.real_pairs([a, b, c], knobs, "appearance")
+    assert (newer.item(), older.item()) == pytest.approx((1 - 0.5 * 4 / 7, 1 - 0.5 * 3 / 7))
+    assert source_tracker.real_pairs([a, b], knobs, "location") == []
+    assert source_tracker.real_pairs([a, b, c], parameters(), "location") == []
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ def identities(backend: str, settings: Settings, clip: list[tuple[np.ndarray | N
         {},
         {"window": 2},
         {"rule": "fixed", "weight": 0.3, "dummy": "formula"},
+        {"dummy": "real_pair", "histogram_scale": 1.0, "appearance_cut": 0.25},
         {"rule": "fixed", "weight": 0.0, "window": 2, "histogram": "count"},
         {"lowest_dispersion": 1.0, "histogram": "count", "dispersion_of": "newest"},
     ],

@@ -77,8 +77,10 @@ class PaperParameters(Group):
         "features", "gate location and appearance, or their weighted sum"
     )
     threshold: float = parameter(0.4, "a dummy's entry is raised if all real ones are below 1 - threshold", "-", 0, 1)
-    dummy: Literal["zero", "formula"] = parameter(
-        "formula", "affinity with a dummy before the gate: eq. 4 and 5 with a zero vector, or zero as the text says"
+    dummy: Literal["zero", "formula", "real_pair"] = parameter(
+        "formula",
+        "affinity with a dummy before the gate: eq. 4 and 5 with a zero vector, or zero as the text says; real_pair "
+        "(ours): as formula, and of three frames the gate raises it only for two targets alike by 1 - threshold",
     )
     histogram: Literal["channel", "count"] = parameter(
         "channel", "channel: histograms sum to 1 per channel; count: they hold counts, so size matters too"

@@ -31,9 +31,11 @@ _PRICE_ROUNDS, _EASY_COLUMNS = 6, 30
 
 def plausible_links(score: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
     """Tracks and detections (P,) of the links worth following into the next frame, from association scores."""
-    row, column = np.nonzero(score > _LEAST_SCORE)
+    row, column = (score > _LEAST_SCORE).nonzero()
+    if not len(row) or min(np.bincount(row).max(), np.bincount(column).max()) < _RIVALS:
+        return row, column
     # Boxes that lie on each other have equal scores, and searching them all never ends.
-    distinct = score[row, column] - _TIE_BREAK * ((column - row) % max(score.shape[1], 1))
+    distinct = score[row, column] - _TIE_BREAK * ((column - row) % score.shape[1])
     leading = _is_leading(distinct, row) | _is_leading(distinct, column)
     return row[leading], column[leading]
 
@@ -57,41 +59,46 @@ def choose_links(
     detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
     leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
     """
-    n, m = len(bridging), len(born)
     price = np.zeros(onward.shape[1])
     best, answer = -np.inf, np.zeros(len(value), bool)
     if not len(value):
         return answer
     # Scores to the next frame, below one another. Only those above 0 can be chosen: a hundredth, of 1000 boxes a frame.
-    parts, last = (onward, born, bridging), np.cumsum([len(value), m, n])
-    row, column = np.concatenate(
-        [np.nonzero(part > 0) + np.array([[end - len(part)], [0]]) for part, end in zip(parts, last, strict=True)], 1
-    )
-    gain = _NEXT_WEIGHT * np.concatenate([part[part > 0] for part in parts])
+    parts, places = (onward, born, bridging), [(part > 0).nonzero() for part in (onward, born, bridging)]
+    begin, free, end = np.cumsum([len(value), len(born), len(bridging)]).tolist()
+    row = np.concatenate([at[0] + first for at, first in zip(places, (0, begin, free), strict=True)])
+    column = np.concatenate([at[1] for at in places])
+    gain = _NEXT_WEIGHT * np.concatenate([part[at] for part, at in zip(parts, places, strict=True)])
+    starts, born_row, old_row = _run_starts(row), begin + now, free + tracks
+    filled = row[starts]
     for _ in range(_ROUNDS):
         # The next frame's detections cost their price; what they are worth then is added to this frame's links.
-        most, to = _dearest(row, column, gain - price[column], last[2])
-        ahead, fresh, bridged = np.split(most, last[:2])
-        worth = np.maximum(value + ahead - fresh[now] - bridged[tracks], 0.0)
-        links = np.flatnonzero(worth)
+        net, most = gain - price[column], np.zeros(end)
+        if len(row):
+            most[filled] = np.maximum(np.maximum.reduceat(net, starts), 0.0)
+        worth = np.maximum(value + most[:begin] - most[born_row] - most[old_row], 0.0)
+        links = worth.nonzero()[0]
         chosen = links[_best_entries(tracks[links], now[links], worth[links])]
-        bound = float(worth[chosen].sum() + fresh.sum() + bridged.sum() + price.sum())
-        number, left = np.full(last[2], -1), np.ones(last[2], bool)
-        left[: len(value)] = False
-        left[chosen] = True
-        left[len(value) + now[chosen]] = left[last[1] + tracks[chosen]] = False
-        number[left] = np.arange(left.sum())
-        kept = np.flatnonzero(left[row])
-        found = float(
-            value[chosen].sum() + gain[kept[_best_entries(number[row[kept]], column[kept], gain[kept])]].sum()
-        )
+        bound = float(worth[chosen].sum() + most[begin:].sum() + price.sum())
+        used = np.zeros(end, bool)
+        used[:begin] = True
+        used[chosen] = False
+        used[born_row[chosen]] = used[old_row[chosen]] = True
+        is_left = ~used[row]
+        left = is_left.nonzero()[0]
+        ahead = gain[left]
+        found = float(value[chosen].sum() + ahead[_best_entries(row[left], column[left], ahead)].sum())
         if found > best:
             best, answer = found, np.zeros(len(value), bool)
             answer[chosen] = True
-        wanted = to[left]
-        excess = np.bincount(wanted[wanted >= 0], minlength=len(price)) - 1
+        if bound - best < _CLOSE * max(1.0, best):
+            break
+        # What each node left would take: its dearest, of equal ones the first.
+        dearest = (is_left & (net > 0) & (net == most[row])).nonzero()[0]
+        wanted = column[dearest[_run_starts(row[dearest])]]
+        excess = np.bincount(wanted, minlength=len(price)) - 1
         excess[(excess < 0) & (price <= 0)] = 0
-        if bound - best < _CLOSE * max(1.0, best) or not excess.any():
+        if not excess.any():
             break
         price = np.maximum(price + (bound - best) / float((excess**2).sum()) * excess, 0.0)
     return answer
@@ -107,41 +114,46 @@ def link_confidences(
     """
     if not len(tracks):
         return np.zeros(0)
-    chosen = score[tracks, detections]
-    lead = chosen.copy()
+    mine = score[tracks]
+    chosen = lead = mine[np.arange(len(tracks)), detections]
     free_tracks, free_detections = np.ones(score.shape[0], bool), np.ones(score.shape[1], bool)
     free_tracks[tracks], free_detections[detections] = False, False
     if free_detections.any():
-        lead = np.minimum(lead, chosen - score[np.ix_(tracks, free_detections)].max(axis=1))
+        lead = np.minimum(lead, chosen - mine[:, free_detections].max(axis=1))
     if free_tracks.any():
-        lead = np.minimum(lead, chosen - score[np.ix_(free_tracks, detections)].max(axis=0))
+        lead = np.minimum(lead, chosen - score[free_tracks][:, detections].max(axis=0))
     if len(tracks) > 1:
-        crossed = score[np.ix_(tracks, detections)]
+        crossed = mine[:, detections]
         loss = chosen[:, None] + chosen - crossed - crossed.T
         np.fill_diagonal(loss, np.inf)
         lead = np.minimum(lead, loss.min(axis=1))
-    return 1 / (1 + np.exp(-np.clip(lead, -50.0, 50.0)))
+    return 1 / (1 + np.exp(-lead.clip(-50.0, 50.0)))
 
 
-def _dearest(row: np.ndarray, column: np.ndarray, value: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(R,) the largest value of each of `count` rows, at least 0, and its column, -1 for none; entries row by row."""
-    most, at = np.zeros(count), np.full(count, -1)
-    if len(row):
-        starts = np.flatnonzero(np.diff(row, prepend=-1))
-        most[row[starts]] = np.maximum(np.maximum.reduceat(value, starts), 0.0)
-    first = np.flatnonzero((value > 0) & (value == most[row]))[::-1]  # of equal ones the first column stays
-    at[row[first]] = column[first]
-    return most, at
+def _run_starts(values: np.ndarray) -> np.ndarray:
+    """Where a run of equal values begins."""
+    begins = np.ones(len(values), bool)
+    np.not_equal(values[1:], values[:-1], out=begins[1:])
+    return begins.nonzero()[0]
 
 
 def _best_entries(row: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Which entries, all above 0, are the one-to-one pairs with the largest sum; as `best_pairs`, by row."""
-    (_, row), (_, column) = (np.unique(nodes, return_inverse=True) for nodes in (row, column))
-    cost = np.zeros((row.max(initial=-1) + 1, column.max(initial=-1) + 1))
-    place = np.full(cost.shape, -1)
-    cost[row, column], place[row, column] = -value, np.arange(len(row))
-    found = place[cheapest(cost)]
-    return found[found >= 0]
+    """Which entries, all above 0, are the one-to-one pairs with the largest sum; as `best_pairs`, by row.
+
+    row: ascending, and column within each row.
+    """
+    if not len(row):
+        return row
+    rows, columns = ((np.bincount(nodes) > 0).cumsum() for nodes in (row, column))
+    count, wide = rows[-1], columns[-1]
+    if count == wide == len(row):
+        return np.arange(count)
+    place = (rows[row] - 1) * wide + columns[column] - 1
+    cost = np.zeros(count * wide)
+    cost[place] = -value
+    row, column = cheapest(cost.reshape(count, wide))
+    found = row * wide + column
+    return place.searchsorted(found[cost[found] < 0])
 
 
 def _is_leading(value: np.ndarray, group: np.ndarray) -> np.ndarray:

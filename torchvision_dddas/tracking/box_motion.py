@@ -13,6 +13,9 @@ import numpy as np
 from torchvision_dddas.geometry import best_pairs
 
 _REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
+_AXIS = np.arange(-np.ceil(_REACH / _CELL) - 1, np.ceil(_REACH / _CELL) + 2) * _CELL  # of the votes' cells
+_AWAY = np.hypot(_AXIS[:, None], _AXIS)
+_AROUND = np.array([[row * len(_AXIS) + column] for row in (-1, 0, 1) for column in (-1, 0, 1)])  # a cell
 _STILL, _STILL_SHARE = 0.15, 0.7  # median heights; share of tracks so near to a detection that no shift is sought
 _MOST = 3  # candidates
 FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
@@ -30,37 +33,41 @@ def candidate_shifts(
     """
     if len(place_px) < FEWEST or len(centre_px) < FEWEST:
         return []
-    unit = float(np.median(height_px))
-    offset = (centre_px - place_px[:, None]) / unit
+    unit = float(medians(height_px))
+    across, down = ((centre_px[:, axis] - place_px[:, axis, None]) / unit for axis in (0, 1))
     alike = np.abs(np.log(box_height_px / height_px[:, None])) < _LARGEST_SIZE_CHANGE
-    away = np.where(alike, np.abs(offset).max(axis=2), np.inf)
+    away = np.where(alike, np.maximum(np.abs(across), np.abs(down)), np.inf)
     if (away.min(axis=1) < _STILL).mean() > _STILL_SHARE:
         return []
-    track, detection = np.nonzero(away < _REACH)
-    votes = offset[track, detection]
-    half = int(np.ceil(_REACH / _CELL)) + 1
-    side = 2 * half + 1
+    near = (away < _REACH).nonzero()
+    votes = np.stack([across[near], down[near]], axis=1)
     # A vote counts for its cell and those around it; a track votes once for a cell.
-    around = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    cell = np.round(votes / _CELL).astype(int)[:, None] + half + around
-    keys = np.unique((track[:, None] * side + cell[..., 0]) * side + cell[..., 1])
-    count = np.bincount(keys % side**2, minlength=side**2).reshape(side, side)
-    axis = (np.arange(side) - half) * _CELL
-    left = count - _FAR_PRICE * len(place_px) * np.hypot(axis[:, None], axis)
+    side = len(_AXIS)
+    row, column = np.rint(votes / _CELL).astype(int).T + side // 2
+    voted = np.zeros(len(place_px) * side**2, bool)
+    voted[(near[0] * side**2 + row * side + column) + _AROUND] = True
+    count = np.bincount(voted.nonzero()[0] % side**2, minlength=side**2).reshape(side, side)
+    left = count - _FAR_PRICE * len(place_px) * _AWAY
     found = []
     for _ in range(_MOST):
         row, column = np.unravel_index(left.argmax(), left.shape)
         if count[row, column] < max(FEWEST, _SHARE * len(place_px)):
             break
-        shift = np.array([axis[row], axis[column]])
+        shift = np.array([_AXIS[row], _AXIS[column]])
         for width in (1.5 * _CELL, _CELL, _CELL):
-            close = np.abs(votes - shift).max(axis=1) < width
+            close = (np.abs(votes - shift) < width).all(axis=1)
             if close.sum() >= FEWEST:
-                shift = np.median(votes[close], axis=0)
+                shift = medians(votes[close])
         if np.abs(shift).max() > _STILL:
             found.append(shift * unit)
         left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -1.0
     return found
+
+
+def medians(values: np.ndarray) -> np.ndarray:
+    """The medians of columns of finite values (K, ...), K > 0: of a few values in a tenth of np.median's time."""
+    ordered, count = np.sort(values, axis=0), len(values)
+    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
 
 
 def likelier_shift(still: np.ndarray, moved: Sequence[np.ndarray], newborn: bool) -> int | None:

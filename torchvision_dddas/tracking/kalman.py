@@ -54,7 +54,7 @@ def start(
 def predict(state: np.ndarray, time: float, wander: float) -> np.ndarray:
     """States at a later time. wander: sd of the change of velocity in one look, heights a look."""
     gap = time - state[..., SEEN]
-    stretch = 1 / (1 - namespace(state).clip(gap * state[..., GROWTH], _FARTHEST, _NEAREST))
+    stretch = 1 / (1 - (gap * state[..., GROWTH]).clip(_FARTHEST, _NEAREST))
     return _table(
         state[..., X : Y + 1] + (gap * stretch)[..., None] * state[..., VX : VY + 1],
         state[..., VX : VY + 1] * (stretch**2)[..., None],

@@ -21,6 +21,7 @@ from torchvision_dddas.tracking.box_motion import FEWEST, candidate_shifts, like
 from torchvision_dddas.tracking.kalman import HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
 from torchvision_dddas.tracking.scene import Scene
 from torchvision_dddas.tracking.scores import (
+    Look,
     association_scores,
     common_velocity,
     is_near_border,
@@ -61,7 +62,11 @@ def _join(first: TrackStates, *others: TrackStates) -> TrackStates:
     """All tracks in one table."""
     tables = [first, *(tracks for tracks in others if len(tracks))]
     width = max(tracks.signature.shape[1] for tracks in tables)
-    return TrackStates.concat([replace(tracks, signature=_widen(tracks.signature, width)) for tracks in tables])
+    same = [
+        tracks if tracks.signature.shape[1] == width else replace(tracks, signature=_widen(tracks.signature, width))
+        for tracks in tables
+    ]
+    return same[0] if len(same) == 1 else TrackStates.concat(same)
 
 
 def _widen(signature: np.ndarray, width: int) -> np.ndarray:
@@ -187,7 +192,8 @@ class ScoreTracker:
 
     def _settle(self, everything: bool = False) -> list[Tracks]:
         settled = self.smoother.settle(everything)
-        return [replace(tracks, appearance=self._uses.pop(tracks.frame, None)) for tracks in settled]
+        uses = (self._uses.pop(tracks.frame, None) for tracks in settled)
+        return [replace(tracks, appearance=use) if use else tracks for tracks, use in zip(settled, uses, strict=True)]
 
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
         """Link a frame's detections to the tracks, in view of the next frame where there is one."""
@@ -209,7 +215,7 @@ class ScoreTracker:
         count = len(box)
         once, look = np.ones(count, np.int64), np.full(count, now.look)
         born = TrackStates(state, now.signature, np.full(count, -1), once, look)
-        continued = self._update(now, tracks, detections)
+        continued = self._update(now, tracks, detections, at_border[detections])
         if ahead is not None and len(ahead.row):
             there = ahead.box_px
             if ahead.step is not None:  # in the coordinates of this frame
@@ -255,38 +261,35 @@ class ScoreTracker:
         shifts = candidate_shifts(later[:, : Y + 1], later[:, HEIGHT], box[:, :2] + box[:, 2:] / 2, box[:, 3])
         if not shifts:
             return None
-        still, *moved = (
-            self._scores(replace(tracks, state=_moved(tracks.state, shift)), now, box)
-            for shift in (np.zeros(2), *shifts)
-        )
+        each = tracks[np.tile(np.arange(len(tracks)), 1 + len(shifts))]
+        each = replace(each, state=_moved(each.state, np.repeat([np.zeros(2), *shifts], len(tracks), axis=0)))
+        still, *moved = np.split(self._scores(each, now, box), 1 + len(shifts))
         chosen = likelier_shift(still, moved, newborn)
         return None if chosen is None else shifts[chosen]
 
     def _scores(self, tracks: TrackStates, sample: _Sample, box_px: np.ndarray) -> np.ndarray:
         """(N, M) scores of tracks and a frame's detections, whose boxes are given in the tracks' coordinates."""
-        score = np.zeros((len(tracks), len(box_px)))
-        if not score.size:
-            return score
+        if not len(tracks) or not len(box_px):
+            return np.zeros((len(tracks), len(box_px)))
         scene, missed = self.scene.state(sample.time), sample.look - tracks.look - 1
-        old, new = tracks.hits > 1, tracks.hits == 1
-        if old.any():
-            score[old] = association_scores(tracks.state[old], missed[old], box_px, scene, self.parameters)
-        if new.any():
-            state = tracks.state[new]
-            velocities = likely_velocities(state, self.flow, self.common_velocity)
-            score[new] = newborn_scores(state, missed[new], box_px, scene, self.parameters, velocities)
+        look = Look.of(tracks.state, missed, box_px, scene, self.parameters)
+        score, once = np.empty((len(tracks), len(box_px))), tracks.hits == 1
+        old, new = (~once).nonzero()[0], once.nonzero()[0]
+        if len(old):
+            score[old] = association_scores(look.of_tracks(old), self.parameters)
+        if len(new):
+            velocities = likely_velocities(tracks.state[new], self.flow, self.common_velocity)
+            score[new] = newborn_scores(look.of_tracks(new), self.parameters, velocities)
         if tracks.signature.shape[1] and sample.signature.shape[1]:
             alike = similarity(tracks.signature, sample.signature)
             score += appearance_scores(alike, sample.visible, self.parameters)
         return score
 
-    def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray) -> TrackStates:
-        """The tracks (K,) after a detection (K,) each."""
+    def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, is_cut: np.ndarray) -> TrackStates:
+        """The tracks (K,) after a detection (K,) each. is_cut: as in `kalman.update`."""
         old, box, parameters = self.tracks, now.box_px[detections], self.parameters
         later = kalman.predict(old.state[tracks], now.time, parameters.wander * self.scene.step)
-        state = kalman.update(
-            later, box, now.time, parameters.scatter, parameters.size_scatter, is_near_border(box, self.size)
-        )
+        state = kalman.update(later, box, now.time, parameters.scatter, parameters.size_scatter, is_cut)
         hits = old.hits[tracks] + 1
         width = max(old.signature.shape[1], now.signature.shape[1])
         signature, seen = _widen(old.signature, width)[tracks], _widen(now.signature, width)[detections]
@@ -324,10 +327,11 @@ class ScoreTracker:
         looks = now.look - self.tracks.look
         self._seen += len(now.row)
         left_alone = (self.tracks.hits == 1) & (looks == _LONE_LOOKS)
-        place = self.tracks.state[left_alone]
-        sides = place[:, WIDTH : HEIGHT + 1]
-        boxes = np.concatenate([place[:, : Y + 1] - sides / 2, sides], axis=1)
-        self._lone += int((~is_near_border(boxes, self.size)).sum())
+        if left_alone.any():
+            place = self.tracks.state[left_alone]
+            sides = place[:, WIDTH : HEIGHT + 1]
+            boxes = np.concatenate([place[:, : Y + 1] - sides / 2, sides], axis=1)
+            self._lone += int((~is_near_border(boxes, self.size)).sum())
         keep = is_remembered(self.tracks.state, now.time, looks, self.interval, self.size, self.parameters)
         late = looks > FILLED + 1
         if late.any():  # those that were seen too seldom to be confirmed
@@ -362,7 +366,7 @@ def is_remembered(
 
 
 def _moved(state: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
-    """States at places shifted by (2,) pixels."""
+    """States at places shifted by (2,) pixels, or (N, 2)."""
     state = state.copy()
     state[:, : Y + 1] += shift_px
     return state

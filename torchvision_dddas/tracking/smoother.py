@@ -16,7 +16,7 @@ _BEFORE = 8  # earlier boxes of a track that may smooth a box
 _WIDTHS = np.array([2.0, 5.0])  # sd of the weights of places and of sizes, which change more slowly
 
 
-@dataclass
+@dataclass(slots=True)
 class _Observation:
     """A box of a track. index: of the sampled frame, from 0. row: of the frame's detections, -1 in a filled gap.
 
@@ -31,7 +31,7 @@ class _Observation:
     link: float = math.nan
 
 
-@dataclass
+@dataclass(slots=True)
 class _Pending:
     """The decision on a sampled frame. tracks: by number."""
 
@@ -155,14 +155,17 @@ class FixedLagSmoother:
         starts, smoothed = [], []
         for place, (number, seen) in enumerate(confirmed.items()):
             past = self.observations.get(number, ()) if self.smooth and seen.score < 1 else ()
-            of_track = [s for s in past if s.index > oldest]
+            of_track = past if past and past[0].index > oldest else [s for s in past if s.index > oldest]
             if len(of_track) > 1:
                 smoothed.append(place)
                 starts.append(len(near))
                 near += of_track
         if not near:
             return given
-        box, index = np.array([s.box_px for s in near]), np.array([s.index for s in near])
+        box, index = (
+            np.concatenate([s.box_px for s in near], dtype=float).reshape(-1, 4),
+            np.array([s.index for s in near]),
+        )
         if self.has_moved:
             for there in np.unique(index).tolist():
                 box[index == there] = self._boxes_at(box[index == there], there, at.index)
@@ -191,15 +194,14 @@ def smooth_boxes(box_px: np.ndarray, since: np.ndarray, starts: np.ndarray) -> n
     where the times do not.
     """
     weight = np.exp(-0.5 * (since[:, None] / _WIDTHS) ** 2)  # (N, 2), of places and of sizes
-    value = np.stack([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)  # (N, 2, 2)
-    time = since[:, None]
-    parts = [weight, weight * time, weight * time**2]
-    parts += [*np.moveaxis(weight[..., None] * value, 2, 0), *np.moveaxis((weight * time)[..., None] * value, 2, 0)]
-    total, once, twice, *sums = np.add.reduceat(np.stack(parts), starts, axis=1)
-    twice = twice + 1e-3 * _WIDTHS**2
-    x, y = (
-        (twice * plain - once * by_time) / (total * twice - once**2)
-        for plain, by_time in zip(sums[:2], sums[2:], strict=True)
-    )
-    centre, side = np.stack([x[:, 0], y[:, 0]], axis=1), np.exp(np.stack([x[:, 1], y[:, 1]], axis=1))
-    return np.concatenate([centre - side / 2, side], axis=1)
+    time, parts = since[:, None], np.empty((len(box_px), 14))
+    parts[:, :2], parts[:, 2:4], parts[:, 4:6] = weight, weight * time, weight * time**2
+    value = np.concatenate([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)
+    both = weight.repeat(2, axis=1)
+    parts[:, 6:10], parts[:, 10:] = both * value, both * time * value
+    sums = np.add.reduceat(parts, starts)
+    total, once, twice = (sums[:, first : first + 2].repeat(2, axis=1) for first in (0, 2, 4))
+    twice = twice + 1e-3 * _WIDTHS.repeat(2) ** 2
+    fitted = (twice * sums[:, 6:10] - once * sums[:, 10:]) / (total * twice - once**2)
+    side = np.exp(fitted[:, 2:])
+    return np.concatenate([fitted[:, :2] - side / 2, side], axis=1)

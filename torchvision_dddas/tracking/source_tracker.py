@@ -12,7 +12,9 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -153,12 +155,12 @@ def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.
     """Affinity of the targets of two or three frames by one feature, with a dummy first on each axis.
 
     Two frames, eq. 1: similarities (N + 1, M + 1). Three, eq. 4 and 5: numerators of (a, b) and (b, c) added, and
-    denominators, (N + 1, M + 1, L + 1). An entry with a dummy is 0, as the source says in words; with `paper.dummy` =
-    formula it is as eq. 4 and 5 give it for a dummy of zeros, up to one half for (i, j, 0) and (0, j, k).
+    denominators, (N + 1, M + 1, L + 1). An entry with a dummy is 0 with `paper.dummy` = zero, as the source says in
+    words; else it is as eq. 4 and 5 give it for a dummy of zeros, up to one half for (i, j, 0) and (0, j, k).
     """
     if len(features) == 2:
         return np.pad(similarity(*features), ((1, 0), (1, 0)))
-    by_formula = parameters.dummy == "formula"
+    by_formula = parameters.dummy != "zero"
     a, b, c = (np.pad(rows, ((1, 0), (0, 0))) if by_formula else rows for rows in features)
     (ab_smaller, ab_larger), (bc_smaller, bc_larger) = _overlap(a, b), _overlap(b, c)
     share = _share(ab_smaller[:, :, None] + bc_smaller[None], ab_larger[:, :, None] + bc_larger[None])
@@ -168,6 +170,14 @@ def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.
 def similarity(a: Float[np.ndarray, "N D"], b: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N M"]:
     """Generalized Jaccard similarity Σ min / Σ max in [0, 1], 0 for two vectors of zeros."""
     return _share(*_overlap(a, b))
+
+
+def real_pairs(features: Sequence[np.ndarray], parameters: PaperParameters, feature: Feature) -> list[np.ndarray]:
+    """Similarities (N, M) and (M, L) that `gate` asks for with `paper.dummy` = real_pair; empty for two frames."""
+    if parameters.dummy != "real_pair" or len(features) < 3:
+        return []
+    scale = parameters.histogram_scale if feature == "appearance" else 1.0
+    return [1 - scale * (1 - similarity(a, b)) for a, b in pairwise(features)]
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,14 +214,18 @@ def histogram_cut(parameters: PaperParameters) -> float:
 
 
 def gate(
-    score: Float[np.ndarray, "..."], threshold: float, reading: Literal["one_dummy", "every_dummy", "off"]
+    score: Float[np.ndarray, "..."],
+    threshold: float,
+    reading: Literal["one_dummy", "every_dummy", "off"],
+    pairs: Sequence[np.ndarray] = (),
 ) -> Float[np.ndarray, "..."]:
     """A copy in which an entry with a dummy is 1 - threshold where all real alternatives are below that (III-E).
 
     score: two or three axes, index 0 of each the dummy. reading: one_dummy raises entries with exactly one dummy;
     every_dummy is the text to the letter, so that entries with two dummies are raised too and the best assignment
     leaves every target alone; off raises none. The entry of dummies alone is never raised. Of an entry with two dummies
-    the smaller of both indices' best alternatives counts.
+    the smaller of both indices' best alternatives counts. pairs: raise only entries of two successive targets that are
+    alike by 1 - threshold themselves [our reading of three frames].
     """
     score = np.array(score, float)
     if reading == "off":
@@ -222,6 +236,9 @@ def gate(
     for first in firsts:
         dummies[first] += 1
     allowed = dummies == 1 if reading == "one_dummy" else dummies < score.ndim
+    if pairs:
+        allowed[:] = False
+        allowed[1:, 1:, 0], allowed[0, 1:, 1:] = (alike >= 1 - threshold for alike in pairs)
     for axis, first in enumerate(firsts):
         real = score.take(np.arange(1, score.shape[axis]), axis).max(axis=axis, initial=-np.inf)
         best[first] = np.where(allowed[first], np.minimum(best[first], real), best[first])
@@ -365,14 +382,15 @@ def associate(
     """
     weight, location, appearance = weigh(window, parameters)
 
-    def affinity_by(feature: Feature) -> np.ndarray:
-        if affinities is not None and feature in affinities:
-            return affinities[feature]
-        return affinity([frame.values(feature, parameters.histogram) for frame in window], parameters)
-
-    by_location = affinity_by("location") if weight > 0 else None
-    by_appearance = affinity_by("appearance") if weight < 1 else None
-    return Association(assign(by_location, by_appearance, weight, parameters), weight, location, appearance)
+    shares: dict[Feature, float] = {"location": weight, "appearance": 1 - weight}
+    scores, pairs = dict(affinities or {}), dict[Feature, list[np.ndarray]]()
+    for feature in [name for name, share in shares.items() if share > 0]:
+        values = [frame.values(feature, parameters.histogram) for frame in window]
+        pairs[feature] = real_pairs(values, parameters, feature)
+        if feature not in scores:
+            scores[feature] = affinity(values, parameters)
+    rows = assign(scores.get("location"), scores.get("appearance"), weight, parameters, pairs)
+    return Association(rows, weight, location, appearance)
 
 
 def assign(
@@ -380,26 +398,26 @@ def assign(
     appearance: Float[np.ndarray, "N1 M1 *L1"] | None,
     weight: float,
     parameters: PaperParameters,
+    pairs: Mapping[Feature, Sequence[np.ndarray]] = MappingProxyType({}),
 ) -> Int[np.ndarray, "Z K"]:
     """The best assignment of affinities with a dummy first on each axis; a feature of no weight may be None.
 
-    appearance: as the histograms give it; it is scaled here. Every real target is in exactly one row; rows are sorted.
-    Source: eq. 2, 6 and 7 with the gate of III-E.
+    appearance: as the histograms give it; it is scaled here. pairs: `real_pairs` by feature. Every real target is in
+    exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
     """
     if appearance is not None:
         appearance = scale_histograms(appearance, parameters.histogram_scale)
-    parts = [(share, score) for share, score in ((weight, location), (1 - weight, appearance)) if score is not None]
-    by_feature = parameters.gated == "features"
-    score = sum(
-        share * (gate(part, parameters.threshold, parameters.gate) if by_feature else part) for share, part in parts
+    given: Any = ("location", weight, location), ("appearance", 1 - weight, appearance)
+    parts: Any = [(share, (score, *pairs.get(name, ()))) for name, share, score in given if score is not None]
+    if parameters.gated == "affinity":
+        parts = [(1.0, [sum(share * of[k] for share, of in parts) for k in range(len(parts[0][1]))])]
+    score: Any = sum(
+        share * gate(part, parameters.threshold, parameters.gate, alike) for share, (part, *alike) in parts
     )
-    assert isinstance(score, np.ndarray)
-    if not by_feature:
-        score = gate(score, parameters.threshold, parameters.gate)
     if score.ndim == 2:
         over_alone = score[1:, 1:] - score[1:, :1] - score[:1, 1:]
-        pairs = add_lone_targets(best_pairs(over_alone) + 1, score.shape)
-        return pairs[np.lexsort(pairs.T[::-1])]
+        rows = add_lone_targets(best_pairs(over_alone) + 1, score.shape)
+        return rows[np.lexsort(rows.T[::-1])]
     if max(score.shape) - 1 <= parameters.exact_targets:
         return assign_triplets(score, gap=0.0, most_exact=None).triplets
     return assign_triplets(score, parameters.gap).triplets

@@ -141,7 +141,7 @@ class TorchSourceTracker(SourceTracker):
         rows = [frame.values(feature, self.parameters.histogram) for frame in frames]
         # A dummy is a vector of zeros; one that is not valid has no affinity.
         values, valid = self._padded([np.pad(row, ((1, 0), (0, 0))) for row in rows])
-        valid[:, 0] = self.parameters.dummy == "formula"
+        valid[:, 0] = self.parameters.dummy != "zero"
         place = {frame: k for k, frame in enumerate(frames)}
         places = torch.tensor([[place[frame] for frame in window] for window in windows], device=self._device)
         found = self._model.affinity(values, valid, places).cpu().numpy()

@@ -1,7 +1,7 @@
 """Tables: records of columns of one length, and boxes."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -94,8 +94,8 @@ class Boxes(Table):
 
 def columns_of(table: Any) -> dict[str, np.ndarray]:
     """The columns of a table by name."""
-    values = {column.name: getattr(table, column.name) for column in fields(table)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    values = ((name, getattr(table, name)) for name in table.__dataclass_fields__)  # `fields` takes much longer
+    return {name: value for name, value in values if isinstance(value, np.ndarray)}
 
 
 def complete_table(table: Any, count: int, **unknown: Any) -> None:

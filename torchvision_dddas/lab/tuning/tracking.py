@@ -31,7 +31,7 @@ from torchvision_dddas.tracking.appearance import (
 from torchvision_dddas.tracking.kalman import transform_boxes
 from torchvision_dddas.tracking.scene import Scene, SceneState
 from torchvision_dddas.tracking.score_tracker import is_remembered
-from torchvision_dddas.tracking.scores import association_scores, is_near_border, newborn_scores
+from torchvision_dddas.tracking.scores import Look, association_scores, is_near_border, newborn_scores
 from torchvision_dddas.tracking.smoother import FILLED
 from torchvision_dddas.types import DetectionTable
 
@@ -259,9 +259,9 @@ def link_nll(
 
 def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: TrackParameters) -> Any:
     """(B, N, N) scores of tracks and boxes, without appearance."""
-    given = tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters
+    look = Look.of(tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters)
     at_rest: Any = torch.zeros_like(tracks.state[None, ..., :2])
-    scores: Any = newborn_scores(*given, velocities=at_rest), association_scores(*given)
+    scores: Any = newborn_scores(look, parameters, at_rest), association_scores(look, parameters)
     return torch.where((tracks.hits == 1)[..., None], *scores)
 
 
