@@ -58,6 +58,9 @@ CASES = [
     ),
     ("simulate joining --save film", "--save must name some of frames, video, masks, ground, all or none, got 'film'"),
     *((f"{command} nosuch.mp4", "nosuch.mp4") for command in ("detect", "track", "people", "run")),
+    *((f"{command} walk --ignore text.png", "not a whole picture") for command in ("detect", "track", "run")),
+    ("detect walk --ignore nosuch.png", "nosuch.png"),
+    ("run sim:joining --ignore text.png", "--ignore is of no use"),
     *((f"{command} --rate 0", "frame rate") for command in ("detect walk", "people walk", "run walk")),
     *((f"{command} --interval 0", "--interval must be 1 or more frames") for command in ("track walk", "run walk")),
     # One command each.

@@ -13,11 +13,20 @@ from torchvision_dddas.chain.foreground import (
 )
 from torchvision_dddas.chain.frame_pairs import later_pair, near_gaps, near_pairs, next_pair, pair_about
 from torchvision_dddas.chain.implementations import IMPLEMENTATIONS, uses_kornia
-from torchvision_dddas.chain.opencv_operations import OpenCVOperations, close_mask, ellipse, no_texture
+from torchvision_dddas.chain.opencv_operations import (
+    REGION_PX,
+    SAMPLED,
+    OpenCVOperations,
+    close_mask,
+    ellipse,
+    no_texture,
+)
 from torchvision_dddas.chain.operations import Number, Operations
 
 __all__ = [
     "IMPLEMENTATIONS",
+    "REGION_PX",
+    "SAMPLED",
     "DetectionChain",
     "Maps",
     "Neighbours",

@@ -1,6 +1,6 @@
 """The exposure between two frames, from the grey levels below which equal shares of their pixels lie."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import cv2
@@ -23,11 +23,12 @@ _MIN_LEVELS = 8
 class View:
     """One frame as an engine holds it, made by `Engine.prepare`; engines add what they use again.
 
-    image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W).
+    image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W). ignored: uint8 (H, W), 255 in what is left out, or None.
     """
 
     image: np.ndarray
     grey: np.ndarray
+    ignored: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -13,8 +13,9 @@ Engines give the operations: OpenCV on arrays, Kornia and torch on tensors. Regi
 their motion, persistence and outlines after it (`detection`).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Generic
 
 from torchvision_dddas.chain.operations import Number, Operations, Picture, Seen, View
@@ -34,7 +35,8 @@ class Window(Generic[View]):
     = past. near: pairs of indices of neighbours whose evidence is combined; the last one is the widest and shows the
     motion. wide: a pair further apart, which fills the inside of large targets. small: one that shows small slow
     targets. close_px: side of the ellipse that closes gaps between fragments of a target; 0: that of the settings.
-    settings: those of the frame, for engines that find blobs themselves; None: those of the engine.
+    settings: those of the frame, for engines that find blobs themselves; None: those of the engine. ignored: set where
+    the reference is left out.
     """
 
     reference: View
@@ -46,6 +48,7 @@ class Window(Generic[View]):
     small: Pair | None = None
     close_px: int = 0
     settings: Settings | None = None
+    ignored: Any = None
 
     @property
     def looks_both_ways(self) -> bool:
@@ -68,7 +71,7 @@ class Maps(Generic[Picture]):
     core: set where a target is certain, cleaned by morphology. evidence: the difference, the largest over the near
     pairs, in steps of 1/16 noise unit or in grey levels; `wide` the same for the wide pair. texture: mean gradient, 4 x
     grey levels a pixel. small: set where something small may move; None where it is not wanted. warped: the two
-    neighbours of the widest near pair, in the reference's frame and exposure.
+    neighbours of the widest near pair, in the reference's frame and exposure. pairs: the evidence of each near pair.
     """
 
     core: Picture
@@ -77,6 +80,7 @@ class Maps(Generic[Picture]):
     texture: Picture
     small: Picture | None
     warped: tuple[Picture, Picture]
+    pairs: tuple[Picture, ...] = ()
 
 
 def evidence_scale(settings: Settings) -> float:
@@ -113,34 +117,37 @@ class DetectionChain(Generic[View, Picture, Seen]):
         """The maps of a window, by all steps of the chain."""
         neighbours = self.neighbours(window)
         reference = neighbours.reference()
-        near = self.find_evidence(map(neighbours.compared_and_seen, window.near), reference)
+        pairs = tuple(self.find_evidences(map(neighbours.compared_and_seen, window.near), reference))
+        near = reduce(self.operations.larger, pairs)
         one, other = window.near[-1]
         warped = neighbours.warped(one), neighbours.warped(other)
         neighbours.keep_for(window.wide, window.small)
         wide = near
         if window.wide is not None:
-            wide = self.find_evidence([neighbours.compared_and_seen(window.wide)], reference)
+            (wide,) = self.find_evidences([neighbours.compared_and_seen(window.wide)], reference)
         neighbours.keep_for(window.small)
         core = self.find_core(near, window.close_px)
         small = None if window.small is None else self.find_small(neighbours, window.small)
-        return Maps(core, near, wide, reference.texture, small, warped)
+        return Maps(core, near, wide, reference.texture, small, warped, pairs)
 
     def neighbours(self, window: Window[View]) -> "Neighbours[View, Picture, Seen]":
         """The neighbours of a window as its reference sees them."""
         return Neighbours(window, self.settings, self.operations)
 
     def find_evidence(self, pairs: Iterable[tuple[Picture, Picture]], reference: Reference[Picture]) -> Picture:
-        """The largest evidence of pairs: their differences where both neighbours are seen, smoothed, in units of noise.
+        """The largest evidence of one or more pairs, as `find_evidences`."""
+        return reduce(self.operations.larger, self.find_evidences(pairs, reference))
+
+    def find_evidences(
+        self, pairs: Iterable[tuple[Picture, Picture]], reference: Reference[Picture]
+    ) -> Iterator[Picture]:
+        """The evidence of each pair: its difference where both neighbours are seen, smoothed, in units of noise.
 
         pairs: of each the difference and the mask of what both neighbours show, as `Neighbours.compared_and_seen`.
         """
-        weight, largest = self._noise_weight(reference.texture), None
+        weight = self._noise_weight(reference.texture)
         for difference, seen in pairs:
-            evidence = self._find_pair_evidence(difference, seen, reference.texture, weight)
-            largest = evidence if largest is None else self.operations.larger(largest, evidence)
-        if largest is None:
-            raise ValueError("a window has at least one pair")
-        return largest
+            yield self._find_pair_evidence(difference, seen, reference.texture, weight)
 
     def _noise_weight(self, texture: Picture) -> Any:
         """Steps of evidence a grey level; None unless differences are in units of local noise."""
@@ -215,9 +222,10 @@ class Neighbours(Generic[View, Picture, Seen]):
         return self._make(index)[0]
 
     def both(self, pair: Pair) -> Picture:
-        """The mask of what both of a pair show."""
+        """The mask of what both of a pair show, and what is not left out."""
         one, other = (self._make(index)[1] for index in pair)
-        return self.operations.seen_by_both(one, other, self.window.reference)
+        both = self.operations.seen_by_both(one, other, self.window.reference)
+        return both if self.window.ignored is None else self.operations.outside(both, self.window.ignored)
 
     def compared(self, pair: Pair) -> Picture:
         """The difference of a pair by `difference.kind`."""

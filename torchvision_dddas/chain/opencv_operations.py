@@ -19,6 +19,8 @@ _STRIP_ROWS = 64
 _SETTLED_LEVELS = 0.1
 _LEAST_PIXELS = 100
 _LEVELS = np.arange(256)
+# The noise of a picture is measured by region, on every so-manyth row and column.
+REGION_PX, SAMPLED = 64, 4
 
 Light = tuple[float, float]
 
@@ -87,8 +89,14 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
         return picture if side == 1 else cv2.GaussianBlur(picture, (side, side), 0)
 
     def in_units_of_median(self, picture: np.ndarray, mask: np.ndarray, least: float) -> np.ndarray:
-        unit = median_above(picture, mask, least) / least
-        return picture if unit == 1.0 else cv2.convertScaleAbs(picture, alpha=1 / unit)
+        most = median_above(picture, mask, least)
+        if most == least:
+            return picture
+        height, width = picture.shape
+        cells = regional_medians(picture[::SAMPLED, ::SAMPLED], mask[::SAMPLED, ::SAMPLED], least, most) / least
+        size = cells.shape[1] * REGION_PX, cells.shape[0] * REGION_PX
+        unit = cv2.resize(cells, size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        return cv2.divide(picture, unit, dtype=cv2.CV_8U)
 
     def above(self, evidence: np.ndarray, limit: float) -> np.ndarray:
         return self.exceeds(evidence, limit)
@@ -269,6 +277,23 @@ def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int
     so_far = np.cumsum(cv2.calcHist([values], [0], mask, [256], [0, 256]).ravel())
     low, high = np.searchsorted(so_far, [(count + 1) // 2, count // 2 + 1])
     return max(least, (int(low) + int(high)) / 2)
+
+
+def regional_medians(values: np.ndarray, mask: np.ndarray, least: float, most: float) -> np.ndarray:
+    """(R, C) float32 medians of regions of REGION_PX, at least `least`, and at most `most`, the whole picture's.
+
+    values, mask: (h, w) of every SAMPLED-th row and column. A region in which the mask is hardly set has `least`: what
+    little it shows must not be hidden by the noise of others. Outliers among the regions are smoothed away.
+    """
+    side = REGION_PX // SAMPLED
+    rows, columns = (-(-length // side) for length in values.shape)
+    cells: np.ndarray = np.full((rows * side, columns * side), 999, np.int16)  # above all levels
+    cells[: values.shape[0], : values.shape[1]] = np.where(mask > 0, values.astype(np.int16), 999)
+    cells = np.sort(cells.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, -1))
+    count = (cells < 999).sum(axis=2)
+    middle = np.take_along_axis(cells, (np.maximum(count - 1, 0) // 2)[..., None], axis=2)[..., 0]
+    medians = np.where(count > 0.1 * side**2, middle, least).astype(np.float32)
+    return np.clip(cv2.medianBlur(medians, 3), least, most)
 
 
 def ellipse(side: int) -> np.ndarray:

@@ -104,7 +104,10 @@ class Operations(Protocol[View, Picture, Seen]):
         ...
 
     def in_units_of_median(self, picture: Picture, mask: Picture, least: float) -> Picture:
-        """The picture divided by its median under the mask over `least` where that is above 1, rounded.
+        """The picture divided by its noise under the mask over `least`, rounded, where that is above 1.
+
+        The noise is the median of regions, see `regional_medians`, which is never above that of the whole picture: what
+        is restless, such as bare trees, must not hide what moves beside it.
 
         Unchanged where the mask has 500 pixels or fewer.
         """

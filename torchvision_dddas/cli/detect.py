@@ -12,11 +12,13 @@ from torchvision_dddas.cli.options import (
     Backend,
     Config,
     EngineOption,
+    Ignore,
     OutPerInput,
     Overrides,
     Quiet,
     Rate,
     Telemetry,
+    load_settings,
     print_lines,
     report_errors,
 )
@@ -38,16 +40,16 @@ def detect(
     ] = "all",
     telemetry: Telemetry = None,
     rate: Rate = None,
+    ignore: Ignore = None,
     quiet: Quiet = False,
 ) -> None:
     """Find what moves in clips filmed by a moving camera.
 
     Writes detections.txt (MOTChallenge), detections.csv, masks/, overlay.mp4 and run.json under --out.
     """
-    from torchvision_dddas.config import load_config
     from torchvision_dddas.io.output import DetectionRecorder, parse_save
 
-    settings, names = load_config(config, set_ or []), parse_save(save, DetectionRecorder.saved)
+    settings, names = load_settings(config, set_, ignore), parse_save(save, DetectionRecorder.saved)
     done: list[str] = []
     with noting(lambda: f"all of {', '.join(done)} is kept", lambda: done):
         for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):

@@ -5,12 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from signal import SIGINT
-from typing import Annotated, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, ParamSpec, TypeVar
 
 import typer
 
 from torchvision_dddas.cli.exits import BAD_INPUT, describe_kept, say, say_stopped
 from torchvision_dddas.errors import InputError, printable
+
+if TYPE_CHECKING:
+    from torchvision_dddas.config import Settings
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -46,6 +49,10 @@ StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default
 Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
 REPORTS = "What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
 Telemetry = Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help=REPORTS)]
+Ignore = Annotated[
+    Path | None,
+    typer.Option("--ignore", metavar="MASK", help="A picture of the frames' size: what is not black is left out."),
+]
 BoxFormat = Annotated[
     BoxOrder | None,
     typer.Option(help="What a box's columns are: left, top, size; corners; centre, size. [default: by the table]"),
@@ -148,3 +155,11 @@ def split_patterns(text: str | None, option: str, what: str = "clip") -> list[st
         example = "'bms_*'" if what == "clip" else "'difference.*'"
         raise InputError(f"{option} '{text}' names no {what}; give patterns of names, such as {example}")
     return words
+
+
+def load_settings(config: str | None, overrides: Sequence[str] | None, ignore: Path | None) -> "Settings":
+    """The settings of --config, --set and --ignore. Raises InputError for what is wrong in them."""
+    from torchvision_dddas.config import load_config, with_parameters
+
+    settings = load_config(config, overrides or [])
+    return settings if ignore is None else with_parameters(settings, {"difference.ignore": str(ignore)})

@@ -17,11 +17,13 @@ from torchvision_dddas.cli.options import (
     Backend,
     Config,
     EngineOption,
+    Ignore,
     Out,
     Overrides,
     Quiet,
     Rate,
     check_interval,
+    load_settings,
     print_lines,
     refuse_options,
     report_errors,
@@ -69,6 +71,7 @@ def run(
         ),
     ] = None,
     rate: Rate = None,
+    ignore: Ignore = None,
     scene: Annotated[
         list[str] | None,
         typer.Option(
@@ -109,7 +112,6 @@ def run(
     overlay.mp4, maps, a report and run.json under --out; of a simulation also crowds.csv (crowds as ground vehicles see
     them).
     """
-    from torchvision_dddas.config import load_config
     from torchvision_dddas.pipeline import AerialInput
 
     check_interval(interval)
@@ -128,7 +130,7 @@ def run(
         refuse_options(others, "is for a run that keeps up with a camera; give --live too")
     beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
-        inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, **beside}
+        inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--ignore": ignore, **beside}
         inputs["--interval"] = None if interval == 1 else interval
         refuse_options(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
         _fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, quiet)
@@ -142,7 +144,7 @@ def run(
     given = None
     if landmarks is not None or telemetry is not None:
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
-    settings = load_config(config, set_ or [])
+    settings = load_settings(config, set_, ignore)
     if live:
         from torchvision_dddas.live import run_live
 

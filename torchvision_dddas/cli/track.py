@@ -12,11 +12,13 @@ from torchvision_dddas.cli.options import (
     BoxFormat,
     Config,
     EngineOption,
+    Ignore,
     Out,
     Overrides,
     Quiet,
     Rate,
     check_interval,
+    load_settings,
     print_lines,
     report_errors,
 )
@@ -46,6 +48,7 @@ def track(
         str | None, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
     ] = None,
     rate: Rate = None,
+    ignore: Ignore = None,
     quiet: Quiet = False,
 ) -> None:
     """Give targets lasting identities: those detected in a clip, or those of a table, with or without its clip.
@@ -56,7 +59,6 @@ def track(
     torch.
     """
     from torchvision_dddas import open_video
-    from torchvision_dddas.config import load_config
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
@@ -64,7 +66,7 @@ def track(
     from torchvision_dddas.pipeline import clip_notes
     from torchvision_dddas.types import is_sampled
 
-    settings, names = load_config(config, set_ or []), parse_save(save, TrackRecorder.saved)
+    settings, names = load_settings(config, set_, ignore), parse_save(save, TrackRecorder.saved)
     if clip is None and detections is None:
         raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
     check_interval(interval)

@@ -11,6 +11,7 @@ from torchvision_dddas.config.detection import (
     PersistenceParameters,
     RegistrationParameters,
     SmallParameters,
+    TrackletParameters,
     exposure_step,
 )
 from torchvision_dddas.config.geo import AerialParameters, GroundParameters, LandmarkParameters
@@ -38,6 +39,7 @@ from torchvision_dddas.config.settings import (
     describe_parameter,
     is_set,
     range_of,
+    uses_tracklets,
 )
 from torchvision_dddas.config.tracking import PaperParameters, TrackParameters
 
@@ -64,6 +66,7 @@ __all__ = [
     "SmallParameters",
     "SteeringParameters",
     "TrackParameters",
+    "TrackletParameters",
     "all_parameters",
     "changes",
     "check_settings",
@@ -81,5 +84,6 @@ __all__ = [
     "parse_override",
     "range_of",
     "read_toml",
+    "uses_tracklets",
     "with_parameters",
 ]

@@ -123,6 +123,14 @@ class DifferenceParameters(Group):
     )
     border_px: int = parameter(4, "width of the strip along a warped frame's border that is ignored", "px", 0, 50)
     halved: bool = parameter(False, "compare frames at half resolution: faster, coarser outlines (onboard)")
+    ignore: str = parameter("", "a picture of the frames' size; what is not black in it is left out, such as text")
+
+
+class TrackletParameters(Group):
+    """Targets by what candidates do over several looks; needs the normalized difference."""
+
+    on: bool = parameter(True, "judge targets by tracklets, and find those that blobs miss")
+    accept: float = parameter(-1.0, "least score of a tracklet that is a target, a log odds", "-", -10, 10)
 
 
 class MorphologyParameters(Group):

@@ -17,6 +17,7 @@ from torchvision_dddas.config.detection import (
     RefineParameters,
     RegistrationParameters,
     SmallParameters,
+    TrackletParameters,
 )
 from torchvision_dddas.config.geo import AerialParameters, CrowdParameters, GroundParameters, LandmarkParameters
 from torchvision_dddas.config.group import Group, odd
@@ -35,6 +36,7 @@ class Settings(Group):
     morphology: MorphologyParameters = MorphologyParameters()
     refine: RefineParameters = RefineParameters()
     persistence: PersistenceParameters = PersistenceParameters()
+    tracklets: TrackletParameters = TrackletParameters()
     small: SmallParameters = SmallParameters()
     history: HistoryParameters = HistoryParameters()
     gates: GateParameters = GateParameters()
@@ -82,6 +84,11 @@ def is_set(settings: Settings, name: str) -> bool:
     """Whether somebody has set a parameter, `group.parameter`: its value counts then, also where it is the default."""
     group, key = name.split(".")
     return key in getattr(settings, group).model_fields_set
+
+
+def uses_tracklets(settings: Settings) -> bool:
+    """Whether targets are judged by tracklets: these need evidence in units of noise."""
+    return settings.tracklets.on and settings.difference.kind == "normalized"
 
 
 def parameter_fields() -> Iterator[tuple[str, FieldInfo]]:

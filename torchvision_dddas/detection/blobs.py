@@ -82,8 +82,8 @@ def find_regions(core: np.ndarray, evidence: np.ndarray, min_area_px: int, peak:
     """The regions of `find_blobs`, in pixels of the maps, by OpenCV."""
     regions = []
     for part in occupied(core, 2):
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(core[box_slices(part)], ltype=cv2.CV_32S)
-        for label, (x, y, width, height, area) in enumerate(stats[1:count].tolist(), 1):
+        labels, stats = label_parts(core[box_slices(part)])
+        for label, (x, y, width, height, area) in enumerate(stats.tolist(), 1):
             if area * scale**2 < min_area_px:
                 continue
             region = labels[y : y + height, x : x + width] == label
@@ -93,6 +93,15 @@ def find_regions(core: np.ndarray, evidence: np.ndarray, min_area_px: int, peak:
                 continue
             regions.append(Region(box, region, seen, highest))
     return regions
+
+
+def label_parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The connected parts (8 neighbours) of a (H, W) uint8 mask: their labels from 1 on, (H, W), and (N, 5) int32.
+
+    A row is x, y, width, height and area. OpenCV's default algorithm takes two to three times as long here.
+    """
+    _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(mask, 8, cv2.CV_32S, cv2.CCL_GRANA)
+    return labels, stats[1:]
 
 
 def make_blobs(regions: Iterable[Region], threshold: float, hull: bool, scale: int = 1) -> list[Blob]:

@@ -4,12 +4,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from torchvision_dddas.chain import View, Window, near_gaps
-from torchvision_dddas.config import Settings, check_settings
+from torchvision_dddas.config import Settings, check_settings, uses_tracklets
 from torchvision_dddas.detection.blob_motion import DenseFlow
+from torchvision_dddas.detection.candidates import Candidates
 from torchvision_dddas.detection.engine import Engine
 from torchvision_dddas.detection.frame_buffer import FrameBuffer, Slot
 from torchvision_dddas.detection.interval import (
@@ -21,11 +23,22 @@ from torchvision_dddas.detection.interval import (
 )
 from torchvision_dddas.detection.interval_controller import IntervalController
 from torchvision_dddas.detection.motion_history import MotionHistory
-from torchvision_dddas.detection.observation import Target, build_detections, draw_targets, observe
+from torchvision_dddas.detection.observation import (
+    Target,
+    build_detections,
+    draw_blobs,
+    draw_candidate,
+    join_fragments,
+    judge_persistence,
+    observe,
+)
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.detection.repeats import RepeatRule
+from torchvision_dddas.detection.tracklet_scores import choose, score_tracklets
+from torchvision_dddas.detection.tracklets import LOOKS_AFTER, LOOKS_BEFORE, follow
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.images import read_ignored
 from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry, as_picture
 
@@ -135,6 +148,7 @@ class MotionDetector:
         self._repeats, self._most_repeats = RepeatRule(), _MOST_REPEATS
         self._held: tuple[Adjustment, ...] = ()  # of repeated frames
         self._ended = False
+        self._mask: tuple[str, np.ndarray | None] | None = None
         self._flow = DenseFlow()
         self._small_tracks = SmallTracks(self.settings.small)
         self._history = MotionHistory(self.settings.history.duration_frames)
@@ -195,6 +209,7 @@ class MotionDetector:
         if not self._total:
             self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1::-1])[0])
         view = self.engine.prepare(frame.image)
+        view.ignored = self._ignored(view.size)
         repeats = self._buffer[self._total - 1].repeats if self._total else []
         most = _MOST_REPEATS_LIVE if np.isfinite(frame.taken_s) else self._most_repeats
         if self._repeats.is_repeat(view.grey) and len(repeats) < most:
@@ -206,6 +221,13 @@ class MotionDetector:
         self._add(frame, view, self._held + adjustments, time.perf_counter() - start)
         if self._total - self._registered > self.batch:
             yield from self._advance()
+
+    def _ignored(self, size: tuple[int, int]) -> np.ndarray | None:
+        """(H, W) uint8, 255 where pictures of a size are left out; None: nowhere. Raises InputError for a bad mask."""
+        if self._mask is None or self._mask[0] != self.settings.difference.ignore:
+            file = self.settings.difference.ignore
+            self._mask = file, read_ignored(Path(file), size) if file else None
+        return self._mask[1]
 
     def _add(self, frame: Frame, view: View, adjustments: tuple[Adjustment, ...], prepare_s: float) -> None:
         passed, self._passed, self._held = self._passed + frame.skipped, 0, ()
@@ -293,14 +315,14 @@ class MotionDetector:
         before = self._buffer.step_before(index)
         if before is not None and not before.reliable:  # a cut or a blank picture: reported once, at this frame
             slot.cause = before.cause
-            return None
         parameters = self.settings.difference
         back = index - max(parameters.wide_frames, 2 * slot.interval, 2 * max(parameters.near_frames))
         first, last = self._buffer.linked(index, back, min(self._registered, index + 2 * slot.interval))
         near, wide, small = choose_pairs(index, slot.interval, first, last, settings)
         if not near:
             is_cut = slot.step is not None and not slot.step.reliable
-            slot.cause = slot.step.cause if slot.step and is_cut else "too few frames hang together with it"
+            alone = slot.step.cause if slot.step and is_cut else "too few frames hang together with it"
+            slot.cause = slot.cause or alone
             return None
         used = sorted({i for pair in [*near, wide, small] if pair for i in pair})
         place = {i: k for k, i in enumerate(used)}
@@ -315,6 +337,7 @@ class MotionDetector:
             (place[small[0]], place[small[1]]) if small else None,
             settings.morphology.close_px,
             settings,
+            slot.view.ignored,
         )
 
     def _motion_between(self, index: int, other: int) -> np.ndarray:
@@ -335,15 +358,46 @@ class MotionDetector:
 
     def _draw(self) -> None:
         """Draw the targets of the frames whose following frames, as far as persistence needs them, are observed."""
-        followers = 2 if self.settings.persistence.on else 0
+        followers = LOOKS_AFTER if uses_tracklets(self.settings) else 2 if self.settings.persistence.on else 0
         while self._drawn < self._observed and (self._drawn + followers < self._observed or self._all_observed):
             index, start = self._drawn, time.perf_counter()
             slot, slots, at = self._buffer[index], *self._around(index)
             observations, steps = [s.observation for s in slots], [s.next_from_this for s in slots]
-            slot.observation.targets = draw_targets(observations, steps, at, slot.distance.settings)
+            persistent = judge_persistence(observations, steps, at, slot.distance.settings)
+            slot.observation.targets = join_fragments(self._judge(index, persistent))
             slot.observation.window = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self._drawn += 1
+
+    def _judge(self, index: int, persistent: list[bool]) -> list[Target]:
+        """The targets of a frame: the blobs that persist, or what its tracklets show."""
+        slot = self._buffer[index]
+        observation, settings, candidates = slot.observation, slot.distance.settings, slot.observation.candidates
+        if candidates is None:
+            drawn = draw_blobs(observation, np.flatnonzero(persistent).tolist(), settings)
+            return [target for parts in drawn for target in parts]
+        others = self._looks_about(index)
+        tracklets = follow(candidates, others, slot.view.size)
+        scores = score_tracklets(candidates, tracklets, {offset: seen for offset, (seen, _) in others.items()})
+        joined_px = 1.5 * settings.morphology.close_px
+        chosen = choose(candidates.box_px, scores, persistent, settings.tracklets.accept, joined_px)
+        blobs = [i for i in chosen if i < len(persistent)]
+        targets = [target for parts in draw_blobs(observation, blobs, settings) for target in parts]
+        for i in chosen:
+            if i >= len(persistent):
+                confidence = float(1 / (1 + np.exp(-scores[i])))
+                targets.append(draw_candidate(observation, i, tracklets.velocity_px[i], confidence, settings))
+        return targets
+
+    def _looks_about(self, index: int) -> dict[int, tuple[Candidates, np.ndarray]]:
+        """The looks that tracklets of a frame may cross: by offset, candidates and the homography from there."""
+        others = {}
+        first, last = self._buffer.linked(index, index - LOOKS_BEFORE, min(index + LOOKS_AFTER, self._observed - 1))
+        for other in range(first, last + 1):
+            seen = self._buffer[other].observation.candidates
+            if other != index and seen is not None:
+                others[other - index] = seen, self._buffer.motion(other, index)
+        return others
 
     @property
     def _all_observed(self) -> bool:
@@ -372,7 +426,7 @@ class MotionDetector:
             slot.frame = replace(slot.frame, image=slot.view.grey)
             self._emitted += 1
             self._buffer.drop_colours(self._emitted - 1 - self.settings.difference.wide_frames)
-            self._buffer.drop_before(min(self._emitted - 2, self._observed - self._memory))
+            self._buffer.drop_before(min(self._emitted - LOOKS_BEFORE, self._observed - self._memory))
 
     def _fill_gap(self, until: int, following: Frame | None, interval: int) -> Iterator[Scene]:
         """Empty scenes for the frame numbers below `until` that could not be read. following: the frame after them."""

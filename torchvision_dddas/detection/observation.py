@@ -12,16 +12,18 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.chain import DetectionChain, OpenCVOperations, View, Window, ellipse, evidence_scale
-from torchvision_dddas.config import EVIDENCE_SCALE, Settings
+from torchvision_dddas.config import EVIDENCE_SCALE, Settings, uses_tracklets
 from torchvision_dddas.detection.blob_motion import DenseFlow, Motion, measure_motions, split_by_flow
 from torchvision_dddas.detection.blobs import (
     Blob,
     Box,
     box_slices,
+    fill_hull,
     find_blobs,
     group_fragments,
     leave_touching,
 )
+from torchvision_dddas.detection.candidates import SILHOUETTES, Candidates, Evidence, find_candidates
 from torchvision_dddas.detection.engine import Foreground
 from torchvision_dddas.detection.motion_history import MotionHistory, split_by_trail
 from torchvision_dddas.detection.persistence import Links, Sighting, find_persistent
@@ -66,7 +68,7 @@ class Target:
 class Observation:
     """What one frame shows, before its targets are chosen. Window and foreground are dropped once they are drawn.
 
-    links: of its blobs to those of the frames beside it, as far as they are known.
+    links: of its blobs to those of the frames beside it, as far as they are known. candidates: for tracklets.
     """
 
     window: Window[View] | None = None
@@ -75,6 +77,7 @@ class Observation:
     motions: list[Motion] = field(default_factory=list)
     targets: list[Target] = field(default_factory=list)
     links: Links = field(default_factory=dict)
+    candidates: Candidates | None = None
 
 
 def observe(
@@ -103,7 +106,16 @@ def observe(
         history.add(foreground.core)
         ways = [part for blob in blobs for part in split_by_trail(blob, history, view.size, settings.history)]
         blobs, motions = [blob for blob, _ in ways], [Motion(velocity_px) for _, velocity_px in ways]
-    return Observation(window, foreground, blobs, motions)
+    candidates = None
+    if uses_tracklets(settings):
+        candidates = find_candidates(_evidence_by_gap(window, foreground), view.grey, blobs)
+    return Observation(window, foreground, blobs, motions, candidates=candidates)
+
+
+def _evidence_by_gap(window: Window[View], foreground: Foreground) -> Evidence:
+    """The evidence of the nearest pair, of the next one and of the wide one."""
+    nearest, further = foreground.pairs[0], foreground.pairs[1] if len(foreground.pairs) > 1 else None
+    return nearest, further, foreground.wide if window.wide is not None else None
 
 
 def _blobs_of(window: Window[View], foreground: Foreground, settings: Settings) -> list[Blob]:
@@ -128,45 +140,77 @@ def _blob_limits(settings: Settings) -> tuple[float, int, float, bool]:
     return difference.threshold * scale, settings.gates.min_area_px, difference.peak * scale, settings.morphology.hull
 
 
-def draw_targets(
+def judge_persistence(
     observations: Sequence[Observation], steps: Sequence[np.ndarray | None], index: int, settings: Settings
-) -> list[Target]:
-    """The targets of `observations[index]`: the blobs that persist, with refined outlines, fragments joined.
-
-    steps: registration from each observation to the next, None at a cut.
-    """
+) -> list[bool]:
+    """Which blobs of `observations[index]` persist. steps: registration from each observation to the next, or None."""
     here = observations[index]
+    if not settings.persistence.on or here.window is None:
+        return [True] * len(here.blobs)
+    sightings = [Sighting(o.blobs, o.motions, step, o.links) for o, step in zip(observations, steps, strict=True)]
+    return find_persistent(sightings, index, here.window.reference.size, settings.persistence)
+
+
+def draw_blobs(here: Observation, chosen: Sequence[int], settings: Settings) -> list[list[Target]]:
+    """The targets that blobs show, with refined outlines, whose parts may lie apart: a list for each chosen index."""
     window, foreground = here.window, here.foreground
-    if window is None or foreground is None or not here.blobs:
+    if window is None or foreground is None:
         return []
     view = window.reference
-    kept = [True] * len(here.blobs)
-    if settings.persistence.on:
-        sightings = [Sighting(o.blobs, o.motions, step, o.links) for o, step in zip(observations, steps, strict=True)]
-        kept = find_persistent(sightings, index, view.size, settings.persistence)
-    chosen = np.flatnonzero(kept).tolist()
     refined: list[np.ndarray] = []
     if here.motions and settings.refine.on:
         moving = [(here.blobs[i], here.motions[i]) for i in chosen]
         refined = refine_outlines(moving, view, foreground, settings)
-    targets = []
+    drawn: list[list[Target]] = []
     for k, i in enumerate(chosen):
         blob, mask, velocity_px = here.blobs[i], here.blobs[i].mask, np.full(2, np.nan)
         if here.motions:
             velocity_px = here.motions[i].velocity_px
             if settings.refine.on:
-                mask = refined[k]
-                # From the air, where targets are small and shadows as large; beside a car they are thin and dark as
-                # its tyres.
-                if window.wide is not None and blob.area_px <= settings.refine.shadow_share * view.grey.size:
-                    grounds = [window.neighbours[k].image for k in window.wide]
-                    matrices = [window.neighbour_from_reference[k] for k in window.wide]
-                    mask = remove_shadow(mask, blob.box, view.image, grounds, matrices)
+                mask = _without_shadow(refined[k], blob.box, blob.area_px, window, settings)
         # A confidence in [0, 1) that grows with the peak of evidence over the threshold.
         score = float(1 - np.exp(-blob.peak / (2 * settings.difference.threshold * evidence_scale(settings))))
+        drawn.append([])
         for box, part in connected_parts(mask, blob.box, settings.gates.min_area_px // 2):
             core = blob.core[box_slices(box, *blob.box[:2])] & part
-            targets.append(Target(box, part, velocity_px, score, core))
+            drawn[-1].append(Target(box, part, velocity_px, score, core))
+    return drawn
+
+
+def draw_candidate(here: Observation, index: int, velocity_px: np.ndarray, score: float, settings: Settings) -> Target:
+    """The target that a candidate shows: the hull of its evidence. score: confidence in [0, 1]."""
+    window, foreground, candidates = here.window, here.foreground, here.candidates
+    assert window is not None and foreground is not None and candidates is not None  # kept until a frame is drawn
+    silhouette = SILHOUETTES[candidates.silhouette[index]]
+    box: Box = tuple(candidates.box_px[index].astype(int).tolist())
+    evidence, wide = foreground.evidence[box_slices(box)], foreground.wide[box_slices(box)]
+    if 2 in silhouette.gaps:
+        evidence = np.maximum(evidence, wide) if len(silhouette.gaps) > 1 else wide
+    core = evidence > silhouette.threshold * EVIDENCE_SCALE
+    mask = fill_hull(core) if core.any() else np.ones(core.shape, bool)
+    if settings.refine.on:
+        mask = _without_shadow(mask, box, int(mask.sum()), window, settings)
+    left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    part = np.s_[top : top + height, left : left + width]
+    box = (box[0] + left, box[1] + top, width, height)
+    return Target(box, mask[part], velocity_px, score, (core & mask)[part])
+
+
+def _without_shadow(mask: np.ndarray, box: Box, area_px: int, window: Window[View], settings: Settings) -> np.ndarray:
+    """The mask without the shadow of a target that is small in the picture.
+
+    From the air, where targets are small, shadows are as large; beside a car they are thin, and dark as its tyres.
+    """
+    view = window.reference
+    if window.wide is None or area_px > settings.refine.shadow_share * view.grey.size:
+        return mask
+    grounds = [window.neighbours[k].image for k in window.wide]
+    matrices = [window.neighbour_from_reference[k] for k in window.wide]
+    return remove_shadow(mask, box, view.image, grounds, matrices)
+
+
+def join_fragments(targets: list[Target]) -> list[Target]:
+    """The same targets, those that are fragments of one moving thing joined."""
     if len(targets) < 2:
         return targets
     boxes = np.array([target.box for target in targets], float)

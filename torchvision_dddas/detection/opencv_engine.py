@@ -73,7 +73,8 @@ class OpenCVView(View):
         """The view at half its resolution, grey; an odd last row or column is left out."""
         width, height = (max(side // 2, 1) for side in self.size)
         grey = cv2.resize(self.grey[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        return OpenCVView(grey, grey)
+        ignored = None if self.ignored is None else self.ignored[: 2 * height : 2, : 2 * width : 2]
+        return OpenCVView(grey, grey, ignored=ignored)
 
 
 class OpenCVEngine(Engine[OpenCVView]):
@@ -122,10 +123,10 @@ def find_foreground(window: Window[OpenCVView], settings: Settings) -> Foregroun
     grey = window.reference.grey
     if min(grey.shape) < 2:  # OpenCV takes a single column for a number
         zero = np.zeros_like(grey)
-        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (-1, 1))
+        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (zero,), (-1, 1))
     chain: DetectionChain[OpenCVView, np.ndarray, np.ndarray] = DetectionChain(settings, OpenCVOperations())
     maps, (a, b) = chain.find_foreground(window), window.near[-1]
-    return Foreground(**vars(maps), offsets=(window.offsets[a], window.offsets[b]))
+    return Foreground(**vars(maps) | {"offsets": (window.offsets[a], window.offsets[b])})
 
 
 # -- half pictures -----------------------------------------------------------------------------------------------------
@@ -139,6 +140,7 @@ def halve_window(window: Window[OpenCVView]) -> Window[OpenCVView]:
         neighbours=tuple(neighbour.half for neighbour in window.neighbours),
         neighbour_from_reference=_HALF_FROM_WHOLE @ window.neighbour_from_reference @ _WHOLE_FROM_HALF,
         close_px=halve_side(window.close_px) if window.close_px else 0,
+        ignored=window.reference.half.ignored,
     )
 
 
@@ -170,6 +172,7 @@ def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foregrou
         texture,
         None if half.small is None else double(half.small, size),
         (double(one, size, smooth=True), double(other, size, smooth=True)) if flow else half.warped,
+        tuple(double(pair, size) for pair in half.pairs),
         half.offsets,
     )
 
@@ -193,6 +196,8 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
     def detect(step: np.ndarray | None) -> Carried:
         points = detect_keypoints(earlier.grey, parameters, halved=parameters.halved_corners and not parameters.halved)
+        if earlier.ignored is not None:
+            points = points[earlier.ignored[tuple(points[:, ::-1].astype(int).T)] == 0]
         return Carried(points, step, 0, len(points), _cover(points, earlier.size))
 
     carried, earlier.carried = earlier.carried if carrying else None, None

@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.config import PersistenceParameters, SmallParameters
 from torchvision_dddas.detection.blob_motion import Motion
-from torchvision_dddas.detection.blobs import Blob, Box, box_slices
+from torchvision_dddas.detection.blobs import Blob, Box, box_slices, label_parts
 from torchvision_dddas.geometry import occupied, transfer
 
 # Two blobs may be one target when their areas differ by less than this factor ...
@@ -144,10 +143,10 @@ def find_candidates(small: np.ndarray, parameters: SmallParameters) -> list[Box]
     """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to tell them apart."""
     boxes: list[Box] = []
     for part in occupied(small, 2):
-        count, _, stats, _ = cv2.connectedComponentsWithStats(small[box_slices(part)], ltype=cv2.CV_32S)
+        stats = label_parts(small[box_slices(part)])[1]
         boxes += [
             (part[0] + x, part[1] + y, w, h)
-            for x, y, w, h, area in stats[1:count].tolist()
+            for x, y, w, h, area in stats.tolist()
             if area >= parameters.min_area_px and w * h <= parameters.max_box_px
         ]
     return sorted(boxes, key=lambda box: (box[1], box[0])) if len(boxes) <= parameters.max_candidates else []

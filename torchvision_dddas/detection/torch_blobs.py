@@ -121,7 +121,7 @@ def foregrounds_with_blobs(
         offsets = window.offsets[a], window.offsets[b]
         one, other, gradient = pictures
         foregrounds.append(
-            Foreground(cores[number], one, other, gradient, smalls[number], warped_here, offsets, blobs=blobs)
+            Foreground(cores[number], one, other, gradient, smalls[number], warped_here, (), offsets, blobs=blobs)
         )
     return foregrounds
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvision_dddas.chain import View, Window, match_exposure
-from torchvision_dddas.config import Settings
+from torchvision_dddas.config import Settings, uses_tracklets
 from torchvision_dddas.detection.detector import MotionDetector
 from torchvision_dddas.detection.engine import Engine, Foreground, grey_of, judge_points
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs
@@ -142,32 +142,41 @@ class TorchEngine(Engine[TensorView]):
         reference = _join([self._levels(window.reference) for window in windows])
         by_place = zip(*(window.neighbours for window in windows), strict=True)
         neighbours = tuple(_join([self._levels(view) for view in views]) for views in by_place)
-        return Window(reference, neighbours, matrices, one.offsets, one.near, one.wide, one.small, one.close_px)
+        given = one.offsets, one.near, one.wide, one.small, one.close_px
+        return Window(reference, neighbours, matrices, *given, ignored=self._ignored(one.reference))
 
     def _foreground(self, windows: list[Window[TensorView]]) -> list[Foreground]:
         settings, one, chain = self.parameters, windows[0], self.segmenter.chain()
         maps = chain.find_foreground(self.batch_of(windows))
         texture = to_bytes(maps.texture)
-        if self.components == "torch":
+        if self.components == "torch" and not uses_tracklets(settings):  # tracklets need whole maps
             is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
             is_weak_wanted &= min(maps.wide.shape[-2:]) > 1
             weak = chain.find_weak(maps.wide, one.close_px) if is_weak_wanted else None
             whole = maps.core, maps.evidence, maps.wide, texture
             return foregrounds_with_blobs(windows, settings, whole, weak, maps.small, maps.warped)
-        pictures = (maps.core, maps.evidence, maps.wide, texture, *maps.warped)
+        pictures = (maps.core, maps.evidence, maps.wide, texture, *maps.warped, *maps.pairs)
         rows = zip(*(made[:, 0].cpu().numpy() for made in pictures), strict=True)
         smalls = [None] * len(windows) if maps.small is None else list(maps.small[:, 0].cpu().numpy())
         a, b = one.near[-1]
         return [
-            Foreground(core, near, wide, texture, small, (first, other), (window.offsets[a], window.offsets[b]))
-            for window, (core, near, wide, texture, first, other), small in zip(windows, rows, smalls, strict=True)
+            Foreground(core, near, wide, texture, small, (w1, w2), tuple(pairs), (window.offsets[a], window.offsets[b]))
+            for window, (core, near, wide, texture, w1, w2, *pairs), small in zip(windows, rows, smalls, strict=True)
         ]
 
     def _keypoints(self, view: TensorView) -> tuple[Tensor, Tensor]:
         """The view's keypoints and which of them are valid, computed once."""
         if view.keypoints is None:
-            view.keypoints = self.segmenter.registration.keypoints(self._levels(view))
+            points, valid = self.segmenter.registration.keypoints(self._levels(view))
+            if (ignored := self._ignored(view)) is not None:
+                u, v = points[0].long().unbind(-1)
+                valid = valid & ~ignored[0, 0, v, u]
+            view.keypoints = points, valid
         return view.keypoints
+
+    def _ignored(self, view: TensorView) -> Tensor | None:
+        """(1, 1, H, W) bool, set where the view is left out."""
+        return None if view.ignored is None else torch.from_numpy(view.ignored > 0)[None, None].to(self.device)
 
     def _levels(self, view: TensorView) -> Tensor:
         """(1, 1, H, W) float32 grey levels, computed once."""

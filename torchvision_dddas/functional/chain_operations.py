@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from torchvision_dddas.chain import Number, Operations
+from torchvision_dddas.chain import REGION_PX, SAMPLED, Number, Operations
 from torchvision_dddas.config import WHITE, exposure_step
 from torchvision_dddas.functional.difference import (
     absolute_difference,
     fit_exposure,
     fit_quantiles,
     level_quantiles,
-    masked_median,
     noise_units,
     noise_weight,
+    regional_medians,
 )
 from torchvision_dddas.functional.filters import gaussian_blur2d, is_above, mean_gradient, to_bytes
 from torchvision_dddas.functional.morphology import closing, dilation, erosion, kernel_array
@@ -142,13 +142,11 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         units = noise_units(bytes_of, mask, least)
         if all_true(units == 1.0):
             return picture
-        per_unit = units.reciprocal().to(self.dtype)
-        if not self.is_hard:
-            # Computed in whole numbers, as in the hard chain; the gradient is that of the pixel in the middle.
-            median = masked_median(picture.flatten(1), mask.flatten(1))[:, 0] / least
-            slope = torch.where(units > 1.0, median.clamp(min=0.5).reciprocal(), per_unit)
-            per_unit = straight_through(per_unit, slope) if self.whole else slope
-        return self._rounded(picture * per_unit.reshape(-1, 1, 1, 1))
+        height, width = picture.shape[-2:]
+        sampled = picture[..., ::SAMPLED, ::SAMPLED].to(self.dtype), mask[..., ::SAMPLED, ::SAMPLED]
+        cells = regional_medians(*sampled, REGION_PX // SAMPLED, least, (least * units).to(self.dtype)) / least
+        unit = functional.interpolate(cells, scale_factor=REGION_PX, mode="bilinear")[..., :height, :width]
+        return self._rounded(picture / unit)
 
     def above(self, evidence: Tensor, limit: Number) -> Tensor:
         if evidence.dtype != torch.uint8:

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
+from torch.nn import functional
 
 from torchvision_dddas.functional.filters import is_above
 from torchvision_dddas.functional.soft import all_true, is_traced, may_branch
@@ -123,6 +124,28 @@ def _middle(values: Float[Tensor, "B N"], kept: Bool[Tensor, "B N"]) -> Float[Te
     ordered = values.masked_fill(~kept, torch.inf).topk(size, dim=1, largest=False).values
     pair = ordered.gather(1, torch.cat([(count - 1).clamp(min=0) // 2, count // 2], 1).clamp(max=values.shape[1] - 1))
     return torch.where(count[:, 0] > 0, pair.mean(1), torch.zeros_like(values[:, 0]))
+
+
+def regional_medians(
+    values: Float[Tensor, "B 1 H W"],
+    mask: Bool[Tensor, "B 1 H W"],
+    side: int,
+    least: float,
+    most: Float[Tensor, "B"],
+) -> Float[Tensor, "B 1 R C"]:
+    """Lower medians of regions of `side` pixels, between `least` and `most`, outliers among the regions smoothed away.
+
+    A region in which less than a tenth of the mask is set has `least`.
+    """
+    down, across = (-length % side for length in values.shape[-2:])
+    cells = functional.pad(values.masked_fill(~mask, torch.inf), (0, across, 0, down), value=torch.inf)
+    cells = cells.unfold(2, side, side).unfold(3, side, side).flatten(4).sort(-1).values
+    count = cells.isfinite().sum(-1, keepdim=True)
+    middle = cells.gather(-1, (count - 1).clamp(min=0) // 2)
+    medians = torch.where(count > 0.1 * side**2, middle, least)[..., 0]
+    around = functional.pad(medians, (1, 1, 1, 1), mode="replicate").unfold(2, 3, 1).unfold(3, 3, 1)
+    smooth = around.flatten(4).sort(-1).values[..., 4]
+    return smooth.clamp(min=least).minimum(most.reshape(-1, 1, 1, 1))
 
 
 def _count_at_most(rising: Float[Tensor, "B N"], values: Float[Tensor, "B M"]) -> Int64[Tensor, "B M"]:

@@ -48,6 +48,23 @@ def read_colour_image(file: Path) -> np.ndarray:
     return np.ascontiguousarray(image[:, :, :3])
 
 
+def read_ignored(file: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) uint8, 255 where a picture is not black: what detection leaves out. size: (width, height) of the frames.
+
+    Raises InputError if it cannot be read, has another size, or leaves nothing.
+    """
+    image = read_image(file)
+    if image is None:
+        raise InputError(f"{file} is not a whole picture; give a PNG of the frames' size, white where nothing counts")
+    shown = (image if image.ndim == 2 else image[:, :, :3].max(axis=2)) > 0
+    if shown.shape[::-1] != size:
+        got, wanted = (f"{width}x{height}" for width, height in (shown.shape[::-1], size))
+        raise InputError(f"{file} has {got} pixels and the frames {wanted}; give a mask of the frames' size")
+    if shown.all():
+        raise InputError(f"{file} is black nowhere, so nothing of the frames is left; black is what is looked at")
+    return np.where(shown, 255, 0).astype(np.uint8)
+
+
 def decode_image(
     data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE, input_size: int | None = None
 ) -> np.ndarray | None:

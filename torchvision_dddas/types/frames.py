@@ -160,7 +160,8 @@ class Scene:
     """The result of motion detection for one frame.
 
     mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
-    reliable: False if registration failed: then the mask is empty and `cause` says why.
+    reliable: False if the frame could not be registered to the one before, as at a cut; `cause` says why. It is then
+    compared with the frames after it alone, and if there are none its mask is empty.
     interval_frames: the detection interval in force. seconds: time spent per stage.
     step: background motion since the previous frame, or None.
     core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.

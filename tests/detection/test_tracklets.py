@@ -1,0 +1,164 @@
+"""Small, fast, rarely seen targets are found by their tracklets, and what stays or flickers is not."""
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.functional.conftest import draw_texture
+from torchvision_dddas.config import load_config
+from torchvision_dddas.detection import detect_motion
+from torchvision_dddas.detection.candidates import Candidates, find_candidates, overlaps
+from torchvision_dddas.detection.tracklet_scores import choose
+from torchvision_dddas.detection.tracklets import follow
+from torchvision_dddas.errors import InputError
+
+HEIGHT, WIDTH = 240, 320
+LOOKS = range(-4, 3)
+
+
+def film(places, frames=12, size=(7, 14), level=235, ground=None):
+    """Pictures of ground that drifts by 2 px a frame, with a bright figure at places(k) of the ground, where it is."""
+    ground = draw_texture(3, HEIGHT + 80, WIDTH + 80) // 2 if ground is None else ground
+    images = []
+    for k in range(frames):
+        image = ground[2 * k : 2 * k + HEIGHT, 2 * k : 2 * k + WIDTH].copy()
+        for u, v in places(k):
+            image[int(v) - 2 * k :, int(u) - 2 * k :][: size[1], : size[0]] = level
+        images.append(cv2.GaussianBlur(image, (3, 3), 0))
+    return images
+
+
+def found_at(scene, box):
+    """Whether a detection overlaps the box by a quarter."""
+    return bool((overlaps(scene.detections.box_px, np.array([box], float)) > 0.25).any())
+
+
+def candidates(*boxes):
+    """Candidates of these boxes, alike in all else."""
+    count = len(boxes)
+    box, one = np.array(boxes, float).reshape(-1, 4), np.ones(count)
+    patch = np.tile(np.eye(1, 144), (count, 1))
+    evidence = np.ones((count, 3)), np.zeros((count, 3))
+    return Candidates(box, np.zeros(count, int), one, 9 * one, *evidence, patch, 0 * one)
+
+
+def seen(at, boxes_at, camera=(0.0, 0.0)):
+    """The looks about one, at offsets in looks; the ground is `camera` further in each."""
+    shifted = {o: [(x + o * camera[0], y + o * camera[1], w, h) for x, y, w, h in boxes_at(o)] for o in at}
+    move = {o: np.array([[1, 0, -o * camera[0]], [0, 1, -o * camera[1]], [0, 0, 1.0]]) for o in at}
+    return {o: (candidates(*shifted[o]), move[o]) for o in at if o}
+
+
+def test_people_who_go_further_than_their_own_size_between_looks_are_found():
+    """As they show in a few pictures a second from 60 m: each step is longer than the person is wide."""
+    images = film(lambda k: [(60 + 15 * k, 90 + 2 * k), (280 - 13 * k, 180)])
+    scenes = list(detect_motion(images))
+    hits = [
+        (found_at(scene, (60 + 13 * k, 90, 7, 14)), found_at(scene, (280 - 15 * k, 180 - 2 * k, 7, 14)))
+        for k, scene in enumerate(scenes)
+    ]
+    assert np.mean(hits[1:-1]) > 0.9
+    assert np.mean([len(scene.detections) for scene in scenes]) < 3.5
+
+
+def test_what_stands_still_and_what_flickers_is_no_target():
+    rng = np.random.default_rng(1)
+    spots = rng.uniform((30, 30), (300, 220), (20, 2))
+    images = film(lambda k: [(150, 120), *spots[rng.random(len(spots)) < 0.05]], size=(4, 4), level=140)
+    assert np.mean([len(scene.detections) for scene in detect_motion(images)]) < 0.3
+
+
+def test_each_side_of_a_cut_is_searched_to_its_ends():
+    one = film(lambda k: [(60 + 15 * k, 90)], 6)
+    two = film(lambda k: [(250 - 15 * k, 150)], 6, ground=draw_texture(9, HEIGHT + 80, WIDTH + 80) // 2)
+    scenes = list(detect_motion(one + two))
+    boxes = [(60 + 13 * k, 90 - 2 * k, 7, 14) for k in range(6)]
+    boxes += [(250 - 17 * k, 150 - 2 * k, 7, 14) for k in range(6)]
+    assert np.mean([found_at(*pair) for pair in zip(scenes, boxes, strict=True)]) > 0.8
+
+
+def test_a_restless_part_of_the_picture_hides_nothing_beside_it():
+    """Bare trees that shimmer over most of a picture, and a walker on a clean road beside them."""
+    rng = np.random.default_rng(0)
+    images = film(lambda k: [(40 + 3 * k, 40 + 6 * k)], size=(9, 18), level=160)
+    for image in images:
+        image[:, 130:] = np.clip(image[:, 130:] + rng.normal(0, 45, (HEIGHT, WIDTH - 130)), 0, 255)
+    scenes = list(detect_motion(images))
+    assert np.mean([found_at(s, (40 + k, 40 + 4 * k, 9, 18)) for k, s in enumerate(scenes)]) > 0.7
+
+
+def test_silhouettes_show_small_and_large_things_that_one_of_them_would_not():
+    evidence = np.zeros((200, 300), np.uint8)
+    evidence[40:54, 50:57] = 160  # small
+    evidence[100:180, 150:170] = evidence[100:180, 190:210] = 160  # two halves of something large and even
+    found = find_candidates((evidence, None, evidence), np.zeros_like(evidence), [])
+    wanted = np.array([(50, 40, 7, 14), (150, 100, 60, 80)], float)
+    assert (overlaps(found.box_px, wanted).max(axis=0) > 0.6).all()
+    assert len(find_candidates((None, None, None), np.zeros_like(evidence), [])) == 0
+    assert len(find_candidates((evidence * 0, None, None), np.zeros_like(evidence), [])) == 0
+
+
+@pytest.mark.parametrize("camera", [(0.0, 0.0), (7.0, -4.0)])
+def test_a_tracklet_follows_its_target_over_the_ground(camera):
+    mover = (100.0, 80.0, 8.0, 16.0)
+    looks = seen(LOOKS, lambda o: [(20, 20, 8, 16), (100 + 12 * o, 80 - 3 * o, 8, 16)], camera)
+    tracklets = follow(candidates((20, 20, 8, 16), mover), looks, (400, 400))
+    np.testing.assert_allclose(tracklets.velocity_px, [[0, 0], [12, -3]], atol=1e-6)
+    assert tracklets.hits.tolist() == [7, 7] and all(tracklets.members[o].tolist() == [0, 1] for o in looks)
+    np.testing.assert_allclose(tracklets.travel_px, [0, 6 * np.hypot(12, 3)], atol=1e-6)
+    assert tracklets.sureness[1] > 20 > tracklets.sureness[0]
+    np.testing.assert_allclose([tracklets.growth_x, tracklets.growth_y, tracklets.stays], 0, atol=1e-9)
+
+
+def test_something_that_stays_where_a_mover_is_seen_speaks_against_it():
+    looks = seen(LOOKS, lambda o: [(100 + 12 * o, 80, 8, 16), (100, 80, 8, 16)])
+    assert follow(candidates((100, 80, 8, 16)), looks, (400, 400)).hits[0] == 7
+    moving = seen(LOOKS, lambda o: [(100 + 12 * o, 80, 8, 16), (130, 80, 8, 16)])
+    there = follow(candidates((100, 80, 8, 16), (130, 80, 8, 16)), moving, (400, 400))
+    assert there.stays[0] == 0
+
+
+def test_without_other_looks_a_candidate_is_its_own_tracklet():
+    alone = follow(candidates((10, 10, 5, 5)), {}, (100, 100))
+    assert alone.hits.tolist() == [1] and np.isfinite(alone.sureness).all()
+    assert len(follow(candidates(), {}, (100, 100)).hits) == 0
+    empty = follow(candidates((10, 10, 5, 5)), {1: (candidates(), np.eye(3))}, (100, 100))
+    assert empty.hits.tolist() == [1] and empty.members[1].tolist() == [-1]
+
+
+def test_of_overlapping_candidates_the_likeliest_is_the_target():
+    box = np.array([(0, 0, 30, 30), (2, 2, 10, 10), (16, 16, 10, 10), (60, 60, 10, 10)], float)
+    scores = np.array([0.5, 1.0, 0.8, -5.0])
+    assert choose(box, scores, [], 0.0, 50) == [1, 2]
+    # A large blob that persists is one thing; a small one may be several that were joined.
+    assert choose(box, scores, [True], 0.0, 20) == [0]
+    assert choose(box, scores, [True], 0.0, 50) == [1, 2]
+    # To persist is evidence by itself.
+    assert choose(box, np.full(4, -1.0), [True], 0.0, 50) == [0]
+    assert choose(np.zeros((0, 4)), np.zeros(0), [], 0.0, 50) == []
+
+
+@pytest.mark.parametrize("backend", ["onboard", "torch"])
+def test_a_mask_leaves_regions_out(tmp_path, backend):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, 200:] = 255
+    assert cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    images = film(lambda k: [(60 + 9 * k, 90), (240 + 5 * k, 180)])
+    settings = load_config(None, [f'difference.ignore="{tmp_path / "mask.png"}"'])
+    scenes = list(detect_motion(images, settings, backend))
+    assert any(len(scene.detections) for scene in scenes)
+    assert all(scene.mask[:, 215:].max() == 0 for scene in scenes)
+    with pytest.raises(InputError, match=r"mask\.png has 320x240 pixels and the frames 160x120"):
+        list(detect_motion([image[:120, :160] for image in images], settings, backend))
+    assert cv2.imwrite(str(tmp_path / "mask.png"), mask | 255)
+    with pytest.raises(InputError, match="black nowhere"):
+        list(detect_motion(images, settings, backend))
+
+
+def test_engines_agree_on_the_targets_of_tracklets():
+    images = film(lambda k: [(60 + 15 * k, 90 + 2 * k), (280 - 13 * k, 180)])
+    one, other = (list(detect_motion(images, None, backend)) for backend in ("onboard", "torch"))
+    found = [[scene.detections.box_px for scene in scenes] for scenes in (one, other)]
+    assert sum(map(len, found[0])) > 15
+    shared = sum((overlaps(*pair) > 0.7).any(axis=1).sum() for pair in zip(*found, strict=True))
+    assert shared > 0.9 * max(sum(map(len, boxes)) for boxes in found)

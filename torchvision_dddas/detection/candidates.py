@@ -1,0 +1,248 @@
+"""What may be a target in one look: connected parts of several silhouettes of its evidence, and what they look like.
+
+One silhouette misses most targets: small ones need no closing, large even ones a wide one, slow ones frames further
+apart, faint ones a low threshold. Which of these parts are targets is decided later, on tracklets (`tracklets`).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from torchvision_dddas.chain import ellipse, halve_side
+from torchvision_dddas.config import EVIDENCE_SCALE
+from torchvision_dddas.detection.blobs import Blob, label_parts
+from torchvision_dddas.geometry import Box
+
+Evidence = Sequence[np.ndarray | None]
+"""The maps of evidence by how far apart the compared frames are: nearest, further, widest; (H, W) uint8 or None."""
+
+
+class Silhouette(NamedTuple):
+    """Where the largest of some maps is above a threshold. gaps: indices of maps. threshold: noise units.
+
+    erode_px, close_px: sides of the ellipses that clean it.
+    """
+
+    gaps: tuple[int, ...]
+    threshold: float
+    erode_px: int
+    close_px: int
+
+
+# Chosen one after the other so that some part overlaps a target, on all kinds of clips (`python eval/tracklets.py`).
+SILHOUETTES = (
+    Silhouette((0, 1), 3.5, 3, 1),
+    Silhouette((0, 1), 2.5, 3, 15),
+    Silhouette((1,), 5.0, 3, 1),
+    Silhouette((2,), 7.0, 1, 5),
+    Silhouette((0, 1), 5.0, 1, 15),
+    Silhouette((0, 1, 2), 2.5, 1, 25),
+)
+LOOK_WEIGHTS = {
+    "peak2": 1.032,
+    "around": 3.428,
+    "around2": -3.41,
+    "size": 1.081,
+    "size2": -0.073,
+    "grows2": -0.119,
+    "inside_over_around": 1.555,
+    "constant": -12.333,
+}
+"""Weights of what one look shows, see `describe_look`."""
+
+# Added to evidence before its logarithm, noise units; and that of surroundings than which none are judged quieter: the
+# clips of which the weights were learned have some noise, and pictures without any must not count as unlike them.
+_LEAST_EVIDENCE = 0.5
+_QUIET = np.log(_LEAST_EVIDENCE + 0.7)
+# Candidates with a smaller score, and all but the likeliest so many, are left out: no tracklet of them is a target.
+_LEAST_SCORE, _MOST_CANDIDATES = -3.0, 60
+
+_LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
+# Of each silhouette the largest so many parts; parts of one look that overlap more than this are one.
+_MOST_PARTS, _ALIKE = 30, 0.85
+# Closings from this side on are done at half the resolution.
+_HALVED_FROM_PX = 9
+_PATCH_PX = 12
+_PATCH_NOISE = 20.0  # grey levels x pixels: a patch without contrast is like nothing
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The N candidates of one look, and G maps of evidence.
+
+    box_px: (N, 4) x, y, width, height. silhouette: (N,) index of the first silhouette that shows it, -1: a blob. fill:
+    (N,) share of the box that its part covers. peak: (N,) largest evidence, noise units. inside, around: (N, G) mean
+    evidence in the box and in a frame about it, noise units; 0 where there is no map. patch: (N, P) grey levels of the
+    box without their mean, of about unit length. score: (N,) log odds that it is a target, by this look alone.
+    """
+
+    box_px: np.ndarray
+    silhouette: np.ndarray
+    fill: np.ndarray
+    peak: np.ndarray
+    inside: np.ndarray
+    around: np.ndarray
+    patch: np.ndarray
+    score: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.box_px)
+
+
+def find_candidates(evidence: Evidence, grey: np.ndarray, blobs: Sequence[Blob]) -> Candidates:
+    """The candidates of one look. grey: (H, W) uint8, its picture. blobs: come first, in their order."""
+    found = [np.array([[*blob.box, blob.mask.mean(), blob.peak / EVIDENCE_SCALE, -1] for blob in blobs]).reshape(-1, 7)]
+    silhouettes = _Silhouettes(evidence)
+    for index, silhouette in enumerate(SILHOUETTES):
+        if (made := silhouettes.parts(silhouette)) is not None:
+            rows = made
+            found.append(np.c_[rows, np.full(len(rows), index)])
+    rows = np.concatenate(found)
+    rows = rows[_first_of_alike(rows[:, :4], len(blobs))]
+    box = rows[:, :4].astype(int)
+    inside, around = measure_evidence(evidence, box)
+    score = weigh(describe_look(rows[:, :4], rows[:, 4], rows[:, 5], inside, around), LOOK_WEIGHTS)
+    likely = np.flatnonzero(score >= _LEAST_SCORE)
+    likely = likely[np.argsort(-score[likely], kind="stable")[:_MOST_CANDIDATES]]
+    kept = np.union1d(np.arange(len(blobs)), likely)
+    patch = np.array([_cut_patch(grey, one) for one in box[kept].tolist()], np.float32).reshape(-1, _PATCH_PX**2)
+    rows, silhouette = rows[kept], rows[kept, 6].astype(int)
+    return Candidates(rows[:, :4], silhouette, rows[:, 4], rows[:, 5], inside[kept], around[kept], patch, score[kept])
+
+
+class _Silhouettes:
+    """The silhouettes of one look's evidence, which share their steps."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.evidence = evidence
+        self._largest: dict[tuple[int, ...], np.ndarray] = {}
+        self._cores: dict[tuple[tuple[int, ...], float, int, bool], np.ndarray] = {}
+
+    def parts(self, silhouette: Silhouette) -> np.ndarray | None:
+        """(N, 6) x, y, width, height, fill, peak in noise units of its connected parts; None: no map shows it."""
+        gaps = tuple(gap for gap in silhouette.gaps if self.evidence[gap] is not None)
+        if not gaps:
+            return None
+        core, scale, close_px = self._core(gaps, silhouette, False), 1, silhouette.close_px
+        if close_px >= _HALVED_FROM_PX and min(core.shape) > 1:
+            core, scale, close_px = self._core(gaps, silhouette, True), 2, halve_side(close_px)
+        if close_px > 1:
+            core = cv2.morphologyEx(core, cv2.MORPH_CLOSE, ellipse(close_px))
+        stats = label_parts(core)[1] * (scale, scale, scale, scale, scale**2)
+        stats = stats[stats[:, 4] >= _LEAST_AREA_PX]
+        stats = stats[np.argsort(-stats[:, 4], kind="stable")[:_MOST_PARTS]]
+        z = self._evidence_of(gaps)
+        peak = np.array([z[y : y + h, x : x + w].max() for x, y, w, h, _ in stats.tolist()]) / EVIDENCE_SCALE
+        parts = np.c_[stats[:, :4], stats[:, 4] / (stats[:, 2] * stats[:, 3]), peak] if len(stats) else np.zeros((0, 6))
+        return parts[parts[:, 5] >= _LEAST_PEAK]
+
+    def _evidence_of(self, gaps: tuple[int, ...]) -> np.ndarray:
+        if gaps not in self._largest:
+            largest: np.ndarray | None = None
+            for gap in gaps:
+                picture = self.evidence[gap]
+                assert picture is not None
+                largest = picture if largest is None else cv2.max(largest, picture)
+            assert largest is not None
+            self._largest[gaps] = largest
+        return self._largest[gaps]
+
+    def _core(self, gaps: tuple[int, ...], silhouette: Silhouette, halved: bool) -> np.ndarray:
+        key = gaps, silhouette.threshold, silhouette.erode_px, halved
+        if key not in self._cores:
+            if halved:
+                whole = self._core(gaps, silhouette, False)
+                height, width = (side // 2 for side in whole.shape)
+                half = cv2.resize(whole[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+                core = cv2.threshold(half, 60, 255, cv2.THRESH_BINARY)[1]
+            else:
+                z = self._evidence_of(gaps)
+                core = cv2.threshold(z, int(silhouette.threshold * EVIDENCE_SCALE), 255, cv2.THRESH_BINARY)[1]
+                if silhouette.erode_px > 1:
+                    core = cv2.erode(core, ellipse(silhouette.erode_px))
+            self._cores[key] = core
+        return self._cores[key]
+
+
+def describe_look(
+    box: np.ndarray, fill: np.ndarray, peak: np.ndarray, inside: np.ndarray, around: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What one look shows, (N,) each, by the names of LOOK_WEIGHTS. The arguments are those of `Candidates`."""
+    outside = np.log(_LEAST_EVIDENCE + around.max(axis=1))
+    restless = np.maximum(outside, _QUIET)
+    size = 0.5 * np.log(box[:, 2:].prod(axis=1)) * fill
+    grows = np.minimum(inside[:, -1] / (inside[:, 0] + 0.3), 5)
+    return {
+        "peak2": np.log(peak) ** 2,
+        "around": restless,
+        "around2": (restless - _QUIET) ** 2,
+        "size": size,
+        "size2": size**2,
+        "grows2": grows**2,
+        "inside_over_around": np.log(_LEAST_EVIDENCE + inside.max(axis=1)) - outside,
+    }
+
+
+def weigh(described: Mapping[str, np.ndarray], weights: Mapping[str, float]) -> np.ndarray:
+    """(N,) log odds: the sum of what is described, (N,) each, by its weights, and a constant."""
+    columns = np.array(list(described.values()))
+    return weights["constant"] + np.array([weights[name] for name in described]) @ columns
+
+
+def measure_evidence(evidence: Evidence, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean evidence, noise units, in boxes and in the frames about them; (N, G) each, 0 where there is no map.
+
+    box: (N, 4) int.
+    """
+    inside, around = np.zeros((2, len(box), len(evidence)))
+    wide = np.floor(2 + 0.2 * box[:, 2:]).astype(int)
+    rim = np.c_[box[:, :2] - wide, box[:, 2:] + 2 * wide]
+    for gap, picture in enumerate(evidence):
+        if picture is None or not len(box):
+            continue
+        table = cv2.integral(picture)
+        (own, area), (both, whole) = _sum_boxes(table, box), _sum_boxes(table, rim)
+        inside[:, gap] = own / np.maximum(area, 1) / EVIDENCE_SCALE
+        around[:, gap] = (both - own) / np.maximum(whole - area, 1) / EVIDENCE_SCALE
+    return inside, around
+
+
+def _sum_boxes(table: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over boxes, cut at the picture's border, by an integral picture; and their areas."""
+    height, width = table.shape[0] - 1, table.shape[1] - 1
+    left, top = np.clip(box[:, 0], 0, width), np.clip(box[:, 1], 0, height)
+    right, bottom = np.clip(box[:, 0] + box[:, 2], 0, width), np.clip(box[:, 1] + box[:, 3], 0, height)
+    sums = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+    return sums, (right - left) * (bottom - top)
+
+
+def _first_of_alike(box: np.ndarray, always: int) -> np.ndarray:
+    """(N,) bool: boxes that overlap none before them nearly wholly, and the first so many in any case."""
+    first = np.ones(len(box), bool)
+    alike = overlaps(box, box) > _ALIKE
+    for i in range(len(box)):
+        if first[i]:
+            first[i + 1 :] &= ~alike[i, i + 1 :]
+    first[:always] = True
+    return first
+
+
+def overlaps(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """(N, M) IoU of boxes (N, 4) and (M, 4) x, y, width, height."""
+    low = np.maximum(one[:, None, :2], other[None, :, :2])
+    high = np.minimum(one[:, None, :2] + one[:, None, 2:], other[None, :, :2] + other[None, :, 2:])
+    both = np.prod(np.maximum(high - low, 0), axis=2)
+    either = np.prod(one[:, 2:], axis=1)[:, None] + np.prod(other[:, 2:], axis=1)[None] - both
+    return both / np.maximum(either, 1e-9)
+
+
+def _cut_patch(grey: np.ndarray, box: Box) -> np.ndarray:
+    x, y, width, height = box
+    pad = 2 + max(width, height) // 10
+    part = grey[max(y - pad, 0) : y + height + pad, max(x - pad, 0) : x + width + pad]
+    patch = cv2.resize(part, (_PATCH_PX, _PATCH_PX), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+    patch -= patch.mean()
+    return patch / (np.linalg.norm(patch) + _PATCH_NOISE)
