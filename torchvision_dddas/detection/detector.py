@@ -35,7 +35,7 @@ from torchvision_dddas.detection.observation import (
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
 from torchvision_dddas.detection.repeats import RepeatRule
-from torchvision_dddas.detection.tracklet_scores import choose, score_tracklets
+from torchvision_dddas.detection.tracklet_scores import PERSISTENT, PERSISTENT_SIZED, choose, score_tracklets
 from torchvision_dddas.detection.tracklets import LOOKS_AFTER, LOOKS_BEFORE, follow
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.images import read_ignored
@@ -380,7 +380,8 @@ class MotionDetector:
         tracklets = follow(candidates, others, slot.view.size)
         scores = score_tracklets(candidates, tracklets, {offset: seen for offset, (seen, _) in others.items()})
         joined_px = 1.5 * settings.morphology.close_px
-        chosen = choose(candidates.box_px, scores, persistent, settings.tracklets.accept, joined_px)
+        worth = PERSISTENT if slot.distance.gates is None else PERSISTENT_SIZED
+        chosen = choose(candidates.box_px, scores, persistent, settings.tracklets.accept, joined_px, worth)
         blobs = [i for i in chosen if i < len(persistent)]
         targets = [target for parts in draw_blobs(observation, blobs, settings) for target in parts]
         for i in chosen:

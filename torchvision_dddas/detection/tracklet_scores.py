@@ -25,8 +25,12 @@ TRACKLET_WEIGHTS = {
 }
 """Weights of what a tracklet shows, see `describe_tracklets`."""
 
-PERSISTENT = 2.0
-"""What a blob that persists, by its links and its flow, has beyond the score of its tracklet."""
+PERSISTENT, PERSISTENT_SIZED = 3.0, 4.0
+"""What a blob that persists, by its links and its flow, has beyond the score of its tracklet.
+
+The second one where telemetry tells that it has the size and the speed of a target. The first is chosen by
+`eval/tracklets.py`, the second so that faint targets of the simulator stay.
+"""
 
 _LEAST_HITS, _LEAST_TRAVEL_PX = 2, 1.0
 _SCORE_BOUNDS = (-8.0, 6.0)
@@ -75,20 +79,26 @@ def score_tracklets(
 
 
 def choose(
-    box: np.ndarray, scores: np.ndarray, persistent: Sequence[bool], accept: float, joined_px: float
+    box: np.ndarray,
+    scores: np.ndarray,
+    persistent: Sequence[bool],
+    accept: float,
+    joined_px: float,
+    worth: float = PERSISTENT,
 ) -> list[int]:
     """Indices of the candidates whose tracklets are targets, the likeliest first; of those that overlap only one.
 
     box: (N, 4). scores: (N,) log odds. persistent: of the blobs, which are the first candidates. accept: least score.
     joined_px: a persistent blob whose narrower side is shorter may be several things that were joined, and so gives
     way to likelier parts of it; one that is about the same as a target stands for it, since its outline is known.
+    worth: what to persist adds to a score.
     """
     lasts = np.zeros(len(box), bool)
     lasts[: len(persistent)] = persistent
     is_whole = lasts & (box[:, 2:].min(axis=1, initial=np.inf) >= joined_px)
-    rank = scores + PERSISTENT * is_whole
+    rank = scores + worth * is_whole
     order = np.argsort(-rank, kind="stable")
-    order = order[(scores + PERSISTENT * lasts)[order] > accept]
+    order = order[(scores + worth * lasts)[order] > accept]
     box = box[order]
     low, high = box[:, None, :2], box[:, None, :2] + box[:, None, 2:]
     shared = np.maximum(np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1)), 0).prod(axis=2)

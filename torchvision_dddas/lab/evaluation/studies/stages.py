@@ -39,7 +39,18 @@ from torchvision_dddas.types import (
 
 OnFrame = Callable[[], object]
 
-_MOTION = ("registration", "interval", "difference", "morphology", "refine", "persistence", "small", "history", "gates")
+_MOTION = (
+    "registration",
+    "interval",
+    "difference",
+    "morphology",
+    "refine",
+    "persistence",
+    "tracklets",
+    "small",
+    "history",
+    "gates",
+)
 _TRACKING = ("track", "paper")
 
 PARAMETER_GROUPS: Mapping[Task, tuple[str, ...]] = {
