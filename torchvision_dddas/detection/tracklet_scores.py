@@ -104,11 +104,14 @@ def choose(
     shared = np.maximum(np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1)), 0).prod(axis=2)
     area = box[:, 2:].prod(axis=1)
     covers = shared > _COVERED * np.minimum(area[:, None], area)
-    free, chosen = np.ones(len(order), bool), []
+    free = np.ones(len(order), bool)
+    chosen: list[int] = []
     for place in range(len(order)):
         if free[place]:
             chosen.append(place)
             free &= ~covers[place]
+    if not chosen:
+        return []
     alike = np.where(lasts[order], overlaps(box[chosen], box), 0)
-    same = np.where(alike.max(axis=1, initial=0) > _SAME, alike.argmax(axis=1), chosen) if chosen else []
+    same = np.where(alike.max(axis=1) > _SAME, alike.argmax(axis=1), chosen)
     return list(dict.fromkeys(order[same].tolist()))
