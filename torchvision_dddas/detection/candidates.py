@@ -14,7 +14,6 @@ import numpy as np
 from torchvision_dddas.chain import ellipse, halve_side
 from torchvision_dddas.config import EVIDENCE_SCALE
 from torchvision_dddas.detection.blobs import Blob, label_parts
-from torchvision_dddas.geometry import Box
 
 Evidence = Sequence[np.ndarray | None]
 """The maps of evidence by how far apart the compared frames are: nearest, further, widest; (H, W) uint8 or None."""
@@ -108,7 +107,7 @@ def find_candidates(evidence: Evidence, grey: np.ndarray, blobs: Sequence[Blob])
     likely = np.flatnonzero(score >= _LEAST_SCORE)
     likely = likely[np.argsort(-score[likely], kind="stable")[:_MOST_CANDIDATES]]
     kept = np.union1d(np.arange(len(blobs)), likely)
-    patch = np.array([_cut_patch(grey, one) for one in box[kept].tolist()], np.float32).reshape(-1, _PATCH_PX**2)
+    patch = cut_patches(grey, box[kept])
     rows, silhouette = rows[kept], rows[kept, 6].astype(int)
     return Candidates(rows[:, :4], silhouette, rows[:, 4], rows[:, 5], inside[kept], around[kept], patch, score[kept])
 
@@ -239,10 +238,13 @@ def overlaps(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return both / np.maximum(either, 1e-9)
 
 
-def _cut_patch(grey: np.ndarray, box: Box) -> np.ndarray:
-    x, y, width, height = box
-    pad = 2 + max(width, height) // 10
-    part = grey[max(y - pad, 0) : y + height + pad, max(x - pad, 0) : x + width + pad]
-    patch = cv2.resize(part, (_PATCH_PX, _PATCH_PX), interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-    patch -= patch.mean()
-    return patch / (np.linalg.norm(patch) + _PATCH_NOISE)
+def cut_patches(grey: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(N, P) float32 grey levels of boxes, (N, 4) int, made as large as one another, without their mean."""
+    patches: np.ndarray = np.empty((len(box), _PATCH_PX, _PATCH_PX), np.float32)
+    for patch, (x, y, width, height) in zip(patches, box.tolist(), strict=True):
+        pad = 2 + max(width, height) // 10
+        part = grey[max(y - pad, 0) : y + height + pad, max(x - pad, 0) : x + width + pad]
+        patch[:] = cv2.resize(part, (_PATCH_PX, _PATCH_PX), interpolation=cv2.INTER_AREA)
+    flat = patches.reshape(len(box), _PATCH_PX**2)
+    flat -= flat.mean(axis=1, keepdims=True)
+    return flat / (np.linalg.norm(flat, axis=1, keepdims=True) + _PATCH_NOISE)
