@@ -150,7 +150,7 @@ class MotionDetector:
         self._ended = False
         self._mask: tuple[str, np.ndarray | None] | None = None
         self._flow = DenseFlow()
-        self._small_tracks = SmallTracks(self.settings.small)
+        self._small_tracks = SmallTracks(self.settings.small, uses_tracklets(self.settings))
         self._history = MotionHistory(self.settings.history.duration_frames)
 
     @property

@@ -24,6 +24,8 @@ _MEMORY_FRAMES = 30
 # It has travelled when it has gone so many of its own lengths, and more of them for each other candidate in the frame:
 # clutter, parallax above all, drifts too.
 _LENGTHS, _LENGTHS_EACH = 0.25, 0.005
+# Where tracklets find the others, it must have left its own place: on open clips all that moved less were false.
+_LENGTHS_BESIDE_TRACKLETS = 1.0
 
 
 Links = dict[int, list[int | None]]
@@ -155,8 +157,10 @@ def find_candidates(small: np.ndarray, parameters: SmallParameters) -> list[Box]
 class SmallTracks:
     """The tracks of small slow targets, confirmed once they have travelled steadily. Feed it every frame in order."""
 
-    def __init__(self, parameters: SmallParameters) -> None:
+    def __init__(self, parameters: SmallParameters, beside_tracklets: bool = False) -> None:
+        """beside_tracklets: whether targets are judged by tracklets too."""
         self.parameters = parameters
+        self._lengths = _LENGTHS_BESIDE_TRACKLETS if beside_tracklets else _LENGTHS
         self.tracks: list[SmallTrack] = []
         self.counts: deque[int] = deque(maxlen=20)
 
@@ -210,6 +214,6 @@ class SmallTracks:
         rms = float(np.sqrt((miss**2).sum(axis=1).mean()))
         speed, sigma = float(np.hypot(*velocity)), max(rms, 0.3) / np.sqrt(spread)
         length = float(np.median([max(w, h) for _, _, w, h in track.boxes]))
-        lengths = _LENGTHS + _LENGTHS_EACH * float(np.median(self.counts))
+        lengths = self._lengths + _LENGTHS_EACH * float(np.median(self.counts))
         far = speed * (time[-1] - time[0]) >= max(self.parameters.min_travel_px, lengths * length)
         track.confirmed |= bool(far and rms <= _STRAIGHT_PX and speed / sigma >= self.parameters.sureness)
