@@ -496,3 +496,13 @@ def test_clips_of_one_flight_are_one_run_and_clips_to_detect_in_are_several(ddda
     assert record(tmp_path / "run")["input"] == [str(film) for film in films]
     result = dddas("detect", *films, "--out", tmp_path / "found", "--save", "none")
     assert result.exit_code == 0 and sorted(path.name for path in (tmp_path / "found").iterdir()) == ["part0", "part1"]
+
+
+@pytest.mark.parametrize("command", ["detect", "track", "run"])
+def test_a_note_says_how_much_a_mask_leaves_out(dddas, clip, tmp_path, command):
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:12] = 255
+    assert cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    result = dddas(command, clip, "--ignore", tmp_path / "mask.png", "--out", tmp_path / "out", "--save", "none")
+    assert result.exit_code == 0, result.output
+    assert "mask.png leaves out 25 % of every picture" in " ".join(record(tmp_path / "out")["notes"])

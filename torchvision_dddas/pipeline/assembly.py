@@ -35,6 +35,7 @@ from torchvision_dddas.io.camera_files import read_aerial_camera
 from torchvision_dddas.io.colour_files import read_colours
 from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
+from torchvision_dddas.io.images import read_ignored
 from torchvision_dddas.io.joined_clips import JoinedSource
 from torchvision_dddas.io.output import NONE_LOCATED, Site
 from torchvision_dddas.io.telemetry import read_telemetry
@@ -207,8 +208,11 @@ def _read_telemetry(path: Path, settings: Settings, clip: str | JoinedSource | N
 
 
 def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:
-    """What keeps anything from being found in a clip that was read to its end: the interval, or its size."""
+    """What keeps targets from being found in a clip that was read to its end: the interval, its size, or a mask."""
     notes = []
+    if settings.difference.ignore:
+        share = (read_ignored(Path(settings.difference.ignore), source.size) > 0).mean()
+        notes.append(f"{settings.difference.ignore} leaves out {100 * share:.0f} % of every picture")
     if interval > 1 and interval >= source.last:
         notes.append(f"--interval {interval} is beyond the clip's {source.last} frames: only frame 1 was tracked")
     (width, height), least = source.size, settings.gates.min_area_px
