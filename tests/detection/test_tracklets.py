@@ -15,6 +15,7 @@ from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.detection.tracklet_scores import choose
 from torchvision_dddas.detection.tracklets import follow
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry import read_telemetry
 
 HEIGHT, WIDTH = 240, 320
 LOOKS = range(-4, 3)
@@ -203,6 +204,13 @@ def test_tracklets_may_be_switched_on_and_off_where_the_device_finds_blobs():
         retune = lambda frame, one=one, other=other: (other if 4 <= frame.number < 9 else one, ())  # noqa: E731
         scenes = list(detect_motion(images, one, engine, batch=1, retune=retune))
         assert len(scenes) == len(images) and any(len(scene.detections) for scene in scenes)
+
+
+def test_a_list_of_pictures_may_come_with_telemetry(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time_s,altitude_m,speed_mps\n0,60,3\n1,60,3\n2,60,3\n")
+    scenes = list(detect_motion(film(lambda k: [(60 + 15 * k, 90)]), telemetry=read_telemetry(log)))
+    assert any(len(scene.detections) for scene in scenes)
 
 
 def test_engines_agree_on_the_targets_of_tracklets():
