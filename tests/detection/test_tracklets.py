@@ -1,5 +1,7 @@
 """Small, fast, rarely seen targets are found by their tracklets, and what stays or flickers is not."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -8,9 +10,12 @@ from tests.functional.conftest import draw_texture
 from torchvision_dddas.config import load_config
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.detection.candidates import Candidates, find_candidates, overlaps
+from torchvision_dddas.detection.opencv_engine import OpenCVEngine
+from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.detection.tracklet_scores import choose
 from torchvision_dddas.detection.tracklets import follow
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.telemetry import read_telemetry
 
 HEIGHT, WIDTH = 240, 320
 LOOKS = range(-4, 3)
@@ -153,6 +158,59 @@ def test_a_mask_leaves_regions_out(tmp_path, backend):
     assert cv2.imwrite(str(tmp_path / "mask.png"), mask | 255)
     with pytest.raises(InputError, match="black nowhere"):
         list(detect_motion(images, settings, backend))
+
+
+def test_each_frame_of_a_batch_has_the_mask_of_its_own_settings(tmp_path):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, 200:] = 255
+    assert cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    images = film(lambda k: [(60 + 9 * k, 90), (240 + 5 * k, 180)])
+    whole, masked = load_config(None), load_config(None, [f'difference.ignore="{tmp_path / "mask.png"}"'])
+    scenes = list(
+        detect_motion(images, whole, "torch", batch=8, retune=lambda frame: (masked if frame.number > 6 else whole, ()))
+    )
+    shown = [bool(scene.mask[:, 215:].any()) for scene in scenes]
+    assert any(shown[:6]) and not any(shown[6:])
+
+
+def test_points_carried_into_a_region_that_is_left_out_are_let_go():
+    """Else those that pass below burnt-in text stay with the text."""
+    engine = OpenCVEngine(load_config(None))
+    views = [engine.prepare(image) for image in film(lambda _: [], 3)]
+    for view in views:
+        view.ignored = np.zeros((HEIGHT, WIDTH), np.uint8)
+        view.ignored[60:120] = 255
+    for pair in pairwise(views):
+        assert engine.register([pair])[0].reliable
+        points = pair[1].carried.points
+        rows = points[:, 1].round()
+        assert len(points) > 20 and not ((rows >= 60) & (rows < 120)).any()
+
+
+def test_a_thin_line_that_is_left_out_is_left_out_at_half_the_resolution():
+    view = OpenCVEngine(load_config(None)).prepare(film(lambda _: [], 1)[0])
+    view.ignored = np.zeros((HEIGHT, WIDTH), np.uint8)
+    view.ignored[31] = view.ignored[:, 45] = 255
+    assert view.half.ignored[15].all() and view.half.ignored[:, 22].all()
+    assert (view.half.ignored > 0).sum() == HEIGHT // 2 + WIDTH // 2 - 1
+
+
+def test_tracklets_may_be_switched_on_and_off_where_the_device_finds_blobs():
+    """A window may be looked at after the settings of its frame have been replaced."""
+    images = film(lambda k: [(60 + 15 * k, 90 + 2 * k), (280 - 13 * k, 180)])
+    on, off = load_config(None), load_config(None, ["tracklets.on=false"])
+    for one, other in ((on, off), (off, on)):
+        engine = TorchEngine(one, components="torch")
+        retune = lambda frame, one=one, other=other: (other if 4 <= frame.number < 9 else one, ())  # noqa: E731
+        scenes = list(detect_motion(images, one, engine, batch=1, retune=retune))
+        assert len(scenes) == len(images) and any(len(scene.detections) for scene in scenes)
+
+
+def test_a_list_of_pictures_may_come_with_telemetry(tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time_s,altitude_m,speed_mps\n0,60,3\n1,60,3\n2,60,3\n")
+    scenes = list(detect_motion(film(lambda k: [(60 + 15 * k, 90)]), telemetry=read_telemetry(log)))
+    assert any(len(scene.detections) for scene in scenes)
 
 
 def test_engines_agree_on_the_targets_of_tracklets():

@@ -69,7 +69,7 @@ def detect_motion(
     Raises InputError for fewer than three frames, and for telemetry that does not overlap the source in time.
     """
     rate_hz, count = getattr(source, "rate_hz", 10.0), getattr(source, "count", None)
-    if telemetry is not None and count:
+    if telemetry is not None and isinstance(count, int) and count:  # that of a list is a method
         telemetry.check_overlap((count - 1) / rate_hz)
     detector = MotionDetector(settings, backend, rate_hz, telemetry, batch)
     live_telemetry = getattr(source, "telemetry", None)

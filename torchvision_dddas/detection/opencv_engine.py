@@ -73,8 +73,10 @@ class OpenCVView(View):
         """The view at half its resolution, grey; an odd last row or column is left out."""
         width, height = (max(side // 2, 1) for side in self.size)
         grey = cv2.resize(self.grey[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-        ignored = None if self.ignored is None else self.ignored[: 2 * height : 2, : 2 * width : 2]
-        return OpenCVView(grey, grey, ignored=ignored)
+        if self.ignored is None:
+            return OpenCVView(grey, grey)
+        share = cv2.resize(self.ignored[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        return OpenCVView(grey, grey, ignored=cv2.threshold(share, 0, 255, cv2.THRESH_BINARY)[1])
 
 
 class OpenCVEngine(Engine[OpenCVView]):
@@ -196,8 +198,7 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
     def detect(step: np.ndarray | None) -> Carried:
         points = detect_keypoints(earlier.grey, parameters, halved=parameters.halved_corners and not parameters.halved)
-        if earlier.ignored is not None:
-            points = points[earlier.ignored[tuple(points[:, ::-1].astype(int).T)] == 0]
+        points = points[_counts(points, earlier)]
         return Carried(points, step, 0, len(points), _cover(points, earlier.size))
 
     carried, earlier.carried = earlier.carried if carrying else None, None
@@ -217,9 +218,17 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
         carried = detect(None)
         found, inliers = _register_points(earlier, later, carried, parameters)
     if carrying and found.reliable:
-        step = found.later_from_earlier
+        step, inliers = found.later_from_earlier, inliers[_counts(inliers, later)]
         later.carried = replace(carried, points=inliers, step=step, age=carried.age + 1)
     return found
+
+
+def _counts(points: np.ndarray, view: OpenCVView) -> np.ndarray:
+    """(N,) bool: which points (N, 2) of a view, or just beside it, are not left out."""
+    if view.ignored is None:
+        return np.ones(len(points), bool)
+    u, v = np.clip(points.round().astype(int), 0, np.array(view.size) - 1).T
+    return view.ignored[v, u] == 0
 
 
 def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:

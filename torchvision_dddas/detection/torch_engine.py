@@ -122,7 +122,8 @@ class TorchEngine(Engine[TensorView]):
 
         def structure(window: Window[TensorView]) -> tuple[Any, ...]:
             sizes = tuple(view.size for view in window.neighbours)
-            return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px
+            ignored = id(window.reference.ignored)  # one mask for all frames of a setting
+            return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px, ignored
 
         def work(group: list[Window[TensorView]]) -> list[Foreground]:
             width, height = group[0].reference.size
@@ -149,7 +150,9 @@ class TorchEngine(Engine[TensorView]):
         settings, one, chain = self.parameters, windows[0], self.segmenter.chain()
         maps = chain.find_foreground(self.batch_of(windows))
         texture = to_bytes(maps.texture)
-        if self.components == "torch" and not uses_tracklets(settings):  # tracklets need whole maps
+        # Tracklets need whole maps; a window may still have the settings from before a change.
+        is_whole = any(uses_tracklets(window.settings or settings) for window in windows)
+        if self.components == "torch" and not is_whole:
             is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
             is_weak_wanted &= min(maps.wide.shape[-2:]) > 1
             weak = chain.find_weak(maps.wide, one.close_px) if is_weak_wanted else None
