@@ -64,6 +64,7 @@ _LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
 _MOST_PARTS, _ALIKE = 30, 0.85
 # Closings from this side on are done at half the resolution.
 _HALVED_FROM_PX = 9
+_LARGE_PX = 2**31 // 256  # a whole number of 32 bits does not hold the sum of more pixels
 _PATCH_PX = 12
 _PATCH_NOISE = 20.0  # grey levels x pixels: a patch without contrast is like nothing
 
@@ -202,7 +203,7 @@ def measure_evidence(evidence: Evidence, box: np.ndarray) -> tuple[np.ndarray, n
     for gap, picture in enumerate(evidence):
         if picture is None or not len(box):
             continue
-        table = cv2.integral(picture)
+        table = cv2.integral(picture, sdepth=cv2.CV_32S if picture.size < _LARGE_PX else cv2.CV_64F)
         (own, area), (both, whole) = _sum_boxes(table, box), _sum_boxes(table, rim)
         inside[:, gap] = own / np.maximum(area, 1) / EVIDENCE_SCALE
         around[:, gap] = (both - own) / np.maximum(whole - area, 1) / EVIDENCE_SCALE

@@ -34,6 +34,8 @@ _MAX_MISFIT = 15.0  # noise units
 # What the levels of texture and evidence maps mean: grey levels a pixel, and noise units.
 _SLOPES, _UNITS = np.arange(256) / 4, np.arange(256) / EVIDENCE_SCALE
 _DIFFERS = np.clip((_UNITS - 2) / 2, 0, 1)
+# Of more blobs in a picture the largest are judged.
+_MOST_BLOBS = 150
 # How much of the surroundings is smoothed with a blob, px.
 _PAD = 24
 _WARP_FLAGS = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -93,6 +95,8 @@ def observe(
     """
     view = window.reference
     blobs = _blobs_of(window, foreground, settings) if foreground.blobs is None else foreground.blobs
+    if uses_tracklets(settings) and len(blobs) > _MOST_BLOBS:  # each is compared with all of the looks about it
+        blobs = sorted(blobs, key=lambda blob: -blob.area_px)[:_MOST_BLOBS]
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):
         flows = flow(view.grey, foreground.warped, [blob.box for blob in blobs])

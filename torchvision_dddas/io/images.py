@@ -51,12 +51,14 @@ def read_colour_image(file: Path) -> np.ndarray:
 def read_ignored(file: Path, size: tuple[int, int]) -> np.ndarray:
     """(H, W) uint8, 255 where a picture is not black: what detection leaves out. size: (width, height) of the frames.
 
+    Black is up to a sixteenth of white, so that a JPEG, in which edges ring, leaves out what was drawn.
     Raises InputError if it cannot be read, has another size, or leaves nothing.
     """
     image = read_image(file)
     if image is None:
         raise InputError(f"{file} is not a whole picture; give a PNG of the frames' size, white where nothing counts")
-    shown = (image if image.ndim == 2 else image[:, :, :3].max(axis=2)) > 0
+    white = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1.0
+    shown = (image if image.ndim == 2 else image[:, :, :3].max(axis=2)) > white / 16
     if shown.shape[::-1] != size:
         got, wanted = (f"{width}x{height}" for width, height in (shown.shape[::-1], size))
         raise InputError(f"{file} has {got} pixels and the frames {wanted}; give a mask of the frames' size")
