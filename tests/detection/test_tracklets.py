@@ -182,7 +182,9 @@ def test_points_carried_into_a_region_that_is_left_out_are_let_go():
         view.ignored[60:120] = 255
     for pair in pairwise(views):
         assert engine.register([pair])[0].reliable
-        points = pair[1].carried.points
+        carried = pair[1].carried
+        assert carried is not None
+        points = carried.points
         rows = points[:, 1].round()
         assert len(points) > 20 and not ((rows >= 60) & (rows < 120)).any()
 
