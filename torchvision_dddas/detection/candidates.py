@@ -11,9 +11,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.chain import ellipse, halve_side
+from torchvision_dddas.chain import close_mask, ellipse, halve_side
 from torchvision_dddas.config import EVIDENCE_SCALE
-from torchvision_dddas.detection.blobs import Blob, label_parts
+from torchvision_dddas.detection.blobs import Blob, box_slices, label_parts
+from torchvision_dddas.geometry import occupied
 
 Evidence = Sequence[np.ndarray | None]
 """The maps of evidence by how far apart the compared frames are: nearest, further, widest; (H, W) uint8 or None."""
@@ -129,9 +130,10 @@ class _Silhouettes:
         core, scale, close_px = self._core(gaps, silhouette, False), 1, silhouette.close_px
         if close_px >= _HALVED_FROM_PX and min(core.shape) > 1:
             core, scale, close_px = self._core(gaps, silhouette, True), 2, halve_side(close_px)
-        if close_px > 1:
-            core = cv2.morphologyEx(core, cv2.MORPH_CLOSE, ellipse(close_px))
-        stats = label_parts(core)[1] * (scale, scale, scale, scale, scale**2)
+        core = close_mask(core, close_px)
+        # Only where something is set: most of a picture is empty.
+        found = [label_parts(core[box_slices(box)])[1] + (*box[:2], 0, 0, 0) for box in occupied(core, 2)]
+        stats = np.concatenate([np.zeros((0, 5), int), *found]) * (scale, scale, scale, scale, scale**2)
         stats = stats[stats[:, 4] >= _LEAST_AREA_PX]
         stats = stats[np.argsort(-stats[:, 4], kind="stable")[:_MOST_PARTS]]
         z = self._evidence_of(gaps)
