@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import MotionDetector
-from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, overlaps, weigh
+from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, weigh
 from torchvision_dddas.detection.observation import Target, draw_blobs, join_fragments
 from torchvision_dddas.detection.tracklet_scores import (
     TRACKLET_WEIGHTS,
@@ -30,6 +30,7 @@ from torchvision_dddas.detection.tracklet_scores import (
     score_tracklets,
 )
 from torchvision_dddas.detection.tracklets import Tracklets, follow
+from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 
 KINDS = {
     "hit": "hit", "car14": "uav", "wakeboard": "uav", "group": "uav", "person12": "person", "S0310": "uavdt",
@@ -186,8 +187,8 @@ def label(film: Film, frame: int) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(len(box)), np.zeros(len(box))
     best, around = np.zeros(len(box)), np.zeros(len(box), bool)
     if len(truth):
-        best = overlaps(box, truth).max(axis=1)
-        best[: len(drawn)] = [overlaps(part, truth).max(initial=0) for part in drawn]
+        best = iou(box, truth).max(axis=1)
+        best[: len(drawn)] = [iou(part, truth).max(initial=0) for part in drawn]
         around = _holds(box, truth[:, :2] + truth[:, 2:] / 2).any(axis=1)
     weight = np.where((best > 0.2) & (best < 0.45), 0.4, 1.0)
     weight[around & (best < 0.45)] = PARTLY
@@ -197,7 +198,7 @@ def label(film: Film, frame: int) -> tuple[np.ndarray, np.ndarray]:
         inside = ((middle[None] >= box[:, None, :2]) & (middle[None] <= box[:, None, :2] + box[:, None, 2:])).all(
             axis=2
         )
-        weight[(best < 0.1) & (inside | (overlaps(box, unsure) > 0.05)).any(axis=1)] = 0
+        weight[(best < 0.1) & (inside | (iou(box, unsure) > 0.05)).any(axis=1)] = 0
     if film.how == "one" or film.kind == "davis":  # others may move too
         weight[best < 0.05] *= 0.3
     return best, weight
@@ -279,11 +280,11 @@ def score(film: Film, found: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         for boxes, truth, unsure in zip(found, film.truth, film.unsure, strict=True):
             if truth is None:
                 continue
-            cost = overlaps(boxes, truth)
+            cost = iou(boxes, truth)
             rows, columns = linear_sum_assignment(-cost)
             middle = unsure[:, :2] + unsure[:, 2:] / 2
             own = truth[:, :2] + truth[:, 2:] / 2
-            on_unsure = (overlaps(boxes, unsure) >= 0.2).any(axis=1) | _holds(boxes, middle).any(axis=1)
+            on_unsure = (iou(boxes, unsure) >= 0.2).any(axis=1) | _holds(boxes, middle).any(axis=1)
             on_unsure &= ~_holds(boxes, own).any(axis=1)
             for least in (0.25, 0.5):
                 taken = rows[cost[rows, columns] >= least]
@@ -298,7 +299,7 @@ def score(film: Film, found: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
             continue
         if truth is None or not len(truth):
             continue
-        cost = overlaps(boxes, truth)[:, 0]
+        cost = iou(boxes, truth)[:, 0]
         labelled, other = labelled + 1, other + int((cost < 0.05).sum())
         if moves:
             n, near = n + 1, near + bool((cost >= 0.3).any())

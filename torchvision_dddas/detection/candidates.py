@@ -14,7 +14,7 @@ import numpy as np
 from torchvision_dddas.chain import close_mask, ellipse, halve_side
 from torchvision_dddas.config import EVIDENCE_SCALE
 from torchvision_dddas.detection.blobs import Blob, box_slices, label_parts
-from torchvision_dddas.geometry import occupied
+from torchvision_dddas.geometry import occupied, shared_px
 
 Evidence = Sequence[np.ndarray | None]
 """The maps of evidence by how far apart the compared frames are: nearest, further, widest; (H, W) uint8 or None."""
@@ -234,9 +234,7 @@ def _first_of_alike(box: np.ndarray, always: int) -> np.ndarray:
 
 def overlaps(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """(N, M) IoU of boxes (N, 4) and (M, 4) x, y, width, height."""
-    low = np.maximum(one[:, None, :2], other[None, :, :2])
-    high = np.minimum(one[:, None, :2] + one[:, None, 2:], other[None, :, :2] + other[None, :, 2:])
-    both = np.prod(np.maximum(high - low, 0), axis=2)
+    both = shared_px(one[:, None], other)
     either = np.prod(one[:, 2:], axis=1)[:, None] + np.prod(other[:, 2:], axis=1)[None] - both
     return both / np.maximum(either, 1e-9)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from torchvision_dddas.detection.candidates import Candidates, overlaps, weigh
 from torchvision_dddas.detection.tracklets import Tracklets
+from torchvision_dddas.geometry import shared_px
 
 TRACKLET_WEIGHTS = {
     "own": 0.246,
@@ -100,10 +101,8 @@ def choose(
     order = np.argsort(-rank, kind="stable")
     order = order[(scores + worth * lasts)[order] > accept]
     box = box[order]
-    low, high = box[:, None, :2], box[:, None, :2] + box[:, None, 2:]
-    shared = np.maximum(np.minimum(high, high.swapaxes(0, 1)) - np.maximum(low, low.swapaxes(0, 1)), 0).prod(axis=2)
     area = box[:, 2:].prod(axis=1)
-    covers = shared > _COVERED * np.minimum(area[:, None], area)
+    covers = shared_px(box[:, None], box) > _COVERED * np.minimum(area[:, None], area)
     free = np.ones(len(order), bool)
     chosen: list[int] = []
     for place in range(len(order)):
