@@ -1,7 +1,7 @@
 """Learn the weights by which tracklets are judged, and measure them on kinds of clips that were left out.
 
-A kind of clips (HIT-UAV, UAV123, UAVDT, DTB70, BMS, DAVIS, clips where nothing moves) is scored with weights and
-limits that were learned on all others. `learn` prints the weights for `detection/tracklet_scores.py`.
+The clips of a data set (HIT-UAV, UAV123, UAVDT, DTB70, BMS, DAVIS) are scored with weights that were learned on all
+others. `learn` prints the weights for `detection/tracklet_scores.py`.
 """
 
 import json
@@ -9,6 +9,7 @@ import pickle
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from torchvision_dddas.detection import MotionDetector
 from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, weigh
 from torchvision_dddas.detection.observation import Target, draw_blobs, join_fragments
 from torchvision_dddas.detection.tracklet_scores import (
+    PERSISTENT,
     TRACKLET_WEIGHTS,
     choose,
     describe_tracklets,
@@ -33,10 +35,10 @@ from torchvision_dddas.detection.tracklets import Tracklets, follow
 from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 
 KINDS = {
-    "hit": "hit", "car14": "uav", "wakeboard": "uav", "group": "uav", "person12": "person", "S0310": "uavdt",
-    "Mountain": "dtb", "bms": "bms", "davis": "davis", "boat1": "still", "building4": "still", "sim": "sim",
+    "hit": "hit", "car14": "uav123", "wakeboard": "uav123", "group": "uav123", "uav123": "uav123", "S0310": "uavdt",
+    "Mountain": "dtb70", "bms": "bms", "davis": "davis",
 }  # fmt: skip
-"""By a part of a clip's name."""
+"""The data set of a clip, by a part of its name; all clips of a data set are left out together."""
 
 SETTINGS = Settings()
 JOINED_PX = 1.5 * SETTINGS.morphology.close_px
@@ -72,7 +74,6 @@ class Film:
     """
 
     name: str
-    kind: str
     how: str
     frames: int
     looks: dict[int, Look]
@@ -81,6 +82,11 @@ class Film:
     unsure: list[np.ndarray]
     moves: list[bool]
     plain: list[np.ndarray]
+
+    @property
+    def kind(self) -> str:
+        """Its data set."""
+        return next((kind for part, kind in KINDS.items() if part in self.name), "other")
 
 
 class _Recorder(MotionDetector):
@@ -119,14 +125,13 @@ def record(case: tuple[Path, int]) -> Film:
     images = [cv2.imread(str(path)) for path in pictures]
     scenes = [scene for image in images for scene in detector.update(image)] + detector.flush()
     repeats = {scene.frame.number - 1: scene.repeats - 1 for scene in scenes if scene.repeats}
-    kind = next((kind for part, kind in KINDS.items() if part in place.name), "other")
     name = place.name if every == 1 else f"{place.name}@{every}"
     how, truth, unsure, moves = read_truth(place, every, pictures)
     plain = []
     for i in range(len(images)):  # each frame and its next two; the last two look back
         step = 1 if i + 2 < len(images) else -1
         plain.append(plain_chain.plain_window(images[i], images[i + step], images[i + 2 * step])[1])
-    return Film(name, kind, how, len(pictures), detector.looks, repeats, truth, unsure, moves, plain)
+    return Film(name, how, len(pictures), detector.looks, repeats, truth, unsure, moves, plain)
 
 
 def read_truth(
@@ -251,7 +256,9 @@ def describe(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[
 # -- scoring -----------------------------------------------------------------------------------------------------------
 
 
-def detect(film: Film, weights: Weights | None, accept: float) -> list[np.ndarray]:
+def detect(
+    film: Film, weights: Weights | None, accept: float = 0.0, persistent: float = PERSISTENT
+) -> list[np.ndarray]:
     """The boxes of every frame by the detector's rule; without weights, those of the persistent blobs alone."""
     found = []
     for frame in range(film.frames):
@@ -264,7 +271,7 @@ def detect(film: Film, weights: Weights | None, accept: float) -> list[np.ndarra
         else:
             seen = seen_by(film, source, weights[0])
             scores = score_tracklets(seen.pop(0), look.tracklets, seen, weights[1])
-            chosen = choose(look.candidates.box_px, scores, look.persistent, accept, JOINED_PX)
+            chosen = choose(look.candidates.box_px, scores, look.persistent, accept, JOINED_PX, persistent)
         boxes = [look.drawn[i] if i < len(look.drawn) else look.candidates.box_px[i : i + 1] for i in chosen]
         small = look.small
         if len(small) and boxes:
@@ -376,10 +383,10 @@ def learn(options: bench.Options) -> tuple[str, Any]:
     left_out = {kind: learn_weights([f for f in films if f.kind != kind]) for kind in sorted({f.kind for f in films})}
     rows: dict[str, dict[str, float]] = {}
     rows["plain OpenCV chain"] = summarize(films, {film.name: film.plain for film in films})
-    rows["blobs alone"] = summarize(films, {film.name: detect(film, None, 0.0) for film in films})
-    for accept in options.accept:
-        found = {film.name: detect(film, left_out[film.kind], accept) for film in films}
-        rows[f"tracklets above {accept:g}"] = summarize(films, found)
+    rows["blobs alone"] = summarize(films, {film.name: detect(film, None) for film in films})
+    for accept, persistent in product(options.accept, options.persistent):
+        found = {film.name: detect(film, left_out[film.kind], accept, persistent) for film in films}
+        rows[f"tracklets above {accept:g}, persistence {persistent:g}"] = summarize(films, found)
     measures = next(iter(rows.values()))
     text = bench.format_table(["measure", *rows], [[m, *(f"{row[m]:.2f}" for row in rows.values())] for m in measures])
     weights = [{name: round(value, 3) for name, value in part.items()} for part in learn_weights(films)]
@@ -388,5 +395,12 @@ def learn(options: bench.Options) -> tuple[str, Any]:
 
 
 if __name__ == "__main__":
-    options = {"data": Path, "--every": [1, 4], "--accept": [SETTINGS.tracklets.accept], "--keep": "", "--jobs": 2}
+    options = {
+        "data": Path,
+        "--every": [1, 4],
+        "--accept": [SETTINGS.tracklets.accept],
+        "--persistent": [PERSISTENT],
+        "--keep": "",
+        "--jobs": 2,
+    }
     bench.main(__doc__, {"learn": (learn, options)})

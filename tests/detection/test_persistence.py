@@ -8,7 +8,7 @@ import pytest
 from torchvision_dddas.config import PersistenceParameters, SmallParameters
 from torchvision_dddas.detection.blob_motion import Motion
 from torchvision_dddas.detection.blobs import Blob
-from torchvision_dddas.detection.persistence import Sighting, SmallTracks, find_candidates, find_persistent
+from torchvision_dddas.detection.persistence import Sighting, SmallTracks, find_persistent, find_small_boxes
 
 SIZE = (640, 480)
 # The flow test for every blob, however few there are.
@@ -133,8 +133,8 @@ def test_a_few_misses_are_bridged_and_more_end_the_track():
 
 
 def test_candidates_are_gated_by_area_box_and_number(painted):
-    assert find_candidates(painted((101, 67), (5, 5, 3, 3), (20, 5, 4, 3), (40, 5, 60, 60)), SMALL) == [(20, 5, 4, 3)]
-    assert find_candidates(painted((101, 67)), SMALL) == []
+    assert find_small_boxes(painted((101, 67), (5, 5, 3, 3), (20, 5, 4, 3), (40, 5, 60, 60)), SMALL) == [(20, 5, 4, 3)]
+    assert find_small_boxes(painted((101, 67)), SMALL) == []
     mask = painted((200, 40), *((16 * k + 2, 10, 5, 5) for k in range(12)))
-    found = [len(find_candidates(mask, SmallParameters(max_candidates=most))) for most in (12, 11)]
+    found = [len(find_small_boxes(mask, SmallParameters(max_candidates=most))) for most in (12, 11)]
     assert found == [12, 0]

@@ -32,7 +32,8 @@ class Silhouette(NamedTuple):
     close_px: int
 
 
-# Chosen one after the other so that some part overlaps a target, on all kinds of clips (`python eval/tracklets.py`).
+# Of nine silhouettes that a prototype chose one after the other, so that some part overlaps each target of the open
+# clips, these six lose the least.
 SILHOUETTES = (
     Silhouette((0, 1), 3.5, 3, 1),
     Silhouette((0, 1), 2.5, 3, 15),
@@ -53,11 +54,11 @@ LOOK_WEIGHTS = {
 }
 """Weights of what one look shows, see `describe_look`."""
 
-# Added to evidence before its logarithm, noise units; and that of surroundings than which none are judged quieter: the
-# clips of which the weights were learned have some noise, and pictures without any must not count as unlike them.
+# _LEAST_EVIDENCE is added to evidence before its logarithm is taken. Surroundings count as restless as _QUIET at least:
+# the weights were learned on clips with noise, and a picture without noise must not be judged worse for that.
 _LEAST_EVIDENCE = 0.5
 _QUIET = np.log(_LEAST_EVIDENCE + 0.7)
-# Candidates with a smaller score, and all but the likeliest so many, are left out: no tracklet of them is a target.
+# Candidates with a smaller score, and all but the likeliest so many, are left out, since following them takes time.
 _LEAST_SCORE, _MOST_CANDIDATES = -3.0, 60
 
 _LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
@@ -98,9 +99,8 @@ def find_candidates(evidence: Evidence, grey: np.ndarray, blobs: Sequence[Blob])
     found = [np.array([[*blob.box, blob.mask.mean(), blob.peak / EVIDENCE_SCALE, -1] for blob in blobs]).reshape(-1, 7)]
     silhouettes = _Silhouettes(evidence)
     for index, silhouette in enumerate(SILHOUETTES):
-        if (made := silhouettes.parts(silhouette)) is not None:
-            rows = made
-            found.append(np.c_[rows, np.full(len(rows), index)])
+        if (parts := silhouettes.parts(silhouette)) is not None:
+            found.append(np.c_[parts, np.full(len(parts), index)])
     rows = np.concatenate(found)
     rows = rows[_first_of_alike(rows[:, :4], len(blobs))]
     box = rows[:, :4].astype(int)

@@ -33,7 +33,7 @@ from torchvision_dddas.detection.observation import (
     observe,
 )
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-from torchvision_dddas.detection.persistence import SmallTracks, find_candidates
+from torchvision_dddas.detection.persistence import SmallTracks, find_small_boxes
 from torchvision_dddas.detection.repeats import RepeatRule
 from torchvision_dddas.detection.tracklet_scores import PERSISTENT, PERSISTENT_SIZED, choose, score_tracklets
 from torchvision_dddas.detection.tracklets import LOOKS_AFTER, LOOKS_BEFORE, follow
@@ -351,7 +351,7 @@ class MotionDetector:
     def _follow_small(self, index: int) -> None:
         start, observation, boxes = time.perf_counter(), self._buffer[index].observation, []
         if observation.foreground is not None and observation.foreground.small is not None:
-            boxes = find_candidates(observation.foreground.small, self.settings.small)
+            boxes = find_small_boxes(observation.foreground.small, self.settings.small)
             observation.foreground = replace(observation.foreground, small=None)  # not needed again
         self._small_tracks.step(index, self._buffer.this_from_last(index), boxes)
         self._buffer[index].seconds["small"] = time.perf_counter() - start

@@ -141,7 +141,7 @@ class SmallTrack:
     confirmed: bool = False
 
 
-def find_candidates(small: np.ndarray, parameters: SmallParameters) -> list[Box]:
+def find_small_boxes(small: np.ndarray, parameters: SmallParameters) -> list[Box]:
     """Boxes of the candidates in a (H, W) uint8 mask; none at all where there are too many to tell them apart."""
     boxes: list[Box] = []
     for part in occupied(small, 2):

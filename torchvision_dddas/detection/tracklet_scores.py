@@ -29,12 +29,13 @@ TRACKLET_WEIGHTS = {
 PERSISTENT, PERSISTENT_SIZED = 3.0, 4.0
 """What a blob that persists, by its links and its flow, has beyond the score of its tracklet.
 
-The second one where telemetry tells that it has the size and the speed of a target. The first is chosen by
-`eval/tracklets.py`, the second so that faint targets of the simulator stay.
+The second value holds where telemetry shows that the blob has the size and the speed of a target. The first value is
+chosen by `python eval/tracklets.py learn DATA --persistent 2 3 4`, the second so that faint simulated targets stay.
 """
 
 _LEAST_HITS, _LEAST_TRAVEL_PX = 2, 1.0
 _SCORE_BOUNDS = (-8.0, 6.0)
+# Of two boxes that share more than this part of the smaller one, one is chosen; two with a larger IoU are the same.
 _COVERED, _SAME = 0.3, 0.5
 
 
