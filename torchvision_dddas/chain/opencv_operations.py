@@ -19,7 +19,7 @@ _STRIP_ROWS = 64
 _SETTLED_LEVELS = 0.1
 _LEAST_PIXELS = 100
 _LEVELS = np.arange(256)
-# The noise of a picture is measured by region, on every so-manyth row and column.
+# Noise is measured in regions of this side; of each region every SAMPLED-th row and column is used.
 REGION_PX, SAMPLED = 64, 4
 
 Light = tuple[float, float]

@@ -107,7 +107,7 @@ def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments
 
 
 def print_lines(lines: Sequence[str], quiet: bool = False) -> None:
-    """Print what a command reports at its end, unless --quiet was given."""
+    """Print the lines that end a command, unless --quiet was given."""
     for line in () if quiet else lines:
         echo(line)
 

@@ -62,11 +62,11 @@ _QUIET = np.log(_LEAST_EVIDENCE + 0.7)
 _LEAST_SCORE, _MOST_CANDIDATES = -3.0, 60
 
 _LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
-# Of each silhouette the largest so many parts; parts of one look that overlap more than this are one.
+# At most so many parts of a silhouette are kept, the largest ones. Two parts with a larger IoU than this are one.
 _MOST_PARTS, _ALIKE = 30, 0.85
 # Closings from this side on are done at half the resolution.
 _HALVED_FROM_PX = 9
-_LARGE_PX = 2**31 // 256  # a whole number of 32 bits does not hold the sum of more pixels
+_LARGE_PX = 2**31 // 256  # the sum of more pixels does not fit into 32 bits
 _PATCH_PX = 12
 _PATCH_NOISE = 20.0  # grey levels x pixels: a patch without contrast is like nothing
 

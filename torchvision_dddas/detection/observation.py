@@ -34,7 +34,7 @@ _MAX_MISFIT = 15.0  # noise units
 # What the levels of texture and evidence maps mean: grey levels a pixel, and noise units.
 _SLOPES, _UNITS = np.arange(256) / 4, np.arange(256) / EVIDENCE_SCALE
 _DIFFERS = np.clip((_UNITS - 2) / 2, 0, 1)
-# Of more blobs in a picture the largest are judged.
+# At most so many blobs of a picture are judged, the largest ones.
 _MOST_BLOBS = 150
 # How much of the surroundings is smoothed with a blob, px.
 _PAD = 24
@@ -48,7 +48,7 @@ _COLOURS_ALIKE = 0.1
 _GROUNDS_ALIKE = 12
 # If less than this share of the mask is left, the target itself is dark.
 _LEAST_LEFT = 0.35
-# Parts smaller than this share of the largest one left go with the shadow.
+# When a shadow is removed, so are parts of the mask that are smaller than this share of its largest part.
 _CRUMB = 0.15
 
 
@@ -95,7 +95,7 @@ def observe(
     """
     view = window.reference
     blobs = _blobs_of(window, foreground, settings) if foreground.blobs is None else foreground.blobs
-    if uses_tracklets(settings) and len(blobs) > _MOST_BLOBS:  # each is compared with all of the looks about it
+    if uses_tracklets(settings) and len(blobs) > _MOST_BLOBS:  # each is compared with all candidates of six looks
         blobs = sorted(blobs, key=lambda blob: -blob.area_px)[:_MOST_BLOBS]
     motions: list[Motion] = []
     if blobs and (settings.persistence.on or settings.refine.on):

@@ -24,7 +24,7 @@ _MEMORY_FRAMES = 30
 # It has travelled when it has gone so many of its own lengths, and more of them for each other candidate in the frame:
 # clutter, parallax above all, drifts too.
 _LENGTHS, _LENGTHS_EACH = 0.25, 0.005
-# Where tracklets find the others, it must have left its own place: on open clips all that moved less were false.
+# Where tracklets are used too, it must have left its own place: on the open clips, slower ones were all false.
 _LENGTHS_BESIDE_TRACKLETS = 1.0
 
 

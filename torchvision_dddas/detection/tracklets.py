@@ -17,11 +17,11 @@ from torchvision_dddas.geometry import transfer
 
 LOOKS_BEFORE, LOOKS_AFTER = 4, 2
 
-# Guesses of a velocity: how many looks away, and the best so many candidates there.
+# Velocities are guessed from other looks: their offsets, and how many candidates are taken there, the best ones.
 _GUESSES = ((1, 3), (-1, 3), (3, 1), (-3, 1))
-# A step of a guess is at most so many diagonals of the box and pixels long.
+# The longest step that is guessed: in diagonals of the box, plus some pixels.
 _LONGEST_STEP, _LONGEST_STEP_PX = 2.5, 4.0
-# How exactly a box's centre is known: this share of its side, and pixels.
+# The standard deviation of the centre of a box is this share of its side, plus some pixels.
 _CENTRE_SHARE, _CENTRE_PX = 0.10, 0.7
 # Squared distance from the line, in units of its own spread, that a link may have.
 _LINE_GATE = 9.0

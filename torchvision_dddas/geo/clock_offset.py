@@ -53,7 +53,7 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
 
 
 def logged_turns(telemetry: Telemetry, elevation: Elevation | None = None) -> Float[np.ndarray, "N 3"]:
-    """The turn of the camera from the sample before as level ground shows it: that of the vehicle's motion counts too.
+    """How far level ground seems to turn between two samples of the log: by the camera's turn and by its motion.
 
     telemetry: in local metres. Angles about right, down and forward, rad; NaN where unknown.
     """

@@ -184,7 +184,7 @@ class BiasFilter:
         return replace(self, mean=mean, covariance=covariance)
 
     def rows_of(self, wanted: np.ndarray) -> np.ndarray:
-        """The rows of the two errors of each wanted landmark."""
+        """(2 K,) rows of mean and covariance that hold the two position errors of each of K wanted landmarks."""
         row = {identity: 7 + 2 * k for k, identity in enumerate(self.ids.tolist())}
         return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)
 

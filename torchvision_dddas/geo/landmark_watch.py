@@ -39,7 +39,7 @@ class WatchedScene:
 
 
 def without_pixels(landmarks: Landmarks) -> Landmarks:
-    """The landmarks without their pixels in the table, for search by colour."""
+    """A copy whose image places are unknown (NaN), so that the landmarks are searched by colour."""
     return replace(landmarks, image_px=np.full_like(landmarks.image_px, np.nan))
 
 
@@ -130,8 +130,8 @@ class LandmarkWatch:
         seen = self._tracker.update(scene.frame.number, masks, scene.detections, scene.mask, step, expected, length)
         pixels, by = np.full((len(marks), 2), np.nan), np.full(len(marks), "", "<U6")
         pixels[rows], by[rows] = seen.image_px[colour], np.array(seen.by, "<U6")[colour]
-        # Of a vehicle that is slow in the picture often a part alone is seen to move, and its centre is not the
-        # vehicle's: where the colour is clearly nearer to where the landmark is expected, it counts.
+        # Often only a part of a slow vehicle is seen to move, and the centre of that part is not the vehicle's. The
+        # place of the colour is taken where it is clearly nearer to the expected place of the landmark.
         worn = np.full((len(marks), 2), np.nan)
         worn[rows] = seen.colour_px[colour]
         off, colour_off = (np.linalg.norm(at - should_px, axis=1) for at in (pixels, worn))

@@ -168,7 +168,7 @@ def describe_too_few(frame: int, n: int, without: str = "") -> str:
 
 
 def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
-    """Why landmarks on one line, or shown in one spot, allow no fix, in words; empty where they are spread out."""
+    """In words, why landmarks allow no fix: they lie on one line or in one spot. Empty where they are spread out."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
     wide = relative_width(marks)

@@ -16,7 +16,7 @@ from torchvision_dddas.types import Camera, CameraPose, Elevation, Float
 
 # A point whose depth is a smaller share of its distance is beside or behind the camera.
 _NEAREST = 1e-6
-# Distance over which heights are compared for a slope.
+# A slope is measured between two points that lie this far apart.
 _SLOPE_M = 0.5
 # A ray is searched this many times as deep as the ground lies below the camera, in so many steps, then halvings.
 _REACH, _SAMPLES, _HALVINGS = 4.0, 96, 14

@@ -74,7 +74,7 @@ class Scene:
         self._steps.extend((distance[mutual, partner] / (before_px[mutual, 3] * gap)).tolist())
         self._changes.extend(np.abs(np.log(now_px[partner, 3] / before_px[mutual, 3])).tolist())
         if (known := len(self._steps)) >= _LEAST_STEPS:
-            # Boxes that are not exact change in size as they seem to move: that part is no step.
+            # Inexact boxes change in size and seem to move by about as much: this part of the distance is noise.
             seen, noise = sorted(self._steps)[(3 * known) // 4], _NOISE * sorted(self._changes)[known // 2]
             usual = max(1.25 * math.sqrt(max(seen**2 - noise**2, (_LEAST_SHARE * seen) ** 2)), _LEAST_STEP)
             share = known / (known + _PRIOR_STEPS)

@@ -113,7 +113,8 @@ def newborn_scores(look: Look, parameters: TrackParameters, velocities: np.ndarr
     count = len(velocities) - 1
     share = _AS_NEIGHBOURS[0] * count / (count + 2)  # few neighbours say little
     other = (1 - share) / (_AT_REST[0] + _ANYHOW[0])
-    # At rest, anyhow, and as each neighbour: velocities, and standard deviations in steps.
+    # A track stays at rest, moves at any velocity, or moves as one of its neighbours. Each case has a place and a
+    # standard deviation, in steps.
     place = state[..., :2] + velocities[[0, *range(count + 1)]] * gap[..., None]
     spread = [_AT_REST[1] * step, _ANYHOW[1] * step, *[_AS_NEIGHBOURS[1] * step] * count]
     variance = noise + functions.stack(spread) ** 2

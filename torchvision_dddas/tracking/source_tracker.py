@@ -196,11 +196,11 @@ def _share(smaller: np.ndarray, larger: np.ndarray) -> np.ndarray:
 
 
 def scale_histograms(affinity: Float[np.ndarray, "..."], scale: float) -> Float[np.ndarray, "..."]:
-    """A copy in which real targets are as dissimilar as `scale` times before; a dummy's entries stay.
+    """A copy in which the dissimilarity of real targets is multiplied by `scale`; entries with a dummy do not change.
 
-    In the source's Fig. 6 accuracy no longer changes from a threshold of 0.4 on: no true link is cut there. Histograms
-    of 3 x 256 bins compared as printed are more dissimilar than 0.4 in 42 % of the true links of PETS09-S2L1 and 7 % of
-    TUD-Stadtmitte, five frames apart, so the source's scale must have been another.
+    In Fig. 6 of the source the accuracy does not change for thresholds above 0.4, so no true link is cut there. As
+    printed, histograms of 3 x 256 bins differ by more than 0.4 in 42 % of the true links of PETS09-S2L1 and in 7 % of
+    those of TUD-Stadtmitte, five frames apart. The source must therefore have used another scale.
     """
     scaled = np.array(affinity, float)
     real = np.index_exp[1:] * scaled.ndim

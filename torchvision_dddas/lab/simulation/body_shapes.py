@@ -147,7 +147,7 @@ def _pose(
 
     turns = [2 * np.pi * (phase + half) for half in (0.0, 0.5)]
     thighs = [swing * np.sin(turn) + 0.02 for turn in turns]
-    # The knee bends while its leg comes forward.
+    # A knee bends while its leg swings forward.
     shins = [
         thigh - 0.08 - 1.6 * swing * np.maximum(np.cos(turn), 0) ** 2 for thigh, turn in zip(thighs, turns, strict=True)
     ]

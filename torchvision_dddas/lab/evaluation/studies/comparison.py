@@ -92,7 +92,7 @@ def _compare_task(pairs: Pairs) -> dict[str, Any]:
     of_clips = [entry for clip in clips.values() for _, _, entry in entries_of(clip)]
     of_pooled = [entry for _, _, entry in entries_of(pooled)]
     for entries, way in ((of_clips, "over_frames"), (of_pooled, "over_clips"), (of_pooled, "over_frames")):
-        # All entries that are tested together are corrected together.
+        # Holm's correction covers all p-values of one kind of test.
         effects = [entry[way] for entry in entries if entry[way] is not None]
         adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(effects)})
         for i, one in enumerate(effects):
