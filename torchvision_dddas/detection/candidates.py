@@ -6,12 +6,13 @@ apart, faint ones a low threshold. Which of these parts are targets is decided l
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.chain import close_mask, ellipse, halve_side
+from torchvision_dddas.chain import OpenCVOperations, close_mask, ellipse, halve_side
 from torchvision_dddas.config import EVIDENCE_SCALE
 from torchvision_dddas.detection.blobs import Blob, box_slices, label_parts
 from torchvision_dddas.geometry import occupied, shared_px
@@ -66,6 +67,7 @@ _LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
 _MOST_PARTS, _ALIKE = 30, 0.85
 # Closings from this side on are done at half the resolution.
 _HALVED_FROM_PX = 9
+_HALF_SET = 60  # level of a halved mask: one of its four pixels is set, or more
 _LARGE_PX = 2**31 // 256  # the sum of more pixels does not fit into 32 bits
 _PATCH_PX = 12
 _PATCH_NOISE = 20.0  # grey levels x pixels: a patch without contrast is like nothing
@@ -118,18 +120,19 @@ class _Silhouettes:
     """The silhouettes of one look's evidence, which share their steps."""
 
     def __init__(self, evidence: Evidence) -> None:
-        self.evidence = evidence
+        self.evidence = {gap: picture for gap, picture in enumerate(evidence) if picture is not None}
         self._largest: dict[tuple[int, ...], np.ndarray] = {}
-        self._cores: dict[tuple[tuple[int, ...], float, int, bool], np.ndarray] = {}
+        self._cores: dict[tuple[tuple[int, ...], float, int], np.ndarray] = {}
 
     def parts(self, silhouette: Silhouette) -> np.ndarray | None:
         """(N, 6) x, y, width, height, fill, peak in noise units of its connected parts; None: no map shows it."""
-        gaps = tuple(gap for gap in silhouette.gaps if self.evidence[gap] is not None)
+        gaps = tuple(gap for gap in silhouette.gaps if gap in self.evidence)
         if not gaps:
             return None
-        core, scale, close_px = self._core(gaps, silhouette, False), 1, silhouette.close_px
+        core, scale, close_px = self._core(gaps, silhouette), 1, silhouette.close_px
         if close_px >= _HALVED_FROM_PX and min(core.shape) > 1:
-            core, scale, close_px = self._core(gaps, silhouette, True), 2, halve_side(close_px)
+            core = cv2.threshold(OpenCVOperations().halve(core), _HALF_SET, 255, cv2.THRESH_BINARY)[1]
+            scale, close_px = 2, halve_side(close_px)
         core = close_mask(core, close_px)
         # Only where something is set: most of a picture is empty.
         found = [label_parts(core[box_slices(box)])[1] + (*box[:2], 0, 0, 0) for box in occupied(core, 2)]
@@ -143,29 +146,15 @@ class _Silhouettes:
 
     def _evidence_of(self, gaps: tuple[int, ...]) -> np.ndarray:
         if gaps not in self._largest:
-            largest: np.ndarray | None = None
-            for gap in gaps:
-                picture = self.evidence[gap]
-                assert picture is not None
-                largest = picture if largest is None else cv2.max(largest, picture)
-            assert largest is not None
-            self._largest[gaps] = largest
+            self._largest[gaps] = reduce(cv2.max, [self.evidence[gap] for gap in gaps])
         return self._largest[gaps]
 
-    def _core(self, gaps: tuple[int, ...], silhouette: Silhouette, halved: bool) -> np.ndarray:
-        key = gaps, silhouette.threshold, silhouette.erode_px, halved
+    def _core(self, gaps: tuple[int, ...], silhouette: Silhouette) -> np.ndarray:
+        key = gaps, silhouette.threshold, silhouette.erode_px
         if key not in self._cores:
-            if halved:
-                whole = self._core(gaps, silhouette, False)
-                height, width = (side // 2 for side in whole.shape)
-                half = cv2.resize(whole[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
-                core = cv2.threshold(half, 60, 255, cv2.THRESH_BINARY)[1]
-            else:
-                z = self._evidence_of(gaps)
-                core = cv2.threshold(z, int(silhouette.threshold * EVIDENCE_SCALE), 255, cv2.THRESH_BINARY)[1]
-                if silhouette.erode_px > 1:
-                    core = cv2.erode(core, ellipse(silhouette.erode_px))
-            self._cores[key] = core
+            z, level = self._evidence_of(gaps), int(silhouette.threshold * EVIDENCE_SCALE)
+            core = cv2.threshold(z, level, 255, cv2.THRESH_BINARY)[1]
+            self._cores[key] = cv2.erode(core, ellipse(silhouette.erode_px)) if silhouette.erode_px > 1 else core
         return self._cores[key]
 
 

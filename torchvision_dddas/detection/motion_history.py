@@ -55,7 +55,7 @@ class MotionHistory:
         self._painted: np.ndarray | None = None
 
     def move(self, number: int, this_from_last: np.ndarray | None) -> None:
-        """Align the history to a frame. this_from_last: (3, 3) registration from the last one; None, at a cut, clears it."""
+        """Align the history to a frame. this_from_last: (3, 3) from the frame before; None, at a cut, clears it."""
         self.number = number
         self._painted = None
         if this_from_last is None:
