@@ -4,9 +4,9 @@ PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-EXTRAS := torch,video,telemetry,elevation,export,train,tune,distributed,parquet,dev
+EXTRAS := torch,video,telemetry,elevation,grid,photos,export,train,tune,distributed,parquet,docs,dev
 
-.PHONY: demo test test-all lint quick oldest onboard peers figures gpu
+.PHONY: demo test test-all test-python lint quick oldest onboard dist docs tutorials peers figures gpu
 
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
@@ -17,12 +17,26 @@ test: lint quick
 quick: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
-# The quick tests with the oldest release of each dependency that pyproject.toml admits.
+# The quick tests of the rooms that call on dependencies most, with the oldest release of each that pyproject.toml admits.
+OLDEST := chain detection functional geometry io nn people
 oldest:
 	test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check uv
 	VIRTUAL_ENV=.venv-oldest .venv-oldest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EXTRAS)]'
-	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
+	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu" \
+		$(OLDEST:%=tests/%)
+
+# What a change needs, with each Python from 3.11 to 3.13 that is installed; those of pyenv are not on the path.
+OTHERS ?= 3.11 3.12 3.13
+test-python:
+	@for version in $(OTHERS); do \
+		for python in "$$(command -v python$$version)" "$${PYENV_ROOT:-$$HOME/.pyenv}"/versions/$$version.*/bin/python; do \
+			if "$$python" -c '' 2> /dev/null; then \
+				$(MAKE) test PYTHON="$$python" VENV=.venv-$$version || exit; continue 2; \
+			fi; \
+		done; \
+		echo "no Python $$version: its tests are left out" >&2; \
+	done
 
 # Everything: the slow tests, those in a browser, and the install without torch too.
 test-all: test onboard
@@ -48,13 +62,36 @@ onboard: .venv-onboard/.installed
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check .
 	@touch $@
 
-# Tables of the documents from the results that studies keep in docs/results: none of their figures is typed.
+# The files of a release, in dist/, as a package index wants them.
+dist: .venv-dist/.installed
+	rm -rf dist
+	.venv-dist/bin/python -m build --outdir dist .
+	.venv-dist/bin/twine check --strict dist/*
+	.venv-dist/bin/check-wheel-contents dist/*.whl
+
+.venv-dist/.installed: Makefile
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check build twine check-wheel-contents
+	@touch $@
+
+# The site of docs/, in build/site; it needs no network. A warning, such as a link that leads nowhere, is an error.
+docs: $(STAMP)
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
+
+# Run the ten tutorials and take over the pictures that they make.
+tutorials: $(STAMP)
+	for script in docs/tutorials/*.py; do \
+		mkdir -p build/tutorials/$$(basename $$script .py) && cd build/tutorials/$$(basename $$script .py) && \
+		PATH="$(abspath $(BIN)):$$PATH" MPLBACKEND=agg $(abspath $(BIN))/python $(CURDIR)/$$script && \
+		cp $$(basename $$script .py).??g $(CURDIR)/docs/tutorials/ && cd $(CURDIR) || exit 1; done
+
+# Tables of the documents from the results that studies keep in eval/results: none of their figures is typed.
 figures: $(STAMP)
 	$(BIN)/python eval/figures.py
 
 # Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
 # tracking measures TrackEval's? With DATA, a folder of sequences with identities: on them as well, and how well do we
-# keep identities beside the other trackers? WRITE=docs/results/identities.json keeps that; what the peers got is kept in
+# keep identities beside the other trackers? WRITE=eval/results/identities.json keeps that; what the peers got is kept in
 # the file KEEP and not measured again while tables and settings are the same.
 peers: $(STAMP) .venv-peers/.installed .venv-norfair/.installed
 	$(BIN)/python eval/peers/check.py $(DATA)

@@ -1,16 +1,14 @@
 """What all studies share: options, results as JSON, tables, timing in turns, the machine and its load.
 
 A study is a function that takes its options and returns Markdown text and figures. `main` runs one from the command
-line: it prints the text, and with `--write docs/results/NAME.json` keeps text and figures with the command, the date,
+line: it prints the text, and with `--write eval/results/NAME.json` keeps text and figures with the command, the date,
 the revision and the machine. `eval/figures.py` puts the text between the marks NAME of the documents.
 """
 
 import argparse
-import functools
 import gc
 import json
 import os
-import platform
 import resource
 import subprocess
 import sys
@@ -18,7 +16,6 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from datetime import date
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +23,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # idle torch threads must n
 
 import numpy as np
 
+from torchvision_dddas.lab.benchmark import describe_machine
+from torchvision_dddas.lab.benchmark import format_table as format_table
+from torchvision_dddas.lab.benchmark import machine_words as machine_words
+
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "docs" / "results"
-LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "torch", "kornia")
+RESULTS = ROOT / "eval" / "results"
 
 Options = argparse.Namespace
 Study = Callable[[Options], tuple[str, Any]]
@@ -82,7 +82,7 @@ def _add_options(parser: argparse.ArgumentParser, options: Mapping[str, Any]) ->
             parser.add_argument(flag, nargs="*", type=type(default[0]) if default else str, default=list(default))
         else:
             parser.add_argument(flag, type=type(default), default=default)
-    parser.add_argument("--write", type=Path, help="keep text and figures in this JSON, usually docs/results/NAME.json")
+    parser.add_argument("--write", type=Path, help="keep text and figures in this JSON, usually eval/results/NAME.json")
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -118,7 +118,7 @@ def _plain(value: Any) -> Any:
 
 
 def read_result(name: str) -> dict[str, Any]:
-    """Content of docs/results/NAME.json."""
+    """Content of eval/results/NAME.json."""
     content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return content
 
@@ -172,12 +172,6 @@ def revision() -> str:
     except (OSError, subprocess.CalledProcessError):
         return ""
     return short + "+" * bool(dirty)
-
-
-def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> str:
-    """Markdown table; the first `words` columns are text, the others numbers set to the right."""
-    align = ["---"] * words + ["---:"] * (len(head) - words)
-    return "\n".join("| " + " | ".join(map(str, cells)) + " |" for cells in (head, align, *rows))
 
 
 # -- statistics ------------------------------------------------------------------------------------------------------
@@ -306,32 +300,6 @@ def read_memory(pid: int) -> tuple[float, float] | None:
 
 
 # -- the machine -----------------------------------------------------------------------------------------------------
-
-
-@functools.cache
-def describe_machine() -> dict[str, Any]:
-    """Processor, cores, Python and the versions of libraries."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return {
-        "processor": model or platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "python": platform.python_version(),
-        **versions,
-    }
-
-
-def machine_words() -> str:
-    """The machine in a table's first line."""
-    about = describe_machine()
-    libraries = ", ".join(f"{name} {about[name]}" for name in LIBRARIES[2:] if name in about)
-    return f"{about['processor']}, {about['cores']} cores, {libraries}"
 
 
 class OtherLoad:

@@ -1,4 +1,4 @@
-"""One table of the source, plain chains and ours: `python eval/comparison.py`; reads docs/results, measures nothing.
+"""One table of the source, plain chains and ours: `python eval/comparison.py`; reads eval/results, measures nothing.
 
 source: our reading of the source's text, on the same data as the others. plain: the tuned OpenCV chain
 (`plain_chain.py`), nearest centres, OpenCV's findHomography in metres. published: the source's own figures, on data of
@@ -28,7 +28,7 @@ class Tables:
             for row in block["rows"]:
                 if column in block["head"] and tuple(row[: len(words)]) == words:
                     return str(row[block["head"].index(column)])
-        raise SystemExit(f"docs/results/{self.name}.json has no {column} of {', '.join(words)}; measure it again")
+        raise SystemExit(f"eval/results/{self.name}.json has no {column} of {', '.join(words)}; measure it again")
 
 
 def mean_of(cell: str) -> str:

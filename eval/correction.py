@@ -1,4 +1,4 @@
-"""What the network of docs/tutorial.py gains: `python eval/correction.py [DATA]`.
+"""What the network of docs/network.py gains: `python eval/correction.py [DATA]`.
 
 It learns from simulated scenes and is scored on others and, where DATA holds clips with frames/ and masks/ as for
 eval/accuracy.py, on these at half their size. What is learned or chosen on real clips leaves the clip that is scored
@@ -24,7 +24,7 @@ from torchvision_dddas.lab.evaluation.metrics.truth import load_truth, read_mask
 from torchvision_dddas.nn import MotionSegmenter
 
 sys.path.insert(0, str(bench.ROOT / "docs"))
-from tutorial import Correction, evidence_maps, f_of, film_scene, learn, loss_of, to_clip
+from network import Correction, evidence_maps, f_of, film_scene, learn, loss_of, to_clip
 
 Row = dict[str, Any]
 """Figures of a clip."""

@@ -1,7 +1,7 @@
-"""Put the results of docs/results into the documents: `python eval/figures.py [--check]`, or `make figures`.
+"""Put the results of eval/results into the documents: `python eval/figures.py [--check]`, or `make figures`.
 
 Text between `<!-- NAME -->` and `<!-- /NAME -->` in README.md and docs/*.md is replaced by the Markdown of
-docs/results/NAME.json (with - for _), so that no measured table is typed by hand. --check changes nothing and ends with
+eval/results/NAME.json (with - for _), so that no measured table is typed by hand. --check changes nothing and ends with
 exit code 1 where a text differs from its result.
 """
 
@@ -28,7 +28,7 @@ def fill(text: str) -> str:
         try:
             result = bench.read_result(name.replace("_", "-"))
         except FileNotFoundError:
-            sys.exit(f"docs/results has no {name.replace('_', '-')}.json for the marks {name}")
+            sys.exit(f"eval/results has no {name.replace('_', '-')}.json for the marks {name}")
         return f"<!-- {name} -->\n\n{bench.result_text(result).strip()}\n\n<!-- /{name} -->"
 
     return MARKED.sub(replace, text)
@@ -48,7 +48,7 @@ def update(options: bench.Options) -> tuple[str, None]:
     if options.check and changed:
         sys.exit(
             "\n".join(
-                f"{path.relative_to(bench.ROOT)} is not what docs/results gives; make figures" for path, _ in changed
+                f"{path.relative_to(bench.ROOT)} is not what eval/results gives; make figures" for path, _ in changed
             )
         )
     for path, text in changed:

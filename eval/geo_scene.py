@@ -42,7 +42,10 @@ LAYOUTS = ("ring", "small ring", "disc", "row", "corner", "L")
 
 @dataclass(frozen=True)
 class Case:
-    """What a batch of scenes has in common. common_m: sigma of the error that all receivers share, along each axis."""
+    """What a batch of scenes has in common. common_m: sigma of the error that all receivers share, along each axis.
+
+    grade: errors of telemetry and receivers as a share of the usual ones. landmarks = 0: telemetry alone.
+    """
 
     altitude_m: float = 50.0
     landmarks: int = 4
@@ -51,6 +54,7 @@ class Case:
     pixel_sigma: float = 1.0
     tilt_deg: float = 0.0
     common_m: float = 0.0
+    grade: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -90,13 +94,13 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     true_axes = turned(flight.normal(0, TILT_SIGMA, (count, 3)) * (1, 1, 0)) @ nominal
     back = case.altitude_m * np.tan(tilt) * np.stack([np.sin(heading), np.cos(heading)], axis=1)
     true_place = np.concatenate([flight.normal(0, 2, (count, 2)) - back, np.full((count, 1), case.altitude_m)], axis=1)
-    true_focal = np.exp(flight.normal(0, FOCAL_SIGMA, count))
-    away = flight.normal(0, (TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA), (count, 3))
+    true_focal = np.exp(case.grade * flight.normal(0, FOCAL_SIGMA, count))
+    away = case.grade * flight.normal(0, (TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA), (count, 3))
     axes = turned(away) @ true_axes
     shift = (POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m)
     # All receivers share an error, the aircraft's too.
     common = flight.normal(0, 1, (count, 2)) * case.common_m
-    place = true_place + flight.normal(0, shift, (count, 3)) + np.pad(common, ((0, 0), (0, 1)))
+    place = true_place + case.grade * flight.normal(0, shift, (count, 3)) + np.pad(common, ((0, 0), (0, 1)))
 
     inner = targets // 2
     true_targets = np.concatenate([disc(crowd, (count, inner), CROWD_M), disc(crowd, (count, targets - inner))], axis=1)
@@ -107,7 +111,7 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     n, shape = case.landmarks, (count, MOST, 2)
     place_noise, pixel_noise = team.normal(0, 1, shape)[:, :n], team.normal(0, case.pixel_sigma, shape)[:, :n]
     true_marks = np.stack([layout(case.layout, n, np.random.default_rng([seed, 3, s])) for s in range(count)])
-    sigma_m = np.full((count, n), GPS[case.gps])
+    sigma_m = np.full((count, n), case.grade * GPS[case.gps])
     if case.gps in ("two RTK", "opposite RTK"):
         sigma_m[:] = GPS["3.5 m"]
         sigma_m[:, [0, n // 2 if case.gps == "opposite RTK" else 1]] = GPS["2 cm RTK"]
@@ -200,7 +204,7 @@ def pose_bound(batch: Scenes) -> np.ndarray:
          ALTITUDE_SIGMA * case.altitude_m, FOCAL_SIGMA]
     )  # fmt: skip
     by_pose, by_place = _slopes(batch, batch.true_marks)
-    information = np.diag(sigma**-2.0) + _gathered(by_pose, by_place, batch.sigma_m, case.pixel_sigma)
+    information = np.diag((case.grade * sigma) ** -2.0) + _gathered(by_pose, by_place, batch.sigma_m, case.pixel_sigma)
     by_pose, by_place = _slopes(batch, batch.true_targets)
     return _carried(by_pose, by_place, information, case.pixel_sigma)
 

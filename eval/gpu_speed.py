@@ -55,7 +55,7 @@ def _time_detectors(frames: Sequence[np.ndarray], options: bench.Options) -> dic
     def make(engine: str, config: str | None, batch: int) -> Callable[[int], object]:
         settings = load_config(config)
         chosen: Any = load_engine(engine, settings) if engine == "onboard" else _torch_engine(settings, options.device)
-        detector = MotionDetector(settings, chosen, 10.0, batch=batch)
+        detector = MotionDetector(settings, backend=chosen, rate_hz=10.0, batch=batch)
 
         def run(turn: int) -> None:
             for i in range(turn * _TURN_FRAMES, (turn + 1) * _TURN_FRAMES):

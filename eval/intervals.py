@@ -39,8 +39,8 @@ COMPARED: dict[str, Case] = {
     "by the rule": {"interval.rule": True},
     **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
 }
-MEASURED = {"default": ("F of pixels", "f"), "patrol": ("F1 of boxes", "box_f1")}
-"""What is measured of a configuration, else F of pixels: in `patrol` a target is a crowd, which boxes show better."""
+MEASURED = {"default": ("F1 of boxes", "box_f1")}
+"""What is measured of a configuration, else F of pixels: the default finds crowds here, which boxes show better."""
 
 
 def measure_fixed(options: bench.Options) -> tuple[str, Any]:
@@ -99,7 +99,7 @@ def detect_in_ways(source: SimulatorSource, config: str, ways: dict[str, Case]) 
     frames, truths, found = list(source), source.truths(), {}
     for way, changed in ways.items():
         settings = with_parameters(fit_settings(_config(config), source), changed)
-        detector = MotionDetector(settings, "onboard", source.rate_hz, source.telemetry())
+        detector = MotionDetector(settings, backend="onboard", rate_hz=source.rate_hz, telemetry=source.telemetry())
         start = bench.now()[1]
         scenes = [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
         spent_ms = 1e3 * float(bench.now()[1] - start) / len(frames)
@@ -130,7 +130,7 @@ def _config(name: str) -> Any:
 
 
 def _measured(config: str) -> tuple[str, str]:
-    return MEASURED.get(config, MEASURED["default"])
+    return MEASURED.get(config, ("F of pixels", "f"))
 
 
 def _name(of: tuple[float, float]) -> str:
@@ -204,7 +204,7 @@ RATES_HZ = (10.0, 25.0)
 def measure_small(options: bench.Options) -> tuple[str, Any]:
     """Accuracy by `small.gap_move_px`, the way of a walker between the frames that show small targets.
 
-    Every frame is looked at. Figures are the mean of F of pixels in the default and F1 of boxes in `patrol`. Left out:
+    Every frame is looked at. Figures are the mean of F1 of boxes in the default. Left out:
     the value for the flights of an altitude and rate is the best on all the others.
     """
     scenes = list(product(RATES_HZ, sorted({a for a, _ in FLIGHTS})))
@@ -225,13 +225,13 @@ def measure_small(options: bench.Options) -> tuple[str, Any]:
     mean = figures.mean(axis=0)
     cells = [" / ".join(f"{v:.2f}" for v in of) for of in (*mean, np.mean(out, axis=0))]
     rows.append(["all", *cells, f"{MOVES_PX[int(mean.mean(axis=1).argmax())]:g}"])
-    head = ["default / `patrol`", *(f"{move:g} px" for move in MOVES_PX), "left out", "chosen, px"]
+    head = ["default", *(f"{move:g} px" for move in MOVES_PX), "left out", "chosen, px"]
     end = f"Flights of {options.seconds:g} s, {len(cases) // len(scenes)} a row."
     return f"{bench.format_table(head, rows)}\n\n{end}", figures.tolist()
 
 
 def fly_small(case: Case) -> list[list[float]]:
-    """Of each way of a walker, the accuracy in the default and in `patrol` on one flight."""
+    """Of each way of a walker, the accuracy in the default on one flight."""
     arguments = [case[name] for name in ("altitude_m", "speed_m_s", "seed", "seconds", "rate_hz")]
     ways = {f"{move}": {"small.gap_move_px": move} for move in MOVES_PX}
     found = [detect_in_ways(flight(*arguments), config, ways) for config in MEASURED]
@@ -241,7 +241,7 @@ def fly_small(case: Case) -> list[list[float]]:
 if __name__ == "__main__":
     common = {"--seconds": 5.0, "--jobs": 1, "--cache": None}
     studies = {
-        "fixed": (measure_fixed, {"--seeds": 3, "--configs": ["patrol", "default", "fast", "source"], **common}),
+        "fixed": (measure_fixed, {"--seeds": 3, "--configs": ["default", "fast", "source"], **common}),
         "search": (measure_search, {"--seeds": 2, **common}),
         "small": (measure_small, {"--seeds": 2, **common, "--seconds": 3.8}),
     }

@@ -13,13 +13,13 @@ from typing import Any
 import bench
 import cv2
 import numpy as np
-import plain_chain
 from clips import clips_in, read_frames
 
 from torchvision_dddas.config import Settings, load_config
 from torchvision_dddas.detection import detect_motion, load_engine
 from torchvision_dddas.geometry import transfer
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.benchmark import plain_chain
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
 from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts, count, measures
 from torchvision_dddas.types import Frame

@@ -24,7 +24,7 @@ import bench
 import cv2
 import numpy as np
 from bench import Spread
-from simulated_clips import CONFIG, GROUND_WAYS, Case, Way, locate_clip, locate_from_ground, walking
+from simulated_clips import GROUND_WAYS, Case, Way, locate_clip, locate_from_ground, walking
 
 from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config, with_parameters
@@ -38,10 +38,10 @@ from torchvision_dddas.types import Command, Frame
 
 GPS = {"exact": 0.0, "3.5 m": 3.5}
 RAW: Case = {"aerial.mode": "paper"}
-CHAINS: dict[str, tuple[str, Case]] = {
-    "ours": (CONFIG, {}),
-    "ours, homography in metres": (CONFIG, {"aerial.mode": "homography"}),
-    "ours, raw degrees": (CONFIG, RAW),
+CHAINS: dict[str, tuple[str | None, Case]] = {
+    "ours": (None, {}),
+    "ours, homography in metres": (None, {"aerial.mode": "homography"}),
+    "ours, raw degrees": (None, RAW),
     "source, raw degrees": ("source", RAW),
 }
 """Configuration and settings: `ours` locates by the camera's pose."""
@@ -263,7 +263,7 @@ def fly(source: SimulatorSource, changed: Case) -> Case:
     """One run with changed settings; `every` of them: look at every so many frames."""
     cv2.setNumThreads(1)
     parameters = {name: value for name, value in changed.items() if name != "every"}
-    settings = with_parameters(load_config(CONFIG, (), scenario_settings(source.scenario)), parameters)
+    settings = with_parameters(load_config(None, (), base=scenario_settings(source.scenario)), parameters)
     timed: Any = TimedSource(source, changed.get("every", 1))
     started = StartedSource(timed)
     ready = assemble_mission(started, settings, "onboard", by_landmarks=True)

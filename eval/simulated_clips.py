@@ -33,8 +33,6 @@ from torchvision_dddas.lab.simulation.sensors import SIGMAS_95, Receivers
 from torchvision_dddas.people import PersonDetector
 from torchvision_dddas.types import Command, FrameResult, Landmarks, Order, Scene, TrackedFrame, Tracks, Truth
 
-CONFIG = "patrol"
-"""The shipped configuration of a team that watches crowds."""
 Case = dict[str, Any]
 
 
@@ -50,14 +48,16 @@ class Way:
     """
 
     gps95_m: float
-    config: str = CONFIG
+    config: str | None = None
     parameters: Mapping[str, object] = field(default_factory=dict)
     used: tuple[int, ...] = ()
 
 
-def usual(source: SimulatorSource, config: str = CONFIG, parameters: Mapping[str, object] | None = None) -> Settings:
+def usual(
+    source: SimulatorSource, config: str | None = None, parameters: Mapping[str, object] | None = None
+) -> Settings:
     """The settings of `dddas run sim: --config CONFIG`, some of them changed."""
-    settings = fit_settings(load_config(config, (), scenario_settings(source.scenario)), source)
+    settings = fit_settings(load_config(config, (), base=scenario_settings(source.scenario, config)), source)
     return with_parameters(settings, parameters or {})
 
 
@@ -87,7 +87,7 @@ class ClipLocator:
                 site, self._source.camera, self._settings, load_solver("onboard"), self._source.rate_hz,
                 focal_known=True,
             )  # fmt: skip
-            self._watch = LandmarkWatch(locator, self._source.colours, "onboard")
+            self._watch = LandmarkWatch(locator, self._source.colours)
         else:
             self._watch.locator.set_site(site)
         locator = self._watch.locator
@@ -167,7 +167,7 @@ def locate_clip(scenario: Scenario, ways: Mapping[str, Way]) -> Case:
     return {name: found[name] for name in ways}
 
 
-def _locate_clip(scenario: Scenario, config: str, ways: Mapping[str, Way]) -> Case:
+def _locate_clip(scenario: Scenario, config: str | None, ways: Mapping[str, Way]) -> Case:
     source = SimulatorSource(scenario)
     locators = {name: ClipLocator(source, way) for name, way in ways.items()}
     scorers, errors = {name: one.scorer() for name, one in locators.items()}, {name: [] for name in locators}
@@ -228,8 +228,11 @@ def locate_from_ground(scenario: Scenario) -> Case:
     Each vehicle's camera is turned to the middle of the nearest crowd; it drives as planned. A crowd's place is the
     mean of the people located within its radius and BESIDE_M.
     """
-    source, settings = SimulatorSource(scenario), load_config(CONFIG, (), scenario_settings(scenario))
-    detector, local = PersonDetector(settings, "onboard"), partial(geometry.east_north, origin_deg=source.origin_deg)
+    source, settings = SimulatorSource(scenario), load_config(None, (), base=scenario_settings(scenario))
+    detector, local = (
+        PersonDetector(settings, backend="onboard"),
+        partial(geometry.east_north, origin_deg=source.origin_deg),
+    )
     found: dict[str, list[float]] = {name: [] for name in GROUND_WAYS}
     counts, every = Counter[str](), round(LOOK_S * source.rate_hz)
     for _ in source:
@@ -249,7 +252,7 @@ def locate_from_ground(scenario: Scenario) -> Case:
             )
             for group in groups:
                 cameras = [picture.camera for picture in pictures[group]]
-                located = GroundLocator(cameras, chosen).locate(people[group], truth.frame).positions
+                located = GroundLocator(cameras, settings=chosen).locate(people[group], frame=truth.frame).positions
                 place = local(located.lonlat_deg) if len(located) else np.zeros((0, 2))
                 apart = np.linalg.norm(place[:, None] - middle, axis=2)
                 nearest = apart.argmin(axis=1)

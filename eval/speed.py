@@ -25,12 +25,12 @@ from typing import Any
 import bench
 import cv2
 import numpy as np
-import plain_chain
 from clips import Size, clips_in, film_of, frames_of, read_frames, resize, scene, there_and_back, truth_of, write_video
 
 from torchvision_dddas.config import PeopleParameters, Settings, load_config
 from torchvision_dddas.detection import Engine, Foreground, MotionDetector, View, Window, load_engine
 from torchvision_dddas.io.sources import open_source
+from torchvision_dddas.lab.benchmark import plain_chain
 from torchvision_dddas.tracking import Tracker, source_tracker
 from torchvision_dddas.types import Frame, Registration, Tracks, is_sampled
 
@@ -108,7 +108,9 @@ class Chain:
             engine, config, *batch = name.split()
             settings = load_config(None if config == "default" else config)
             timed: Any = TimedEngine(load_engine(engine, settings), self._watch)
-            self._detector = MotionDetector(settings, timed, 10.0, batch=int(batch[0][1:]) if batch else 1)
+            self._detector = MotionDetector(
+                settings, backend=timed, rate_hz=10.0, batch=int(batch[0][1:]) if batch else 1
+            )
 
     def __call__(self, turn: int) -> None:
         """Process the frames of a turn."""
@@ -385,7 +387,7 @@ def measure_batches(options: bench.Options) -> tuple[str, Any]:
         settings = load_config(None if config == "default" else config)
 
         def run(turn: int, batch_mb: float, settings: Settings = settings) -> None:
-            detector = MotionDetector(settings, TorchEngine(settings, "cpu", batch_mb=batch_mb), batch=8)
+            detector = MotionDetector(settings, backend=TorchEngine(settings, "cpu", batch_mb=batch_mb), batch=8)
             for frame in frames:
                 detector.update(frame)
             detector.flush()
@@ -425,7 +427,7 @@ def measure_association(options: bench.Options) -> tuple[str, Any]:
         return rows
 
     def associate(backend: str) -> list[Tracks]:
-        tracker, found = Tracker(settings, interval, backend=backend), []
+        tracker, found = Tracker(settings, interval=interval, backend=backend), []
         for number, image in frames:
             box_px = truth.box_px[slice(*np.searchsorted(truth.frame, [number, number + 1]))]
             found += tracker.update(box_px, image=image, frame=number)

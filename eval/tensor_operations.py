@@ -11,9 +11,16 @@ from clips import Size
 
 import torchvision_dddas.functional as F
 from torchvision_dddas.detection.torch_blobs import label_components
+from torchvision_dddas.lab.benchmark.torch_operations import (
+    MATRIX,
+    Call,
+    brightest,
+    kornia_pairs,
+    random_pictures,
+    to_grey,
+)
 from torchvision_dddas.tracking import rgb_histograms
 
-Call = Callable[[], object]
 _POINTS, _WRONG, _HYPOTHESES, _TOLERANCE_PX = 300, 0.3, 128, 2.0
 _BOXES, _BOX_PX = 10, (40, 90)
 
@@ -29,19 +36,11 @@ def operations(size: Size, batch: int, device: str = "cpu") -> dict[str, dict[st
 
 def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, Call, Call | None]]:
     width, height = size
-    random = np.random.default_rng(0)
-    coloured = random.integers(0, 256, (batch, height, width, 3), np.uint8)
-    coloured = np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in coloured])
-    grey = np.stack([cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in coloured])
-    bytes_ = torch.from_numpy(grey)[:, None].to(device)
-    levels = bytes_.float()
-    bgr = torch.from_numpy(coloured).to(device).permute(0, 3, 1, 2).float().div(255).contiguous()
-    rgb = bgr.flip(1)
-    is_set = (grey > np.percentile(grey, 90)).astype(np.uint8)
+    coloured = random_pictures(size, batch)
+    grey, random = to_grey(coloured), np.random.default_rng(1)
+    is_set = brightest(grey)
+    rgb = torch.from_numpy(coloured).to(device).permute(0, 3, 1, 2).float().div(255).flip(1).contiguous()
     masks = torch.from_numpy(is_set)[:, None].to(device)
-    around = {side: F.structuring_element("ellipse", side) for side in (3, 15)}
-    matrix = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
-    matrices = torch.from_numpy(matrix).float().expand(batch, 3, 3).to(device)
     smaller = (height * 2 // 3, width * 2 // 3)
     corner = random.integers(0, (width - _BOX_PX[0], height - _BOX_PX[1]), (batch, _BOXES, 2))
     box_px = np.concatenate([corner, np.broadcast_to(_BOX_PX, corner.shape)], axis=2).astype(float)
@@ -49,15 +48,9 @@ def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, C
         torch.from_numpy(box_px).float().to(device),
         torch.ones(batch, _BOXES, dtype=torch.bool, device=device),
     )
-    box_blur, sobel = kornia.filters.box_blur, kornia.filters.sobel
 
     def each(call: Callable[[np.ndarray], object], pictures: np.ndarray = grey) -> Call:
         return lambda: [call(picture) for picture in pictures]
-
-    def kornia_corners() -> object:
-        du, dv = kornia.filters.spatial_gradient(levels).unbind(2)
-        uu, vv, uv = (box_blur(product, 5) for product in (du * du, dv * dv, du * dv))
-        return (uu + vv - ((uu - vv).square() + 4 * uv.square()).sqrt()) / 2
 
     def kornia_histograms() -> object:
         crops = [
@@ -68,60 +61,34 @@ def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, C
         count = kornia.enhance.image_histogram2d
         return [count(crop, 0.0, 255.0, 256, 1.0, torch.arange(256.0, device=device)) for crop in crops]
 
-    def morphology(side: int, how: int, name: str) -> tuple[Call, Call, Call]:
-        kernel = around[side]
-        ones = kernel.float().to(device)
-        return (
-            each(lambda picture: cv2.morphologyEx(picture, how, kernel.numpy()), is_set),
-            lambda: getattr(F, name)(masks, kernel),
-            lambda: getattr(kornia.morphology, name)(masks.float(), ones),
-        )
+    def morphology(side: int, how: int) -> Call:
+        kernel = F.structuring_element("ellipse", side).numpy()
+        return each(lambda picture: cv2.morphologyEx(picture, how, kernel), is_set)
 
     components = each(lambda picture: cv2.connectedComponentsWithStats(picture, ltype=cv2.CV_32S), is_set)
     labelled = components if device == "cpu" else lambda: label_components(masks > 0, masks)
-    return {
-        "warp (ours: Kornia's remap)": (
-            each(lambda picture: cv2.warpPerspective(picture, matrix, size)),
-            lambda: F.warp_perspective(levels, matrices, (height, width)),
-            lambda: kornia.geometry.warp_perspective(levels, matrices, (height, width)),
+    opencv = {
+        "warp (ours: Kornia's remap)": each(lambda picture: cv2.warpPerspective(picture, MATRIX, size)),
+        "resize to two thirds": each(
+            lambda picture: cv2.resize(picture, smaller[::-1], interpolation=cv2.INTER_LINEAR_EXACT)
         ),
-        "resize to two thirds": (
-            each(lambda picture: cv2.resize(picture, smaller[::-1], interpolation=cv2.INTER_LINEAR_EXACT)),
-            lambda: F.resize(levels, smaller, rounded=True),
-            lambda: kornia.geometry.resize(levels, smaller),
+        "Gaussian 7, floats (ours: Kornia's)": each(
+            lambda picture: cv2.GaussianBlur(picture, (7, 7), 0), grey.astype(np.float32)
         ),
-        "Gaussian 7, floats (ours: Kornia's)": (
-            each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0), grey.astype(np.float32)),
-            lambda: F.gaussian_blur2d(levels, 7),
-            lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),
+        "Gaussian 7, bytes (ours: Kornia's and conversions)": each(
+            lambda picture: cv2.GaussianBlur(picture, (7, 7), 0)
         ),
-        "Gaussian 7, bytes (ours: Kornia's and conversions)": (
-            each(lambda picture: cv2.GaussianBlur(picture, (7, 7), 0)),
-            lambda: F.gaussian_blur2d(bytes_, 7),
-            lambda: kornia.filters.gaussian_blur2d(levels, 7, (1.4, 1.4)),
+        "gradient, box mean 5": each(
+            lambda p: cv2.blur(cv2.magnitude(cv2.Sobel(p, 5, 1, 0), cv2.Sobel(p, 5, 0, 1)), (5, 5))
         ),
-        "gradient, box mean 5": (
-            each(lambda p: cv2.blur(cv2.magnitude(cv2.Sobel(p, 5, 1, 0), cv2.Sobel(p, 5, 0, 1)), (5, 5))),
-            lambda: F.mean_gradient(levels),
-            lambda: box_blur(sobel(levels, normalized=False), 5),
-        ),
-        "smaller eigenvalue 5": (
-            each(lambda picture: cv2.cornerMinEigenVal(picture, 5)),
-            lambda: F.corner_min_eigenvalue(levels, 5),
-            kornia_corners,
-        ),
-        "pyramid of 4": (
-            each(lambda picture: cv2.buildOpticalFlowPyramid(picture, (21, 21), 3, withDerivatives=False)),
-            lambda: F.build_pyramid(levels, 4),
-            lambda: kornia.geometry.build_pyramid(levels, 4),
-        ),
-        "erosion 3": morphology(3, cv2.MORPH_ERODE, "erosion"),
-        "closing 15": morphology(15, cv2.MORPH_CLOSE, "closing"),
-        "RGB to HSV": (
-            each(lambda picture: cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), coloured),
-            lambda: F.bgr_to_hsv(bgr),
-            lambda: kornia.color.rgb_to_hsv(rgb),
-        ),
+        "smaller eigenvalue 5": each(lambda picture: cv2.cornerMinEigenVal(picture, 5)),
+        "pyramid of 4": each(lambda picture: cv2.buildOpticalFlowPyramid(picture, (21, 21), 3, withDerivatives=False)),
+        "erosion 3": morphology(3, cv2.MORPH_ERODE),
+        "closing 15": morphology(15, cv2.MORPH_CLOSE),
+        "RGB to HSV": each(lambda picture: cv2.cvtColor(picture, cv2.COLOR_BGR2HSV), coloured),
+    }
+    shared = {name: (opencv[name], *calls) for name, calls in kornia_pairs(coloured, device).items()}
+    return shared | {
         "components (ours: OpenCV's)" if device == "cpu" else "components": (
             components,
             labelled,
@@ -137,7 +104,7 @@ def _of_pictures(size: Size, batch: int, device: str) -> dict[str, tuple[Call, C
 
 def _of_points(batch: int, device: str) -> dict[str, tuple[Call, Call, Call | None]]:
     generator = torch.Generator().manual_seed(0)
-    matrix = torch.tensor([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]]).expand(batch, 3, 3)
+    matrix = torch.from_numpy(MATRIX).float().expand(batch, 3, 3)
     points = 400 * torch.rand(batch, _POINTS, 2, generator=generator)
     seen = F.transform_points(matrix, points) + 0.3 * torch.randn(batch, _POINTS, 2, generator=generator)
     wrong = seen.clone()

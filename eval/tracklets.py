@@ -17,21 +17,24 @@ import bench
 import clips
 import cv2
 import numpy as np
-import plain_chain
 from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection import MotionDetector
+from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.candidates import LOOK_WEIGHTS, Candidates, describe_look, weigh
-from torchvision_dddas.detection.observation import Target, draw_blobs, join_fragments
+from torchvision_dddas.detection.fragments import join_fragments
+from torchvision_dddas.detection.observation import Target, draw_chosen
 from torchvision_dddas.detection.tracklet_scores import (
-    PERSISTENT,
+    BLOB,
     TRACKLET_WEIGHTS,
+    Worth,
     choose,
     describe_tracklets,
     score_tracklets,
 )
 from torchvision_dddas.detection.tracklets import Tracklets, follow
+from torchvision_dddas.lab.benchmark import plain_chain
 from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 
 KINDS = {
@@ -41,7 +44,6 @@ KINDS = {
 """The data set of a clip, by a part of its name; all clips of a data set are left out together."""
 
 SETTINGS = Settings()
-JOINED_PX = 1.5 * SETTINGS.morphology.close_px
 PARTLY = 0.2
 """Weight of a candidate about a target that is much larger than it."""
 
@@ -54,12 +56,11 @@ Weights = tuple[dict[str, float], dict[str, float]]
 class Look:
     """What the detector had when it judged one look.
 
-    persistent: of its blobs. drawn: of each blob, (N, 4) boxes of its refined outline. small: of small tracks.
+    drawn: of each blob, (N, 4) boxes of its refined outline. small: of small tracks.
     """
 
     candidates: Candidates
     tracklets: Tracklets
-    persistent: list[bool]
     drawn: list[np.ndarray]
     small: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     described: dict[str, np.ndarray] = field(default_factory=dict)
@@ -89,6 +90,17 @@ class Film:
         return next((kind for part, kind in KINDS.items() if part in self.name), "other")
 
 
+class _WholeFlow(DenseFlow):
+    """The flow of one whole frame, searched once."""
+
+    flows: list[np.ndarray] | None = None
+
+    def __call__(self, grey: np.ndarray, others: Any, boxes: Any = None) -> list[np.ndarray]:
+        if self.flows is None:
+            self.flows = super().__call__(grey, others)
+        return self.flows
+
+
 class _Recorder(MotionDetector):
     """The default detector, which keeps what tracklets are judged by and takes all blobs."""
 
@@ -96,16 +108,17 @@ class _Recorder(MotionDetector):
         super().__init__(*given)
         self.looks: dict[int, Look] = {}
 
-    def _judge(self, index: int, persistent: list[bool]) -> list[Target]:
+    def _judge(self, index: int) -> list[Target]:
         slot = self._buffer[index]
-        observation, candidates = slot.observation, slot.observation.candidates
+        observation, candidates, settings = slot.observation, slot.observation.candidates, slot.distance.settings
         if candidates is None:
             return []
-        drawn = draw_blobs(observation, range(len(observation.blobs)), slot.distance.settings)
-        boxes = [_boxes([target.box for target in join_fragments(parts)]) for parts in drawn]
-        tracklets = follow(candidates, self._looks_about(index), slot.view.size)
-        self.looks[slot.frame.number - 1] = Look(candidates, tracklets, list(persistent), boxes)
-        return [target for i in np.flatnonzero(persistent) for target in drawn[i]]
+        tracklets, flow = follow(candidates, self._looks_about(index), slot.view.size), _WholeFlow()
+        given = tracklets.velocity_px, np.zeros(len(candidates)), flow, settings
+        drawn = [join_fragments(draw_chosen(observation, [i], *given)) for i in range(len(observation.blobs))]
+        boxes = [_boxes([target.box for target in parts]) for parts in drawn]
+        self.looks[slot.frame.number - 1] = Look(candidates, tracklets, boxes)
+        return [target for parts in drawn for target in parts]
 
     def _small_targets(self, index: int, targets: list[Target]) -> list[Target]:
         small = super()._small_targets(index, targets)
@@ -256,10 +269,8 @@ def describe(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[
 # -- scoring -----------------------------------------------------------------------------------------------------------
 
 
-def detect(
-    film: Film, weights: Weights | None, accept: float = 0.0, persistent: float = PERSISTENT
-) -> list[np.ndarray]:
-    """The boxes of every frame by the detector's rule; without weights, those of the persistent blobs alone."""
+def detect(film: Film, weights: Weights | None, accept: float = 0.0, worth: Worth = BLOB) -> list[np.ndarray]:
+    """The boxes of every frame by the detector's rule; without weights, those of all blobs."""
     found = []
     for frame in range(film.frames):
         source = film.repeats.get(frame, frame)
@@ -267,11 +278,12 @@ def detect(
             found.append(np.zeros((0, 4)))
             continue
         if weights is None:
-            chosen = np.flatnonzero(look.persistent).tolist()
+            chosen = list(range(len(look.drawn)))
         else:
             seen = seen_by(film, source, weights[0])
-            scores = score_tracklets(seen.pop(0), look.tracklets, seen, weights[1])
-            chosen = choose(look.candidates.box_px, scores, look.persistent, accept, JOINED_PX, persistent)
+            candidates = seen.pop(0)
+            scores = score_tracklets(candidates, look.tracklets, seen, weights[1])
+            chosen = choose(candidates, scores, accept, SETTINGS.morphology.close_px, worth)
         boxes = [look.drawn[i] if i < len(look.drawn) else look.candidates.box_px[i : i + 1] for i in chosen]
         small = look.small
         if len(small) and boxes:
@@ -384,9 +396,10 @@ def learn(options: bench.Options) -> tuple[str, Any]:
     rows: dict[str, dict[str, float]] = {}
     rows["plain OpenCV chain"] = summarize(films, {film.name: film.plain for film in films})
     rows["blobs alone"] = summarize(films, {film.name: detect(film, None) for film in films})
-    for accept, persistent in product(options.accept, options.persistent):
-        found = {film.name: detect(film, left_out[film.kind], accept, persistent) for film in films}
-        rows[f"tracklets above {accept:g}, persistence {persistent:g}"] = summarize(films, found)
+    for accept, worth in product(options.accept, options.blob):
+        worths = Worth(worth, BLOB.narrow)
+        found = {film.name: detect(film, left_out[film.kind], accept, worths) for film in films}
+        rows[f"tracklets above {accept:g}, blobs {worth:g}"] = summarize(films, found)
     measures = next(iter(rows.values()))
     text = bench.format_table(["measure", *rows], [[m, *(f"{row[m]:.2f}" for row in rows.values())] for m in measures])
     weights = [{name: round(value, 3) for name, value in part.items()} for part in learn_weights(films)]
@@ -397,9 +410,9 @@ def learn(options: bench.Options) -> tuple[str, Any]:
 if __name__ == "__main__":
     options = {
         "data": Path,
-        "--every": [1, 4],
+        "--every": [1, 2, 4, 8],
         "--accept": [SETTINGS.tracklets.accept],
-        "--persistent": [PERSISTENT],
+        "--blob": [BLOB.wide],
         "--keep": "",
         "--jobs": 2,
     }

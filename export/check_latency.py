@@ -77,7 +77,7 @@ def checked(options: argparse.Namespace) -> bool:
     """Measure and print; whether the rate is kept."""
     width, _, height = options.size.partition("x")
     settings = load_config(options.config, [])
-    loop = MotionDetector(settings, "onboard", options.rate)
+    loop = MotionDetector(settings, backend="onboard", rate_hz=options.rate)
     ms: list[float] = []
     last = None
     for i, image in enumerate(pictures(options.clip, (int(width), int(height)), options.frames + WARM_UP)):

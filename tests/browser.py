@@ -23,12 +23,15 @@ _HOST = """<!DOCTYPE html><meta charset="utf-8"><style>iframe{{width:{width}px;h
   var view = document.getElementById("page").contentWindow, page = view.document, result;
   try {{ result = (function (page, view) {{ {script} }})(page, view); }}
   catch (error) {{ result = "thrown: " + error; }}
-  document.getElementById("result").textContent = JSON.stringify(result);
+  Promise.resolve(result).catch(String).then(function (kept) {{
+    document.getElementById("result").textContent = JSON.stringify(kept); }});
 }});</script>"""
 
 
 def evaluate(page: str, script: str, folder: Path, width: int = 1280, dark: bool = False) -> Any:
     """Show a page in a frame of such a width and return what a script returns that has `page` and `view` (its window).
+
+    The script may return a promise.
 
     folder: for the browser's files. dark: whether the user prefers dark pages.
     """

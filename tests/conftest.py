@@ -35,3 +35,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Leave out the tests that need a CUDA device where there is none, and say so."""
     if item.get_closest_marker("gpu") is not None and not HAS_GPU:
         pytest.skip("needs a CUDA device")
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Write a file: file(name, text) gives its path."""
+
+    def write(name, text):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write

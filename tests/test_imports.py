@@ -26,7 +26,7 @@ ORDER = (
     ("control",),
     ("pipeline",),
     ("live",),
-    ("lab", "lab.simulation"),
+    ("lab", "lab.simulation", "lab.benchmark"),
     ("lab.evaluation", "lab.export"),
     ("lab.tuning",),
     ("cli",),
@@ -36,15 +36,17 @@ FLOOR = {room: floor for floor, rooms in enumerate(ORDER) for room in rooms}
 TORCH_ROOMS = ("functional", "nn", "lab.tuning", "lab.export")
 # Rooms that load a file at a time, for the start of a command: these modules are what other rooms may name.
 OPEN = {
-    "io": "atomic_files camera_files colour_files detection_tables elevation ground_tables images interrupts "
-    "joined_clips live_streams maps.formats maps.ground_tracks output overlay overlay_video report report.charts "
-    "sources streams tables telemetry",
+    "io": "atomic_files camera_files colour_files detection_tables drawing elevation foreign_boxes ground_tables "
+    "images interrupts joined_clips live_streams maps.formats maps.ground_tracks output overlay overlay_video report "
+    "report.charts report.figure_files report.table_files platform_files sources streams tables telemetry track_files "
+    "zone_files",
     "lab.evaluation": "datasets.record evaluate metrics.matching metrics.registry metrics.truth simulated_run "
-    "studies.cache studies.comparison studies.jobs studies.records studies.runner studies.scoring studies.stages "
-    "studies.summary studies.sweep",
+    "studies.cache studies.comparison studies.jobs studies.kept studies.methods studies.records studies.runner "
+    "studies.scoring studies.stages studies.summary studies.sweep",
 }
 # Tuning and export take the inside of the engines apart; what needs torch is not loaded with a room that does not.
 PAST = {
+    ("cli", "lab.benchmark.torch_operations"),
     ("cli", "lab.export.graph_files"),
     ("detection", "functional.filters"),
     *(("lab.export", name) for name in ("functional.hog_svm", "people.onnx_scorer", "people.torch_scorer")),
@@ -213,4 +215,4 @@ def test_an_import_loads_nothing_heavy(statement: str, heavy: set[str]) -> None:
 
 def test_unknown_public_names_are_refused() -> None:
     with pytest.raises(AttributeError, match="has no attribute 'absent'"):
-        _ = torchvision_dddas.absent
+        _ = torchvision_dddas.absent  # type: ignore[attr-defined]

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.control.test_ground_team import STANDS, platform
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo import AerialLocator
@@ -54,6 +55,60 @@ def test_a_source_and_single_frames_give_the_same_results(frames):
     assert any(len(r.tracks) for r in called)
 
 
+def test_a_function_takes_the_place_of_the_motion_detector_and_its_classes_last(frames):
+    asked = []
+
+    def detect(frame: Frame) -> Detections:
+        asked.append(frame.number)
+        box = np.array([[36.0 + 4 * frame.number, 60, 20, 20], [150, 100, 30, 15]])
+        return Detections(box, np.array([0.9, 0.8]), label=np.array(["car", "person"], object))
+
+    results = list(Pipeline(detector=detect, interval=2)(frames))
+    assert asked == [1, 3, 5, 7, 9, 11, 13] == [result.number for result in results]
+    tracks = results[3].tracks
+    assert sorted(zip(tracks.label.tolist(), tracks.id.tolist(), strict=True)) == [("car", 1), ("person", 2)]
+    pipeline = Pipeline(detector=detect, interval=2)
+    fed = [result for image in frames for result in pipeline.update(image)] + pipeline.flush()
+    assert [r.tracks.id.tolist() for r in fed] == [r.tracks.id.tolist() for r in results]
+
+
+def test_what_a_function_returns_instead_of_detections_is_one_line(frames):
+    with pytest.raises(InputError, match="returned list for frame 1; return"):
+        list(Pipeline(detector=lambda frame: [[1, 2, 3, 4]])(frames))
+    with pytest.raises(InputError, match="detector must be a function"):
+        Pipeline(detector=frames)
+
+
+def test_scores_of_ones_own_detector_count(frames):
+    def detect(frame: Frame) -> Detections:
+        return Detections(np.array([[40.0, 60, 20, 20], [150, 100, 30, 15]]), np.array([0.9, 0.02]))
+
+    results = list(Pipeline(detector=detect)(frames))
+    assert {len(result.tracks) for result in results} == {1}
+    with pytest.raises(InputError, match="scores must be probabilities"):
+        list(Pipeline(detector=lambda frame: Detections(np.array([[40.0, 60, 20, 20]]), np.array([90.0])))(frames))
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_boxes_that_move_are_told_and_what_moves_without_a_box_is_kept(frames, is_seen):
+    def detect(frame: Frame) -> Detections:
+        boxes = np.array([[36.0 + 4 * frame.number, 60, 20, 20], [150, 100, 30, 15]])
+        both = Detections(boxes, np.array([0.9, 0.8]), label=np.array(["car", "person"], object))
+        return both if is_seen else both[1:]
+
+    settings = with_parameters(Settings(), {"gates.min_area_px": 40})
+    results = list(Pipeline(settings, detector=detect, movers=True)(frames))
+    assert len(results) == len(frames)
+    for result in results[3:-3]:
+        found = result.tracked.detections
+        speed = dict(zip(found.label.tolist(), found.speed_px.tolist(), strict=True))
+        assert len(found) == 2 and speed["person"] == 0 and found.kind == "given"
+        assert speed["car" if is_seen else ""] == pytest.approx(4, abs=1.6)  # of a blob without texture
+    assert set(results[6].tracks.label.tolist()) == {"person", "car" if is_seen else ""}
+    with pytest.raises(InputError, match="movers is for a detector"):
+        Pipeline(movers=True)
+
+
 def test_the_backend_of_a_pipeline_is_that_of_its_tracker_too(frames, monkeypatch):
     pytest.importorskip("torch")
     from torchvision_dddas.tracking import torch_source_tracker
@@ -68,7 +123,7 @@ def test_the_backend_of_a_pipeline_is_that_of_its_tracker_too(frames, monkeypatc
     monkeypatch.setattr(torch_source_tracker, "TorchSourceTracker", Watched)
     for backend, count in (("onboard", 0), ("torch", 1)):
         made.clear()
-        list(Pipeline("paper", backend)(frames))
+        list(Pipeline("paper", backend=backend)(frames))
         assert len(made) == count
 
 
@@ -85,6 +140,18 @@ def test_frames_are_located_where_telemetry_says_where_the_camera_is(frames):
     camera = Camera("uav", (240, 160), (200.0, 200.0), (119.5, 79.5))
     results = list(Pipeline(None, telemetry=DOWN, camera=camera)(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))
     assert all(r.locations is not None and r.locations.fix.by == "telemetry" for r in results)
+
+
+def test_a_pipeline_with_a_ground_platform_has_fused_and_confirmed_targets(frames, tmp_path):
+    camera = replace(CAMERA, size_px=(240, 160), centre_px=(119.5, 79.5))
+    path = platform(tmp_path, "ugv1", STANDS, "rate_hz = 10")
+    pipeline = Pipeline(telemetry=DOWN, camera=camera, ground=path)  # one path is a list of one
+    results = list(pipeline(Frame(n, n / 10, f) for n, f in enumerate(frames, 1)))
+    assert all(result.confirmed is not None for result in results)
+    assert max(len(result.fused) for result in results if result.fused is not None) > 0
+    last = results[-1].fused
+    assert last is not None and any("ugv1" in seen for seen in last.seen_by)
+    assert any("ugv1 locates people" in note for note in pipeline.notes)
 
 
 def test_a_pipeline_takes_what_the_telemetry_lacks_from_the_camera(frames):
@@ -197,16 +264,16 @@ LIST: Any = [5]
         (lambda: Pipeline(interval=0), "interval must be at least 1"),
         (lambda: Pipeline("no_such"), "no_such"),
         (lambda: Pipeline(telemetry=WRONG), "telemetry must be of type Telemetry, got str"),
-        (lambda: Pipeline(camera=CAMERA), "of no use without landmarks"),
-        (lambda: Pipeline()(LIST[0]), "wants a path or frames, got int"),
+        (lambda: Pipeline(camera=CAMERA), "need landmarks"),
+        (lambda: Pipeline()(LIST[0]), "needs a path or frames, got int"),
         (lambda: Pipeline().update(WRONG), "must be a Frame or a NumPy image, got str"),
         (lambda: list(Pipeline()([np.zeros((8, 8, 3))] * 4)), "must be uint8"),
         (lambda: AerialLocator(CAMERA), "landmarks, or telemetry"),
-        (lambda: AerialLocator(CAMERA, WRONG), "got str where a Telemetry is wanted"),
+        (lambda: AerialLocator(CAMERA, WRONG), "expects a Telemetry, got str"),
         (lambda: AerialLocator(CAMERA, DOWN, rate_hz=0), "rate_hz must be positive"),
-        (lambda: AerialLocator(CAMERA, DOWN).locate(LIST), "wants Tracks or a TrackedFrame, got list"),
-        (lambda: GroundLocator([]), "wants one Camera or several"),
-        (lambda: GroundLocator(CAMERA).locate([WRONG]), "wants the People of each camera"),
+        (lambda: AerialLocator(CAMERA, DOWN).locate(LIST), "expects Tracks or a TrackedFrame, got list"),
+        (lambda: GroundLocator([]), "expects one Camera or several"),
+        (lambda: GroundLocator(CAMERA).locate([WRONG]), "expects the People of each camera"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_line(make, message):
@@ -216,9 +283,9 @@ def test_what_cannot_be_used_is_one_clear_line(make, message):
 
 def test_telemetry_without_places_locates_nothing_and_says_so(frames):
     pipeline = Pipeline(telemetry=replace(DOWN, place=np.full((2, 2), np.nan)))
-    assert pipeline.notes == [
-        "nothing is located: the telemetry holds no place of the vehicle, and there are no landmarks"
-    ]
+    (note,) = pipeline.notes
+    assert note.startswith("nothing is located: the telemetry holds no place of the vehicle (add the columns longitude")
+    assert note.endswith("), and there are no landmarks")
     assert all(result.locations is None for result in pipeline(frames))
 
 

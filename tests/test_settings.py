@@ -100,14 +100,15 @@ def test_numbers_may_begin_or_end_with_their_point(text: str, number: float) -> 
         ("difference.near_frames=[]", ["near_frames", "a list of 1 to 30 frames"]),
         ("difference.near_frames=[0]", ["near_frames must be a list of 1 to 30 frames, got 0"]),
         ("registration.model=plane", ["'plane'", "homography or affine"]),
+        ("aerial.grid=ups", ["'ups'", "nothing or mgrs or utm"]),
         ("interval.rule=1", ["true or false"]),
         ("interval.minimum_frames=50", ["minimum_frames = 50", "above maximum_frames"]),
-        ("people.block_px=12", ["people: block_px = 12 is no multiple of cell_px = 8"]),
+        ("people.block_px=12", ["people: block_px = 12 is not a multiple of cell_px = 8"]),
         ("people.window_width_px=60", ["do not fill window_width_px = 60; wanted 16 + a multiple of 8"]),
         ("people.window_height_px=8", ["do not fill window_height_px = 8"]),
         ("gates.min_size_m=90", ["min_size_m", "above max_size_m"]),
-        ("registration.keypoints", ["no override", "group.parameter=value"]),
-        ("=3", ["no override"]),
+        ("registration.keypoints", ["not an override", "group.parameter=value"]),
+        ("=3", ["not an override"]),
     ],
 )
 def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: str, wanted: list[str]) -> None:
@@ -123,7 +124,7 @@ def test_a_mistaken_override_gets_one_line_that_says_what_was_wanted(override: s
     [
         ("[registration]\nkeypoints = = 3\n", ["line 2", "not valid TOML"]),
         ("[registration]\nkeypoints = [\n", ["end of document", "not valid TOML"]),
-        ("keypoints = 300\n", ["outside a [group]", "registration.keypoints"]),
+        ("keypoints = 300\n", ["outside of a [group]", "registration.keypoints"]),
         ("[registration]\nkeypoint = 300\n", ["unknown parameter", "registration.keypoints"]),
         ("[registration]\nkeypoints = 1\n", ["registration.keypoints must be", "between 50 and 5000 points, got 1"]),
     ],

@@ -14,14 +14,18 @@ from torchvision_dddas.types import (
     Adjustment,
     Camera,
     Detections,
+    Frame,
+    FrameResult,
     Positions,
     Telemetry,
+    TrackedFrame,
     Tracks,
     as_picture,
     share_orders,
 )
 
 CORNERS = np.array([[10.0, 20, 40, 80], [0, 0, 5, 5]])
+LOG = Telemetry(np.arange(3.0), np.full(3, 40.0), np.zeros(3), np.zeros((3, 2)))
 
 
 def test_boxes_of_another_detector_come_back_as_they_were():
@@ -108,6 +112,39 @@ def test_telemetry_takes_lists_and_refuses_columns_of_other_lengths_and_times_th
 
 def test_an_adjustment_calls_a_bound_that_is_not_set_none():
     assert Adjustment(3, "gates.max_size_px", float("inf"), 75.0, "").describe() == "gates.max_size_px none -> 75"
+
+
+def test_a_record_prints_counts_and_ranges_in_one_short_line():
+    tracks = Tracks(3, np.array([7, 9]), CORNERS, np.array([0.5, 0.9]), np.arange(2))
+    assert repr(tracks).startswith("Tracks(2 rows, frame=3, identity: 7 to 9, box_px: 0 to 80, score: 0.5 to 0.9")
+    result = FrameResult(TrackedFrame(3, Frame(3, 0.2, np.zeros((480, 640), np.uint8)), Detections(), tracks))
+    assert repr(result) == "FrameResult(tracked=TrackedFrame(...))"
+    assert "frame=Frame(...), detections=Detections(0 rows), tracks=Tracks(2 rows)" in repr(result.tracked)
+    assert repr(result.frame) == "Frame(number=3, time_s=0.2, image: 480x640 0)"
+    long = [replace(LOG, origin="/a/long/path" * 9, notes=("A note for the user.",) * 9), Positions(), result.tracked]
+    assert all(len(repr(record)) < 300 and "array" not in repr(record) for record in long)
+
+
+def test_a_table_is_sliced_by_a_number_and_goes_row_by_row():
+    rows = list(Detections(CORNERS, np.ones(2)))
+    assert [row.xyxy.tolist() for row in rows] == [[[10, 20, 50, 100]], [[0, 0, 5, 5]]]
+    assert rows[0][-1].xyxy.tolist() == rows[0].xyxy.tolist() and len(LOG[1:]) == 2
+    with pytest.raises(IndexError):
+        LOG[3]
+
+
+def test_tables_that_mean_something_else_are_not_joined():
+    assert len(Telemetry.concat([LOG[:2], LOG[2:]])) == 3
+    with pytest.raises(InputError, match=r"must have the same geographic$"):
+        Telemetry.concat([LOG[:2], replace(LOG[2:], geographic=False)])
+    with pytest.raises(InputError, match=r"must have the same lonlat_deg$"):
+        Positions.concat([Positions(), Positions(lonlat_deg=np.zeros((0, 2)))])
+    with pytest.raises(InputError, match="concat got no tables"):
+        Positions.concat([])
+
+
+def test_places_are_columns_by_their_unit():
+    assert "latitude_deg" in LOG.to_columns() and "north_m" in replace(LOG, geographic=False).to_columns()
 
 
 def test_a_table_becomes_a_pandas_frame_of_its_columns(monkeypatch):
@@ -281,3 +318,21 @@ def test_a_log_is_asked_for_one_time():
     assert flight is not None and flight.altitude_m == 40.0
     with pytest.raises(InputError, match="one number, got"):
         log.at(np.array([0.5, 1.5]))  # type: ignore[arg-type]
+
+
+def test_detections_may_be_lists():
+    found = Detections([[40, 60, 20, 20]], [0.9], label=["car"])  # type: ignore[arg-type]
+    assert found.xyxy.tolist() == [[40, 60, 60, 80]] and found.label.dtype == object and found.class_id.tolist() == [-1]
+    assert Detections([], []).xyxy.shape == (0, 4)  # type: ignore[arg-type]
+
+
+def test_detections_may_be_tensors():
+    torch = pytest.importorskip("torch")
+    found = Detections(torch.tensor([[40.0, 60, 20, 20]]), torch.tensor([0.5]), class_id=torch.tensor([2]))
+    assert found.xyxy.tolist() == [[40, 60, 60, 80]] and found.class_id.dtype == np.int64
+
+
+@pytest.mark.parametrize("wrong", [{"box_px": [1, 2, 3]}, {"class_id": [np.nan]}, {"label": "car"}, {"score": 0.9}])
+def test_what_is_no_column_of_detections_is_one_line(wrong):
+    with pytest.raises(InputError, match=f"{next(iter(wrong))} of Detections"):
+        Detections(**{"box_px": [[40, 60, 20, 20]], "score": [0.9], **wrong})

@@ -30,7 +30,7 @@ def pixels(points, cam, place=(0.0, 0.0)):
     rotation = np.array([right * cos(r) + down * sin(r), down * cos(r) - right * sin(r), ahead])
     inner = np.array([[cam.focal_px[0], 0, cam.centre_px[0]], [0, cam.focal_px[1], cam.centre_px[1]], [0, 0, 1]])
     offset = -rotation @ [*place, cam.height_m]
-    bend = np.array([cam.k1, cam.k2, 0.0, 0.0])
+    bend = np.array(cam.distortion)
     return cv2.projectPoints(np.asarray(points, float), cv2.Rodrigues(rotation)[0], offset, inner, bend)[0][:, 0]
 
 

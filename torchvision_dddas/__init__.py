@@ -17,26 +17,76 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.types import Source
 
-# Public name -> the module that holds it, and its name there.
+# Each public name by subject, with the module that defines it, and its name in that module. `__init__.pyi` tells type
+# checkers and editors the same; a test compares the two.
 _HOME = {
-    "AerialLocator": ("geo", "AerialLocator"),
-    "GroundLocator": ("geo", "GroundLocator"),
-    "__version__": ("runtime", "VERSION"),
-    "Adjustment": ("types", "Adjustment"),
-    "Detections": ("types", "Detections"),
+    # Clips, settings, and runs
+    "Source": ("types", "Source"),
     "Frame": ("types", "Frame"),
-    "InputError": ("errors", "InputError"),
-    "MotionDetector": ("detection", "MotionDetector"),
+    "Settings": ("config", "Settings"),
+    "load_settings": ("config", "load_config"),
     "Pipeline": ("pipeline", "Pipeline"),
+    "FrameResult": ("types", "FrameResult"),
+    "Adjustment": ("types", "Adjustment"),
+    "InputError": ("errors", "InputError"),
+    "__version__": ("runtime", "VERSION"),
+    # Detection
+    "MotionDetector": ("detection", "MotionDetector"),
+    "OnnxDetector": ("detection", "OnnxDetector"),
+    "PersonDetector": ("people", "PersonDetector"),
+    "Detections": ("types", "Detections"),
+    "People": ("types", "People"),
+    "LinearSvm": ("types", "LinearSvm"),
     "Registration": ("types", "Registration"),
     "Scene": ("types", "Scene"),
-    "Settings": ("config", "Settings"),
-    "Telemetry": ("types", "Telemetry"),
-    "load_settings": ("config", "load_config"),
-    "read_telemetry": ("io.telemetry", "read_telemetry"),
-    "PersonDetector": ("people", "PersonDetector"),
+    # Tracking
     "Tracker": ("tracking", "Tracker"),
+    "MultiViewTracker": ("tracking", "MultiViewTracker"),
     "Tracks": ("types", "Tracks"),
+    "TrackedFrame": ("types", "TrackedFrame"),
+    "AppearanceUse": ("types", "AppearanceUse"),
+    "SharedFrame": ("types", "SharedFrame"),
+    "ViewMap": ("types", "ViewMap"),
+    "DetectionTable": ("types", "DetectionTable"),
+    "read_detections": ("io.detection_tables", "read_detections"),
+    # Positions on the ground
+    "AerialLocator": ("geo", "AerialLocator"),
+    "GroundLocator": ("geo", "GroundLocator"),
+    "TargetFusion": ("geo", "TargetFusion"),
+    "Camera": ("types", "Camera"),
+    "CameraPose": ("types", "CameraPose"),
+    "Poses": ("types", "Poses"),
+    "PoseTable": ("types", "PoseTable"),
+    "Telemetry": ("types", "Telemetry"),
+    "Flight": ("types", "Flight"),
+    "Landmarks": ("types", "Landmarks"),
+    "LandmarkObservations": ("types", "LandmarkObservations"),
+    "Colours": ("types", "Colours"),
+    "Elevation": ("types", "Elevation"),
+    "Ortho": ("types", "Ortho"),
+    "Fix": ("types", "Fix"),
+    "Positions": ("types", "Positions"),
+    "AerialLocations": ("types", "AerialLocations"),
+    "GroundLocations": ("types", "GroundLocations"),
+    "Sightings": ("types", "Sightings"),
+    "FusedTargets": ("types", "FusedTargets"),
+    "Confirmation": ("types", "Confirmation"),
+    "GroundCrowds": ("types", "GroundCrowds"),
+    "read_telemetry": ("io.telemetry", "read_telemetry"),
+    "read_camera": ("io.camera_files", "read_camera"),
+    "read_poses": ("io.camera_files", "read_poses"),
+    "read_landmarks": ("io.ground_tables", "read_landmarks"),
+    "read_positions": ("io.ground_tables", "read_positions"),
+    "read_colours": ("io.colour_files", "read_colours"),
+    "read_elevation": ("io.elevation", "read_elevation"),
+    "read_ortho": ("io.elevation", "read_ortho"),
+    # Pictures and files of results
+    "draw": ("io.drawing", "draw"),
+    "write_tracks": ("io.track_files", "write_tracks"),
+    # Zones
+    "Zones": ("geo", "Zones"),
+    "Zone": ("types", "Zone"),
+    "ZoneEvent": ("types", "ZoneEvent"),
 }
 
 __all__ = ["open_source", "open_video", *_HOME]
@@ -47,6 +97,13 @@ def open_video(spec: "str | Path", **options: Any) -> "Source":
 
     options: rate_hz, full_scale, single, as `io.sources.open_source` has them. A simulated clip can be steered.
     Raises InputError with one line when it cannot be read.
+
+    >>> import cv2
+    >>> for number in (1, 2):
+    ...     written = cv2.imwrite(f"{number:06d}.png", np.zeros((48, 64), np.uint8))
+    >>> clip = td.open_video(".", rate_hz=25)
+    >>> clip.size, [frame.time_s for frame in clip]
+    ((64, 48), [0.0, 0.04])
     """
     from torchvision_dddas.io.sources import names_file, open_source
 

@@ -1,29 +1,29 @@
-"""The one error that a user's mistake raises; and what any message, table or page may show of a name or an address."""
+"""InputError, the error that a user's mistake raises, and functions that make names and addresses safe to print."""
 
 import re
 from unicodedata import category
 
 LONGEST = 1000
-"""Characters of a message; what came may have been of any length."""
+"""Largest number of characters of a message. Longer messages are shortened, because input may have any length."""
 
-_END = 300  # of these, those that are kept of its end, which says what to do
+_END = 300  # characters kept from the end of a long message, because the end says what to do
 
 
-# Each of these needs time in proportion to a text's length: names are bounded, and a search for an @ finds one.
-# Between a scheme and the last @ stands who logs in, if there is a colon or no path in between: a password may hold /.
+# Each of these patterns needs time in proportion to the length of the text: the names in them have bounded lengths.
+# A login stands between the scheme and the last @ if there is a colon or no path in between; a password may contain /.
 _LOGIN = re.compile(r"((?:^|(?<=[\s'\"(=/]))[a-z][\w+.-]{0,30}:/+|[a-z][\w+.-]{0,30}://)(?:[^/?#]*:.*|[^/?#]*)@", re.I)
-# user:password@host in a word, as it is written where the scheme is forgotten or mistyped.
+# user:password@host in a word, for addresses whose scheme is missing or mistyped.
 _WORD = re.compile(r"\S+")
 _BARE_LOGIN = re.compile(r"(?:^|(?<=['\"(])|(?<=//))[^/:@'\"(]+:(?!/).*@")
-# A path has one slash of two.
+# The scheme of an address. A path object reduces :// to :/.
 _SCHEME = re.compile(r"://|(?:https?|rtsps?|rtmps?|srt|tcp|udp|ftps?):/", re.I)
-# Cameras also have user=NAME_password=WORD in their path.
+# Keys of secrets in a query. Some cameras also have user=NAME_password=WORD in their path.
 _SECRET_KEY = re.compile(
     r"((?:(?<=[?&;/])(?:[^\s=?&;/]{0,60}(?:pass|pwd|psw|token|secret|auth|key|sig|cred|session)[^\s=?&;/]{0,60}"
     r"|[^\s=?&;/]{0,60}pas|p|pw|pin|otp|sas|jwt|code)|(?<=_)(?:password|passwd|pass|pwd))=)(?!\*\*\*(?:[^\w]|$))[^&]+",
     re.I,
 )
-# Of a query any other value too, up to a blank, unless its key is known to tell of no secret.
+# All other values of a query, up to a blank, unless the key is known to be harmless.
 _OTHER_KEY = re.compile(
     r"((?<=[?&;])(?!(?:(?:rtsp_)?transport|timeout|stimeout|port|rate|fps|framerate|width|height|size|resolution|channel"
     r"|camera|stream|subtype|profile|codec|video|audio|format|quality|mode|latency|ttl|hops|bytes|interface|localaddr"
@@ -34,11 +34,12 @@ _HIDDEN = r"\1***"
 
 
 def without_secrets(text: str) -> str:
-    """A text without the names and passwords of its addresses: `user:password@` is left out, `?password=` says ***.
+    """Remove the user names and passwords of addresses from a text.
 
-    So does any other value of a query whose key is not known to tell of no secret, as `?stream=2` does. A password may
-    hold any sign. Where it cannot be known whether an @ ends one, all before it is left out, and of a query all from
-    its secret to the next & or the end of the line. What was hidden once keeps the words that follow.
+    `user:password@` is removed. In a query the value of `password=` is replaced by ***, and so is any other value
+    unless its key is known to be harmless, as in `?stream=2`. A password may contain any character: if it is unclear
+    whether an @ ends a password, everything before the @ is removed; in a query, everything from the secret to the
+    next & or the end of the line is replaced. A second call does not change the result.
     """
     if "@" not in text and (":/" not in text or "=" not in text):
         return text
@@ -62,20 +63,23 @@ def _without_login(word: re.Match[str]) -> str:
 
 
 def readable(text: str) -> str:
-    r"""A text that any encoding of Unicode holds: bytes of a file's name that are no UTF-8 are shown as `\xff`."""
+    r"""Return a text that can be encoded as UTF-8. Bytes of a file name that are not UTF-8 are shown as `\xff`."""
     if text.isascii():
         return text
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    except UnicodeEncodeError:  # half a character that is no byte of a name either
+    except UnicodeEncodeError:  # the text has a lone surrogate that does not stand for a byte of a name
         return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 class InputError(ValueError):
-    """Bad input in one clear line: what came, what was wanted, what to do. The command line exits with 2 on it.
+    """Bad input, described in one line: what came, what was wanted, what to do. The command line exits with code 2.
 
-    What came may hold line feeds, what steers a terminal, or half a character: such is shown by its number. The middle
-    of an endless line is left out, and so are passwords.
+    Line feeds are replaced by spaces, and control characters and lone surrogates by their codes. Passwords and the
+    middle of a very long line are removed.
+
+    >>> issubclass(td.InputError, ValueError)
+    True
     """
 
     def __init__(self, text: object = "") -> None:
@@ -83,7 +87,7 @@ class InputError(ValueError):
 
 
 class LostInputError(InputError):
-    """The input stopped before its end. What came until then is kept."""
+    """The input stopped before its end. The results up to that point are kept."""
 
 
 def _line(text: str) -> str:
@@ -93,7 +97,7 @@ def _line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """The text with its line feeds and spaces; what steers a terminal, or is no UTF-8, by its number."""
+    """Replace control characters and lone surrogates in a text by their codes; keep line feeds and spaces."""
     if text.isprintable():
         return text
     text = readable(text)

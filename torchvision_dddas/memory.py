@@ -1,28 +1,31 @@
-"""The memory that an input may take. Every reader asks here before it makes room for what a header announces.
+"""The memory budget of an input. Every reader calls `check_memory` before it allocates what a header announces.
 
-A file of some bytes can announce billions of pixels or numbers. Such a file is small, so small files have the smaller
-budget. The costs are the most that any command was measured to take (docs/limitations.md).
+A file of a few bytes can announce billions of pixels or numbers. Small files therefore have a smaller budget. The costs
+are the largest that were measured for any command (docs/limitations.md).
 """
 
 import os
+import sys
+from contextlib import suppress
+from pathlib import Path
 
 from torchvision_dddas.errors import InputError
 
 SMALL_FILE = 5_000_000
-"""Files of fewer bytes have the smaller budget."""
+"""Files with fewer bytes have the smaller budget."""
 
 SMALL_MB, LARGE_MB = 1100, 6000
-"""Megabytes (10^6 bytes) that a small file may take, and a larger one or what comes from no file."""
+"""Budget in megabytes (10^6 bytes) of a small file, and of a larger file or an input without a file."""
 
 VARIABLE = "DDDAS_MEMORY_MB"
 """The environment variable that sets another budget for all files."""
 
 PHOTO, PICTURE, VIDEO, MASK = 30, 52, 100, 40
-"""Bytes for each pixel: of a clip of one picture, of one of a few, of a frame of a video, and of a mask."""
+"""Bytes per pixel: a clip of one picture, a clip of a few pictures, a frame of a video, and a mask."""
 
 
 def cost_of_pictures(count: int) -> int:
-    """Bytes for each pixel of a clip of so many pictures: detection holds up to 14 of them."""
+    """Return the bytes per pixel of a clip with this number of pictures: detection keeps up to 14 of them."""
     return PHOTO if count == 1 else min(max(PICTURE, 16 + 6 * count), VIDEO)
 
 
@@ -43,3 +46,22 @@ def check_memory(needed: float, what: str, size: int | None = None, advice: str 
             f"{what}; that takes {needed / 1e6:,.0f} MB of memory, wanted at most {budget_mb:,} MB{about}: {advice}, "
             f"or set {VARIABLE} in the environment"
         )
+
+
+def reset_peak_memory() -> None:
+    """Let the peak memory count from now on, where the system allows that."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def peak_memory_mb() -> float:
+    """Return the process's peak in units of 2**20 bytes, NaN where it is not reported; some systems cannot reset it."""
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 1024

@@ -1,8 +1,8 @@
-"""What computes: torch, or ONNX graphs, opened only where they are what the manifest of `dddas export` says.
+"""Choose the backend (torch or onboard), and open ONNX graphs that agree with the manifest of `dddas export`.
 
-A folder of graphs has one manifest.json. It holds each file's SHA-256, inputs, outputs and parameters, the version of
-this package that made it, and a seal: the SHA-256 of everything else in it. This reveals damage, edits and mixed-up
-versions from the graphs that were checked; it is no signature, which would need a key.
+A folder of graphs has one manifest.json. It states each file's SHA-256, inputs, outputs and parameters, the version of
+this package that made it, and a seal, which is the SHA-256 of the other content. This detects damage, edits and mixed
+versions of graphs. It is not a signature, which would need a key.
 """
 
 import ctypes
@@ -17,37 +17,64 @@ from typing import Any
 
 from torchvision_dddas.errors import InputError
 
-VERSION = "0.1.0"
-"""Of this package."""
+VERSION = "0.3.0"
+"""Version of this package."""
 
 SHIPPED = Path(__file__).parent / "graphs"
 MANIFEST = "manifest.json"
 
 
 def opened(folder: Path, name: str, **options: Any) -> Any:
-    """An ONNX Runtime session of a graph, on one thread of this process's own.
+    """Open an ONNX Runtime session of a graph that runs on a single thread.
 
-    options: further attributes of SessionOptions. Raises InputError as `verified`, and where the runtime refuses.
+    options: further attributes of SessionOptions. Raises InputError as `verified`, and if ONNX Runtime cannot open it.
     """
-    content = verified(folder, name)
+    # Pass the verified bytes, not the file, which may change meanwhile.
+    return open_session(verified(folder, name), folder / name, threads=1, **options)
+
+
+def open_session(content: bytes | str, path: Path, provider: str = "cpu", threads: int = 0, **options: Any) -> Any:
+    """An ONNX Runtime session of a graph's bytes, or of the file of this name, whose weights may lie beside it.
+
+    path: of the graph, for messages. provider: one of `providers`. threads: 0 lets the runtime choose. options: further
+    attributes of SessionOptions. Raises InputError for a provider that is not there and where the runtime refuses.
+    """
     import onnxruntime
 
+    known, wanted = providers(), ["cpu"] if provider == "cpu" else [provider, "cpu"]
+    if provider not in known:
+        raise InputError(
+            f"no provider of ONNX Runtime is named '{provider}' here; there are {', '.join(known)}. Others come with "
+            "other packages, such as onnxruntime-gpu or onnxruntime-openvino in place of onnxruntime"
+        )
     chosen = onnxruntime.SessionOptions()
-    chosen.intra_op_num_threads = chosen.inter_op_num_threads = 1
+    chosen.intra_op_num_threads = chosen.inter_op_num_threads = threads
     for option, value in options.items():
         setattr(chosen, option, value)
     try:
-        # The bytes that were verified, not the file, which may change meanwhile.
-        return onnxruntime.InferenceSession(content, chosen, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's own classes have no common ancestor but this
+        session = onnxruntime.InferenceSession(content, chosen, providers=[known[name] for name in wanted])
+    except Exception as error:  # the error classes of onnxruntime have no other common base class
         first = str(error).partition("\n")[0]
         raise InputError(
-            f"onnxruntime {onnxruntime.__version__} cannot open {folder / name}: {first}; a newer one may"
+            f"onnxruntime {onnxruntime.__version__} cannot open {path}: {first}; is it a model in ONNX, or a newer one?"
         ) from None
+    # The runtime falls back to the CPU with no more than a warning, as where a library of CUDA is missing.
+    if known[provider] not in session.get_providers():
+        raise InputError(f"ONNX Runtime could not start the provider '{provider}'; its own warning above says why")
+    return session
+
+
+def providers() -> dict[str, str]:
+    """The providers that the installed ONNX Runtime computes with: short names, such as cuda, and its own names."""
+    import onnxruntime
+
+    names = onnxruntime.get_available_providers()
+    # Azure's sends pictures elsewhere.
+    return {name.removesuffix("ExecutionProvider").lower(): name for name in names if "Azure" not in name}
 
 
 def verified(folder: Path, name: str) -> bytes:
-    """A graph's bytes. Raises InputError where it is not there, not listed, or not the one that is listed."""
+    """Return the bytes of a graph. Raises InputError if it is missing, not listed, or differs from the manifest."""
     held = manifest(folder)["graphs"]
     if name not in held:
         raise InputError(f"{folder / MANIFEST} lists no {name}; {_again(folder)}")
@@ -57,20 +84,18 @@ def verified(folder: Path, name: str) -> bytes:
         raise InputError(f"cannot read {folder / name}: {error.strerror or error}; {_again(folder)}") from None
     if hashlib.sha256(content).hexdigest() != held[name].get("sha256"):
         raise InputError(
-            f"{folder / name} is not the graph that its {MANIFEST} lists: damaged or changed; {_again(folder)}"
+            f"{folder / name} is not the graph that its {MANIFEST} lists: it is damaged or changed; {_again(folder)}"
         )
     return content
 
 
 def manifest(folder: Path) -> dict[str, Any]:
-    """What a folder's manifest says. Raises InputError for none, a changed one, or another version's."""
+    """Return the manifest of a folder. Raises InputError if it is missing, changed, or made by another version."""
     path = folder / MANIFEST
     try:
         text = path.read_bytes()
     except OSError as error:
-        raise InputError(
-            f"{folder} holds no graphs with their {MANIFEST} ({error.strerror}); {_again(folder)}"
-        ) from None
+        raise InputError(f"{folder} has no graphs with a {MANIFEST} ({error.strerror}); {_again(folder)}") from None
     return _checked(path, text)
 
 
@@ -82,54 +107,54 @@ def _checked(path: Path, text: bytes) -> dict[str, Any]:
         intact = isinstance(held["graphs"], dict) and held["seal"] == seal(held)
     except (ValueError, KeyError, TypeError, RecursionError):
         intact, held, made_by = False, {}, VERSION
-    # Before the seal, which another version may make in another way.
+    # Check the version before the seal, because another version may compute the seal in another way.
     if isinstance(made_by, str) and made_by != VERSION:
         raise InputError(
             f"the graphs in {path.parent} were made by torchvision-dddas {made_by}, "
-            f"and this is {VERSION}; {_again(path.parent)}"
+            f"but this is version {VERSION}; {_again(path.parent)}"
         )
     if not intact:
-        raise InputError(f"{path} is not as `dddas export` wrote it: damaged or changed; {_again(path.parent)}")
+        raise InputError(f"{path} is not as `dddas export` wrote it: it is damaged or changed; {_again(path.parent)}")
     return dict(held)
 
 
 def seal(content: dict[str, Any]) -> str:
-    """The SHA-256 of a manifest without its seal, independent of its layout."""
+    """Return the SHA-256 of a manifest without its seal. It does not depend on the layout of the JSON text."""
     rest = {name: value for name, value in content.items() if name != "seal"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _again(folder: Path) -> str:
-    """What to do."""
+    """Return the advice for a bad folder of graphs."""
     if folder == SHIPPED:
         return "install torchvision-dddas again"
     return f"make the graphs again with `dddas export --out {folder}`"
 
 
 def wants_torch(backend: str, auto_with_gpu: bool = True) -> bool:
-    """Whether the back end is torch, which is then made ready to be imported.
+    """Return whether the backend is torch, and prepare the environment for its import.
 
-    `auto` is torch where it sees a CUDA device, else onboard, the quicker one for a single stream on a CPU.
-    auto_with_gpu: False for work that a GPU does not help. Raises InputError for another name or missing packages.
+    `auto` is torch if torch sees a CUDA device, else onboard, which is faster for a single stream on a CPU.
+    auto_with_gpu: False for work that a GPU does not speed up. Raises InputError for another name or missing packages.
     """
     if backend == "onboard" or (backend == "auto" and not (auto_with_gpu and _has_cuda())):
         return False
     if backend not in ("auto", "torch"):
-        raise InputError(f"no back end is named '{backend}'; give auto, torch or onboard")
+        raise InputError(f"no backend is named '{backend}'; give auto, torch or onboard")
     if missing := _missing_packages():
         raise InputError(
             f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
-            "or take --backend onboard"
+            "or use --backend onboard"
         )
-    # Waiting threads that spin take the cores from the threads they wait for, minutes a frame on a busy machine.
+    # Without this, waiting threads spin and take the cores from working threads: minutes a frame on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return True
 
 
 def torch_device() -> str:
-    """Where torch computes: on the CUDA device if there is one, else on the CPU.
+    """Return the device for torch: cuda if there is a CUDA device, else cpu.
 
-    Apple's MPS is not taken: homographies are fitted in float64, which it does not have.
+    Apple's MPS is not used, because homographies are fitted in float64, which MPS does not support.
     """
     import torch
 
@@ -142,7 +167,7 @@ def _missing_packages() -> list[str]:
 
 @cache
 def _has_cuda() -> bool:
-    """Whether torch sees a CUDA device; where there is no driver it is not loaded to be asked, which takes seconds."""
+    """Return whether torch sees a CUDA device. Without a driver torch is not imported, which would take seconds."""
     if _missing_packages():
         return False
     try:

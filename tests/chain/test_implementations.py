@@ -41,7 +41,7 @@ def test_the_table_is_printed() -> None:
 
 
 def test_the_ratios_of_a_cpu_are_those_of_the_results() -> None:
-    measured = json.loads((ROOT / "docs/results/operations.json").read_text())["figures"]
+    measured = json.loads((ROOT / "eval/results/operations.json").read_text())["figures"]
     rows = {"HSV conversion": "RGB to HSV", "gradient": "gradient, box mean 5", "corners": "smaller eigenvalue 5"}
     rows |= {"pyramid": "pyramid of 4", "morphology": "erosion 3", "histograms": "histograms of 10 boxes"}
     for line in IMPLEMENTATIONS:
@@ -61,7 +61,7 @@ def traced(settings: Settings, batch: int) -> tuple[Counter[str], dict[str, list
         elif event == "call" and name in watched and module.startswith("torchvision_dddas.functional"):
             sizes.setdefault(name, []).append(len(frame.f_locals[watched[name]]))
 
-    detector = MotionDetector(settings, TorchEngine(settings, "cpu"), batch=batch)
+    detector = MotionDetector(settings, backend=TorchEngine(settings, "cpu"), batch=batch)
     sys.setprofile(watch)
     try:
         for image in render(1, 56, (160, 120)).images:
@@ -84,7 +84,7 @@ def test_a_run_of_the_torch_engine_calls_kornia_and_works_on_full_batches() -> N
 def test_what_kornia_computes_on_a_gpu_is_what_we_compute_on_a_cpu(operation, monkeypatch) -> None:
     assert uses_kornia(operation, "cuda") and not uses_kornia(operation, "cpu")
     levels = F.gaussian_blur2d(torch.randint(0, 256, (2, 1, 60, 80), dtype=torch.uint8), 7).float()
-    compute = {"gradient": F.mean_gradient, "corners": lambda x: F.corner_min_eigenvalue(x / 255, 5)}[operation]
+    compute = {"gradient": F.mean_gradient, "corners": lambda x: F.corner_min_eigenvalue(x / 255, block=5)}[operation]
     ours = compute(levels)
     for module in (filters, keypoints):
         monkeypatch.setattr(module, "uses_kornia", lambda *_: True)

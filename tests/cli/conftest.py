@@ -128,15 +128,3 @@ def scorer(monkeypatch):
 
     install()
     return install
-
-
-@pytest.fixture
-def file(tmp_path):
-    """Write a file: file(name, text) gives its path."""
-
-    def write(name, text):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write

@@ -23,14 +23,20 @@ ISOLATED = ["unshare", "--map-root-user", "--net"]
 MADE = "--telemetry made/telemetry.csv --landmarks made/landmarks.csv --colours made/colours.toml"
 COMMANDS = f"""
 settings
+citation
 demo --out demo
 simulate four --set clip.seconds=1 --out made
 detect made/frames --config patrol --out found
+advise made/frames --rate 10 --telemetry made/telemetry.csv
+bench --seconds 5 --size 160x120
 people made/ground/ugv1 --out people
 track made/frames --config patrol --out tracks
+convert tracks/tracks.csv boxes.json
 run made/frames --rate 10 --config patrol {MADE} --camera made/camera.toml --dem made/dem.tif --out run
 run sim:four --scene clip.seconds=1 --out flown
 colours made/frames/000001.jpg --count 2 --out colours.toml
+calibrate-flight run/landmarks.csv --telemetry made/telemetry.csv --camera made/camera.toml --rate 10 --out flight.toml
+views run/tracks.csv run/tracks.csv --out shared
 locate aerial run/tracks.csv --landmarks run/landmarks.csv --camera made/camera.toml --out located
 locate ground people/detections.csv --camera camera.toml --out walkers
 confirm located/positions.csv walkers/positions.csv --camera camera.toml --out confirmed
@@ -76,7 +82,8 @@ def test_no_command_leaves_a_file_at_home_or_beside_its_outputs_or_needs_a_netwo
     for module in ("torch", "distributed", "rasterio", "onnxscript"):
         pytest.importorskip(module)
     lines = [line.split() for line in COMMANDS.strip().splitlines()]
-    names = {command.callback.__name__ for command in app.registered_commands if command.callback is not None}
+    called = (command.callback for command in app.registered_commands)
+    names = {callback.__name__.replace("_", "-") for callback in called if callback is not None}
     assert {words[0] for words in lines} == names | {group.name for group in app.registered_groups}
     world.three(tmp_path / "clips")
     (tmp_path / "camera.toml").write_text(CAMERA)
@@ -86,4 +93,5 @@ def test_no_command_leaves_a_file_at_home_or_beside_its_outputs_or_needs_a_netwo
         assert done.returncode == 0, (words, done.stderr[-2000:])
         assert files_at_home(tmp_path) == [], words
     named = {words[words.index("--out") + 1] for words in lines if "--out" in words}
+    named |= {"boxes.json", "compare-tables", "compare-figures"}  # of convert, and beside the page of compare
     assert {path.name for path in tmp_path.iterdir()} - known == named

@@ -99,9 +99,10 @@ def test_a_clip_in_which_nothing_is_found_has_empty_tables(dddas, engine, scorer
 
 
 def test_detect_saves_everything_by_default_and_sums_up(dddas, engine, clip, tmp_path):
-    result = dddas("detect", clip, "--out", tmp_path / "out", "--backend", "onboard")
+    result = dddas("detect", clip, "--rate", 10, "--out", tmp_path / "out", "--backend", "onboard")
     assert result.stdout.splitlines() == [
         "5 frames, 5 detections, 1 frames with unreliable registration",
+        "scale: the size of people is not known: height above ground and focal length are not both known",
         f"{tmp_path / 'out'}: detections.csv, detections.txt, masks/, overlay.mp4, run.json",
     ]
     assert names(tmp_path / "out/masks") == [f"{k:06d}.png" for k in range(1, 6)]

@@ -87,6 +87,30 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     assert "holds no study: no scores.bin" in bad(dddas("compare", tmp_path / "out", tmp_path / "clips"))
 
 
+def test_what_a_study_keeps_is_scored_as_the_study_was(study, dddas, tmp_path) -> None:
+    done = study("--keep", "tracks,masks", "--clips", "other")
+    assert done.exit_code == 0 and "note: --keep masks: no task of this study has masks" in done.output
+    kept = tmp_path / "out" / "kept" / "tracking"
+    assert dddas("evaluate", tmp_path / "clips", kept).exit_code == 0
+    of_study = measures(tmp_path / "out")["tasks"]["tracking"]["clips"]["other"]["tracks"]
+    assert measures(kept)["clips"]["other"]["tracks"] == of_study
+    assert "--keep takes tracks, detections, masks, got 'boxes'" in bad(study("--keep", "boxes"))
+
+
+def test_results_of_several_methods_are_a_study_each_and_compared(dddas, file, tmp_path) -> None:
+    truth, out = file("gt.txt", TRUTH), tmp_path / "out"
+    for side in "ab":
+        (tmp_path / side).mkdir()
+    places = file("a/tracks.txt", FOUND), file("b/tracks.txt", FOUND.replace("2,8,", "2,7,"))
+    done = dddas("evaluate", truth, *places, "--names", "ours,sort", "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "A: ours" in done.stdout and "p, corrected" in done.stdout and (out / "report.html").is_file()
+    shown = dddas("compare", out / "ours", out / "sort", "--out", tmp_path / "page.html")
+    assert shown.exit_code == 0 and (tmp_path / "page-tables" / "tracking.tex").is_file()
+    assert "two results are named 'tracks'" in bad(dddas("evaluate", truth, *places, "--out", out))
+    assert "--names is of no use" in bad(dddas("evaluate", "--dataset", truth, "--names", "a"))
+
+
 @pytest.fixture
 def own_study(dddas, tmp_path):
     """Runs `dddas evaluate --dataset` on a file of the test's own."""
@@ -147,3 +171,11 @@ def test_a_mistake_is_one_line_and_exit_2(study, words, message) -> None:
     if "--scheduler" in words:
         pytest.importorskip("distributed", reason="the extra 'distributed' is not installed")
     assert message in bad(study("--quiet", *words))
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "tracks.json"])
+def test_results_in_another_format_are_refused_with_the_command_that_converts_them(dddas, tmp_path, name):
+    (tmp_path / "gt.txt").write_text("1,1,10,10,20,20,1,-1,-1,-1\n")
+    (tmp_path / name).write_text("frame,identity,x_px,y_px,width_px,height_px\n1,1,10,10,20,20\n")
+    said = bad(dddas("evaluate", tmp_path / "gt.txt", tmp_path / name))
+    assert f"dddas convert {name} tracks.txt" in said

@@ -59,7 +59,8 @@ def test_tracks_become_positions_with_covariances(locate, out, tmp_path):
     assert np.allclose(found.east_north_m[2:4], walked(2), atol=1e-3)
     assert (np.linalg.eigvalsh(found.covariance_m2) > 0).all()
     assert (out / "positions.csv").read_text().splitlines()[0] == (
-        "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,score,cameras,class,class_id"
+        "frame,target,east_m,north_m,var_east_m2,cov_east_north_m2,var_north_m2,score,cameras,class,class_id,"
+        "above_sea_m,above_ellipsoid_m,circular_error90_m,error_category"
     )
     (first, *_) = rows(out / "sightings.csv")
     assert (first["camera"], first["target"], first["by"], first["cut"]) == ("c0", "4", "both", "0")

@@ -1,11 +1,15 @@
 """`dddas run`: from a clip to places on the ground, and one line for each mistake."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 
 from tests.cli.conftest import bad, names, record, rows
-from tests.overflight import COLOURS_TOML, Overflight, pictures
+from tests.onnx_models import write_finder
+from tests.overflight import COLOURS_TOML, ORIGIN, Overflight, pictures
+from torchvision_dddas.geometry import lonlat
 
 RATE_HZ = 8.0
 FLIGHT = Overflight(
@@ -235,6 +239,86 @@ def test_a_clip_and_a_log_alone_give_places_maps_and_a_picture_without_a_bar_of_
     assert kept["telemetry"].endswith("telemetry.csv") and kept["landmarks_file"] is None
 
 
+def test_boxes_of_ones_own_detector_are_located_with_their_classes(dddas, flown, file, tmp_path):
+    lines = ["frame,x,y,width,height,score,class"]
+    for frame in range(1, FLIGHT.frames + 1):
+        for at, label in zip(
+            FLIGHT.shown(frame, FLIGHT.targets(frame)), ("car", "person", "car", "person"), strict=True
+        ):
+            lines.append(f"{frame},{at[0] - 8:.2f},{at[1] - 8:.2f},17,17,0.9,{label}")
+    boxes = file("boxes.csv", "\n".join(lines) + "\n")
+    words = alone(flown, "--camera", flown / "camera.toml", "--detections", boxes, "--save", "none", "--out", tmp_path)
+    result = dddas(*words)
+    assert result.exit_code == 0, result.output
+    assert sorted(row["class"] for row in rows(tmp_path / "summary.csv")) == ["car", "car", "person", "person"]
+    found = rows(tmp_path / "positions.csv")
+    assert len(found) == 4 * FLIGHT.frames and {row["class"] for row in found} == {"car", "person"}
+    assert record(tmp_path)["detections_file"] == str(boxes) and "scale:" not in result.stdout
+
+
+def test_a_network_gives_classes_to_places_and_zones_and_what_moves_is_kept(dddas, flown, file, tmp_path):
+    (tmp_path / "clip").mkdir()
+    for frame, picture in enumerate(pictures(FLIGHT), 1):
+        picture = np.minimum(picture, 150)
+        u, v = np.round(FLIGHT.shown(frame, FLIGHT.targets(frame))[0]).astype(int)
+        picture[v - 8 : v + 9, u - 8 : u + 9] = (0, 0, 255)
+        cv2.imwrite(str(tmp_path / "clip" / f"{frame:05d}.png"), picture)
+    metadata = {"names": "['car', 'person', 'bus']", "imgsz": "[640, 640]"}
+    model = write_finder(tmp_path / "finder.onnx", "YOLO without NMS", metadata=metadata, is_free=True)
+    corners = lonlat(np.array([[-2.0, -60], [60, -60], [60, 60], [-2, 60], [-2, -60]]), ORIGIN).tolist()
+    field = {"type": "Polygon", "coordinates": [corners]}
+    feature = {"type": "Feature", "properties": {"name": "field"}, "geometry": field}
+    zones = file("zones.geojson", json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    words = alone(flown, "--camera", flown / "camera.toml", "--detector", model, "--movers", "--zones", zones)
+    words[1] = tmp_path / "clip"
+    result = dddas(*words, "--save", "none", "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    summary = rows(tmp_path / "out" / "summary.csv")
+    assert [row["class"] for row in summary].count("person") == 1 and "" in {row["class"] for row in summary}
+    assert sum(row["class"] == "person" for row in rows(tmp_path / "out" / "positions.csv")) == FLIGHT.frames
+    assert "person" in {row["class"] for row in rows(tmp_path / "out" / "events.csv")}
+    assert record(tmp_path / "out")["detector"]["layout"] == "YOLO without NMS"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--detections", "{boxes}", "--ignore", "mask.png"], "--ignore is for the search"),
+        (["--detections", "{boxes}", "--live"], "--detections is of no use with --live"),
+        (["--box-format", "xyxy"], "--box-format is for --detections FILE"),
+        (["--provider", "cuda"], "--provider is for --detector MODEL"),
+        (["--movers"], "--movers is for --detector or --detections"),
+        (["--detector", "a.onnx", "--detections", "{boxes}"], "were both given"),
+        (["--detector", "none.onnx"], "none.onnx is no file"),
+        (["--detector", "a.onnx", "--live"], "--detector is of no use with --live"),
+        (["--detections", "none.csv"], "none.csv cannot be read"),
+    ],
+)
+def test_boxes_that_cannot_be_used_are_one_line(dddas, flown, file, tmp_path, words, says):
+    boxes = file("boxes.csv", "frame,x,y,width,height\n1,5,5,9,9\n")
+    out = tmp_path / "out"
+    words = [str(boxes) if word == "{boxes}" else word for word in words]
+    assert says in bad(dddas("run", flown / "clip", *words, "--out", out)) and not out.exists()
+
+
+def test_single_pixels_of_a_moment_are_located(dddas, flown):
+    flight = [flown / "clip", "--rate", RATE_HZ, "--telemetry", flown / "telemetry.csv"]
+    (u, v), *_ = FLIGHT.shown(9, FLIGHT.targets(9))
+    words = ["locate", "pixel", *flight, "--camera", flown / "camera.toml", "--time", FLIGHT.time(9)]
+    result = dddas(*words, f"{u:.1f},{v:.1f}", "320,180")
+    assert result.exit_code == 0, result.output
+    one, other, *_ = result.stdout.splitlines()
+    assert (
+        one.startswith(f"{u:g}"[:4])
+        and "latitude" in one
+        and "with 95 % within" in one
+        and other.startswith("320,180: ")
+    )
+    for pixel, says in (("9000,5", "lies outside of"), ("5", "a pixel must be u,v")):
+        assert says in bad(dddas(*words, pixel))
+    assert "give its --telemetry" in bad(dddas("locate", "pixel", flown / "clip", "5,5"))
+
+
 def test_a_rate_that_nothing_tells_is_named(dddas, flown, tmp_path):
     words = [word for word in alone(flown, "--camera", flown / "camera.toml", "--config", "fast") if word != "--rate"]
     result = dddas(*[word for word in words if word != RATE_HZ], "--save", "none", "--out", tmp_path)
@@ -287,7 +371,7 @@ def test_detect_and_run_take_the_logs_field_of_view_before_the_cameras(dddas, fl
     ):
         result = dddas(command, *clip, *out, "--telemetry", tmp_path / log, *more)
         assert result.exit_code == 3 * (log == "placeless.csv"), result.output
-        assert "note: gates.focal_px is 554 px by the log's field of view" in result.stdout
+        assert "note: gates.focal_px is set to 554 px from the log's field of view" in result.stdout
         focal.append(record(tmp_path / "out")["settings"]["gates"]["focal_px"])
     assert focal == pytest.approx([320 / np.tan(np.radians(30))] * 4)
     (tmp_path / "own.toml").write_text("[gates]\nfocal_px = 1000\n")
@@ -320,3 +404,58 @@ def test_a_file_that_is_not_there_is_refused_also_where_nothing_can_be_located(d
     log.write_text("time_s,altitude_m\n" + "".join(f"{k},50\n" for k in range(5)))
     said = bad(dddas("run", clip, "--telemetry", log, option, tmp_path / "nowhere.x", "--out", tmp_path / "out"))
     assert "nowhere.x" in said and not (tmp_path / "out" / "run.json").exists()
+
+
+def test_the_scale_stands_on_the_screen_in_the_record_and_in_the_report(dddas, flown, tmp_path):
+    """45 m above ground at 457 px people are 5.1 px."""
+    result = dddas(*alone(flown, "--camera", flown / "camera.toml"), "--save", "report", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    said = "a person is about 5.1 px (altitude 45.0 m, focal length 457 px); the settings for tiny people"
+    assert f"scale: {said}" in result.stdout.splitlines() and said in (tmp_path / "report.html").read_text()
+    scale = record(tmp_path)["scale"]
+    assert scale["person_px"] == pytest.approx([5.08, 5.08], abs=0.02)
+    assert scale["frames"] == scale["frames_tiny"] == FLIGHT.frames and scale["from"] in said
+
+
+def test_the_same_clip_without_telemetry_says_that_its_scale_is_not_known(dddas, engine, flown, tmp_path):
+    for words, said in (
+        ((), "the size of people is not known"),
+        (("--config", "patrol"), "about 4.0 px (as gates.person_px"),
+    ):
+        result = dddas("detect", flown / "clip", "--rate", RATE_HZ, *words, "--save", "none", "--out", tmp_path)
+        assert result.exit_code == 0 and "scale: " in result.stdout and said in result.stdout, result.output
+        assert ("--config patrol takes people to be" in result.stderr) == bool(words)
+
+
+def test_patrol_beside_a_configuration_on_which_it_has_no_effect_is_refused(dddas, flown):
+    result = dddas("detect", flown / "clip", "--config", "fast,patrol")
+    assert result.exit_code == 2 and "patrol has no effect beside fast" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["detect", "track"])
+def test_pictures_outside_of_the_telemetry_are_counted_in_a_note(dddas, engine, flown, tmp_path, command):
+    (tmp_path / "short.csv").write_text("time_s,altitude_m,hfov_deg\n0,45,60\n0.5,45,60\n")
+    words = (flown / "clip", "--rate", RATE_HZ, "--telemetry", tmp_path / "short.csv", "--save", "none")
+    result = dddas(command, *words, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "note: 11 of 24 pictures lie outside the telemetry, which covers 0.0 to 0.5 s" in result.stdout
+    assert "note: gates.focal_px is set to 554 px from the log's field of view" in result.stdout
+
+
+def test_track_takes_telemetry_as_detect_does_and_refuses_it_beside_a_table(dddas, flown, tmp_path):
+    clip, log = (flown / "clip", "--rate", RATE_HZ), ("--telemetry", flown / "telemetry.csv")
+    focal, out = ("--set", "gates.focal_px=457"), ("--save", "none", "--out")
+    for command in ("detect", "track"):
+        result = dddas(command, *clip, *log, *focal, *out, tmp_path / command)
+        assert result.exit_code == 0 and "scale: a person is about 5.1 px" in result.stdout, result.output
+    found, tracked = (record(tmp_path / command) for command in ("detect", "track"))
+    assert found["targets"] == tracked["targets"] > 40 and tracked["telemetry"] == str(flown / "telemetry.csv")
+    table = ("--detections", tmp_path / "detect" / "detections.csv")
+    assert "leave --detections out" in bad(dddas("track", *clip, *log, *table, *out, tmp_path / "none"))
+
+
+@pytest.mark.parametrize("command", ["detect", "track", "run"])
+def test_pictures_without_a_rate_are_noted(dddas, engine, clip, tmp_path, command):
+    for words, is_noted in (((), True), (("--rate", 5), False)):
+        result = dddas(command, clip, *words, "--save", "none", "--out", tmp_path / "out")
+        assert result.exit_code == 0 and ("10 frames a second are assumed" in result.stdout) == is_noted, result.output

@@ -242,7 +242,7 @@ def test_the_log_of_another_time_is_refused_beside_a_camera_and_leaves_no_sessio
     film_camera(40)
     given = ("--telemetry", file("log.nmea", nmea(time.time() - ago_s, 20)), "--camera", file("camera.toml", CAMERA))
     said = bad(dddas("run", "rtsp://127.0.0.1:9/live", *FAST, *given, "--out", tmp_path / "out"))
-    assert "before the first picture" in said and "its places are not those of now" in said
+    assert "before the first picture" in said and "its places are not current" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -285,7 +285,7 @@ def test_a_log_without_times_of_day_is_taken_from_the_first_picture_on_and_a_not
     done = dddas("run", "rtsp://127.0.0.1:9/live", *FAST, "--telemetry", log, "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output
     _, record, results = session(tmp_path / "out")
-    assert any("says no time of day: its time 0 counts as the first picture's" in note for note in record["notes"])
+    assert any("gives no time of day: its time 0 is taken as the first picture's" in note for note in record["notes"])
     places = [target["lonlat_deg"] for line in results for target in line["targets"] if target.get("lonlat_deg")]
     assert places and np.abs(np.subtract(places, [-110.95, 32.23])).max() < 0.002
 

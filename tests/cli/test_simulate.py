@@ -87,7 +87,7 @@ def test_the_elevation_is_that_of_the_world(folder):
 
     scenario = load_scenario(folder / "scenario.toml")
     places = np.random.default_rng(0).uniform(-25, 25, (50, 2))
-    read = read_elevation(folder / "dem.tif", places, scenario.world.origin_deg, 10.0)
+    read = read_elevation(folder / "dem.tif", places, scenario.world.origin_deg, margin_m=10.0)
     np.testing.assert_allclose(height_at(read, places), open_simulator(scenario).world.up_m(places), atol=0.02)
     assert read.base_m == pytest.approx(scenario.world.above_sea_m, abs=0.05)
 

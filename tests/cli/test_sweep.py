@@ -7,6 +7,7 @@ import pytest
 
 from tests.cli.conftest import bad
 from tests.lab.evaluation.studies import world
+from tests.pages import Page
 from torchvision_dddas.config import load_config
 
 GRID = ("--grid", "difference.threshold=10,60", "--grid", "morphology.erode_px=1")
@@ -19,7 +20,7 @@ def study(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("sweep")
     for seed, name in enumerate(("one", "two", "held")):
         world.filmed(place / "clips", name, seed, frames=7)
-    return world.study(place / "clips", 'config = "fast"')
+    return world.study(place / "clips", 'config = "fast"\nset = ["gates.min_area_px=300"]')
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,18 @@ def test_the_best_of_a_grid_is_written_for_config_and_measured_on_clips_held_out
     assert best.difference.kind == load_config("fast").difference.kind
     assert record["clips"] == ["one", "two"] and record["held_out"] == ["held"]
     assert set(record["on_held_out"]) == {"before", "best"} and "Held out (held)" in swept[1]
+
+
+def test_a_report_shows_the_trials_over_each_parameter_and_what_a_parameter_means_here(swept) -> None:
+    folder, printed = swept
+    note = "difference.threshold is in grey levels with difference.kind = to_reference"
+    page = Page((folder / "report.html").read_text())
+    assert note in page.shown() and f"note: {note}" in printed and "best: trial 1" in page.shown()
+    assert {path.name for path in (folder / "figures").glob("*.svg")} == {
+        "difference-threshold.svg",
+        "morphology-erode-px.svg",
+    }
+    assert len((folder / "tables" / "trials.csv").read_text().splitlines()) == 4
 
 
 def test_the_default_is_shown_and_marked(swept) -> None:

@@ -11,7 +11,7 @@ from torchvision_dddas.config import ConfirmParameters, GroundParameters, People
 from torchvision_dddas.control.confirmation import (
     Beliefs,
     GroundObservation,
-    View,
+    GroundView,
     evidence,
     field_of_view,
     observe_ground,
@@ -21,7 +21,7 @@ from torchvision_dddas.types import Camera
 
 KNOBS = ConfirmParameters(spread_m=0.0)
 CROWD = [[0.2, 10], [-0.3, 10.1], [0.1, 9.8], [5, 12]]
-NORTH = View(np.zeros(2), 0.0, math.radians(30), 2.0, 20.0)
+NORTH = GroundView(np.zeros(2), 0.0, math.radians(30), 2.0, 20.0)
 
 
 def observed(blobs, people=(), views=(NORTH,), score=None):
@@ -70,7 +70,7 @@ def test_turning_and_moving_the_whole_scene_changes_nothing(angle, east, north):
     first = observed(blobs, people)
     # Clockwise, as headings go.
     turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-    view = View(np.array([east, north]), angle, NORTH.half_rad, NORTH.near_m, NORTH.far_m)
+    view = GroundView(np.array([east, north]), angle, NORTH.half_rad, NORTH.near_m, NORTH.far_m)
     second = observed(blobs @ turn.T + (east, north), people @ turn.T + (east, north), views=[view])
     np.testing.assert_array_equal(first.looked, second.looked)
     np.testing.assert_array_equal(first.people, second.people)

@@ -9,7 +9,7 @@ from tests.lab.simulation.small import small
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control import StartedSource
 from torchvision_dddas.geometry import east_north, lonlat
-from torchvision_dddas.lab.simulation import SimulatorSource
+from torchvision_dddas.lab.simulation import SimulatorSource, scenario_settings
 from torchvision_dddas.pipeline import Pipeline, assemble_mission
 
 FAULTS = (
@@ -41,7 +41,7 @@ def fly(overrides=(), seconds=6.0, **tables):
         steer(command)
 
     simulated.steer = record  # type: ignore[method-assign]
-    source, settings = StartedSource(simulated), load_config("patrol", [*overrides])
+    source, settings = StartedSource(simulated), load_config(None, [*overrides], base=scenario_settings(scenario))
     ready = assemble_mission(source, settings, "onboard", scenario.clip.located_by == "landmarks")
     flown.mission = ready.mission
     for result in Pipeline.from_assembly(ready)(source):
@@ -94,7 +94,7 @@ def test_crowds_are_where_ground_vehicles_see_their_people_and_steer_only_where_
         crowds, located = result.crowds, result.locations
         assert not np.isin(crowds.target[crowds.steers], located.positions.target).any()
         for place in east_north(lonlat(crowds.east_north_m, origin), flown.source.origin_deg):
-            assert np.linalg.norm(place - (located.time_s - 3.0, 0.0)) < 2.0  # where the crowd walks
+            assert np.linalg.norm(place - (located.time_s - 3.0, 0.0)) < 3.5  # where the crowd walks, 3 m wide
             seen += 1
     assert seen
 
@@ -103,9 +103,9 @@ def test_what_goes_wrong_is_noticed_and_dropped_frames_are_scenes_without_target
     said = {frame: text for frame, text in flown.noticed if "camera" in text}
     # Frames 11 to 13 show frame 10 again; reports of the lost vehicle end at frame 3.
     assert "frozen" in said[11]
-    assert said[14] == "the camera sees again: 3 pictures repeated the one before"
+    assert said[14] == "the camera works again: 3 pictures repeated the one before"
     (silent,) = [text for _, text in flown.noticed if "ugv2" in text]
-    assert silent.startswith("ugv2 reports no place for 2.")
+    assert silent.startswith("ugv2 reports no position for 2.")
     lost = [r.tracked for r in flown.results if "could not be read" in r.tracked.cause]
     assert [f.number for f in lost] == [17, 18]
 

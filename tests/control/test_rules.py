@@ -13,11 +13,11 @@ EVERY = SteeringParameters(sampling_share=0.5, maximum_every=6)
 def test_between_two_looks_no_target_moves_by_more_than_half_its_size_nor_a_walker_by_1_m_while_none_is_found():
     """4 m at 10 m/s and 10 Hz: 2 m in two frames, and a slow one does not matter; half of 1 m at 1.4 m/s: 3.6."""
     none = np.zeros(0)
-    assert every_wanted(8.0, 10, none, none, EVERY) == (3.0, "; nothing is found yet")
+    assert every_wanted(8.0, 10, none, none, EVERY) == (3.0, "; no target is known yet")
     assert every_wanted(8.0, 10, np.array([np.nan]), np.array([2.0]), EVERY)[0] == 3.0
     assert every_wanted(4.0, 10, none, none, EVERY) == (2.0, "")
     wanted, why = every_wanted(8.0, 10, np.array([0.5, 10.0]), np.array([2.0, 4.0]), EVERY)
-    assert wanted == 2.0 and why == "; a target of 4.0 m goes at 10.0 m/s"
+    assert wanted == 2.0 and why == "; a target of 4.0 m moves at 10.0 m/s"
     assert every_wanted(8.0, 10, np.array([1e9]), np.array([1.0]), EVERY)[0] == 1.0
 
 

@@ -37,16 +37,16 @@ def watched(until, rows, flown=1000):
 
 PLANNED = [(frame, 1, 5.0, 1) for frame in range(30, 100, 10)]
 LEAP = "ugv2's reports leap by 10.0 m within 0.1 s"
-SILENT, MUTE = "ugv2 reports no place for 2.1 s", "the UAV says nothing of itself for 2.1 s"
-BACK = (50, "ugv2 reports its place again, after 3.0 s")
+SILENT, MUTE = "ugv2 reports no position for 2.1 s", "the UAV sends no telemetry for 2.1 s"
+BACK = (50, "ugv2 reports its position again, after 3.0 s")
 
 
 @pytest.mark.parametrize(
     ("rows", "flown", "said"),
     [
-        (standing([*range(1, 21), *range(50, 61)]), 60, [(41, f"{SILENT}: nothing stands in for it"), BACK]),
-        (standing(range(1, 21)) + PLANNED, 60, [(41, f"{SILENT}: its plan stands in for it")]),
-        (standing(range(1, 61)), 10, [(31, f"{MUTE}: landmarks alone tell its place")]),
+        (standing([*range(1, 21), *range(50, 61)]), 60, [(41, f"{SILENT}: it has no planned waypoints"), BACK]),
+        (standing(range(1, 21)) + PLANNED, 60, [(41, f"{SILENT}: its planned waypoints are used")]),
+        (standing(range(1, 61)), 10, [(31, f"{MUTE}: only landmarks give its position")]),
         ([(f, 1, 15.0 if 10 <= f < 20 else 5.0) for f in range(1, 61)], 60, [(10, LEAP), (20, LEAP)]),
     ],
     ids=["silent", "planned", "no telemetry", "leap"],
@@ -72,7 +72,7 @@ def film(moves_px, frozen=()):
 def test_pictures_that_repeat_are_noticed_at_the_first_and_counted_at_the_end():
     assert film([0.0] * 20, frozen=(8, 9, 10)) == [
         (9, "the picture repeats the one before: the camera is frozen"),
-        (12, "the camera sees again: 3 pictures repeated the one before"),
+        (12, "the camera works again: 3 pictures repeated the one before"),
     ]
 
 

@@ -204,8 +204,8 @@ def test_a_crowd_that_only_ground_vehicles_see_is_followed_and_the_log_says_so()
     kept.hidden = False
     began, ended = kept.run(3).changes("team.by_ground")
     assert (began.new, ended.new) == (1, 0)
-    assert began.cause.startswith("target 1 is not located from the air: 5 of its people seen by ugv1 and ugv2 about")
-    assert began.cause.endswith("going at 1.0 m/s") and ended.cause == "target 1 is located from the air again"
+    assert began.cause.startswith("target 1 is not located from the air: 5 of its people seen by ugv1 and ugv2 around")
+    assert began.cause.endswith("moving at 1.0 m/s") and ended.cause == "target 1 is located from the air again"
 
 
 def test_a_target_is_looked_for_once_it_is_lost_for_a_while_and_does_not_go_on_under_another_number():
@@ -258,7 +258,7 @@ def test_a_vehicle_is_sent_to_what_nobody_can_see_from_the_ring_and_called_back_
     far, team = [[0, 0], [1, 0], [0, 1], [-70, -30]], np.r_[SQUARE, [[0, 16], [0, -16]]]
     w = World(far, 0.0, ("human", "human", "human", "unseen"), team, altitude_m=140.0).run(14)
     (sent,) = w.changes(".sent_to")
-    assert sent.new == 4.0 and "nobody has seen it" in sent.cause
+    assert sent.new == 4.0 and "not yet seen by a ground vehicle" in sent.cause
     apart = np.linalg.norm(w.team - w.targets[3], axis=1)
     nearer = np.linalg.norm(w.run(10).team - w.targets[3], axis=1)
     assert 4 < nearer.min() < apart.min() and w.inside(w.team).sum() >= 4

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import Settings, with_parameters
-from torchvision_dddas.detection.blobs import find_blobs, group_fragments
-from torchvision_dddas.detection.observation import find_weak_blobs, remove_shadow, smooth_along_edges
+from torchvision_dddas.detection.blobs import find_blobs
+from torchvision_dddas.detection.fragments import Ground, group_fragments, join_fragments
+from torchvision_dddas.detection.observation import Target
+from torchvision_dddas.detection.outlines import remove_shadow, smooth_along_edges
 
 SIZE = (101, 67)
 
@@ -30,15 +31,6 @@ def test_a_region_without_a_peak_is_left_out_and_only_evidence_above_the_thresho
     assert blob.box == (20, 20, 6, 6) and blob.peak == 120
     assert np.argwhere(blob.core).tolist() == [[2, 2], [2, 3]]
     assert found(core, evidence, peak=121) == []
-
-
-def test_weak_blobs_come_from_wide_evidence_away_from_strong_blobs(painted):
-    wide = painted(SIZE, (3, 4, 12, 12), (50, 30, 20, 20))
-    strong = found(painted(SIZE, (5, 6, 10, 10)))
-    every = {"difference.peak": 0.1, "morphology.erode_px": 1, "morphology.close_px": 1, "gates.min_area_px": 1}
-    (weak,) = find_weak_blobs(wide, strong, with_parameters(Settings(), every))
-    assert weak.weak and weak.box == (50, 30, 20, 20)
-    assert not strong[0].weak
 
 
 @pytest.mark.parametrize("hull", [False, True])
@@ -119,3 +111,42 @@ def test_a_mask_is_kept_without_two_colour_pictures_or_where_all_is_shadow(body,
 def test_a_region_in_the_box_of_another_but_outside_its_hull_is_kept(painted):
     core = painted(SIZE, (10, 10, 40, 4), (10, 10, 4, 40), (40, 40, 8, 8))
     assert sorted(b.box for b in found(core, hull=True)) == [(10, 10, 40, 40), (40, 40, 8, 8)]
+
+
+def ends_of_a_body(way: tuple[int, int], body: int | None, passed: int = 10) -> list[Target]:
+    """Two targets 40 px apart along their way, with an even body between them, or the ground (None), after joining."""
+    ground = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 240)).astype(np.uint8), (0, 0), 1.5)
+    pictures = []
+    for frame in (-passed, 0, passed):
+        picture = ground.copy()
+        middle = np.array([120, 120]) + frame * np.array(way)
+        ends = [np.round(middle + side * 25 * np.array(way) / np.hypot(*way)).astype(int) for side in (-1, 1)]
+        if body is not None:
+            cv2.line(picture, ends[0].tolist(), ends[1].tolist(), body, 16)
+        for end in ends:
+            cv2.circle(picture, end.tolist(), 8, 250, -1)
+        pictures.append(picture)
+        if frame == 0:
+            boxes = [(end[0] - 8, end[1] - 8, 17, 17) for end in ends]
+    full = np.ones((17, 17), bool)
+    targets = [Target(box, full, np.array(way, float), 0.9, full) for box in boxes]
+    grounds = [Ground(pictures[k], (k - 1) * passed, np.eye(3)) for k in (0, 2)]
+    return join_fragments(targets, pictures[1], grounds)
+
+
+@pytest.mark.parametrize("way", [(3, 0), (0, -3), (2, 2)])
+def test_two_ends_of_an_even_body_are_one_target_and_two_walkers_are_not(way):
+    assert len(ends_of_a_body(way, body=30)) == 1
+    assert len(ends_of_a_body(way, body=None)) == 2
+
+
+def test_ends_are_not_joined_before_the_body_has_left_its_place():
+    assert len(ends_of_a_body((3, 0), body=30, passed=1)) == 2
+
+
+def test_a_shadow_that_the_blue_sky_lights_is_removed():
+    image, mask = pictured((20, 200, 90))
+    image[20:60, 50:80] = (GROUND[20:60, 50:80] * (0.46, 0.39, 0.35)).astype(np.uint8)
+    left = remove_shadow(mask, BOX, image, [GROUND, GROUND], [np.eye(3), np.eye(3)])
+    assert left[:, :29].mean() > 0.97
+    assert left[:, 33:].mean() < 0.03

@@ -28,7 +28,7 @@ def frames_of(images: Sequence[np.ndarray]) -> list[Frame]:
 
 
 def detect(frames: Sequence[Frame | np.ndarray], settings: Settings, batch: int = 1) -> list[Scene]:
-    detector = MotionDetector(settings, "onboard", RATE_HZ, batch=batch)
+    detector = MotionDetector(settings, backend="onboard", rate_hz=RATE_HZ, batch=batch)
     return [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
 
 
@@ -96,6 +96,18 @@ def test_every_frame_has_one_scene_in_order_and_missing_frames_an_empty_one(conf
             rows, columns = np.nonzero(scene.mask == i + 1)
             assert x <= columns.min() and columns.max() < x + width
             assert y <= rows.min() and rows.max() < y + height
+
+
+@pytest.mark.parametrize("config", [*CONFIGS, "two_frames"])
+@pytest.mark.parametrize("interval", [1, 3, 5])
+@pytest.mark.parametrize("batch", [1, 4])
+def test_a_scene_is_late_by_as_many_frames_as_the_detector_says(config, interval, batch, noise):
+    settings = with_parameters(load_config(config), {"interval.rule": False, "interval.frames": interval})
+    detector, delays = MotionDetector(settings, backend="onboard", batch=batch), []
+    for image in pan(noise[:100, :140], 26, size=(64, 64)):
+        delays += [detector._last.number - scene.frame.number for scene in detector.update(image)]
+    assert max(delays[batch:]) == detector.delay_frames
+    assert batch > 1 or set(delays[2:]) == {detector.delay_frames}
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -186,11 +198,13 @@ def test_the_interval_adapts_to_the_telemetry_and_the_change_is_recorded(film):
 
 def test_an_interval_that_changes_for_dropped_frames_says_how_many_were_dropped(film):
     changed = {"interval.frames": 6, "interval.minimum_frames": 1, "interval.maximum_frames": 6}
-    detector = MotionDetector(with_parameters(load_config(), changed), "onboard", telemetry=flight([0, 2], 100.0))
+    detector = MotionDetector(
+        with_parameters(load_config(), changed), backend="onboard", telemetry=flight([0, 2], 100.0)
+    )
     frames = [replace(frame, skipped=2 * (k > 0)) for k, frame in enumerate(frames_of(film.images))]
     scenes = [scene for frame in frames for scene in detector.update(frame)] + list(detector.flush())
     (cause, *_) = [a.cause for s in scenes for a in s.adjustments if a.parameter == "interval.frames" and a.frame > 1]
-    assert "altitude 100.0 m" in cause and cause.endswith(", 2 frames before it dropped or left out")
+    assert "altitude 100.0 m" in cause and cause.endswith(", 2 frames before it dropped or skipped")
 
 
 @pytest.mark.parametrize("config", [None, "fast", "half", "source", "two_frames"])
@@ -276,7 +290,7 @@ def test_the_gates_take_the_focal_length_that_the_log_says_unless_one_is_set(hfo
 @pytest.mark.parametrize("config", [None, "fast"])
 def test_no_more_pictures_are_held_than_a_window_spans(config, film):
     settings = with_parameters(load_config(config), {"interval.rule": False})
-    detector, pictures, held = MotionDetector(settings, "onboard", RATE_HZ), [], []
+    detector, pictures, held = MotionDetector(settings, backend="onboard", rate_hz=RATE_HZ), [], []
     for k in range(64):
         image = film.images[min(k % 32, 31 - k % 32)].copy()
         pictures.append(weakref.ref(image))
@@ -315,5 +329,5 @@ def test_three_frames_are_enough_and_fewer_are_refused(config, noise):
     images = pan(noise, 3, car=5.0)
     assert [s.reliable for s in detect(images, load_config(config))] == [True] * 3
     for count, says in enumerate(("no frame", "1 frame ", "2 frames")):
-        with pytest.raises(InputError, match=f"{says}.* {3 - count} missing"):
+        with pytest.raises(InputError, match=f"{says}.* needs at least 3"):
             detect(images[:count], load_config(config))

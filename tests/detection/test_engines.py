@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,9 +17,11 @@ from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas import config as parameters
 from torchvision_dddas import runtime
 from torchvision_dddas.detection import Engine, View, Window, load_engine
+from torchvision_dddas.detection.blob_motion import DenseFlow
+from torchvision_dddas.detection.observation import observe
+from torchvision_dddas.detection.person_scale import TINY
 from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.geo.colours import load_colours, mask_colours
 from torchvision_dddas.geometry import chain, corner_error
 
 SIZES = [(320, 240), (251, 187)]
@@ -158,19 +161,40 @@ def test_a_batch_of_pairs_or_windows_equals_one_at_a_time() -> None:
         assert found.offsets == single.offsets
 
 
+@pytest.mark.parametrize("components", ["opencv", "torch"])
+def test_a_window_is_searched_by_its_own_settings_beside_others_in_the_same_batch(components) -> None:
+    usual = parameters.load_config(None, ["tracklets.on=false"])
+    tiny = parameters.with_parameters(usual, TINY)
+    engines = load_engine("onboard", usual), TorchEngine(usual, "cpu", components)
+    images, found = render(1, FRAMES, (320, 240)).images, []
+    for engine in engines:
+        views, steps = registered(engine, images)
+        of_each = ((2, usual), (3, tiny), (4, usual))
+        windows = [replace(window(views, steps, at, [(at - 1, at + 1)], False), settings=own) for at, own in of_each]
+        maps = zip(windows, engine.foreground(windows), of_each, strict=True)
+        found.append([observe(window, shown, DenseFlow(), own).blobs for window, shown, (_, own) in maps])
+        cores = [engine.foreground([replace(windows[1], settings=own)])[0].core > 0 for own in (usual, tiny)]
+        if engine.name == "onboard":
+            assert cores[1].sum() > 1.2 * cores[0].sum()
+    for onboard, batched in zip(*found, strict=True):
+        assert len(onboard) == len(batched) > 0
+        for a, b in zip(onboard, batched, strict=True):
+            assert a.box == pytest.approx(b.box, abs=2)
+
+
 @pytest.mark.parametrize(("driver", "wanted"), [(True, "torch"), (False, "onboard")])
 def test_auto_takes_torch_where_there_is_a_cuda_device_and_only_for_pictures(monkeypatch, driver, wanted) -> None:
     monkeypatch.setattr(runtime, "_has_cuda", lambda: driver)
     assert load_engine("auto", parameters.Settings()).name == wanted
-    assert load_colours("auto") is mask_colours, "of a picture's colours a GPU makes other ones"
+    assert not runtime.wants_torch("auto", auto_with_gpu=False)
     for backend in ("onboard", "torch"):
         assert load_engine(backend, parameters.Settings()).name == backend
-    with pytest.raises(InputError, match="no back end is named 'gpu'"):
+    with pytest.raises(InputError, match="no backend is named 'gpu'"):
         load_engine("gpu", parameters.Settings())
 
 
 def test_a_device_without_float64_is_refused_and_auto_does_not_take_it(monkeypatch) -> None:
-    with pytest.raises(InputError, match="needs float64, which mps does not have"):
+    with pytest.raises(InputError, match="needs float64, which mps does not support"):
         TorchEngine(parameters.Settings(), "mps")
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -202,7 +226,7 @@ def test_without_a_driver_torch_is_not_asked_for_its_devices(monkeypatch) -> Non
 @pytest.mark.parametrize("name", ["registration.halved", "difference.halved"])
 def test_half_resolution_is_opencvs_alone(name, monkeypatch) -> None:
     settings = parameters.with_parameters(parameters.Settings(), {name: True})
-    with pytest.raises(InputError, match=f"no {name}: take the backend onboard"):
+    with pytest.raises(InputError, match=f"does not support {name}; set it false or use onboard"):
         load_engine("torch", settings)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert load_engine("auto", settings).name == "onboard"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchvision_dddas.config import IntervalParameters, Settings, config_folder, load_config, with_parameters
+from torchvision_dddas.config import IntervalParameters, Settings, changes, config_folder, load_config, with_parameters
 from torchvision_dddas.detection import interval as windows
 from torchvision_dddas.detection.interval import (
     DistanceSettings,
@@ -15,6 +15,7 @@ from torchvision_dddas.detection.interval import (
     look_cost,
     settings_at,
 )
+from torchvision_dddas.detection.person_scale import TINY, person_px
 from torchvision_dddas.types import Flight
 
 PARAMETERS = IntervalParameters(minimum_frames=1, maximum_frames=12)
@@ -113,11 +114,14 @@ def test_the_longer_side_and_the_speed_decide(box, velocity, passes):
 
 
 @pytest.mark.parametrize(
-    ("altitude", "area", "small"), [(50.5, 157, True), (49.5, 163, False), (10.0, 300, False), (500.0, 12, True)]
+    ("altitude", "area", "small"), [(50.5, 157, True), (20.0, 300, True), (12.0, 300, False), (500.0, 12, True)]
 )
 def test_the_expected_size_sets_the_smallest_area_and_switches_the_small_path(altitude, area, small):
-    """2 m at 1000 px focal length are 2000 / altitude px; the smallest area is a tenth of its square, bounded."""
-    settings = settings_at(altitude, 10, BASE).settings
+    """2 m at 1000 px focal length are 2000 / altitude px; the smallest area is a tenth of its square, bounded.
+
+    The search for small targets ends where a person seen from above, 0.5 m, is 39 px wide.
+    """
+    settings = settings_at(Flight(altitude), 10, BASE).settings
     assert (settings.gates.min_area_px, settings.small.on) == (area, small)
 
 
@@ -130,12 +134,12 @@ def test_a_walker_moves_as_far_between_the_frames_that_show_small_targets_at_any
 ):
     """1.4 m/s at 1000 px focal length are 1400 / altitude px a second; the gap is at most the longest interval."""
     base = with_parameters(BASE, {"small.gap_move_px": move_px})
-    assert settings_at(altitude, rate, base).settings.small.gap_frames == gap
+    assert settings_at(Flight(altitude), rate, base).settings.small.gap_frames == gap
 
 
 def test_a_gap_that_is_set_holds_at_any_distance():
     base = with_parameters(BASE, {"small.gap_frames": 6})
-    assert settings_at(50.0, 10, base).settings.small.gap_frames == 6
+    assert settings_at(Flight(50.0), 10, base).settings.small.gap_frames == 6
 
 
 @pytest.mark.parametrize(
@@ -157,14 +161,14 @@ def test_the_gap_of_small_targets_is_reported_only_where_they_can_be_searched(al
     ("altitude", "rate", "gates"), [(50, 10, (10, 200, 60)), (50, 30, (10, 200, 20)), (100, 10, (5, 100, 30))]
 )
 def test_gates_are_metric_bounds_times_focal_over_altitude(altitude, rate, gates):
-    assert settings_at(altitude, rate, BASE).gates == Gates(*gates)
+    assert settings_at(Flight(altitude), rate, BASE).gates == Gates(*gates)
 
 
 def test_closing_in_metres_is_bounded_by_the_pixels():
     base = with_parameters(Settings(), {"morphology.close_m": 1.5, "gates.focal_px": 554.0})
-    closes = [settings_at(altitude, 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
+    closes = [settings_at(Flight(altitude), 10.0, base).settings.morphology.close_px for altitude in (10, 50, 200)]
     assert closes == [base.morphology.close_px, 17, 4]
-    assert settings_at(200.0, 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
+    assert settings_at(Flight(200.0), 10.0, Settings()).settings.morphology.close_px == Settings().morphology.close_px
 
 
 def test_where_no_speed_is_computed_its_gate_is_not_set():
@@ -181,7 +185,8 @@ def test_settings_change_only_when_the_distance_changes_by_a_fifth_or_is_lost():
     higher, records = follow_distance(3, current, Flight(121.0), 10, BASE)
     bound = next(record for record in records if record.parameter == "gates.max_size_px")
     assert bound.new == pytest.approx(bound.old * 100 / 121)
-    assert higher.distance_m == 121.0 and "altitude 121.0 m" in bound.cause and "was 100.0 m" in bound.cause
+    assert higher.flight is not None and higher.flight.altitude_m == 121.0
+    assert "altitude 121.0 m" in bound.cause and "was 100.0 m" in bound.cause
     after, records = follow_distance(9, current, None, 10, BASE)
     assert after == DistanceSettings(BASE)
     assert {record.cause for record in records} == {"no telemetry for this frame"}
@@ -250,3 +255,61 @@ def test_two_frames_are_compared_one_interval_apart_and_at_the_end_with_the_earl
     settings = with_parameters(Settings(), {"difference.kind": "to_next"})
     assert windows.choose_pairs(3, 2, 0, 9, settings)[0] == [(5, 5)]
     assert windows.choose_pairs(9, 2, 0, 9, settings)[0] == [(7, 7)]
+
+
+def down(altitude_m, pitch_deg=90.0):
+    return Flight(altitude_m, pitch_rad=float(np.radians(pitch_deg)))
+
+
+@pytest.mark.parametrize(
+    ("flight", "size_px"), [(down(50), 10.0), (Flight(50.0), 10.0), (down(50, 45), 12.47), (down(0.1), 500.0)]
+)
+def test_a_person_covers_a_square_of_the_shoulders_from_above_and_of_more_of_the_body_aslant(flight, size_px):
+    """0.5 m at 1000 px / 50 m. At 45 degrees the body shows 1.56 m by 0.5 m, from 71 m."""
+    assert person_px(flight, 1000.0) == pytest.approx(size_px, abs=0.05)
+
+
+def test_tiny_people_get_their_settings_until_the_vehicle_flies_lower_or_its_log_ends():
+    base = with_parameters(Settings(), {"gates.focal_px": 1000.0})
+    high, records = follow_distance(1, settings_at(None, 10, base), down(100), 10, base)
+    changed = {record.parameter: record.new for record in records}
+    assert changed["gates.tiny"] == 1 and changed["gates.person_px"] == 5
+    assert "altitude 100.0 m, focal length 1000 px" in records[0].cause
+    assert high.settings.difference.threshold == TINY["difference.threshold"] and high.settings.tracklets.on
+    assert high.settings.morphology.close_px == 15, "1.5 m"
+    low, records = follow_distance(2, high, down(40), 10, base)
+    assert low.settings.difference == base.difference and low.settings.refine.on
+    assert ("gates.tiny", 1, 0) in {(record.parameter, record.old, record.new) for record in records}
+    after, _ = follow_distance(3, high, None, 10, base)
+    assert after == settings_at(None, 10, base) == DistanceSettings(base)
+
+
+def test_a_pitch_that_changes_the_size_of_people_changes_the_settings_at_the_same_distance():
+    base = with_parameters(Settings(), {"gates.focal_px": 1000.0})
+    below = settings_at(down(75), 10, base)
+    aslant = down(75 * float(np.sin(np.radians(45))), 45)
+    assert aslant.distance_m == pytest.approx(75) and below.tiny
+    assert not follow_distance(2, below, aslant, 10, base)[0].tiny
+
+
+@pytest.mark.parametrize(
+    ("given", "tiny", "threshold"),
+    [
+        ({"gates.focal_px": 1000.0}, True, 2.0),
+        ({}, False, 3.5),  # the focal length is not known
+        ({"gates.focal_px": 1000.0, "gates.tiny_px": 0.0}, False, 3.5),
+        ({"gates.focal_px": 1000.0, "difference.threshold": 3.0}, True, 3.0),  # what is set stays
+        ({"gates.focal_px": 1000.0, "difference.kind": "to_reference"}, False, 3.5),
+        ({"gates.person_px": 4.0}, True, 2.0),
+        ({"gates.person_px": 4.0, "gates.focal_px": 4000.0}, False, 3.5),  # telemetry counts before it
+    ],
+)
+def test_the_settings_for_tiny_people_need_a_known_scale_and_leave_what_is_set(given, tiny, threshold):
+    found = settings_at(down(100), 10, with_parameters(Settings(), given))
+    assert (found.tiny, found.settings.difference.threshold) == (tiny, threshold)
+
+
+def test_patrol_is_the_default_with_a_size_of_people_for_clips_without_telemetry():
+    patrol = load_config("patrol")
+    assert changes(patrol) == {"gates.person_px": 4.0}
+    assert settings_at(None, 10, patrol).settings.difference.blur_px == TINY["difference.blur_px"]

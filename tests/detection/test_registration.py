@@ -84,14 +84,14 @@ def test_clipped_white_in_both_neighbours_is_no_motion(backend) -> None:
 @pytest.mark.parametrize("size", [SIZE, (251, 187)], ids=["even", "odd"])
 def test_corners_found_at_half_resolution_are_on_even_pixels_the_same_in_both_engines_and_fit_the_ground(size) -> None:
     torch = pytest.importorskip("torch")
-    from torchvision_dddas.nn import Registration
+    from torchvision_dddas.nn import FrameRegistration
 
     settings = parameters.load_config(None, ["registration.halved_corners=true"])
     clip = render(3, 2, size)
     engine = load_engine("torch", settings)
     views = [engine.prepare(image) for image in clip.images]
     levels = torch.from_numpy(views[0].grey)[None, None].float()
-    points, valid = Registration(settings.registration).keypoints(levels)
+    points, valid = FrameRegistration(settings.registration).keypoints(levels)
     found = {tuple(point) for point in points[0][valid[0]].tolist()}
     wanted = {tuple(point) for point in detect_keypoints(views[0].grey, settings.registration, halved=True).tolist()}
     assert all(u % 2 == v % 2 == 0 for u, v in found)

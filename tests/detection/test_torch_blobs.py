@@ -12,7 +12,6 @@ from tests.synthetic_clip import render
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.detection import MotionDetector, View, Window
 from torchvision_dddas.detection.blobs import Blob, find_blobs
-from torchvision_dddas.detection.observation import find_weak_blobs
 from torchvision_dddas.detection.torch_blobs import foregrounds_with_blobs, label_components
 from torchvision_dddas.detection.torch_engine import TorchEngine
 
@@ -52,8 +51,8 @@ def window(settings: Settings) -> Window:
 
 
 def assert_same(found: list[Blob], wanted: list[Blob]) -> None:
-    assert [(blob.box, blob.peak, blob.area_px, blob.weak) for blob in found] == [
-        (blob.box, blob.peak, blob.area_px, blob.weak) for blob in wanted
+    assert [(blob.box, blob.peak, blob.area_px) for blob in found] == [
+        (blob.box, blob.peak, blob.area_px) for blob in wanted
     ]
     for blob, other in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(blob.mask, other.mask)
@@ -77,23 +76,20 @@ def test_areas_boxes_and_peaks_are_opencvs() -> None:
 
 
 @pytest.mark.parametrize("hull", [False, True])
-def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> None:
+def test_blobs_are_opencvs_each_frame_by_its_own_gates(hull) -> None:
     settings = with_parameters(Settings(), KNOBS | {"morphology.hull": hull})
     freer = with_parameters(settings, {"gates.min_area_px": 1, "difference.peak": 1.0})
     given = [settings if number % 2 else freer for number in range(len(MASKS))]
     cores, near = (list(column) for column in zip(*MASKS, strict=True))
     islands = [smooth(10 + number, 2) for number in range(len(MASKS))]
     wide = [np.where(picture > 185, picture, 0).astype(np.uint8) for picture in islands]
-    engine = TorchEngine(settings, "cpu")
-    weak = engine.segmenter.chain().find_weak(batch(wide))
     maps = batch(cores), batch(near), batch(wide), batch(near)
     windows = [window(one) for one in given]
-    found = foregrounds_with_blobs(windows, settings, maps, weak, None, (maps[1], maps[2]))
-    assert any(blob.weak for frame in found for blob in frame.blobs or [])
+    found = foregrounds_with_blobs(windows, settings, maps, None, (maps[1], maps[2]))
+    assert any(frame.blobs for frame in found)
     for frame, own, core, evidence, far in zip(found, given, cores, near, wide, strict=True):
         limits = 16 * own.difference.threshold, own.gates.min_area_px, 16 * own.difference.peak
         wanted = find_blobs(core, evidence, *limits, hull)
-        wanted += find_weak_blobs(far, wanted, own)
         assert frame.blobs is not None
         assert_same(frame.blobs, wanted)
         for x, y, width, height in (blob.box for blob in frame.blobs):
@@ -106,14 +102,14 @@ def test_blobs_strong_and_weak_are_opencvs_each_frame_by_its_own_gates(hull) -> 
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"persistence.on": False, "refine.on": False, "history.on": True}],
+    [{}, {"refine.on": False, "history.on": True}],
     ids=["default", "history"],
 )
 def test_a_clip_has_the_same_scenes_whoever_finds_the_blobs(changes) -> None:
-    settings = with_parameters(Settings(), {"gates.min_area_px": 20, **changes})
+    settings = with_parameters(Settings(), {"gates.min_area_px": 20, "tracklets.on": False, **changes})
     images, scenes = render(1, 9, (160, 120)).images, []
     for components in ("opencv", "torch"):
-        detector = MotionDetector(settings, TorchEngine(settings, "cpu", components))
+        detector = MotionDetector(settings, backend=TorchEngine(settings, "cpu", components))
         scenes.append([scene for image in images for scene in detector.update(image)] + detector.flush())
     assert any(len(scene.detections) for scene in scenes[0])
     for one, other in zip(*scenes, strict=True):

@@ -1,5 +1,6 @@
 """Small, fast, rarely seen targets are found by their tracklets, and what stays or flickers is not."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -12,7 +13,7 @@ from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.detection.candidates import Candidates, find_candidates, overlaps
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
 from torchvision_dddas.detection.torch_engine import TorchEngine
-from torchvision_dddas.detection.tracklet_scores import choose
+from torchvision_dddas.detection.tracklet_scores import BLOB_SIZED, choose
 from torchvision_dddas.detection.tracklets import follow
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.telemetry import read_telemetry
@@ -43,7 +44,7 @@ def candidates(*boxes):
     count = len(boxes)
     box, one = np.array(boxes, float).reshape(-1, 4), np.ones(count)
     patch = np.tile(np.eye(1, 144), (count, 1))
-    evidence = np.ones((count, 3)), np.zeros((count, 3))
+    evidence = np.ones((count, 4)), np.zeros((count, 4))
     return Candidates(box, np.zeros(count, int), one, 9 * one, *evidence, patch, 0 * one)
 
 
@@ -96,11 +97,11 @@ def test_silhouettes_show_small_and_large_things_that_one_of_them_would_not():
     evidence = np.zeros((200, 300), np.uint8)
     evidence[40:54, 50:57] = 160  # small
     evidence[100:180, 150:170] = evidence[100:180, 190:210] = 160  # two halves of something large and even
-    found = find_candidates((evidence, None, evidence), np.zeros_like(evidence), [])
+    found = find_candidates((evidence, None, evidence, evidence), np.zeros_like(evidence), [])
     wanted = np.array([(50, 40, 7, 14), (150, 100, 60, 80)], float)
     assert (overlaps(found.box_px, wanted).max(axis=0) > 0.6).all()
-    assert len(find_candidates((None, None, None), np.zeros_like(evidence), [])) == 0
-    assert len(find_candidates((evidence * 0, None, None), np.zeros_like(evidence), [])) == 0
+    assert len(find_candidates((None,) * 4, np.zeros_like(evidence), [])) == 0
+    assert len(find_candidates((evidence * 0, None, None, None), np.zeros_like(evidence), [])) == 0
 
 
 @pytest.mark.parametrize("camera", [(0.0, 0.0), (7.0, -4.0)])
@@ -132,15 +133,29 @@ def test_without_other_looks_a_candidate_is_its_own_tracklet():
 
 
 def test_of_overlapping_candidates_the_likeliest_is_the_target():
-    box = np.array([(0, 0, 30, 30), (2, 2, 10, 10), (16, 16, 10, 10), (60, 60, 10, 10)], float)
+    found = candidates((0, 0, 30, 30), (2, 2, 10, 10), (16, 16, 10, 10), (60, 60, 10, 10))
+    blob = replace(found, silhouette=np.array([-1, 0, 0, 0]), inside=9 * found.inside)
     scores = np.array([0.5, 1.0, 0.8, -5.0])
-    assert choose(box, scores, [], 0.0, 50) == [1, 2]
-    # A large blob that persists is one thing; a small one may be several that were joined.
-    assert choose(box, scores, [True], 0.0, 20) == [0]
-    assert choose(box, scores, [True], 0.0, 50) == [1, 2]
-    # To persist is evidence by itself.
-    assert choose(box, np.full(4, -1.0), [True], 0.0, 50) == [0]
-    assert choose(np.zeros((0, 4)), np.zeros(0), [], 0.0, 50) == []
+    assert choose(found, scores, 0.0, 25) == [1, 2]
+    assert choose(blob, scores, 0.0, 25) == [0]
+    # One that is narrower than the closing is left out, or taken where nothing else is.
+    assert choose(blob, scores, 0.0, 50) == [1, 2]
+    assert choose(blob, scores, 0.0, 50, BLOB_SIZED) == [1, 2]
+    assert choose(blob, np.array([-1.0, -1, -1, -5]), 0.0, 50, BLOB_SIZED) == [0]
+    # To be a blob is evidence by itself.
+    assert choose(blob, np.full(4, -1.0), 0.0, 25) == [0]
+    assert choose(candidates(), np.zeros(0), 0.0, 25) == []
+
+
+@pytest.mark.parametrize(("between", "wanted"), [(1.0, [1, 2]), (4.0, [0])])
+def test_a_blob_that_joins_two_people_gives_way_to_them_where_background_shows_between_them(between, wanted):
+    """A car whose ends alone stand out is one thing: what lies between them moves too."""
+    box = np.array([(0, 0, 60, 60), (2, 5, 16, 50), (40, 5, 16, 50)], float)
+    evidence = np.array([9.0, 9.0, 9.0])
+    evidence[0] = (2 * 9 * 800 + between * (3600 - 1600)) / 3600
+    found = candidates(*box)
+    found = replace(found, silhouette=np.array([-1, 0, 0]), inside=np.tile(evidence[:, None], 4))
+    assert sorted(choose(found, np.array([1.0, 0.9, 0.8]), 0.0, 25)) == wanted
 
 
 @pytest.mark.parametrize("backend", ["onboard", "torch"])
@@ -156,7 +171,7 @@ def test_a_mask_leaves_regions_out(tmp_path, backend):
     with pytest.raises(InputError, match=r"mask\.png has 320x240 pixels and the frames 160x120"):
         list(detect_motion([image[:120, :160] for image in images], settings, backend))
     assert cv2.imwrite(str(tmp_path / "mask.png"), mask | 255)
-    with pytest.raises(InputError, match="black nowhere"):
+    with pytest.raises(InputError, match="has no black pixel"):
         list(detect_motion(images, settings, backend))
 
 

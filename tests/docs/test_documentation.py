@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,8 +26,10 @@ from torchvision_dddas.geometry import lonlat
 from torchvision_dddas.io.telemetry import autopilots, nmea
 
 ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
 PAGES = {
-    path.name: path.read_text(encoding="utf-8") for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    "README.md": (ROOT / "README.md").read_text(encoding="utf-8"),
+    **{path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))},
 }
 
 
@@ -99,9 +102,23 @@ def test_the_table_from_equation_to_file_names_code_that_the_product_runs() -> N
 
 @pytest.mark.parametrize("page", PAGES)
 def test_every_link_and_picture_leads_to_a_file(page: str) -> None:
-    home = ROOT if page == "README.md" else ROOT / "docs"
-    links = [link.partition("#")[0] for link in re.findall(r"\]\(([^)]+)\)", PAGES[page]) if "://" not in link]
-    assert [link for link in links if link and not (home / link).exists()] == []
+    home = ROOT if page == "README.md" else (DOCS / page).parent
+    links = [link.partition("#") for link in re.findall(r"\]\(([^)]+)\)", PAGES[page]) if "://" not in link]
+    assert [file for file, _, _ in links if file and not (home / file).exists()] == []
+    targets = [((home / file if file else DOCS / page).resolve(), anchor) for file, _, anchor in links if anchor]
+    assert [anchor for file, anchor in targets if anchor not in anchors(file.read_text(encoding="utf-8"))] == []
+
+
+def anchors(page: str) -> set[str]:
+    """The anchors of a page's headings, as hosts of repositories and the site's generator make them."""
+    headings = re.findall(r"^#+ (.+)$", page, re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "```toml" in PAGES[page]])
+def test_every_block_of_toml_can_be_read(page: str) -> None:
+    for block in blocks(page, "toml"):
+        tomllib.loads(block)
 
 
 def test_every_file_that_the_method_page_names_is_there() -> None:
@@ -124,7 +141,13 @@ def demo_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("page", ["README.md", "python.md"])
+def test_the_first_example_of_the_formats_page_runs(demo_folder: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(demo_folder)
+    exec(compile(blocks("formats.md", "python")[0], "formats.md", "exec"), {})
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+@pytest.mark.parametrize("page", ["README.md", "python.md", "quickstart/python.md"])
 def test_the_python_examples_run_one_after_another(page: str, demo_folder: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(demo_folder)
     names: dict[str, object] = {}
@@ -136,7 +159,7 @@ def test_the_python_examples_run_one_after_another(page: str, demo_folder: Path,
 def test_the_camera_and_the_configuration_of_the_commands_page_can_be_read(tmp_path: Path) -> None:
     from torchvision_dddas.io.camera_files import describe_missing, read_camera
 
-    own, _, camera = blocks("commands.md", "toml")
+    own, _, camera, *_ = blocks("commands.md", "toml")
     (tmp_path / "own.toml").write_text(own)
     assert load_config(tmp_path / "own.toml").gates.min_area_px == 80
     (tmp_path / "ugv.toml").write_text(camera)

@@ -1,4 +1,4 @@
-"""Every measured table in the documents is what docs/results says: none is typed by hand."""
+"""Every measured table in the documents is what eval/results says: none is typed by hand."""
 
 import argparse
 import importlib
@@ -15,10 +15,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 pytestmark = pytest.mark.skipif(
-    not (ROOT / "docs" / "results").is_dir(), reason="results and studies are in a checkout, not in a package"
+    not (ROOT / "eval" / "results").is_dir(), reason="results and studies are in a checkout, not in a package"
 )
 
-TEXTS = ("docs/benchmarks.md", "docs/tuning.md", "docs/tutorial.md")
+TEXTS = ("docs/benchmarks.md", "docs/tuning.md", "docs/network.md")
 # A table with a column of numbers, which are set to the right.
 MEASURED = re.compile(r"^\|[- |:]*---:[- |:]*\|$", re.M)
 
@@ -48,7 +48,7 @@ def test_a_figure_that_is_changed_by_hand_is_noticed_and_mended(figures, tmp_pat
 
 
 def test_marks_without_a_result_end_the_program_with_one_line(figures) -> None:
-    with pytest.raises(SystemExit, match=r"docs/results has no no-such\.json"):
+    with pytest.raises(SystemExit, match=r"eval/results has no no-such\.json"):
         figures.fill("<!-- no_such --><!-- /no_such -->")
 
 
@@ -60,7 +60,7 @@ def test_every_table_of_numbers_stands_between_marks_that_results_fill(figures, 
 
 
 def test_every_result_says_how_and_when_it_was_measured_and_names_no_place() -> None:
-    for path in sorted((ROOT / "docs" / "results").glob("*.json")):
+    for path in sorted((ROOT / "eval" / "results").glob("*.json")):
         text = path.read_text(encoding="utf-8")
         result = json.loads(text)
         assert result["command"].startswith("python eval/"), path.name

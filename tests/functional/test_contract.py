@@ -37,7 +37,7 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     F.triplet_affinity: (P, Q[:, :4], P[:, :3], ONES.bool(), ONES[:, :4].bool(), ONES[:, :3].bool()),
     F.bgr_to_hsv: (HSV / 30,),
     F.within_ranges: (HSV, RANGES, RANGES),
-    F.rgb_histogram: (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool), 1.0),
+    partial(F.rgb_histogram, softness=1.0): (COLOUR, BOXES, torch.ones(BATCH, 2, dtype=torch.bool)),
     F.log_partition: (P[:, :4, :], 1.0),
     F.fit_exposure: (GREY, GREY * 0.9 + 0.01, MASK),
     F.mean_gradient: ((GREY * 255).round(),),
@@ -57,14 +57,15 @@ CASES: dict[Callable[..., typing.Any], tuple[typing.Any, ...]] = {
     F.erosion: (GREY, F.structuring_element("ellipse", (3, 5))),
     F.opening: (MASK, torch.ones(3, 3)),
     F.closing: (GREY, F.structuring_element("ellipse", 5)),
-    F.step: (GREY, 0.1),
+    partial(F.step, softness=0.1): (GREY,),
     F.resize: (COLOUR * 255, (20, 57)),
     F.warp_perspective: (GREY, EYES, (37, 53)),
 }
 NO_SHAPES = {F.hog: (COLOUR * 255, LAYOUT)}
 
 
-def label(function: Callable[..., object]) -> str:
+def label(function: typing.Any) -> str:
+    function = getattr(function, "func", function)
     return f"{function.__module__.rpartition('.')[2]}.{function.__name__}"
 
 
@@ -143,12 +144,12 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         (double(2, 4, 3), double(2, 3, 3, seed=1), double(2, 5, 3, seed=2)),
     ),
     "F.within_ranges": (
-        lambda picture, low, high: F.within_ranges(F.bgr_to_hsv(picture), low, high, 20.0),
+        lambda picture, low, high: F.within_ranges(F.bgr_to_hsv(picture), low, high, softness=20.0),
         (0.1 + 0.8 * double(1, 3, 2, 3, seed=1), LOW, HIGH.double()),
     ),
     **{
         f"F.rgb_histogram {softness}": (
-            lambda x, softness=softness: F.rgb_histogram(x, BOX, THERE_ARE, softness)[0] @ double(768, seed=3),
+            lambda x, softness=softness: F.rgb_histogram(x, BOX, THERE_ARE, softness=softness)[0] @ double(768, seed=3),
             (0.9 * double(1, 3, 4, 5, seed=2),),
         )
         for softness in (1.0, 0.5)
@@ -181,9 +182,9 @@ GRADIENTS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]
         )
         for operation in (F.dilation, F.erosion)
     },
-    "F.step": (lambda x: F.step(x, 0.2), (torch.linspace(-1, 1, 7).double(),)),
+    "F.step": (lambda x: F.step(x, softness=0.2), (torch.linspace(-1, 1, 7).double(),)),
     "F.gate_regions": (
-        lambda m, e, a, p: F.gate_regions(m, e, LABELS, 2, a, p, 0.3),
+        lambda m, e, a, p: F.gate_regions(m, e, LABELS, 2, a, p, softness=0.3),
         (0.8 * (LABELS > 0).double(), 8 * double(1, 1, 3, 4), number(1.5), number(6.0)),
     ),
     "F.resize": (lambda x: F.resize(x, (9, 4)), (255 * double(1, 2, 6, 7),)),
@@ -199,10 +200,10 @@ def test_gradients_are_those_of_finite_differences(name):
 
 TWO, SPOTS = torch.ones(BATCH, 2, dtype=torch.bool), (LABELS > 0).float()
 SOFT: dict[str, Callable[[float], torch.Tensor]] = {
-    "F.step": lambda s: F.step(torch.tensor([-0.3, -0.01, 0.01, 0.3]), s),
-    "F.gate_regions": lambda s: F.gate_regions(SPOTS, 8 * GREY[:1, :, :3, :4], LABELS, 2, 2.5, 4.0, s),
-    "F.within_ranges": lambda s: F.within_ranges(F.bgr_to_hsv(COLOUR), LOW.float(), HIGH.float(), s),
-    "F.rgb_histogram": lambda s: F.rgb_histogram(COLOUR, BOXES, TWO, s, normalize=False)[0],
+    "F.step": lambda s: F.step(torch.tensor([-0.3, -0.01, 0.01, 0.3]), softness=s),
+    "F.gate_regions": lambda s: F.gate_regions(SPOTS, 8 * GREY[:1, :, :3, :4], LABELS, 2, 2.5, 4.0, softness=s),
+    "F.within_ranges": lambda s: F.within_ranges(F.bgr_to_hsv(COLOUR), LOW.float(), HIGH.float(), softness=s),
+    "F.rgb_histogram": lambda s: F.rgb_histogram(COLOUR, BOXES, TWO, softness=s, normalize=False)[0],
     **{
         f"morphology.{operation.__name__} {size} {shape}": partial(
             lambda s, operation, size, shape: operation(4 * GREY - 2, F.structuring_element(shape, size), softness=s),

@@ -54,7 +54,7 @@ def test_the_columns_seen_are_those_of_a_warped_mask(matrix, border):
     inset = np.zeros(size, np.uint8)
     inset[border : height - border, border : width - border] = 255
     wanted = cv2.warpPerspective(inset, matrix, (width, height), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP) > 0
-    first, last = F.seen_columns(torch.from_numpy(matrix)[None], size, size, border)
+    first, last = F.seen_columns(torch.from_numpy(matrix)[None], size, size, border_px=border)
     np.testing.assert_array_equal(F.columns_between(first, last, width)[0, 0].numpy(), wanted)
 
 
@@ -101,7 +101,7 @@ def test_exposure_of_a_blank_frame_or_of_nothing_seen_keeps_the_gain(seen):
 def test_min_eigenvalue_is_opencvs_to_a_millionth_of_its_maximum(texture, tensor, block):
     picture = texture(0, 37, 53)
     wanted = torch.from_numpy(cv2.cornerMinEigenVal(picture, block))
-    found = F.corner_min_eigenvalue(tensor(picture), block)[0, 0]
+    found = F.corner_min_eigenvalue(tensor(picture), block=block)[0, 0]
     assert (found - wanted).abs().max() < 2e-6 * wanted.max()
 
 
@@ -185,6 +185,6 @@ def test_a_masked_median_is_the_lower_one_of_each_row_and_0_of_none():
 def test_frame_features_are_those_of_opencv(texture, tensor):
     grey = texture(3, 160, 200)
     wanted = cv2.goodFeaturesToTrack(grey, 60, 0.01, 7, blockSize=5)[:, 0]
-    points, valid = F.frame_features(tensor(grey), 60, 0.01, 7, 5)
+    points, valid = F.frame_features(tensor(grey), 60, quality=0.01, min_distance_px=7, block=5)
     found = {tuple(point) for point in points[0][valid[0]].tolist()}
     assert len(found & {tuple(point) for point in wanted.tolist()}) >= 0.95 * max(len(wanted), len(found)) > 0

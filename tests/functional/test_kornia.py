@@ -95,7 +95,7 @@ def test_corners_are_where_kornias_gradients_under_a_box_say(picture, block):
     uu, vv, uv = (kornia.filters.box_blur(product, block) for product in (du * du, dv * dv, du * dv))
     wanted = torch.linalg.eigvalsh(torch.stack([uu, uv, uv, vv], -1).unflatten(-1, (2, 2)))[..., 0]
     torch.testing.assert_close(
-        F.corner_min_eigenvalue(picture, block)[..., 4:-4, 4:-4], wanted[..., 4:-4, 4:-4], atol=1e-9, rtol=1e-6
+        F.corner_min_eigenvalue(picture, block=block)[..., 4:-4, 4:-4], wanted[..., 4:-4, 4:-4], atol=1e-9, rtol=1e-6
     )
 
 

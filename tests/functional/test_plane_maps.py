@@ -194,7 +194,7 @@ def test_the_source_as_printed_refuses_only_what_is_exactly_singular():
 def test_ransac_finds_the_map_among_half_wrong_pairs(model):
     module, true, size = model
     p, q, right = pairs(noise=0.2, wrong=0.5, true=true)
-    found, inliers, valid = ransac(p, q, torch.ones(2, 200).bool(), samples(256, 200, size), module)
+    found, inliers, valid = ransac(p, q, torch.ones(2, 200).bool(), samples(256, 200, size), model=module)
     assert valid.all()
     assert corner_error(found, true) < 0.4
     assert (inliers & right).sum() >= 0.99 * right.sum() and (inliers & ~right).sum() <= 3

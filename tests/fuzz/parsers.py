@@ -139,7 +139,7 @@ def _evaluated(path: Path) -> None:
 
 
 def _landmarks(path: Path) -> None:
-    found = read_landmarks(path, 10.0, 0.5)
+    found = read_landmarks(path, rate_hz=10.0, clock_offset_s=0.5)
     _check_finite(found.frame)
     looks_swapped(found, (-110.95, 32.23))
 
@@ -310,8 +310,16 @@ _BYTES: tuple[tuple[str, str, Callable[[Path], object], Callable[..., Sequence[b
     ("video .avi", "a.avi", _video, seeds.videos, (".avi", "MJPG"), "", 0.15),
     ("video .mp4", "a.mp4", _video, seeds.videos, (".mp4", "mp4v"), "", 0.15),
     ("video H.264", "a.mp4", _video, seeds.videos, (".mp4", "libx264"), "av", 0.15),
-    ("elevation", "a.tif", lambda path: read_elevation(path, _CORNERS, None, 30), seeds.raster, (1,), "rasterio", 0.3),
-    ("photo", "a.tif", lambda path: read_ortho(path, _CORNERS, None, 30), seeds.raster, (3,), "rasterio", 0.3),
+    (
+        "elevation",
+        "a.tif",
+        lambda path: read_elevation(path, _CORNERS, None, margin_m=30),
+        seeds.raster,
+        (1,),
+        "rasterio",
+        0.3,
+    ),
+    ("photo", "a.tif", lambda path: read_ortho(path, _CORNERS, None, margin_m=30), seeds.raster, (3,), "rasterio", 0.3),
 )
 _OPENCV = ("a.yml", "a.xml", "a.json")
 _CONFIG = (
@@ -330,7 +338,7 @@ _DATA_SETS: tuple[tuple[str, str, str, str, Sequence[str]], ...] = (
     ("UAVDT's ignored regions", "uavdt", "M1", f"{_GT}ignore.txt", ["1,1,20,0,10,10,1,-1,-1\n"]),
     ("Stanford Drone", "sdd", "a-b", "annotations/a/b/annotations.txt", []),
     ("CVML", "cvml", "a", "a.xml", []),
-    *((f"KITTI's {part}", "kitti", "0", f"training/{part}/0.txt", []) for part in ("label_02", "calib", "oxts")),
+    ("KITTI's label_02", "kitti", "0", "training/label_02/0.txt", []),
     ("INRIA's annotations", "inria", "a", "Test/annotations/a.txt", []),
     ("BMS's definition", "bms", "cars", "Trainingset/cars/GroundTruth/carsDef.dat", []),
     ("CDnet's temporal region", "cdnet", "PTZ-zoom", "PTZ/zoom/temporalROI.txt", ["2\t2"]),
@@ -343,7 +351,7 @@ _WORDS = {
     "motchallenge": ("imDir=..", "%(name)s", "frameRate=nan", "[DEFAULT]"),
     "sdd": ('"Biker"', "Car", '"'),
     "cvml": ("<frame", "</objectlist>", 'id="', "&amp;", "&a;", "<!DOCTYPE a [", 'encoding="utf-7"', "]]>", "<box/>"),
-    "kitti": ("DontCare", "Car", "R_rect", "Tr_velo_cam", "-1000", "1e9"),
+    "kitti": ("DontCare", "Car", "-1000", "1e9"),
     "inria": ("(Xmin, Ymin)", "object 3", "-99999999", "Image size (X x Y x C) :"),
     "bms": ("File name:", "Frame number:", "Scale of region 1:", "../../a.pgm", "/"),
     "uav123": ("NaN,NaN,NaN,NaN", "'startFrame',", "'endFrame',9", "'name','..'", "'path','/'"),

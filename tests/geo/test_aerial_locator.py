@@ -57,6 +57,54 @@ def flies(locator, **telemetry):
     return locator
 
 
+def test_single_pixels_are_located_in_any_order_without_changing_what_follows(prepared):
+    flight = Overflight(frames=20, size=(640, 360), focal_px=457.0, height_m=45.0, heading_rad=0.3, rate_hz=8.0)
+    locator, table = prepared(flight)
+    for frame in (15, 3):
+        found = locator.locate_pixels(flight.shown(frame, flight.targets(frame)), time_s=flight.time(frame))
+        away = found.east_north_m - (flight.targets(frame) - flight.marks(1)[0])
+        assert np.abs(away).max() < 0.5 and np.isfinite(found.covariance_m2).all()
+    again = prepared(flight)[0]
+    for one, other in zip(locator.locate_table(table), again.locate_table(table), strict=True):
+        np.testing.assert_array_equal(one.positions.east_north_m, other.positions.east_north_m)
+
+
+def test_a_pixel_above_the_horizon_has_no_place_and_the_others_keep_their_rows():
+    flat = Telemetry(
+        np.array([0.0, 1.0]),
+        np.array([50.0, 50.0]),
+        np.zeros(2),
+        place=np.zeros((2, 2)),
+        geographic=False,
+        heading_rad=np.zeros(2),
+        pitch_rad=np.full(2, np.radians(15)),
+        roll_rad=np.zeros(2),
+    )
+    locator = AerialLocator(Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5)), flat)
+    found = locator.locate_pixels([[320, 5], [320, 470]], time_s=0.5)
+    assert np.isnan(found.east_north_m[0]).all() and np.isfinite(found.east_north_m[1]).all()
+    assert found.target.tolist() == [1, 2]
+    with pytest.raises(InputError, match=r"shape \(N, 2\)"):
+        locator.locate_pixels(np.array([320, 5]))
+    with pytest.raises(InputError, match="nothing can be located at 99 s"):
+        locator.locate_pixels([[320, 470]], time_s=99.0)
+
+
+def test_a_place_of_the_camera_that_is_poorly_known_hides_no_target():
+    poor = Telemetry(
+        np.zeros(1),
+        np.full(1, 50.0),
+        np.zeros(1),
+        place=np.zeros((1, 2)),
+        geographic=False,
+        heading_rad=np.zeros(1),
+        pitch_rad=np.full(1, 1.2),
+        position_sigma_m=np.full(1, 40.0),
+    )
+    locator = AerialLocator(Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5)), poor)
+    assert locator.locate_pixels([[320, 240]], time_s=0.0).covariance_m2[0, 0, 0] > 40**2
+
+
 def test_on_a_slope_seen_at_45_degrees_the_raster_turns_metres_into_decimetres(prepared):
     flight = Overflight(pitch_deg=45, ground=hill, geographic=False, gps_m=0.1, pixel=0.5)
 
@@ -145,7 +193,7 @@ def test_colours_lead_to_the_tables_pixels_and_a_blob_off_its_landmark_gives_way
     flight = Overflight(frames=4, size=(640, 360), focal_px=457.0, height_m=45, heading_rad=0.1, geographic=False)
     (tmp_path / "colours.toml").write_text(COLOURS_TOML)
     locator, _ = prepared(flight, pictured=False)
-    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"), "onboard")
+    watch = LandmarkWatch(locator, read_colours(tmp_path / "colours.toml"))
     for frame, picture in zip(flight.numbers(), pictures(flight), strict=True):
         truth = flight.shown(frame, flight.marks(frame))
         found = watch.update(scene(frame, picture, truth[0] + (9.0 * (frame == 4), 0.0)))
@@ -160,7 +208,7 @@ def test_a_tables_pixels_remove_the_smallest_box_about_each_landmark_from_the_ta
     flight = Overflight(frames=1, geographic=False)
     locator, _ = prepared(flight)
     truth = flight.shown(1, flight.marks(1))
-    found = LandmarkWatch(locator, None, "onboard").update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
+    found = LandmarkWatch(locator, None).update(scene(1, np.zeros((1080, 1920, 3), np.uint8), truth[0]))
     assert found.sighted_by == ("table",) * len(truth)
     assert found.scene.detections.box_px.tolist() == [[300, 30, 20, 20]]
 
@@ -200,7 +248,7 @@ def test_a_focal_length_as_for_36_mm_holds_along_the_longer_side_of_the_pictures
     locator = AerialLocator(None, hovering(), size_px=size, rate_hz=1)
     focal_px = 24 / 36 * max(size)
     assert metres_right(locator, 1) == pytest.approx(100 / focal_px * 50, rel=1e-3)
-    assert any(f"nominal focal length, {focal_px:.0f} px" in note and "crops" in note for note in locator.notes)
+    assert any(f"nominal focal length, {focal_px:.0f} px" in note and "cropping" in note for note in locator.notes)
     settings, (note,) = with_logged_focal(Settings(), hovering(), size)
     assert settings.gates.focal_px == pytest.approx(focal_px) and f"{focal_px:.0f} px" in note
 
@@ -254,7 +302,7 @@ def over(ground_m, risen=RISEN, zero="takeoff", above_sea_m=None, raster_m=None,
     heights = np.tile((raster_m or ground_m)(k), (len(k), 1))
     base = float(heights[0, 10])
     camera = camera or Camera("uav", (640, 480), (554.0, 554.0), (319.5, 239.5))
-    return AerialLocator(camera, log, None, Elevation(heights - base, (-50.0, -50.0), 5.0, base))
+    return AerialLocator(camera, log, None, elevation=Elevation(heights - base, (-50.0, -50.0), 5.0, base))
 
 
 def hillside(east):

@@ -44,16 +44,18 @@ def test_crowds_do_not_depend_on_the_order_of_targets(places, chance):
     assert (same[np.ix_(order, order)] == (shuffled[:, None] == shuffled[None])).all()
 
 
-def test_a_crowd_has_the_box_area_score_and_mean_motion_of_its_parts():
+def test_a_crowd_has_the_box_area_score_class_and_mean_motion_of_its_parts():
     mask = np.zeros((20, 30), np.uint16)
     mask[2:6, 3:7], mask[10:12, 20:28], mask[3:5, 9:11] = 1, 2, 3
     boxes = np.array([[3.0, 2, 4, 4], [20, 10, 8, 2], [9, 3, 2, 2]])
     heading, speed = np.array([0.0, np.nan, np.pi / 2]), np.array([2.0, np.nan, 2.0])
     found = Detections(boxes, np.array([0.5, 0.7, 0.9]), np.array([16.0, 16, 4]), heading, speed)
-    found = replace(found, middle_px=middles_of(found.box_px, mask))
+    label, number = np.array(["man", "car", "man"], object), np.array([0, 2, 0])
+    found = replace(found, middle_px=middles_of(found.box_px, mask), label=label, class_id=number)
     crowds, numbered = merge_detections(found, mask, np.array([0, 1, 0]))
     assert crowds.box_px.tolist() == [[3, 2, 8, 4], [20, 10, 8, 2]]
     assert (crowds.score.tolist(), crowds.area_px.tolist()) == ([0.9, 0.7], [20, 16])
+    assert (crowds.label.tolist(), crowds.class_id.tolist()) == (["man", "car"], [0, 2])
     assert crowds.middle_px[0] == pytest.approx([(16 * 4.5 + 4 * 9.5) / 20, 3.5])
     # Four fifths of it go right at 2 px a frame, one fifth down.
     assert crowds.speed_px == pytest.approx([np.hypot(1.6, 0.4), np.nan], nan_ok=True)

@@ -145,7 +145,12 @@ def test_the_turns_of_a_log_are_those_of_the_registrations_of_level_ground():
 def test_a_note_offers_the_value_to_set_on_top_of_the_one_in_force():
     telemetry, seen = fly(late_s=0.62)
     locator = AerialLocator(
-        CAMERA, telemetry, None, None, with_parameters(Settings(), {"aerial.clock_offset_s": 10.0}), rate_hz=10.0
+        CAMERA,
+        telemetry,
+        None,
+        elevation=None,
+        settings=with_parameters(Settings(), {"aerial.clock_offset_s": 10.0}),
+        rate_hz=10.0,
     )
     said = describe_clock_offset(locator, seen)
     assert "the camera turns 0.62" in said and "later in the pictures" in said

@@ -67,7 +67,7 @@ def test_a_log_without_a_heading_takes_the_file_then_the_nose_then_the_course():
         if source:
             assert np.degrees(middle.heading_sigma_rad) == pytest.approx(10.0, abs=0.5)
             assert any("sigma of 10 degrees" in note for note in notes)
-    assert "camera drone: heading_deg not used, because the log says it" in notes
+    assert "camera drone: heading_deg not used for the camera's pose, because the log says it" in notes
     with_landmarks, _ = fill_gaps(log(), None, PARAMETERS, has_landmarks=True)
     assert np.isnan(with_landmarks.heading_rad).all()
 
@@ -97,9 +97,18 @@ def test_heights_of_unknown_zero_count_from_the_take_off_where_they_would_lie_be
 @pytest.mark.parametrize(
     ("heights", "unused"),
     [
-        ({"above_sea_m": 1350.0}, "height_m, takeoff_above_sea_m not used, because the height above ground is known"),
-        ({"altitude_m": np.nan, "above_sea_m": 1350.0}, "height_m not used, because the height above ground is known"),
-        ({"altitude_m": np.nan}, "takeoff_above_sea_m not used, because the log says no height above the sea"),
+        (
+            {"above_sea_m": 1350.0},
+            "height_m, takeoff_above_sea_m not used for the camera's pose, because the height above ground is known",
+        ),
+        (
+            {"altitude_m": np.nan, "above_sea_m": 1350.0},
+            "height_m not used for the camera's pose, because the height above ground is known",
+        ),
+        (
+            {"altitude_m": np.nan},
+            "takeoff_above_sea_m not used for the camera's pose, because the log gives no height above the sea",
+        ),
     ],
 )
 def test_why_a_height_of_the_cameras_file_is_not_used_is_said(heights, unused):
@@ -138,12 +147,16 @@ def test_the_class_locates_by_telemetry_and_the_cameras_angles_and_says_what_the
 @pytest.mark.parametrize(
     ("camera", "telemetry", "missing"),
     [
-        (CAMERA, log(), "pitch; pitch_deg in the camera's file"),
-        (replace(CAMERA, pitch_rad=0.7), log(altitude_m=np.nan), "altitude; height_m or takeoff_above_sea_m"),
-        (replace(CAMERA, pitch_rad=0.7), log(np.zeros((len(TIME), 2))), "heading; heading_deg"),
+        (CAMERA, log(), "pitch; add the column pitch_deg to a CSV of it, or give pitch_deg in"),
+        (
+            replace(CAMERA, pitch_rad=0.7),
+            log(altitude_m=np.nan),
+            "altitude; add the column altitude_m to a CSV of it, or give height_m or takeoff_above_sea_m",
+        ),
+        (replace(CAMERA, pitch_rad=0.7), log(np.zeros((len(TIME), 2))), "heading; add the column heading_deg"),
     ],
 )
-def test_what_is_lacking_for_a_place_is_named_with_the_key_that_helps(camera, telemetry, missing):
+def test_what_is_lacking_for_a_place_is_named_with_the_column_and_the_key_that_help(camera, telemetry, missing):
     found = one_box(camera, telemetry)
     assert found.fix.by == "" and not len(found.positions)
     assert f"does not say the camera's {missing}" in found.fix.cause

@@ -40,7 +40,7 @@ def table(cam, place=(0.0, 0.0), frames=(1, 2, 3), identity=(5, 9)):
 
 
 def found(tables, cameras, *overrides):
-    return list(GroundLocator(cameras, load_config(overrides=overrides)).locate_tables(tables))
+    return list(GroundLocator(cameras, settings=load_config(overrides=overrides)).locate_tables(tables))
 
 
 def test_one_camera_keeps_the_identities_of_its_table():
@@ -87,7 +87,7 @@ def test_paper_mode_converts_by_111320_metres_a_degree():
     north = ORIGIN[1] + depth * np.cos(angle) / 111_320
     east = ORIGIN[0] + depth * np.sin(angle) / (111_320 * np.cos(np.radians(ORIGIN[1])))
     assert np.allclose(look.positions.lonlat_deg[0], (east, north), atol=1e-12)
-    with pytest.raises(InputError, match="no covariances to fuse 2 cameras by"):
+    with pytest.raises(InputError, match="no covariances, so it cannot fuse 2 cameras"):
         found([table(cam), table(cam)], [cam, cam], "ground.mode=paper")
 
 

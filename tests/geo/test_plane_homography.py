@@ -188,7 +188,7 @@ def test_landmarks_too_few_or_nearer_to_a_line_than_their_places_are_known_are_r
         return fix_by_homography(17, look(1, places=np.array(places, float), errors=0, **known).marks, SOLVER)
 
     row, corner = [[-25, 0], [-8, 1], [8, 0], [25, 1]], [[-20, 0], [0, 0], [20, 0], [0, 20]]
-    assert "for how well they are known" in fix(row).cause and fix(corner).by == ""
+    assert "for their accuracy" in fix(row).cause and fix(corner).by == ""
     assert fix(row, sigma_m=0.0, pixel_sigma=0.1).by == "homography"
     few = fix(ring(3))
     assert few.by == "" and few.cause == "frame 17 has 3 landmarks, 1 missing of the 4 that are needed"

@@ -45,6 +45,13 @@ def test_exact_data_give_the_exact_pose_whatever_the_telemetry_leaves_out(known,
     assert found.covariance[6, 6] <= PARAMETERS.focal_sigma**2 * (1 + 1e-9)
 
 
+def test_a_log_that_states_the_error_of_its_places_counts_before_the_parameters():
+    flight = replace(look(0).flight, position_sigma_m=0.02)
+    prior = pose_prior(flight, CAMERA, PARAMETERS)
+    assert prior is not None
+    np.testing.assert_allclose(prior.information.diagonal()[3:5], 1 / 0.02**2)
+
+
 def test_a_bent_lens_is_allowed_for():
     bent = replace(CAMERA, k1=-0.15, k2=0.03)
     seen = look(3, errors=0, camera=bent)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,7 +23,7 @@ from torchvision_dddas.geometry.projection import (
 )
 from torchvision_dddas.types import CameraPose, Elevation
 
-BENT = replace(CAMERA, k1=-0.2, k2=0.05, focal_px=(1400.0, 1380.0))
+BENT = replace(CAMERA, k1=-0.2, k2=0.05, p1=1e-3, p2=-2e-3, k3=0.01, focal_px=(1400.0, 1380.0))
 FOLDING = replace(CAMERA, k1=-0.3, k2=0.02)
 POINTS = np.array([[5.0, 8.0, 0.0], [-7.0, 3.0, 1.5], [1.0, -6.0, 0.0], [12.0, 9.0, -2.0]])
 ABOVE = CameraPose(np.array([2.0, -3.0, 50.0]), axes_of(0.7, 1.3, 0.1), 1.02)
@@ -51,6 +52,13 @@ def test_the_ray_through_where_a_point_is_shown_meets_the_point(camera):
     assert np.allclose(np.cross(way, apart), 0, atol=1e-6) and ((way * apart).sum(axis=1) > 0).all()
 
 
+def test_points_show_where_opencv_shows_them():
+    inner = np.array([[1400 * 1.02, 0, 959.5], [0, 1380 * 1.02, 539.5], [0, 0, 1]])
+    turn, offset = cv2.Rodrigues(ABOVE.axes.T)[0], -ABOVE.axes.T @ ABOVE.place_m
+    theirs = cv2.projectPoints(POINTS, turn, offset, inner, np.array(BENT.distortion))[0][:, 0]
+    assert np.allclose(project(POINTS, ABOVE, BENT), theirs, atol=1e-6)
+
+
 def test_a_point_beyond_the_bend_of_the_lens_is_shown_nowhere():
     wide = np.array([[30.0, 0.0, 0.0], [150.0, 0.0, 0.0], [400.0, 0.0, 0.0]])
     for camera, shown in ((CAMERA, [True] * 3), (BENT, [True] * 3), (FOLDING, [True, False, False])):
@@ -76,7 +84,10 @@ def test_slopes_of_the_ground_are_its_differences(surface):
 
 def test_a_straight_lens_shows_points_at_unbent_pixels_and_bent_ones_are_the_lens_again():
     pose = replace(ABOVE, focal=1.0)
-    seen, straight = project(POINTS, pose, BENT), project(POINTS, pose, replace(BENT, k1=0.0, k2=0.0))
+    seen, straight = (
+        project(POINTS, pose, BENT),
+        project(POINTS, pose, replace(BENT, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)),
+    )
     assert np.allclose(undistort_pixels(seen, BENT), straight, atol=1e-6)
     assert np.allclose(distort_pixels(straight, BENT), seen, atol=1e-6)
     assert np.abs(straight - seen).max() > 1

@@ -12,19 +12,19 @@ from tests.io.ground import NAMES, ORIGIN, START, grounded
 from torchvision_dddas import geometry
 from torchvision_dddas.geometry.projection import axes_of
 from torchvision_dddas.io.ground_tables import read_positions
-from torchvision_dddas.io.output import AerialRecorder, Site
+from torchvision_dddas.io.output import AerialRecorder, MapSite
 from torchvision_dddas.io.output.tables import angles_deg, upper_edge_deg
 from torchvision_dddas.types import Adjustment, CameraPose, Ortho
 
 TABLES = {"positions.csv", "fixes.csv", "run.json"}
-COT, GEOJSON, KML = "tracks.cot.xml", "tracks.geojson", "tracks.kml"
-ALL = {*TABLES, GEOJSON, KML, COT, "map.png", "report.html"}
+COT, GEOJSON, ELLIPSES, KML = "tracks.cot.xml", "tracks.geojson", "ellipses.geojson", "tracks.kml"
+ALL = {*TABLES, GEOJSON, ELLIPSES, KML, COT, "map.png", "report.html"}
 GOOD = [grounded(k) for k in range(1, 13)]
 
 
 def run(folder, frames=GOOD, origin=ORIGIN, start=START, save=("cot", "map", "report"), **site):
     with AerialRecorder(folder, save) as output:
-        output.begin({"input": "clip.mp4", "settings": {}}, Site(NAMES, origin, start, 10.0, **site))
+        output.begin({"input": "clip.mp4", "settings": {}}, MapSite(NAMES, origin, start, 10.0, **site))
         for frame in frames:
             output.write(frame)
     return record(folder)
@@ -53,7 +53,8 @@ def test_small_covariances_are_read_back_as_they_are_and_unknown_cells_as_unknow
     run(tmp_path, [unknown], origin=None)
     assert [name for name, value in rows(tmp_path / "positions.csv")[0].items() if value == ""] == [
         *("var_east_m2", "cov_east_north_m2", "var_north_m2"),
-        *("relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s", "class", "class_id"),
+        *("relative_sigma_m", "velocity_east_m_s", "velocity_north_m_s"),
+        *("class", "class_id", "above_sea_m", "above_ellipsoid_m", "circular_error90_m", "error_category"),
     ]
     assert np.isnan(read_positions(tmp_path / "positions.csv").covariance_m2).all()
 
@@ -93,15 +94,16 @@ def test_all_files_are_there_and_valid(tmp_path):
     photo = Ortho(noise, np.array([[0.1, 0, -30.0], [0, -0.1, 20.0]]))
     kept = run(tmp_path, to_degrees=lambda metres: geometry.lonlat(metres, ORIGIN), background=photo)
     assert set(names(tmp_path)) == ALL and kept["state"] == "complete" and kept["notes"] == []
-    found = [feature["properties"] for feature in json.loads((tmp_path / GEOJSON).read_text())["features"]]
-    assert len(found) == 2 + 2 * 3 + 4 and [p["landmark"] for p in found if "landmark" in p] == list(NAMES)
+    layers = [json.loads((tmp_path / name).read_text()) for name in (GEOJSON, ELLIPSES)]
+    assert [layer["name"] for layer in layers] == ["tracks", "ellipses"] and len(layers[1]["features"]) == 2 * 3
+    found = [feature["properties"] for feature in layers[0]["features"]]
+    assert len(found) == 2 + 4 and [p["landmark"] for p in found if "landmark" in p] == list(NAMES)
     assert "delta &amp; &lt;co&gt;" in (tmp_path / KML).read_text()
     assert all(len(ElementTree.parse(tmp_path / name).getroot()) > 0 for name in (KML, COT))
     picture = cv2.imread(str(tmp_path / "map.png"))
     assert picture is not None and picture.shape[1] == 1400
-    # Of a map over a photo, the report has a JPEG.
-    assert (tmp_path / "map.png").stat().st_size > 400_000
-    assert "data:image/jpeg" in (tmp_path / "report.html").read_text()
+    text = (tmp_path / "report.html").read_text()
+    assert "data:image/jpeg" in text and "data:image/png" not in text and 'src="map.png"' in text
 
 
 def test_maps_that_cannot_be_made_or_are_not_wanted_are_left_out_and_those_of_an_earlier_run_go(tmp_path):
@@ -110,9 +112,10 @@ def test_maps_that_cannot_be_made_or_are_not_wanted_are_left_out_and_those_of_an
     assert set(names(tmp_path)) == ALL - {COT} and "no clock" in unclocked["notes"][0]
     assert "no clock" in (tmp_path / "report.html").read_text()
     local = run(tmp_path, [grounded(k, origin=None) for k in (1, 2)], origin=None)
-    assert set(names(tmp_path)) == ALL - {GEOJSON, KML, COT} and "no longitude and latitude" in local["notes"][0]
+    assert "no longitude and latitude" in local["notes"][0]
+    assert set(names(tmp_path)) == ALL - {GEOJSON, ELLIPSES, KML, COT}
     run(tmp_path, save=())
-    assert set(names(tmp_path)) == {*TABLES, GEOJSON, KML}
+    assert set(names(tmp_path)) == {*TABLES, GEOJSON, ELLIPSES, KML}
 
 
 def test_the_record_counts_by_what_frames_were_located_and_says_what_went_wrong(tmp_path):

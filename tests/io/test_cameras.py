@@ -59,6 +59,9 @@ def test_every_key_reaches_the_camera(write):
     latitude_deg = 32.23
     k1 = -0.1
     k2 = 0.01
+    p1 = 0.001
+    p2 = -0.002
+    k3 = 0.03
     focal_sigma = 0.02
     height_sigma_m = 0.1
     pitch_sigma_deg = 1
@@ -70,7 +73,7 @@ def test_every_key_reaches_the_camera(write):
     assert (camera.centre_px, camera.place, camera.geographic) == ((310, 250), (-110.95, 32.23), True)
     angles = (camera.pitch_rad, camera.roll_rad, camera.heading_rad, camera.pitch_sigma_rad, camera.heading_sigma_rad)
     assert np.degrees(angles) == pytest.approx([10, -1, 90, 1, 5])
-    assert (camera.height_m, camera.k1, camera.k2) == (1.2, -0.1, 0.01)
+    assert (camera.height_m, *camera.distortion) == (1.2, -0.1, 0.01, 0.001, -0.002, 0.03)
     assert (camera.focal_sigma, camera.height_sigma_m, camera.position_sigma_m) == (0.02, 0.1, 0.5)
     assert describe_missing(write(text)) == ""
 
@@ -85,7 +88,7 @@ def test_every_key_reaches_the_camera(write):
         (LEAST + "height_m = -1", "height_m is -1; wanted a number from 0.01 to 1000"),
         (LEAST + 'pitch_deg = "down"', "pitch_deg is 'down'; wanted a number from -89 to 89"),
         (LEAST + "heading_deg = true", "heading_deg is True; wanted a number"),
-        (LEAST + "latitude_deg = 3", "latitude_deg alone; wanted longitude_deg and latitude_deg"),
+        (LEAST + "latitude_deg = 3", "latitude_deg alone; give longitude_deg and latitude_deg"),
         (LEAST + "latitude_deg = 3\nlongitude_deg = 4\neast_m = 1\nnorth_m = 1", "in degrees or in metres"),
         (LEAST + "centre_px = [1, 2, 3]", "centre_px is [1, 2, 3]; wanted [u, v]"),
         (LEAST + "name = 3", "name is 3; wanted a text in quotes"),
@@ -127,7 +130,7 @@ def test_poses_need_a_rate_where_they_are_by_time_and_must_cover_the_frames(writ
     table = read_poses(write("time_s,longitude_deg,latitude_deg\n0,10,50\n1,10.001,50\n", "p.csv"))
     moved, poses = poses_at(camera, table, np.array([1, 6, 11]), rate_hz=10)
     assert moved.geographic and np.allclose(poses.place[:, 0], [10, 10.0005, 10.001])
-    with pytest.raises(InputError, match="by time_s; say with --rate how many frames a second"):
+    with pytest.raises(InputError, match="by time_s; give the number of frames a second with --rate"):
         poses_at(camera, table, np.array([1]))
     table = read_poses(write("frame,heading_deg\n1,0\n40,10\n", "p.csv"))
     with pytest.raises(InputError, match=r"cover frames 1 to 40; 2 of 3 rows .* the first at frame 41"):
@@ -179,7 +182,7 @@ def test_colours_are_read_in_order_and_what_is_written_is_read_again(write):
         ("[red", "is not valid TOML"),
         ("red = 3", "red lacks low or high"),
         ("[red]\nlow = [1, 2, 3]", "red lacks low or high"),
-        ("[red]\nlow = [1, 2, 3]\nhigh = [2, 3, 4]\nhue = 1", "red has hue, which no colour has"),
+        ("[red]\nlow = [1, 2, 3]\nhigh = [2, 3, 4]\nhue = 1", "red has the unknown key hue"),
         ("[red]\nlow = [1, 2]\nhigh = [2, 3, 4]", "red.low is [1, 2]; wanted [hue, saturation, value]"),
         ("[red]\nlow = [1, 2, 3]\nhigh = [190, 3, 4]", "red.high is [190, 3, 4]; wanted"),
         ("[red]\nlow = [1.5, 2, 3]\nhigh = [9, 3, 4]", "red.low is [1.5, 2, 3]; wanted"),

@@ -42,7 +42,9 @@ def test_whatever_the_values_a_plot_is_whole_and_inside_its_frame(kind, log, equ
     x, y = (np.array(values, float) for values in KINDS[kind])
     across = Axis("x <m>", log=log and not equal)
     points_inside(chart("a & b", across, Axis("y"), [Line("l", x, y), Line("s", x, y, 2, steps=True)], equal=equal))
-    points_inside(chart("dots", across, Axis("y"), dots=[Dots("<d>", x, y, sign="ring"), Dots("e", x, y)], equal=equal))
+    points_inside(
+        chart("dots", across, Axis("y"), dots=[Dots("<d>", x, y, is_ring=True), Dots("e", x, y)], equal=equal)
+    )
 
 
 def test_a_curve_goes_up_where_its_values_do_and_breaks_where_they_are_unknown():

@@ -78,7 +78,7 @@ def test_what_opencvs_descriptor_saves_is_read_with_its_layout(tmp_path, ending)
     theirs.save(parameters.classifier)
     svm = load_classifier(parameters)
     np.testing.assert_allclose(np.append(svm.weights, svm.bias), numbers, rtol=1e-6)
-    with pytest.raises(InputError, match=r"clip of 0\.2, the settings say 0\.3; change people\.clip"):
+    with pytest.raises(InputError, match=r"clip of 0\.2, but the settings say 0\.3; change people\.clip"):
         load_classifier(parameters.model_copy(update={"clip": 0.3}))
 
 
@@ -155,7 +155,7 @@ def test_a_mistake_gets_one_line_that_says_what_to_do(tmp_path, name, content, w
 
 
 def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"no classifier is named 'absent', nor is it a file; give opencv"):
+    with pytest.raises(InputError, match=r"no classifier or file is named 'absent'; give opencv"):
         read_classifier("absent", 6)
     with pytest.raises(InputError, match="cannot be read: File name too long"):
         read_classifier("x" * 300, 6)

@@ -205,7 +205,7 @@ def lines_of(box: np.ndarray, second: object = -1, score: object = 0.5, sep: str
     ],
 )
 def test_the_order_of_a_box_comes_from_its_numbers_or_is_given(write, order, shares, given):
-    table = read_detections(write(lines_of(in_order(order, shares))), given, SHAPE)
+    table = read_detections(write(lines_of(in_order(order, shares))), order=given, size=SHAPE)
     np.testing.assert_allclose(table.box_px, PLACES, atol=1e-3)
     assert bool(table.notes) == (shares or (order, given) == ("xyxy", None))
 
@@ -214,13 +214,13 @@ def test_the_order_of_a_box_comes_from_its_numbers_or_is_given(write, order, sha
 @pytest.mark.parametrize(("order", "names"), [(order, names) for order, several in ORDERS.items() for names in several])
 def test_columns_of_other_programs_are_known_by_their_names(write, order, names, shares):
     header = f"frame_index,tracker_id,{names.replace(' ', ',')},confidence"
-    table = read_detections(write(header + "\n" + lines_of(in_order(order, shares), 4)), None, SHAPE)
+    table = read_detections(write(header + "\n" + lines_of(in_order(order, shares), 4)), order=None, size=SHAPE)
     np.testing.assert_allclose(table.box_px, PLACES, atol=1e-3)
     assert (table.frame[-1], unique(table.identity), set(table.score)) == (12, {4}, {0.5})
 
 
 def test_the_class_of_yolo_is_kept_and_shares_without_a_size_are_refused(write, refused):
-    table = read_detections(write(lines_of(in_order("yolo", True), 0, sep=" ")), "yolo", SHAPE)
+    table = read_detections(write(lines_of(in_order("yolo", True), 0, sep=" ")), order="yolo", size=SHAPE)
     assert set(table.at(1).class_id) == {0} and set(table.at(1).label) == {"0"} and unique(table.identity) == {-1}
     assert "are shares of a picture (yolo or xywh), whose size is not known" in refused(
         read_detections, lines_of(in_order("yolo", True))
@@ -249,9 +249,11 @@ def test_capitals_prefixes_and_the_names_of_yolov5_are_known(write, header, orde
 def test_shares_and_percent_without_names_are_refused_where_their_order_is_not_known(write):
     for order in ("yolo", "xywh"):
         with pytest.raises(InputError, match=r"boxes in \[0, 1\] may be yolo or xywh; pass --box-format"):
-            read_detections(write(lines_of(in_order(order, True))), None, SHAPE)
+            read_detections(write(lines_of(in_order(order, True))), order=None, size=SHAPE)
     # Some of these would leave the picture if they were top left corners.
-    table = read_detections(write(lines_of(in_order("yolo", True) + np.array([0.655, 0, 0, 0]))), None, SHAPE)
+    table = read_detections(
+        write(lines_of(in_order("yolo", True) + np.array([0.655, 0, 0, 0]))), order=None, size=SHAPE
+    )
     np.testing.assert_allclose(table.box_px, PLACES + np.array([0.655 * SHAPE[0], 0, 0, 0]), atol=1e-3)
 
 
@@ -263,7 +265,7 @@ def test_boxes_in_percent_are_read_where_there_are_many_and_noted_else(write, or
     box = np.c_[first + 0.123, np.full((count, 2), 8)] + (4 * np.eye(4)[:2].sum(0) if order == "yolo" else 0)
     box[:, 2:] += box[:, :2] if order == "xyxy" else 0
     given = order if many else None
-    table = read_detections(write(lines_of(box)), given, (1280, 720))
+    table = read_detections(write(lines_of(box)), order=given, size=(1280, 720))
     if many:
         corner = (first + 0.123) * [12.80, 7.20]
         np.testing.assert_allclose(table.box_px, np.c_[corner, np.full((count, 2), 8) * [12.80, 7.20]], atol=1e-4)
@@ -275,15 +277,15 @@ def test_boxes_in_percent_are_read_where_there_are_many_and_noted_else(write, or
 def test_labels_of_a_folder_in_pixels_are_centre_and_size_or_refused(tmp_path):
     for k in range(8):
         (tmp_path / f"img_{k:03d}.txt").write_text(f"2 {60 + 5 * k} 70 90 90 0.9\n")
-    table = read_detections(tmp_path, None, SHAPE)
+    table = read_detections(tmp_path, order=None, size=SHAPE)
     np.testing.assert_allclose(table.box_px[0], [15, 25, 90, 90])
     assert unique(table.class_id) == {2} and unique(table.identity) == {-1}
     assert "centre and size in pixels" in " ".join(table.notes)
     for k in range(8):
         (tmp_path / f"img_{k:03d}.txt").write_text(f"2 {60 + 9 * k} {70 + 5 * k} {80 + 9 * k} {90 + 5 * k} 0.9\n")
     with pytest.raises(InputError, match="corners; pass --box-format xyxy if so"):
-        read_detections(tmp_path, None, SHAPE)
-    table = read_detections(tmp_path, "xyxy", SHAPE)
+        read_detections(tmp_path, order=None, size=SHAPE)
+    table = read_detections(tmp_path, order="xyxy", size=SHAPE)
     np.testing.assert_allclose(table.box_px[0], [60, 70, 20, 20])
     assert unique(table.class_id) == {2} and unique(table.identity) == {-1}
 
@@ -299,7 +301,7 @@ def test_a_folder_of_yolos_labels_is_read_frame_by_frame(tmp_path, first):
     for k, row in enumerate(in_order("yolo", True)):
         (tmp_path / f"clip_{first + k}.txt").write_text("2 {:.7f} {:.7f} {:.7f} {:.7f} 0.9 5\n\n".format(*row) * 2)
     (tmp_path / "classes.txt").write_text("person\ncar\n")
-    table = read_detections(tmp_path, None, SHAPE)
+    table = read_detections(tmp_path, order=None, size=SHAPE)
     np.testing.assert_allclose(table.box_px[::2], PLACES, atol=1e-3)
     assert (table.first, table.last, set(table.score), unique(table.class_id)) == (
         first or 1,
@@ -308,14 +310,14 @@ def test_a_folder_of_yolos_labels_is_read_frame_by_frame(tmp_path, first):
         {2},
     )
     # With the pictures of the clip their names count.
-    named = read_detections(tmp_path, None, SHAPE, [f"clip_{first + k}" for k in range(12)])
+    named = read_detections(tmp_path, order=None, size=SHAPE, pictures=[f"clip_{first + k}" for k in range(12)])
     assert (named.first, named.last) == (1, 12)
     (tmp_path / "clip_x.txt").write_text("0 0.5 0.5 0.1 0.1\n")
     with pytest.raises(InputError, match=r"clip_x\.txt belongs to no picture"):
-        read_detections(tmp_path, None, SHAPE)
+        read_detections(tmp_path, order=None, size=SHAPE)
     (tmp_path / "clip_x.txt").rename(tmp_path / "clip_99.txt").write_text("0 0.1 0.1 0.2 0.2 0.3 0.3 0.4 0.1\n")
     with pytest.raises(InputError, match=r"clip_99\.txt, line 1: 9 columns; wanted class cx cy w h"):
-        read_detections(tmp_path, None, SHAPE)
+        read_detections(tmp_path, order=None, size=SHAPE)
 
 
 @pytest.mark.parametrize(
@@ -383,3 +385,10 @@ def test_a_table_of_another_clip_or_interval_is_refused():
         check_table(rows_on([1, 5, 6, 9]), 1, clip(5))
     with pytest.raises(InputError, match=r"no row on frames 1, 6, 11, .* --interval 5 .* first is on frame 5"):
         check_table(rows_on([5, 10, 15]), 5)
+
+
+def test_the_classes_of_a_folder_of_labels_have_the_names_of_classes_txt(tmp_path):
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / "a_1.txt").write_text("0 0.5 0.5 0.1 0.1\n7 0.2 0.2 0.1 0.1\n")
+    (tmp_path / "classes.txt").write_text("person\ncar\n")
+    assert read_detections(tmp_path / "labels", size=(640, 480)).classes(slice(None))[0].tolist() == ["person", "7"]

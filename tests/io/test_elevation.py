@@ -44,7 +44,7 @@ def slope(crs="EPSG:32612", step=1.0, cells=201, base=1300.0):
 
 
 def test_heights_are_relative_to_the_origin_and_lie_where_they_belong(tmp_path):
-    found = read_elevation(write(tmp_path / "a.tif", slope()), HERE, ORIGIN, 60)
+    found = read_elevation(write(tmp_path / "a.tif", slope()), HERE, ORIGIN, margin_m=60)
     assert found.base_m == pytest.approx(1300, abs=1e-3)
     places = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [-30.3, 25.7]])
     # The grid's north is turned by a third of a degree against true north here.
@@ -59,13 +59,13 @@ def test_a_raster_in_degrees_gives_the_same_heights(tmp_path):
     cells, tall = 301, 1300.0
     k = np.arange(cells) - cells // 2
     heights = (tall - 0.1 * k[:, None] * step * 110_900 + 0 * k[None]).astype("float32")
-    found = read_elevation(write(tmp_path / "a.tif", heights, "EPSG:4326", step), HERE, ORIGIN, 60)
+    found = read_elevation(write(tmp_path / "a.tif", heights, "EPSG:4326", step), HERE, ORIGIN, margin_m=60)
     assert ground_height(found, np.array([[0.0, 50.0]]))[0] == pytest.approx(5.0, abs=0.01)
 
 
 def test_local_metres_without_an_origin_are_those_of_the_raster(tmp_path):
     path = write(tmp_path / "a.tif", slope(), None, middle=(500.0, 700.0))
-    found = read_elevation(path, np.array([[500.0, 700.0]]), None, 60)
+    found = read_elevation(path, np.array([[500.0, 700.0]]), None, margin_m=60)
     first, second = ground_height(found, np.array([[500.0, 700.0], [520.0, 730.0]]))
     assert second - first == pytest.approx(0.05 * 20 + 0.1 * 30, abs=1e-3)
 
@@ -74,7 +74,7 @@ def test_local_metres_without_an_origin_are_those_of_the_raster(tmp_path):
 def test_holes_are_unknown_whether_declared_or_not(tmp_path, declared):
     heights = slope()
     heights[40:60, 100:160] = -9999.0 if declared else -32768.0
-    found = read_elevation(write(tmp_path / "a.tif", heights, **declared), HERE, ORIGIN, 80)
+    found = read_elevation(write(tmp_path / "a.tif", heights, **declared), HERE, ORIGIN, margin_m=80)
     row = np.array([[30.0, 50.0]])
     assert np.isnan(ground_height(found, row))
     known = found.up_m[np.isfinite(found.up_m)]
@@ -85,7 +85,7 @@ def test_where_the_origin_is_not_covered_up_is_counted_from_the_landmarks(tmp_pa
     x, y = centre("EPSG:32612")
     path = write(tmp_path / "a.tif", slope(base=900.0), middle=(x + 300, y))
     places = np.array([[0.0, 0.0], [280.0, 0.0], [320.0, 0.0]])
-    found = read_elevation(path, places, ORIGIN, 50)
+    found = read_elevation(path, places, ORIGIN, margin_m=50)
     assert np.isnan(ground_height(found, places[:1]))
     assert ground_height(found, places[1:]).mean() == pytest.approx(0, abs=0.1)
     assert found.base_m == pytest.approx(900, abs=0.5)
@@ -94,7 +94,7 @@ def test_where_the_origin_is_not_covered_up_is_counted_from_the_landmarks(tmp_pa
 def test_a_fine_raster_is_averaged_down(tmp_path):
     heights = np.full((800, 800), 100, "float32")
     heights[::2] += 1
-    found = read_elevation(write(tmp_path / "a.tif", heights, step=0.01), HERE, ORIGIN, 200)
+    found = read_elevation(write(tmp_path / "a.tif", heights, step=0.01), HERE, ORIGIN, margin_m=200)
     inside = found.up_m[np.isfinite(found.up_m)]
     assert found.step_m == pytest.approx(0.2)
     assert np.abs(inside).max() < 0.3
@@ -121,12 +121,12 @@ BANDS = np.zeros((3, 20, 20), "uint8")
         (read_elevation, lambda p: write(p, slope()), (2.0, 48.0), r"covers longitude -110\.95.*landmarks lie at east"),
         (read_elevation, text, ORIGIN, "cannot be read as a raster"),
         (read_elevation, lambda p: p, ORIGIN, "cannot be read as a raster"),
-        (read_elevation, lambda p: write(p, BANDS), ORIGIN, "3 bands; wanted one"),
+        (read_elevation, lambda p: write(p, BANDS), ORIGIN, "3 bands; give one"),
         (read_elevation, lambda p: write(p, slope(), None, middle=(0.0, 0.0)), ORIGIN, "no CRS"),
         (read_elevation, lambda p: write(p, slope(), "EPSG:4326", 1e-5), None, "the landmarks in local metres"),
         (read_elevation, bare_picture, None, "does not say where it lies"),
-        (read_ortho, lambda p: write(p, slope()), ORIGIN, "1 bands of float32; wanted a photo"),
-        (read_ortho, lambda p: write(p, BANDS), (2.0, 48.0), "none shows"),
+        (read_ortho, lambda p: write(p, slope()), ORIGIN, "1 bands of float32; give a photo"),
+        (read_ortho, lambda p: write(p, BANDS), (2.0, 48.0), "it has no data there"),
     ],
 )
 def test_what_is_no_such_raster_or_lies_elsewhere_is_refused_in_one_line(tmp_path, read, make, origin, words):
@@ -184,7 +184,7 @@ _LARGE = 4100  # cells a side: more than are read of it
         ("text.tif", "cannot be read as a raster"),
         ("overviews.tif", ""),
         ("beside.tif", ""),
-        ("inside.tif", "names another file"),
+        ("inside.tif", "in another file"),
         ("/vsicurl/{}", "no such file"),
         ("{}", "no such file"),
     ],
@@ -204,9 +204,9 @@ def test_a_raster_never_makes_a_request(tmp_path, requests, name, words):
         name_overviews(path, address)
     if words:
         with pytest.raises(InputError, match=words):
-            read_elevation(path, HERE, ORIGIN, 2050)
+            read_elevation(path, HERE, ORIGIN, margin_m=2050)
     else:
-        assert np.nanmax(read_elevation(path, HERE, ORIGIN, 2050).up_m) == 0
+        assert np.nanmax(read_elevation(path, HERE, ORIGIN, margin_m=2050).up_m) == 0
     assert requests == []
 
 
@@ -219,7 +219,7 @@ def test_without_rasterio_the_extra_is_named(tmp_path, monkeypatch):
 def test_a_photo_shows_each_place_in_its_colour(tmp_path):
     photo = np.full((3, 200, 200), 90, "uint8")
     photo[0, :100, 100:] = 250  # red in the north-east
-    found = read_ortho(write(tmp_path / "a.tif", photo, step=0.5), HERE, ORIGIN, 40)
+    found = read_ortho(write(tmp_path / "a.tif", photo, step=0.5), HERE, ORIGIN, margin_m=40)
     pixel_from_place = np.linalg.inv(np.vstack([found.east_north_from_pixel, [0, 0, 1]]))
     for place, blue_green_red in (((20, 20), (90, 90, 250)), ((-20, 20), (90, 90, 90)), ((20, -20), (90, 90, 90))):
         u, v, _ = np.rint(pixel_from_place @ [*place, 1]).astype(int)
@@ -230,7 +230,7 @@ def test_a_white_band_of_a_photo_is_no_hole(tmp_path):
     photo = np.full((3, 60, 60), 90, "uint8")
     photo[0, 28:32, 28:32] = 255
     photo[:, :10] = 255
-    found = read_ortho(write(tmp_path / "a.tif", photo, nodata=255), HERE, ORIGIN, 20)
+    found = read_ortho(write(tmp_path / "a.tif", photo, nodata=255), HERE, ORIGIN, margin_m=20)
     middle = found.image.shape[0] // 2
     assert found.image[middle, middle].tolist() == [90, 90, 255]
 
@@ -243,10 +243,10 @@ def test_a_raster_whose_strips_or_tiles_take_too_much_memory_is_refused(tmp_path
     if of == "overview":
         with rasterio.Env(GDAL_TIFF_OVR_BLOCKSIZE=512), rasterio.open(path, "r+") as file:
             file.build_overviews([2])
-    assert read_elevation(path, HERE, ORIGIN, 60).base_m == pytest.approx(1300, abs=0.2)
+    assert read_elevation(path, HERE, ORIGIN, margin_m=60).base_m == pytest.approx(1300, abs=0.2)
     monkeypatch.setenv("DDDAS_MEMORY_MB", "1")
     with pytest.raises(InputError, match=r"a\.tif has strips or tiles of (512|1024)x512 cells; that takes [12] MB of"):
-        read_elevation(path, HERE, ORIGIN, 60)
+        read_elevation(path, HERE, ORIGIN, margin_m=60)
 
 
 @pytest.mark.parametrize("side", [30_000, 29_999])

@@ -40,9 +40,11 @@ def test_metres_pictures_sigmas_and_plans_are_read_and_further_columns_are_not(t
 
 def test_times_become_frames_whole_ones_where_the_picture_shows_it(table):
     text = "time_s,landmark,east_m,north_m,u_px,v_px\n-2,a,0,0,,\n0,a,0,0,,\n0.5,a,0,0,,\n0.51,a,0,0,,\n"
-    assert read_landmarks(table(text), 25.0, 2.0).frame.tolist() == pytest.approx([1, 51, 63.5, 63.75])
+    assert read_landmarks(table(text), rate_hz=25.0, clock_offset_s=2.0).frame.tolist() == pytest.approx(
+        [1, 51, 63.5, 63.75]
+    )
     seen = "time_s,landmark,east_m,north_m,u_px,v_px\n0.033,a,0,0,1,1\n0.067,a,0,0,,\n"
-    assert read_landmarks(table(seen), 30.0).frame.tolist() == pytest.approx([2, 3.01])
+    assert read_landmarks(table(seen), rate_hz=30.0).frame.tolist() == pytest.approx([2, 3.01])
 
 
 @pytest.mark.parametrize(
@@ -56,15 +58,15 @@ def test_times_become_frames_whole_ones_where_the_picture_shows_it(table):
         ("time_s,landmark,east_m,north_m\n0,a,0,0\n", "has times (time_s); pass --rate"),
         (HEADER + "1,a,1,1\n1,b,x,1\n", "line 3: longitude_deg is 'x'; wanted a number"),
         (HEADER + "1.5,a,1,1\n", "line 2: frame is '1.5'; wanted a whole number from 1; between two pictures, give"),
-        (HEADER + "1,,1,1\n", "line 2: landmark is empty; wanted its name or number"),
+        (HEADER + "1,,1,1\n", "line 2: landmark is empty; give its name or number"),
         (HEADER + "1,a,32.23,-110.95\n", "line 2: latitude_deg is '-110.95'; wanted -90 to 90; longitude and latitude"),
         (HEADER + "1,a,500123,3566000\n", "wanted -90 to 90; if these are metres, name the columns east_m,north_m"),
         (HEADER + "1,a,1,\n", "line 2: longitude_deg alone; wanted longitude_deg and latitude_deg, or neither"),
-        (HEADER + "1,a,1,1\n1,a,1,1\n", "line 3: a is in frame 1 already, by line 2; wanted each landmark once"),
+        (HEADER + "1,a,1,1\n1,a,1,1\n", "line 3: a is in frame 1 already, by line 2; give each landmark once"),
         (HEADER + "1,a,1,1\n2,a,1,1\n3,a,1,2\n", "line 4: 1, 2 lies 111 km from most others"),
-        (HEADER + "1,a,1,1\n2,a,1,1\n3,a,0,0\n", "a receiver without a fix says so: leave the place empty"),
+        (HEADER + "1,a,1,1\n2,a,1,1\n3,a,0,0\n", "a receiver without a fix reports 0, 0: leave it empty"),
         (BOTH + "1,a,1,1,,\n2,a,,,1,1\n", "line 2 has its place in degrees, line 3 in metres; give one kind"),
-        (BOTH + "1,a,,,,\n2,a,1,1,1,1\n", "line 3: a place in degrees and in metres"),
+        (BOTH + "1,a,,,,\n2,a,1,1,1,1\n", "line 3: the row has a place in degrees and in metres"),
         (f"{METRES},sigma_m\n1,a,0,0,-1\n", "line 2: sigma_m is '-1'; wanted a number from 0 to 100000"),
         (f"{METRES},planned\n1,a,0,0,0.5\n", "line 2: planned is '0.5'; wanted 0 or 1"),
         (f"{METRES},planned\n1,a,,,1\n", "line 2: planned is 1 but there is no place"),

@@ -13,6 +13,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from tests.io.flights import packet, sentence, ulog
@@ -358,8 +359,12 @@ def test_a_video_of_too_many_pixels_is_refused_before_a_frame_is_read(tmp_path, 
 
 @pytest.mark.parametrize("suffix", [".webp", ".jp2", ".gif", ".png", ".bmp", ".jpg", ".tif", ".ppm"])
 def test_the_size_in_a_header_is_the_pictures(suffix):
-    ok, data = cv2.imencode(suffix, np.full((48, 64, 3), 90, np.uint8))
-    assert ok and size_in_header(bytes(data)) == (64, 48)
+    if suffix == ".gif":  # OpenCV writes it from 4.11 on
+        Image.new("L", (64, 48), 90).save(written := io.BytesIO(), "GIF")
+        data = written.getvalue()
+    else:
+        data = bytes(cv2.imencode(suffix, np.full((48, 64, 3), 90, np.uint8))[1])
+    assert size_in_header(data) == (64, 48)
 
 
 SVM = "   svmType: C_SVC\n   kernel: {{ type: LINEAR }}\n   support_vectors: {}\n   decision_functions: {}\n"
@@ -450,7 +455,7 @@ def test_of_an_archive_only_the_arrays_of_a_classifier_are_read(tmp_path):
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 5_000_000
-    with pytest.raises(InputError, match="holds a0, a1, a2, a3, a4; wanted weights, and a bias"):
+    with pytest.raises(InputError, match=r"holds a0, a1, a2, a3, a4; wanted weights \(and bias\)"):
         read_classifier(archive(tmp_path / "b.npz", **others), 3)
 
 

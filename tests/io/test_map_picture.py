@@ -8,13 +8,14 @@ import pytest
 from tests.io.ground import DOWN, NAMES, positions, tracks
 from torchvision_dddas.geometry.projection import axes_of, rays
 from torchvision_dddas.io.maps.map_picture import (
+    EVENTS,
     FINE,
     LEFT,
     TOP,
-    VERDICTS,
     WIDTH,
     CameraPath,
     Signs,
+    extent,
     frame_around,
     map_picture,
     round_step,
@@ -33,6 +34,10 @@ def walk(offset=(0.0, 0.0), frames=range(1, 31)):
 
 def landmarks(*places):
     return tracks([positions(1, places, origin=None, target=range(len(places)))])
+
+
+def frame_of(targets, marks=NONE):
+    return frame_around(extent(targets, marks, CameraPath(), Signs()))
 
 
 def pixel(frame, east_north):
@@ -65,6 +70,14 @@ def test_the_ellipse_has_its_size_in_metres():
     assert np.ptp(up) * frame.metres_a_pixel == pytest.approx(2 * 12.24, abs=0.5)
 
 
+def test_the_last_ellipse_of_a_target_is_not_cut_off_unless_it_reaches_far_beyond_all_places():
+    def size_m(sigma_m):
+        still = tracks([positions(1, [[0, 0], [40, 0]], np.diag([1, sigma_m**2]), None)])
+        return float(np.subtract(*frame_of(still).box_m[3::-2]))
+
+    assert 2 * 2.44 * 20 < size_m(20) < 3 * 2.44 * 20 and size_m(100) < 100
+
+
 def test_north_is_up_all_places_are_inside_and_steps_of_the_grid_are_round():
     places = np.array([[0, 0], [30, 0], [0, 300.0]])
     frame = frame_around(places)
@@ -77,16 +90,17 @@ def test_north_is_up_all_places_are_inside_and_steps_of_the_grid_are_round():
 
 
 def test_places_far_from_all_others_do_not_stretch_the_map():
-    near = [positions(k + 1, [[k, -k]], None, None) for k in range(90)]
-    lost = positions(31, [[50_000, 0]], None, None)
+    unknown = np.full((2, 2), np.nan)
+    near = [positions(k + 1, [[k, -k]], unknown, None) for k in range(90)]
+    lost = positions(31, [[50_000, 0]], unknown, None)
     alone, together = map_picture(tracks(near), NONE), map_picture(tracks([*near, lost]), NONE)
     # Only the label of the last place, and the count below, differ.
     assert alone.shape == together.shape and (alone != together).any(axis=2).mean() < 0.01
 
 
 def test_a_track_is_broken_where_the_target_was_not_located():
-    picture = map_picture(walk(frames=[*range(1, 41), *range(61, 101)]), NONE)
-    frame = frame_around(np.array([[0, 0], [99, -99.0]]))
+    broken = walk(frames=[*range(1, 41), *range(61, 101)])
+    picture, frame = map_picture(broken, NONE), frame_of(broken)
     assert is_coloured(picture, frame, [20, -20]) and not is_coloured(picture, frame, [49, -49])
 
 
@@ -97,7 +111,7 @@ def test_a_photo_lies_under_the_map_where_its_metres_are():
     image[v - 10 : v + 11, u - 10 : u + 11] = (0, 255, 0)
     photo = Ortho(image, np.array([[0.5, 0, -60.0], [0, -0.5, 50.0]]))
     picture = map_picture(walk((-20, 0)), landmarks([40, 30]), NAMES, photo=photo)
-    frame = frame_around(np.array([[-20, -29], [40, 30.0]]))
+    frame = frame_of(walk((-20, 0)), landmarks([40, 30]))
     green = (picture[..., 1] > 200) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
     x, y = pixel(frame, [20, 10])
     reach = round(10 / frame.metres_a_pixel)
@@ -111,7 +125,7 @@ def test_a_photo_finer_than_the_map_is_averaged():
     image[::2, ::2] = image[1::2, 1::2] = 255
     photo = Ortho(image, np.array([[0.05, 0, -100.0], [0, -0.05, 100.0]]))
     picture = map_picture(walk(), landmarks([-60, 60]), NAMES, photo=photo)
-    x, y = pixel(frame_around(np.array([[-60, 60], [29, -29.0]])), [13, 33])
+    x, y = pixel(frame_of(walk(), landmarks([-60, 60])), [13, 33])
     assert picture[y - 8 : y + 8, x - 8 : x + 8].std() < 5
 
 
@@ -166,7 +180,7 @@ def with_signs(*verdicts, looks=()):
     """The map of a target that walks from west to east, above the legend, int."""
     signs = Signs()
     for place, kind in verdicts:
-        signs.add_verdict(kind, np.array(place))
+        signs.add_event(kind, np.array(place))
     for from_m, at_m in looks:
         signs.add_look("ugv1", np.array(from_m), np.array(at_m))
     east = tracks([positions(k, [(k, 0.0)]) for k in range(40)])
@@ -175,7 +189,7 @@ def with_signs(*verdicts, looks=()):
 
 def test_the_map_shows_where_a_target_was_human_and_where_not():
     def count(picture, kind):
-        return int((np.abs(picture - VERDICTS[kind]).max(axis=2) < 12).sum())
+        return int((np.abs(picture - EVENTS[kind][2]).max(axis=2) < 12).sum())
 
     bare, human = with_signs(), with_signs(([10.0, 0], "human"))
     both = with_signs(([10.0, 0], "human"), ([30.0, 0], "not_human"))
@@ -199,6 +213,6 @@ def test_looks_from_one_place_are_one_those_from_nowhere_none_and_memory_is_boun
     signs.add_look("ugv2", np.full(2, np.nan), np.zeros(2))
     assert len(signs.looks) == 1
     for k in range(3000):
-        signs.add_verdict("human", np.zeros(2))
+        signs.add_event("human", np.zeros(2))
         signs.add_look("ugv1", np.array([10.0 * k, 0.0]), np.zeros(2))
-    assert len(signs.verdicts) < 1000 and len(signs.looks) < 1000
+    assert len(signs.events) < 1000 and len(signs.looks) < 1000

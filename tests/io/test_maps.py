@@ -1,6 +1,7 @@
 """Maps for other tools: GeoJSON, KML, Cursor-on-Target, and the ellipses that they show."""
 
 import json
+from dataclasses import replace
 from datetime import datetime
 from xml.etree import ElementTree
 
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.io.ground import NAMES, ORIGIN, START, positions, tracks
 from torchvision_dddas import geometry
-from torchvision_dddas.io.maps.formats import UNKNOWN, cot, encode_geojson, geojson, kml, xml_text
+from torchvision_dddas.io.maps.formats import UNKNOWN, cot, ellipses_geojson, encode_geojson, geojson, kml, xml_text
 from torchvision_dddas.io.maps.ground_tracks import CHI2_95, cut_line, ellipse_rows, ring_about, ring_m, semi_axes
 from torchvision_dddas.io.output import GroundRecorder
 from torchvision_dddas.types import GroundLocations, Sightings
@@ -30,7 +31,7 @@ def signed_area(ring):
     return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2)
 
 
-@pytest.mark.parametrize("make", [geojson, kml, cot])
+@pytest.mark.parametrize("make", [geojson, ellipses_geojson, kml, cot])
 def test_no_positions_are_a_valid_map_and_local_metres_are_refused(make):
     assert make(tracks([]))
     with pytest.raises(ValueError, match="no longitude"):
@@ -44,8 +45,8 @@ def test_no_positions_are_a_valid_map_and_local_metres_are_refused(make):
 # GeoJSON.
 
 
-def features(*given, **rest):
-    return json.loads(encode_geojson(geojson(*given, **rest)))["features"]
+def features(*given, make=geojson, **rest):
+    return json.loads(encode_geojson(make(*given, **rest)))["features"]
 
 
 def places(found):
@@ -66,22 +67,25 @@ def test_a_track_has_its_frames_times_and_errors_beside_its_places():
 
 
 def test_ellipses_are_polygons_of_95_percent_where_the_error_is_known_and_landmarks_are_named():
-    found = [f for f in features(tracks(walk()), ellipses=True) if "ellipse_of" in f["properties"]]
-    assert [f["properties"]["frame"] for f in found if f["properties"]["ellipse_of"] == 2] == [1, 11, 21, 30]
+    found = features(tracks(walk()), make=ellipses_geojson)
+    assert [f["properties"]["frame"] for f in found if f["properties"]["target"] == 2] == [1, 11, 21, 30]
     properties = found[-1]["properties"]
     assert (properties["semi_major_m"], properties["semi_minor_m"]) == pytest.approx((4.8955, 2.4477), abs=1e-3)
     assert properties["bearing_deg"] == 90 and properties["time"].startswith("2020-09-13T12:26:43.15")
     (ring,) = found[-1]["geometry"]["coordinates"]
     assert ring[0] == ring[-1] and signed_area(ring) > 0
-    unknown = features(tracks(walk(covariance=np.full((2, 2), np.nan))), ellipses=True)
-    assert len(unknown) == 2 and unknown[0]["properties"]["sigma_m"][0] is None
+    unknown = tracks(walk(covariance=np.full((2, 2), np.nan)))
+    assert features(unknown, make=ellipses_geojson) == []
+    assert features(unknown)[0]["properties"]["sigma_m"][0] is None
     mark = features(tracks(walk()), landmarks=tracks([positions(1, [[5, 5]], target=[3])]), names=NAMES)[-1]
     assert mark["properties"]["landmark"] == "delta & <co>" and mark["geometry"]["type"] == "Point"
 
 
-@pytest.mark.parametrize("origin", [ORIGIN, DATE_LINE, (-180.0, 60.0)])
-def test_the_box_holds_all_places_also_over_180_degrees(origin):
-    found = geojson(tracks(walk(origin=origin, step=5.0)), ellipses=True)
+@pytest.mark.parametrize(
+    ("origin", "make"), [(ORIGIN, geojson), (DATE_LINE, geojson), ((-180.0, 60.0), ellipses_geojson)]
+)
+def test_the_box_holds_all_places_also_over_180_degrees(origin, make):
+    found = make(tracks(walk(origin=origin, step=5.0)))
     west, south, east, north = found["bbox"]
     assert (west > east) == (origin != ORIGIN)
     for feature in found["features"]:
@@ -188,6 +192,16 @@ def test_a_target_gives_one_event_a_second_with_its_place_and_error():
     assert (track.get("course"), track.get("speed")) == ("0.0", "2.00")
     (point,) = events(tracks([positions(1, [[0, 0]], np.full((2, 2), np.nan))]))[0].iter("point")
     assert point.get("ce") == UNKNOWN
+
+
+def test_heights_of_targets_stand_in_geojson_and_as_hae_in_events_where_they_are_known():
+    high = replace(positions(1, [[0, 0]]), above_sea_m=np.array([720.0]), above_ellipsoid_m=np.array([691.26]))
+    found = tracks([high, positions(2, [[0, 0]])])
+    (point,) = events(found)[0].iter("point")
+    assert point.get("hae") == "691.26"
+    properties = geojson(found)["features"][0]["properties"]
+    assert properties["above_sea_m"] == [720.0, None] and properties["above_ellipsoid_m"] == [691.26, None]
+    assert "above_sea_m" not in geojson(tracks(walk(2)))["features"][0]["properties"]
 
 
 def test_events_are_at_least_a_second_apart_and_valid_until_after_the_next():

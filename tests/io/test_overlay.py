@@ -3,17 +3,21 @@
 import importlib.util
 import sys
 import threading
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from torchvision_dddas.errors import InputError
 from torchvision_dddas.io import overlay
+from torchvision_dddas.io.drawing import draw
 from torchvision_dddas.io.overlay import (
     CUT,
     PERSON,
     SEARCHED,
+    TARGET,
     UNLIKELY,
     UNTRACKED,
     RunPictures,
@@ -146,7 +150,6 @@ def test_searched_regions_are_drawn_and_the_caption_says_how_much_was_searched()
     assert not shows(nowhere, SEARCHED) and (nowhere[-40:] != draw_people(people())[-40:]).any()
 
 
-# --------------------------------------------------------------------------------------------------------------------
 # Files.
 
 NEEDS_AV = pytest.mark.skipif(not importlib.util.find_spec("av"), reason="needs av")
@@ -258,3 +261,44 @@ def test_the_caption_of_a_located_frame_counts_landmarks_only_where_there_are_an
     tracked = TrackedFrame(1, frame, Detections(), Tracks(1))
     RunPictures(SIZE)(FrameResult(tracked, located))
     assert f"located by telemetry, {said}0 targets" in written
+
+
+def test_draw_shows_what_overlays_of_runs_show_of_tracks():
+    results = [tracked([[5 + 9 * k, 20, 20, 30]], [3], number=k + 1) for k in range(3)]
+    pictures = RunPictures(SIZE)
+    shown = [pictures(result) for result in results][-1]
+    drawn = draw(results[-1].frame, results)
+    above, below = slice(0, 19), slice(51, 60)
+    assert (drawn[24:50] == shown[24:50]).all() and (drawn[below] == 90).all()
+    assert (drawn[above] != shown[above]).any()  # the label has a speed too
+
+
+@pytest.mark.parametrize("kind", ["result", "tracks", "detections", "scene"])
+def test_draw_takes_each_result_of_a_frame_and_leaves_the_frame_alone(kind):
+    found = Detections(np.array([[5.0, 20, 20, 30]]), np.array([0.9]), label=np.array(["car"], object))
+    scene = Scene(Frame(1, 0.0, image()), np.zeros(SIZE[::-1]), found, 1)
+    result = {"result": tracked(), "tracks": tracked().tracks, "detections": found, "scene": scene}[kind]
+    frame = image(grey=True)
+    drawn = draw(frame, result)
+    assert drawn.shape == (*SIZE[::-1], 3) and (frame == 90).all()
+    assert shows(drawn, identity_colour(1) if kind in ("result", "tracks") else TARGET)
+
+
+def test_draw_refuses_what_is_no_result_of_one_frame():
+    bad: list[Any] = [[1], 3, Tracks.concat([tracked().tracks] * 2)]
+    for given in bad:
+        with pytest.raises(InputError, match="draw got"):
+            draw(image(), given)
+
+
+def test_labels_have_the_class_and_the_speed_in_metres_where_targets_are_located(monkeypatch):
+    said: list[str] = []
+    monkeypatch.setattr(overlay, "label", lambda picture, box, text, colour: said.append(text))
+    one = tracked()
+    tracks = replace(one.tracks, label=np.array(["car"], object))
+    places = Positions(np.array([1]), np.array([1]), np.zeros((1, 2)), np.zeros((1, 2, 2)), np.ones(1))
+    velocity, none = np.array([[3.0, 4.0]]), np.zeros(0, int)
+    located = AerialLocations(1, 0.0, places, none, none, velocity, none, Fix(1, "telemetry"), LandmarkObservations())
+    draw(image(), tracks)
+    draw(image(), replace(one, tracked=replace(one.tracked, tracks=tracks), locations=located))
+    assert said == ["1 car", "1 car 5.0 m/s"]

@@ -20,9 +20,9 @@ from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import (
     AerialRecorder,
     DetectionRecorder,
+    MapSite,
     PeopleRecorder,
     PipelineRecorder,
-    Site,
     TrackRecorder,
     describe_nothing_located,
     parse_save,
@@ -42,7 +42,7 @@ from torchvision_dddas.types import (
 )
 
 PICTURE = np.zeros((60, 80, 3), np.uint8)
-SITE = Site(NAMES, ORIGIN, START, 10.0)
+SITE = MapSite(NAMES, ORIGIN, START, 10.0)
 FULL = errno.ENOSPC, os.strerror(errno.ENOSPC)
 BOTH = ("masks", "overlay")
 ALL_OF_TWO = ["detections.csv", "detections.txt", "masks/000001.png", "masks/000002.png", "overlay.mp4", "run.json"]
@@ -307,7 +307,7 @@ def test_a_full_disk_is_one_line_that_names_the_file_and_leaves_nothing_half_wri
     with pytest.raises(InputError, match="No space left on device") as error:
         fill(tmp_path, [make_scene(1), make_scene(2)])
     assert f"cannot write {tmp_path / file}: " in str(error.value)
-    assert "What was not whole, such as tables under way, is removed" in str(error.value)
+    assert "Unfinished files, such as tables being written, are removed" in str(error.value)
     assert not any(".part" in name for name in visible(tmp_path))
     assert not {"detections.csv", "overlay.mp4"} & set(visible(tmp_path)) or victim == "closing"
     # The film is encoded beside the rest: the next mask may be there, and whole, before its error is known.

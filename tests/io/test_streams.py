@@ -208,7 +208,7 @@ def test_a_frame_that_cannot_be_encoded_is_reported_and_the_next_one_goes_out():
     bench = Bench(encode)
     bench.write(1, 2, 3, 4, 5)
     assert bench.got == [b"1\n", b"3\n", b"5\n"] and bench.stream.lost == 2
-    assert bench.notes == ["json:x: frame 2 cannot be told, ZeroDivisionError: division by zero; 1 message lost"]
+    assert bench.notes == ["json:x: frame 2 cannot be encoded, ZeroDivisionError: division by zero; 1 message lost"]
 
 
 def test_the_age_of_a_frame_is_counted_from_its_capture():

@@ -180,6 +180,11 @@ def test_a_flight_log_that_says_when_the_film_begins_tells_how_to_count_from_the
     assert moved.at(0.0).place[0] == pytest.approx(11.5006) and not [n for n in moved.notes if "film" in n]
 
 
+def test_a_table_that_counts_frames_takes_the_rate_that_is_given(fly):
+    flown = fly("frame,latitude,longitude,rel_alt\n1,48.1,11.5,50\n6,48.1,11.5,55\n", rate_hz=2.0)
+    assert flown.time_s.tolist() == [0.0, 2.5]
+
+
 def test_a_table_that_counts_frames_takes_the_times_of_its_clip(fly, tmp_path: Path):
     clip = tmp_path / "pictures"
     clip.mkdir()

@@ -68,6 +68,13 @@ def test_the_position_of_the_autopilot_is_read_in_each_form(fly):
         assert flown.height_zero == "takeoff" and not flown.notes
 
 
+def test_a_receiver_states_the_error_of_the_places(fly):
+    rows = [("GPA", us, 0, 1.2, 2.0, 3.0, 0.5) for us in range(10_000_000, 12_000_000, 200_000)]
+    kinds = KINDS | {"GPA": ("QBCCCC", "TimeUS,I,VDop,HAcc,VAcc,SAcc")}
+    for name, content in forms(kinds, sorted(messages() + rows, key=lambda row: row[1])):
+        assert fly(content, name).at(1.0).position_sigma_m == pytest.approx(math.sqrt(2))
+
+
 @pytest.mark.parametrize("dead", [0, 1])
 def test_of_two_receivers_the_one_with_a_fix_is_used(fly, dead):
     for name, content in forms(KINDS, messages(dead, names=("GPS",))):
@@ -162,7 +169,7 @@ RANDOM = np.random.default_rng(0)
 def test_a_damaged_binary_log_is_read_around_the_damage(fly, damage, least):
     flown = fly(damage(dataflash(KINDS, messages())), "a.bin")
     assert np.isfinite(flown.altitude_m).sum() >= least and np.nanmax(flown.altitude_m) < 100
-    assert any("are no whole messages and left out" in note for note in flown.notes)
+    assert any("are not whole messages and are left out" in note for note in flown.notes)
 
 
 def test_a_damaged_text_log_is_read_around_the_damage(fly):

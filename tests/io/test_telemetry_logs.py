@@ -95,6 +95,20 @@ def test_without_an_estimate_the_receivers_places_are_taken_where_it_has_a_fix(f
     assert np.isnan(flown.altitude_m).all() and any("above ground" in note for note in flown.notes)
 
 
+@pytest.mark.parametrize(("h_acc_mm", "sigma_m"), [(2000, math.sqrt(2)), (0, math.nan)])
+def test_a_receiver_states_the_error_of_the_places(fly, h_acc_mm, sigma_m):
+    fix = {"time_usec": 0, "fix_type": 3, "lat": 481_000_000, "lon": 115_000_000, "alt": 560_000, "vel": 700}
+    fix |= {"eph": 100, "epv": 100, "cog": 0, "satellites_visible": 9, "h_acc": h_acc_mm}
+    said = [
+        row
+        for k, place in enumerate(eastward(8))
+        for row in (place, (place[0], "GPS_RAW_INT", {**fix, "time_usec": k}))
+    ]
+    flown = fly(tlog(said), "flight.tlog")
+    assert flown.at(0.5).position_sigma_m == pytest.approx(sigma_m, nan_ok=True)
+    assert any("states the error of its places" in note for note in flown.notes) == bool(h_acc_mm)
+
+
 def test_of_two_vehicles_the_one_that_reports_most_is_taken_and_the_other_named(fly):
     other = tlog([(t + 9, name, part) for t, name, part in eastward(5)], system=7)
     flown = fly(tlog(eastward(20)) + other, "flight.tlog")
@@ -452,12 +466,12 @@ BATTERY = ulog({"battery_status": (("float voltage",), [(0, 12.0)])})
     [
         ("a.tlog", tlog([(CLOCK_S + i, "HEARTBEAT", HEARTBEAT) for i in range(5)]), "none of its 5 MAVLink messages"),
         ("a.ulg", BATTERY, "has no position, height or attitude"),
-        ("a.ulg", b"XX" + BATTERY, "does not begin as a PX4 log"),
+        ("a.ulg", b"XX" + BATTERY, "does not begin like a PX4 log"),
         ("a.ulg", BATTERY[:12], "damaged from its beginning"),
         ("a.ulg", b"", "is empty"),
         ("a.bin", b"\x00\x00\x00\x20ftypisom" + bytes(90), "is a video"),
         ("a.bin", b"\xa3\x95\x80\x80" + bytes(90), "the DataFlash log has no position, height or attitude"),
-        ("a.bin", np.random.default_rng(0).bytes(500), "none of the kinds"),
+        ("a.bin", np.random.default_rng(0).bytes(500), "of no supported kind"),
     ],
 )
 def test_a_file_of_no_use_is_refused_in_one_line(refused, name, content, words):

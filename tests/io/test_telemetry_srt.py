@@ -149,7 +149,7 @@ def test_no_fix_is_no_place_and_no_height_above_the_sea(read):
         (timed("[latitude: 18.2] [longitude: 234.1]"), "line 2: longitude_deg is 234.1"),
         (timed(*["[latitude: 18.2] [longitude: 34.1]"] * 9) * 2, "time runs back from 8.000 to 0.000"),
         ("\n\n", "is empty"),
-        ("no telemetry at all", "none of the kinds"),
+        ("no telemetry at all", "of no supported kind"),
     ],
 )
 def test_a_file_of_no_use_is_refused_in_one_line(refused, text, words):
@@ -254,7 +254,7 @@ def test_the_dialect_tells_which_coordinate_comes_first(read, body, place):
 
 def test_two_coordinates_alone_need_an_order(fly):
     text = timed("GPS(48.1, 11.5) BAROMETER:9.2")
-    with pytest.raises(InputError, match=r"GPS\(...\) may be lat-lon or lon-lat; wanted aerial\.order=lat-lon or"):
+    with pytest.raises(InputError, match=r"GPS\(...\) may be lat-lon or lon-lat; set aerial\.order=lat-lon or"):
         fly(text, "flight.SRT")
     assert fly(text, "flight.SRT", order="lat-lon").place.tolist() == [[11.5, 48.1]]
     assert fly(text, "flight.SRT", order="lon-lat").place.tolist() == [[48.1, 11.5]]

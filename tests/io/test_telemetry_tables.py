@@ -481,7 +481,7 @@ def test_places_are_read_in_every_form(fly, names, cells, place):
 
 def test_two_coordinates_in_one_cell_need_an_order_unless_the_program_or_a_value_tells_it(fly):
     text = table("time_s,position,relative_altitude", "{i},48.5 11.25,50")
-    with pytest.raises(InputError, match=r"wanted aerial\.order=lat-lon or aerial\.order=lon-lat"):
+    with pytest.raises(InputError, match=r"set aerial\.order=lat-lon or aerial\.order=lon-lat"):
         fly(text)
     assert fly(text, order="lat-lon").place[0].tolist() == [11.25, 48.5]
     assert fly(text, order="lon-lat").place[0].tolist() == [48.5, 11.25]

@@ -409,5 +409,5 @@ def test_a_port_alone_is_on_this_machine_only():
 
 @pytest.mark.parametrize("spec", ["", "1.2.3.4", "host:", "70000", "-1", "8080/"])
 def test_a_wrong_address_is_one_line(spec):
-    with pytest.raises(InputError, match=r"--serve .* is no address; wanted PORT or HOST:PORT"):
+    with pytest.raises(InputError, match=r"--serve .* is no address; give PORT or HOST:PORT"):
         parse_address(spec)

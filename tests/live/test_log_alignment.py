@@ -59,16 +59,16 @@ def test_a_log_that_ended_a_minute_before_the_first_picture_is_refused_beside_a_
 def test_a_log_whose_dates_lack_a_zone_is_refused_beside_a_camera_where_no_zone_makes_it_current(days, is_refused):
     given = replace(log(-1500, 60, has_clock=False), latest_utc_s=NOW_S - 86_400 * days + 43_200)
     if is_refused:
-        with pytest.raises(InputError, match="by its dates, which lack a time zone: its places are not those of now"):
+        with pytest.raises(InputError, match="by its dates, which lack a time zone: its places are not current"):
             describe_log(given, False, NOW_S, 0.0)
     else:
-        assert "says no time of day" in describe_log(given, False, NOW_S, 0.0)
+        assert "gives no time of day" in describe_log(given, False, NOW_S, 0.0)
     assert "this is a recording" in describe_log(given, True, NOW_S, 0.0)
 
 
 def test_a_log_without_a_clock_is_said_to_count_from_the_first_picture_of_a_camera():
     given = log(-1500, 60, has_clock=False)
-    assert "says no time of day: its time 0 counts as the first picture's" in describe_log(given, False, NOW_S, 0.0)
+    assert "gives no time of day: its time 0 is taken as the first picture's" in describe_log(given, False, NOW_S, 0.0)
     assert describe_log(given, True, NOW_S, 0.0) == "times of day are those of playing it: this is a recording"
 
 

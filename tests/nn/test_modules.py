@@ -9,7 +9,7 @@ import torchvision_dddas.functional as F
 from tests.synthetic_clip import RATE_HZ, flight, render
 from torchvision_dddas.config import PaperParameters, RegistrationParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.nn import HistogramAffinity, HOGDescriptor, PersonScorer, PlaneHomography, Registration
+from torchvision_dddas.nn import FrameRegistration, HistogramAffinity, HOGDescriptor, PersonScorer, PlaneHomography
 from torchvision_dddas.tracking import rgb_histograms, source_tracker
 
 NONE = torch.zeros(1, 0, 2)
@@ -31,7 +31,7 @@ def rgb(*pictures: np.ndarray) -> torch.Tensor:
 def test_a_person_scorer_scores_windows_as_opencv_does_and_learns(stride):
     random = np.random.default_rng(1)
     weights, image = random.normal(0, 0.02, LAYOUT.features).astype(np.float32), picture()
-    scorer = PersonScorer(torch.from_numpy(weights), -0.3, LAYOUT, stride)
+    scorer = PersonScorer(torch.from_numpy(weights), -0.3, layout=LAYOUT, window_stride_px=stride)
     detector = cv2.HOGDescriptor(LAYOUT.window, (8, 8), (4, 4), (4, 4), 9, 1, -1, 0, 0.2, True)
     detector.setSVMDetector(np.append(weights, -0.3).astype(np.float32))
     places, wanted = (np.asarray(hit) for hit in detector.detect(image, -1e9, (stride, stride), (0, 0)))
@@ -57,7 +57,7 @@ def test_a_hog_descriptor_is_that_of_opencv():
 def test_a_registration_finds_the_motion_of_the_background_whatever_the_exposure():
     images, size = render(1, 4, (320, 240), [1.0, 1.2, 1.0, 0.8]).images, (320, 240)
     grey = torch.from_numpy(np.stack([cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]))[:, None]
-    motion = Registration(RegistrationParameters())(grey[:-1] / 255.0, grey[1:] / 255.0)
+    motion = FrameRegistration(RegistrationParameters())(grey[:-1] / 255.0, grey[1:] / 255.0)
     corners = torch.tensor([[0.0, 0], [319, 0], [0, 239], [319, 239]], dtype=torch.float64).expand(3, 4, 2)
     ground = torch.from_numpy(np.stack([view.image_from_ground for view in flight(1, 4, size, RATE_HZ)]))
     true = ground[1:] @ torch.linalg.inv(ground[:-1])

@@ -13,7 +13,7 @@ from torchvision_dddas.detection.interval import choose_pairs
 from torchvision_dddas.detection.torch_engine import TorchEngine
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional import soft
-from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Registration
+from torchvision_dddas.nn import Core, Differences, FrameRegistration, MotionSegmenter, Regions
 from torchvision_dddas.nn.motion_segmenter import TUNED, chain_motion
 
 KNOBS: dict[str, float] = {
@@ -53,10 +53,11 @@ def values() -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("noisy", [False, True])
 def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> None:
     motion, windows = MotionSegmenter(NOISY if noisy else SETTINGS, tuned=()), differences(noisy=noisy)
-    hard = motion.segment(windows, {}).mask
+    hard = motion.segment(windows, values={}).mask
     assert 0 < float(hard.mean()) < 1 and set(hard.unique().tolist()) == {0.0, 1.0}
     misses = [
-        float((motion.segment(windows, {}, softness).mask - hard).abs().mean()) for softness in (0.5, 0.1, 0.02, 0.004)
+        float((motion.segment(windows, values={}, softness=softness).mask - hard).abs().mean())
+        for softness in (0.5, 0.1, 0.02, 0.004)
     ]
     assert misses[0] > misses[1] > misses[2] > misses[3] and misses[3] < 0.01
 
@@ -65,7 +66,10 @@ def test_a_soft_core_tends_to_the_hard_one_as_softness_vanishes(noisy: bool) -> 
 def test_parameters_as_tensors_give_what_the_settings_give(kind: str) -> None:
     settings = with_parameters(SETTINGS, {"difference.kind": kind})
     motion, windows = MotionSegmenter(settings, tuned=()), differences()
-    given, tuned = motion.segment(windows, {}, 0.1), motion.segment(windows, values(), 0.1)
+    given, tuned = (
+        motion.segment(windows, values={}, softness=0.1),
+        motion.segment(windows, values=values(), softness=0.1),
+    )
     torch.testing.assert_close(given.mask, tuned.mask)
     torch.testing.assert_close(given.evidence, tuned.evidence)
 
@@ -80,7 +84,9 @@ def test_the_gradient_of_every_parameter_of_the_core_is_right(noisy: bool) -> No
     weight = torch.rand(2, 1, 24, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def total(*parameters: torch.Tensor) -> torch.Tensor:
-        return (motion.segment(windows, dict(zip(names, parameters, strict=True)), 0.2).mask * weight).sum()
+        return (
+            motion.segment(windows, values=dict(zip(names, parameters, strict=True)), softness=0.2).mask * weight
+        ).sum()
 
     starts = tuple(torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in at)
     # The unit of noise has whole steps and so has jumps; small steps stay between them.
@@ -104,21 +110,23 @@ def regions(core: Core) -> Regions:
 )
 def test_a_region_below_its_area_or_its_peak_is_gone_and_one_above_both_is_whole(name, value, left) -> None:
     motion = MotionSegmenter(SETTINGS, tuned=())
-    core = motion.segment(differences(), {})
-    mask = motion.outlined(core, regions(core), {name: torch.tensor(value)})
+    core = motion.segment(differences(), values={})
+    mask = motion.outlined(core, regions(core), values={name: torch.tensor(value)})
     assert torch.equal(mask, core.mask if left else torch.zeros_like(mask))
 
 
 def test_a_hole_in_a_hull_is_there_as_far_as_its_region() -> None:
     motion, windows = MotionSegmenter(SETTINGS, tuned=()), differences()
-    core = motion.segment(windows, {})
+    core = motion.segment(windows, values={})
     near = regions(core).near
     filled = near.clone()
     filled[0, 0, 0, 5] = 1
     found = Regions(near, filled, 1)
-    assert float(motion.outlined(core, found, {})[0, 0, 0, 5]) == 1.0
+    assert float(motion.outlined(core, found, values={})[0, 0, 0, 5]) == 1.0
     area = torch.tensor(300.0, dtype=torch.float64, requires_grad=True)
-    soft = motion.outlined(motion.segment(windows, {}, 0.1), found, {"gates.min_area_px": area}, 0.3)[0, 0, 0, 5]
+    soft = motion.outlined(
+        motion.segment(windows, values={}, softness=0.1), found, values={"gates.min_area_px": area}, softness=0.3
+    )[0, 0, 0, 5]
     (slope,) = torch.autograd.grad(soft, area)
     assert 0 < float(soft.detach()) < 1 and float(slope) < 0
 
@@ -127,8 +135,8 @@ def test_windows_that_show_nothing_give_nothing_and_no_nan() -> None:
     none = torch.zeros(1, 1, 20, 20)
     parameters = {name: value.requires_grad_() for name, value in values().items()}
     motion = MotionSegmenter(SETTINGS, tuned=())
-    core = motion.segment(Differences(none.byte(), none.bool(), none, none.byte()), parameters, 0.1)
-    mask = motion.outlined(core, Regions(none.long(), none.long(), 0), parameters, 0.1)
+    core = motion.segment(Differences(none.byte(), none.bool(), none, none.byte()), values=parameters, softness=0.1)
+    mask = motion.outlined(core, Regions(none.long(), none.long(), 0), values=parameters, softness=0.1)
     mask.sum().backward()
     assert not mask.any() and all(v.grad is None or bool(v.grad.isfinite()) for v in parameters.values())
 
@@ -191,7 +199,7 @@ def test_with_the_later_steps_it_is_the_detector_with_the_torch_engine(images, c
         model.get_parameter("difference_threshold").mul_(1.2)
     settings = model.tuned_settings()
     assert settings.difference.threshold == pytest.approx(1.2 * Settings().difference.threshold)
-    detector = MotionDetector(settings, TorchEngine(settings, "cpu"))
+    detector = MotionDetector(settings, backend=TorchEngine(settings, "cpu"))
     scenes = [scene for image in images for scene in detector.update(image)] + detector.flush()
     found = detect_masks(model, torch.cat([clip, clip.flip(1)]))
     assert found.shape == (2, FRAMES, 1, *reversed(SIZE)) and found[0].any()
@@ -231,7 +239,7 @@ def test_from_pictures_to_masks_the_gradient_of_every_learned_parameter_is_right
     weight = torch.rand(1, 3, 1, 32, 40, generator=random, dtype=torch.float64)
 
     def total(*parameters: torch.Tensor) -> torch.Tensor:
-        return (model(clip, still, dict(zip(TUNED, parameters, strict=True))).mask * weight).sum()
+        return (model(clip, still, values=dict(zip(TUNED, parameters, strict=True))).mask * weight).sum()
 
     starts = tuple(parameter.detach().clone().requires_grad_() for parameter in model.parameters())
     slopes = torch.autograd.grad(total(*starts), starts)
@@ -258,7 +266,7 @@ def test_frames_without_two_neighbours_show_nothing(clip) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_off_the_cpu_nothing_from_pictures_to_masks_asks_for_a_value(kind, softness, asks, clip, monkeypatch) -> None:
     """Tensors on `meta` have none, and meet no others: the first question raises, as branches on a CPU show."""
-    model = MotionSegmenter(of_kind(kind), softness).to("meta")
+    model = MotionSegmenter(of_kind(kind), softness=softness).to("meta")
     if asks:
         monkeypatch.setattr(soft, "may_branch", lambda _: True)
         with pytest.raises((RuntimeError, NotImplementedError)):
@@ -273,7 +281,7 @@ def test_both_ways_of_registration_taken_at_once_give_what_the_branches_give(cli
     """Of pairs whose scouts agree, and of one whose scouts do not."""
     grey = clip[0].mean(1, keepdim=True)
     noise = torch.rand(1, 1, SIZE[1], SIZE[0], generator=torch.Generator().manual_seed(0))
-    earlier, later, registration = grey[:-1], torch.cat([grey[1:4], noise, grey[5:]]), Registration()
+    earlier, later, registration = grey[:-1], torch.cat([grey[1:4], noise, grey[5:]]), FrameRegistration()
     wanted = registration(earlier, later)
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
     found = registration(earlier, later)
@@ -326,7 +334,7 @@ def test_clips_without_a_step_show_nothing(batch, frames) -> None:
         (lambda: MotionSegmenter()(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8)), "got torch.uint8"),
         (lambda: MotionSegmenter()(torch.rand(1, 3, 1, 48, 64), torch.eye(3).expand(1, 3, 3, 3)), "one matrix a step"),
         (
-            lambda: MotionSegmenter()(torch.rand(1, 3, 1, 48, 64), None, {"difference.treshold": 9.0}),
+            lambda: MotionSegmenter()(torch.rand(1, 3, 1, 48, 64), values={"difference.treshold": 9.0}),
             "treshold; wanted",
         ),
     ],

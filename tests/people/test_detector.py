@@ -140,7 +140,7 @@ def test_the_public_detector_takes_one_picture_or_several(monkeypatch):
     with pytest.raises(InputError, match=r"^picture 2: a picture of 10 x 20 px"):
         detector([picture, np.zeros((20, 10), np.uint8)])
     monkeypatch.undo()
-    with pytest.raises(InputError, match="no back end is named"):
+    with pytest.raises(InputError, match="no backend is named"):
         PersonDetector(backend="quantum")
 
 

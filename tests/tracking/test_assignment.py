@@ -89,10 +89,10 @@ def test_the_order_of_the_columns_does_not_matter_even_among_equal_sums(seed):
     ("columns", "score", "message"),
     [
         ([[0, 0]], [1.0], "got \\(1, 2\\)"),
-        ([[0, 0, 0]], [1.0, 2.0], "one score a column"),
+        ([[0, 0, 0]], [1.0, 2.0], "one score for each column"),
         ([[0.0, 0.0, 0.0]], [1.0], "integer"),
         ([[0, -2, 0]], [1.0], "below -1"),
-        ([[-1, -1, -1]], [1.0], "column of none"),
+        ([[-1, -1, -1]], [1.0], "column without a node"),
         ([[0, 0, 0]], [np.nan], "NaN"),
         ([[0, 0, 0]], [np.inf], "inf"),
     ],

@@ -8,7 +8,7 @@ from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.box_motion import candidate_shifts, likelier_shift, medians
 from torchvision_dddas.tracking.kalman import HEIGHT, X, Y
 from torchvision_dddas.tracking.scene import SceneState
-from torchvision_dddas.tracking.scores import Look, association_scores, newborn_scores
+from torchvision_dddas.tracking.scores import BoxLook, association_scores, newborn_scores
 
 KNOBS = Settings().track
 SCENE = SceneState(time=1, step=0.1, density=1e-5, missing=0.1, turnover=0.02)
@@ -33,7 +33,7 @@ def found(before: np.ndarray, now: np.ndarray, newborn: bool = False) -> np.ndar
     def scores(shift: np.ndarray) -> np.ndarray:
         moved = state.copy()
         moved[:, : Y + 1] += shift
-        look = Look.of(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS)
+        look = BoxLook.of(moved, np.zeros(len(moved)), boxes(now), SCENE, KNOBS)
         return newborn_scores(look, KNOBS, at_rest) if newborn else association_scores(look, KNOBS)
 
     shifts = candidate_shifts(state[:, [X, Y]], state[:, HEIGHT], now, np.full(len(now), 80.0))

@@ -13,7 +13,7 @@ from torchvision_dddas.tracking import kalman
 from torchvision_dddas.tracking.kalman import HEIGHT, VX, VY, WIDTH, X, Y
 from torchvision_dddas.tracking.scene import SceneState
 from torchvision_dddas.tracking.scores import (
-    Look,
+    BoxLook,
     association_scores,
     common_velocity,
     is_near_border,
@@ -39,7 +39,7 @@ def track(box: np.ndarray = PERSON, velocity: tuple[float, float] = (0, 0), seen
 def scored(boxes, state=None, scene=SCENE, missed=0) -> list[float]:
     """The scores of one track's links."""
     state = track() if state is None else state
-    look = Look.of(state, np.full(len(state), missed), np.asarray(boxes, float), scene, KNOBS)
+    look = BoxLook.of(state, np.full(len(state), missed), np.asarray(boxes, float), scene, KNOBS)
     return association_scores(look, KNOBS)[0].tolist()
 
 
@@ -47,7 +47,7 @@ def first(boxes, flow=None, scene=SCENE, missed=0, box=PERSON) -> list[float]:
     """The scores of links of a track with one detection."""
     state = kalman.start(box[None], scene.time - 1 - missed, KNOBS.scatter, scene.step)
     velocities = ways(state, np.zeros((0, kalman.COLUMNS)) if flow is None else flow)
-    look = Look.of(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS)
+    look = BoxLook.of(state, np.array([missed]), np.asarray(boxes, float), scene, KNOBS)
     return newborn_scores(look, KNOBS, velocities)[0].tolist()
 
 
@@ -101,7 +101,7 @@ def test_scores_do_not_depend_on_the_scale_or_place_of_the_scene(seed, scale, x,
 @pytest.mark.parametrize(("tracks", "boxes"), [(0, 0), (0, 2), (2, 0)])
 def test_no_tracks_or_no_boxes_give_an_empty_table(tracks, boxes):
     state, boxes_px = np.repeat(track(), tracks, axis=0), np.tile(PERSON, (boxes, 1))
-    look = Look.of(state, np.zeros(tracks), boxes_px, SCENE, KNOBS)
+    look = BoxLook.of(state, np.zeros(tracks), boxes_px, SCENE, KNOBS)
     assert association_scores(look, KNOBS).shape == (tracks, boxes)
     assert newborn_scores(look, KNOBS, ways(state, track())).shape == (tracks, boxes)
 

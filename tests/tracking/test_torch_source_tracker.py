@@ -89,5 +89,5 @@ def test_a_batch_is_settled_earlier_where_its_windows_are_large_and_pictures_go_
 
 
 def test_a_back_end_of_another_name_is_refused():
-    with pytest.raises(InputError, match="no back end is named 'gpu'"):
+    with pytest.raises(InputError, match="no backend is named 'gpu'"):
         Tracker(SOURCE, backend="gpu")

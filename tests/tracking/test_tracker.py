@@ -195,7 +195,7 @@ def test_both_modes_track_a_walker_in_pictures_and_settle_every_frame_once(mode)
     tracker, tracks = Tracker(load_config(overrides=[f"track.mode={mode}"]), interval=2, size=SIZE), []
     for frame in Clip(11).every(2):
         boxes = np.array([box for _, box in walkers([frame.number], lanes=(60,))])
-        tracks += tracker.update(boxes, np.eye(3), frame.image, frame.number)
+        tracks += tracker.update(boxes, np.eye(3), image=frame.image, frame=frame.number)
     tracks += tracker.flush()
     assert [t.frame for t in tracks] == [1, 3, 5, 7, 9, 11]
     assert {int(i) for t in tracks for i in t.identity} == {1}
@@ -234,7 +234,7 @@ def test_every_change_of_whether_appearance_is_looked_at_is_an_adjustment_with_i
     ("given", "message"),
     [
         ({"detections": np.zeros((2, 3))}, r"boxes must be \(N, 4\)"),
-        ({"detections": (np.ones((2, 4)), np.ones(3))}, r"one a box, \(2,\); got \(3,\)"),
+        ({"detections": (np.ones((2, 4)), np.ones(3))}, r"one score for each box, \(2,\); got \(3,\)"),
         ({"detections": np.full((1, 4), np.nan)}, "finite"),
         ({"detections": np.array([[0, 0, 0, 5.0]])}, "above 0 px, got 0 x 5 in box 0"),
         ({"detections": "boxes"}, "Detections record"),
@@ -371,13 +371,34 @@ def test_damage_that_looks_like_targets_for_a_few_frames_begins_no_identities():
         tracker, found = Tracker(motion=True, size=(640, 480)), []
         for number in range(1, 80):
             boxes = car_at(number / 20)
-            if number % 4 < 2 and number > 10:  # what lasts for two frames
-                blocks = np.random.default_rng(number // 4).uniform(0, 440, (4, 2))
+            if number % 5 < 3 and number > 10:  # what lasts for three frames
+                blocks = np.random.default_rng(number // 5).uniform(0, 440, (4, 2))
                 boxes = np.concatenate([boxes, np.c_[blocks + rng.normal(0, 1, (4, 2)), np.full((4, 2), 24.0)]])
             found += tracker.update(boxes, frame=number, damaged=damaged and number > 10)
         found += tracker.flush()
         identities = {n for tracks in found for n in tracks.identity.tolist()}
         assert 1 in identities and (len(identities) == 1 if damaged else len(identities) > most)
+
+
+@pytest.mark.parametrize(
+    ("interval", "lasts", "is_tracked"), [(1, 2, False), (1, 3, True), (2, 2, False), (3, 3, True)]
+)
+def test_own_detections_confirm_a_track_after_as_many_frames_as_hits(interval, lasts, is_tracked):
+    tracker, found = Tracker(motion=True, interval=interval, size=(640, 480)), []
+    for number in range(1, 40, interval):
+        there = 10 <= number < 10 + lasts
+        found += tracker.update(car_at(0.5) if there else np.zeros((0, 4)), frame=number)
+    assert any(len(tracks) for tracks in found + tracker.flush()) == is_tracked
+
+
+def test_a_part_beside_the_part_that_continues_a_track_begins_none():
+    tracker, found = Tracker(motion=True, size=(640, 480)), []
+    for number in range(1, 60):
+        x, y, width, height = np.array([100 + 3 * number, 200, 90, 40])
+        is_split = number > 6 and number % 4 == 3
+        parts = [[x, y, 25, height], [x + 60, y, 30, height]] if is_split else [[x, y, width, height]]
+        found += tracker.update(np.array(parts, float), frame=number)
+    assert {n for tracks in found + tracker.flush() for n in tracks.identity.tolist()} == {1}
 
 
 def test_a_target_that_comes_in_a_damaged_stretch_gets_its_identity_after_five_looks():

@@ -1,4 +1,4 @@
-"""The detection chain, written once, and its operations on OpenCV: no torch."""
+"""The detection chain, written once for all engines, and its operations in OpenCV. No torch is needed."""
 
 from torchvision_dddas.chain.exposure import View, exposure_between, fit_exposure, match_exposure
 from torchvision_dddas.chain.foreground import (

@@ -1,4 +1,4 @@
-"""The exposure between two frames, from the grey levels below which equal shares of their pixels lie."""
+"""Estimate the change of exposure between two frames from quantiles of their grey levels."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -6,24 +6,23 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-# Exposures are compared by the grey levels below which these shares of a picture lie: a moving camera shifts them
-# little, and not in the way a gain does.
+# The quantiles of the grey levels that are compared. Camera motion changes them little, and not as a gain does.
 _SHARES = np.linspace(0.02, 0.98, 33)
-_EDGES = np.arange(257) - 0.5  # where grey levels begin and end
-# Levels nearer to black or white than this may be clipped.
+_EDGES = np.arange(257) - 0.5  # edges of the histogram's bins
+# Quantiles nearer to black or white than this may be clipped, and are not used.
 _CLIPPED = 3.0
-# A smaller median difference of those levels does not disturb the search: 2 % of gain on a usual picture.
+# A smaller median difference of the quantiles does not disturb Lucas-Kanade: 2 % of gain on a usual picture.
 _MIN_DIFFERENCE = 2.0
-# A gain and an offset must leave at most this share of the difference; otherwise it is the content that has changed.
+# The fit of gain and offset must reduce the median difference to this share; otherwise the content has changed.
 _MAX_LEFT = 0.5
 _MIN_LEVELS = 8
 
 
 @dataclass
 class View:
-    """One frame as an engine holds it, made by `Engine.prepare`; engines add what they use again.
+    """A frame as `Engine.prepare` returns it. Engines subclass it to cache their own data.
 
-    image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W). ignored: uint8 (H, W), 255 in what is left out, or None.
+    image: uint8 (H, W) or (H, W, 3) BGR. grey: uint8 (H, W). ignored: uint8 (H, W), 255 at excluded pixels, or None.
     """
 
     image: np.ndarray
@@ -37,16 +36,16 @@ class View:
 
     @cached_property
     def level_shares(self) -> np.ndarray:
-        """(33,) grey levels; see `measure_level_shares`."""
+        """The (33,) quantiles of the grey levels; see `measure_level_shares`."""
         return measure_level_shares(self.grey)
 
 
 def match_exposure(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:
-    """The grey pictures of both, (H, W) uint8, the darker one in the other's exposure where the two differ clearly.
+    """Return both grey pictures, (H, W) uint8, the darker one converted to the other's exposure if they differ clearly.
 
-    Lucas-Kanade compares grey levels: a gain that jumps by 15 % moves its homographies by 1 to 10 px at the corners,
-    and most of its points still agree with each other. The darker one, so that what the lighter exposure has clipped
-    at white is clipped in both.
+    Lucas-Kanade compares grey levels. A jump of the gain by 15 % moves its homographies by 1 to 10 px at the corners,
+    although most of its points still agree. The darker picture is converted, so that pixels that are clipped at white
+    in the lighter picture are clipped in both.
     """
     gain, offset = exposure_between(earlier, later)
     if (gain, offset) == (1.0, 0.0):
@@ -59,26 +58,27 @@ def match_exposure(earlier: View, later: View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def exposure_between(reference: View, other: View) -> tuple[float, float]:
-    """(gain, offset) that take the other frame's grey levels to the reference's, (1, 0) where they hardly differ."""
+    """Return (gain, offset) that convert the other frame's grey levels to the reference's, (1, 0) if nearly equal."""
     return fit_exposure(reference.level_shares, other.level_shares)
 
 
 def measure_level_shares(grey: np.ndarray) -> np.ndarray:
-    """(33,) the grey levels below which 2 to 98 % of a picture lie, (H, W) uint8."""
-    # From every 3rd pixel of every 5th row, both odd: pictures enlarged or coded in steps of 2, 4 or 8 px have less
-    # contrast on some of these, and a camera that pans would seem to change its exposure.
+    """Return the (33,) quantiles, 2 to 98 %, of the grey levels of a picture, (H, W) uint8."""
+    # Use every 3rd pixel of every 5th row. The steps are odd: enlarged or compressed pictures have less contrast on a
+    # grid of 2, 4 or 8 px, so that with even steps a panning camera would seem to change its exposure.
     sample = np.ascontiguousarray(grey[::5, ::3])
     below = np.zeros(257)
     below[1:] = np.cumsum(cv2.calcHist([sample], [0], None, [256], [0, 256]).ravel()) / sample.size
-    # The pixels of a level are spread evenly over it, or shares would move in whole levels.
+    # Interpolate within grey levels, because quantiles would otherwise jump by whole levels.
     return np.interp(_SHARES, below, _EDGES)
 
 
 def fit_exposure(wanted: np.ndarray, given: np.ndarray) -> tuple[float, float]:
-    """(gain, offset) that take the grey levels `given` to the levels `wanted` at the same shares of a picture.
+    """Fit (gain, offset) that convert the quantiles `given` to the quantiles `wanted`.
 
-    (1, 0) where they hardly differ, or not as exposures do. Iteratively reweighted least squares (Cauchy's weights):
-    what enters or leaves the picture changes some shares, not all.
+    Return (1, 0) if they are nearly equal, or if gain and offset do not explain the difference. The fit is iteratively
+    reweighted least squares with Cauchy's weights, because objects that enter or leave the picture change some
+    quantiles.
     """
     kept = (np.minimum(wanted, given) > _CLIPPED) & (np.maximum(wanted, given) < 255 - _CLIPPED)
     y, x = wanted[kept], given[kept]
@@ -98,5 +98,5 @@ def fit_exposure(wanted: np.ndarray, given: np.ndarray) -> tuple[float, float]:
 
 
 def _median_size(difference: np.ndarray) -> float:
-    size = np.sort(np.abs(difference))  # `np.median` takes four times as long for so few
+    size = np.sort(np.abs(difference))  # for so few values `np.median` takes four times as long
     return float((size[(len(size) - 1) // 2] + size[len(size) // 2]) / 2)

@@ -1,20 +1,24 @@
-"""Which frames a frame is compared with, by their numbers."""
+"""Choose the frames with which a frame is compared, by their numbers."""
 
 from collections.abc import Iterable, Sequence
 
-# The detection interval that distances to near frames are meant for.
+# The detection interval for which the distances in `difference.near_frames` are stated.
 _NEAR_INTERVAL = 3
 
 
 def pair_about(at: int, gap: int, first: int, last: int) -> tuple[int, int] | None:
-    """Two frames of first..last a gap apart from frame `at` on both sides, else two on one side, else None."""
+    """Return the frames one gap before and after frame `at` if both lie in first..last.
+
+    Otherwise return the frames one and two gaps away on one side, or None if they do not lie in first..last either.
+    """
     return _first_within([(at - gap, at + gap), (at + gap, at + 2 * gap), (at - gap, at - 2 * gap)], first, last)
 
 
 def near_gaps(near_frames: Sequence[int], wide_frames: int, interval: int) -> list[int]:
-    """Distances to the frames that a frame is compared with at a detection interval.
+    """Return the distances to the near frames at a detection interval.
 
-    Without a wide pair the longest, which is meant for 3 frames, follows the interval in proportion, up to its length.
+    Without a wide pair the longest distance, which is stated for an interval of 3 frames, scales with the interval. It
+    is at most the larger of its stated value and the interval.
     """
     if wide_frames:
         return list(near_frames)
@@ -24,9 +28,9 @@ def near_gaps(near_frames: Sequence[int], wide_frames: int, interval: int) -> li
 
 
 def near_pairs(at: int, gaps: Sequence[int], first: int, last: int) -> list[tuple[int, int]]:
-    """The pairs of frames that a frame is compared with, within first..last; may be empty."""
-    # Near an end gaps shrink, so that pairs look both ways. At the end itself one looks one way only, to the closest
-    # frames: it shows a target's next places too, the more of them the longer its gap.
+    """Return the near pairs of frames with which a frame is compared, within first..last. The list may be empty."""
+    # Near an end of the range gaps shrink, so that pairs stay symmetric. At the end itself use the closest one-sided
+    # pair: such a pair also marks the target's next positions, and more so with a longer gap.
     if room := min(at - first, last - at):
         return list(dict.fromkeys((at - min(gap, room), at + min(gap, room)) for gap in gaps))
     pair = pair_about(at, 1, first, last)
@@ -34,15 +38,15 @@ def near_pairs(at: int, gaps: Sequence[int], first: int, last: int) -> list[tupl
 
 
 def later_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
-    """The source's pair: one and two intervals later, else earlier, at the shortest one frame; may be empty."""
+    """List the source's pair: one and two intervals later, else earlier, closer at an end; empty if none fits."""
     later = [(at + side * gap, at + 2 * side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
-    # The middle one of three frames has a neighbour on either side only.
+    # The middle one of three frames has one neighbour on each side.
     pair = _first_within([*later, (at - 1, at + 1)], first, last)
     return [] if pair is None else [pair]
 
 
 def next_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
-    """The one frame that a two-frame difference looks at, as a pair of itself: later, else earlier; may be empty."""
+    """List the frame of a two-frame difference, twice: later, else earlier, closer at an end; empty if none fits."""
     single = [(at + side * gap, at + side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
     pair = _first_within(single, first, last)
     return [] if pair is None else [pair]

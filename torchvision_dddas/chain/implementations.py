@@ -1,16 +1,16 @@
-"""Which implementation computes each tensor operation on which device, and why. `dddas settings --backends` prints it.
+"""The table of implementations of tensor operations by device. `dddas settings --backends` prints it.
 
-Kornia comes first. Our own form computes where Kornia's takes more than twice its time on that device, or cannot do
-what the reason says. The ratios are Kornia's time by that of our form: `python eval/speed.py operations` on a CPU
-(docs/results/operations.json), `python eval/speed.py gpu` on a GPU (docs/results/gpu.json). The ratios of the Gaussian
-and the warp on a CPU are of the forms that Kornia's replaced.
+Kornia's implementation is preferred. Our own is used if Kornia's takes more than twice its time on that device, or for
+the reason stated in the table. The ratios are Kornia's time divided by ours: `python eval/speed.py operations` on a CPU
+(eval/results/operations.json), `python eval/speed.py gpu` on a GPU (eval/results/gpu.json). The ratios of the Gaussian
+and the warp on a CPU compare with our earlier implementations, which Kornia's replaced.
 """
 
 from typing import NamedTuple
 
 
 class Implementation(NamedTuple):
-    """One line of the table. form: Kornia, ours or OpenCV. ratio: Kornia's time by ours; NaN where not measured."""
+    """A row of the table. form: Kornia, ours or OpenCV. ratio: Kornia's time divided by ours; NaN if not measured."""
 
     operation: str
     device: str
@@ -69,5 +69,5 @@ _FORMS = {(line.operation, line.device): line.form for line in IMPLEMENTATIONS}
 
 
 def uses_kornia(operation: str, device: str) -> bool:
-    """Whether Kornia computes an operation on a device type."""
+    """Return whether Kornia computes an operation on a device type."""
     return _FORMS[operation, device if device == "cpu" else "cuda"] == "Kornia"

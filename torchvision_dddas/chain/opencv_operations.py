@@ -1,4 +1,4 @@
-"""The operations of the detection chain on OpenCV: 8-bit arrays, in as few passes over memory as possible."""
+"""The operations of the detection chain in OpenCV, on 8-bit arrays with as few passes over memory as possible."""
 
 from itertools import pairwise
 
@@ -10,16 +10,16 @@ from torchvision_dddas.chain.operations import Operations
 from torchvision_dddas.config import WHITE, exposure_step
 from torchvision_dddas.geometry import occupied, transfer
 
-# An affine map may stand for a homography inside a tile where they differ by this much at most, px: OpenCV's own warps
-# round places to 1/32 px.
+# Inside a tile an affine map may replace a homography if they differ by at most this, px. OpenCV's own warps round
+# positions to 1/32 px.
 _TILE_ERROR_PX = 1 / 32
 _MOST_TILES = 8
 _STRIP_ROWS = 64
-# An exposure is found when no grey level moves by more than this, and not judged by fewer pixels.
+# The fit of an exposure has converged when no grey level changes by more than this. It needs at least _LEAST_PIXELS.
 _SETTLED_LEVELS = 0.1
 _LEAST_PIXELS = 100
 _LEVELS = np.arange(256)
-# Noise is measured in regions of this side; of each region every SAMPLED-th row and column is used.
+# Noise is measured in square regions with sides of REGION_PX, on every SAMPLED-th row and column.
 REGION_PX, SAMPLED = 64, 4
 
 Light = tuple[float, float]
@@ -29,7 +29,7 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
     """Implements `Operations` on one picture at a time; masks are 0 and 255."""
 
     def grey(self, view: View) -> np.ndarray:
-        """See `Operations`, as of every other method."""
+        """See `Operations`, also for all other methods."""
         return view.grey
 
     def texture(self, view: View) -> np.ndarray:
@@ -50,8 +50,8 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
     def fit_light(self, reference: View, warped: np.ndarray, seen: np.ndarray) -> Light:
         return fit_light(reference.grey, warped, seen)
 
-    def fit_level_shares(self, reference: View, other: View) -> Light:
-        return exposure_between(reference, other)
+    def fit_level_shares(self, reference: View, neighbour: View) -> Light:
+        return exposure_between(reference, neighbour)
 
     def apply_light(self, reference: View, warped: np.ndarray, light: Light) -> np.ndarray:
         return apply_light(reference.grey, warped, *light)
@@ -116,18 +116,19 @@ class OpenCVOperations(Operations[View, np.ndarray, np.ndarray]):
 
 
 def no_texture(shape: tuple[int, ...]) -> np.ndarray:
-    """A texture map that is not needed: it takes no memory."""
+    """Return a texture map of zeros that takes no memory."""
     return np.broadcast_to(np.uint8(0), shape)
 
 
 def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
-    """The picture as the reference sees it, bilinear, (H, W) uint8; border pixels are repeated outside.
+    """Warp a picture to the reference's coordinates, bilinear, (H, W) uint8. Border pixels are repeated outside.
 
-    `cv2.warpPerspective` takes twice as long as one affine map a tile, which stays within the 1/32 px to which both
-    round places. Where that needs many tiles, maps of all places are as quick.
+    One affine map per tile takes half the time of `cv2.warpPerspective`, and stays within the 1/32 px to which both
+    round positions. If that needs too many tiles, use a map of all pixel positions, which is as fast.
     """
     height, width = picture.shape
-    # The error falls with the square of the number of tiles across: that of a single one gives the number needed.
+    # The error falls with the square of the number of tiles along a side, so that the error of one tile tells how many
+    # are needed.
     tiles = np.array([[0, 0, width - 1, height - 1]])
     maps, error = _affine_maps(picture_from_reference, tiles)
     count = np.ceil(np.sqrt(error / _TILE_ERROR_PX))
@@ -147,7 +148,7 @@ def warp(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
 
 
 def _warp_by_maps(picture: np.ndarray, picture_from_reference: np.ndarray) -> np.ndarray:
-    """As `warp`, by the place of every pixel, in strips whose maps stay in the cache."""
+    """Warp like `warp`, by the position of every pixel, in strips whose maps fit into the cache."""
     height, width = picture.shape
     by_column = np.outer(picture_from_reference[:, 0], np.arange(width))
     by_row = np.outer(picture_from_reference[:, 1], np.arange(height)) + picture_from_reference[:, 2:]
@@ -164,9 +165,9 @@ def _warp_by_maps(picture: np.ndarray, picture_from_reference: np.ndarray) -> np
 
 
 def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, float]:
-    """The tiles' affine maps, (N, 2, 3), from pixels counted within the tile, and their largest error in pixels.
+    """Return affine maps of tiles, (N, 2, 3), from pixel coordinates within the tile, and their largest error, px.
 
-    The slopes are the means over opposite sides; the error is shared between the corners and the middle.
+    The slopes are the means over opposite sides. The offset balances the errors at the corners and at the centre.
     """
     left, top, right, bottom = tiles.T.astype(float)
     from_places = np.empty((3, 5, len(tiles)))
@@ -188,9 +189,9 @@ def _affine_maps(to_from: np.ndarray, tiles: np.ndarray) -> tuple[np.ndarray, fl
 
 
 def find_seen(picture_from_reference: np.ndarray, size: tuple[int, int], border: int) -> np.ndarray:
-    """255 where the picture shows the reference's pixels, a strip inside its border left out; (H, W) uint8.
+    """Return a (H, W) uint8 mask, 255 at the reference's pixels that the picture shows, without a strip at its border.
 
-    size: (width, height) of both.
+    border: width of the strip, px. size: (width, height) of both frames.
     """
     width, height = size
     right, bottom = width - 1 - border, height - 1 - border
@@ -209,9 +210,9 @@ def find_seen(picture_from_reference: np.ndarray, size: tuple[int, int], border:
 
 
 def measure_texture(grey: np.ndarray) -> np.ndarray:
-    """Mean gradient magnitude over 5x5 px, 4 x grey levels a pixel, uint8."""
+    """Return the mean gradient magnitude over 5x5 px, in 4 x grey levels a pixel, uint8."""
     steep = np.empty_like(grey)
-    # In strips, with a row more on either side: float pictures of the whole would hold 11 MB at 1280x720.
+    # Work in strips with an extra row on each side: float pictures of the whole frame would take 11 MB at 1280x720.
     for top in range(0, len(grey), _STRIP_ROWS):
         above, bottom = min(top, 1), top + _STRIP_ROWS
         strip = grey[top - above : bottom + 1]
@@ -223,9 +224,9 @@ def measure_texture(grey: np.ndarray) -> np.ndarray:
 
 
 def fit_light(reference: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
-    """Gain and offset that give the warped picture the reference's exposure, by trimmed least squares on a sparse grid.
+    """Fit gain and offset from the warped picture to the reference by trimmed least squares on a sparse grid.
 
-    seen: 255 where the warped picture may be compared. All are (H, W) uint8.
+    seen: 255 where the pictures may be compared. All arrays are (H, W) uint8.
     """
     step = exposure_step(reference.shape)
     inside = seen[::step, ::step] > 0
@@ -254,36 +255,37 @@ def _lower_median(values: np.ndarray) -> float:
 
 
 def apply_light(reference: np.ndarray, warped: np.ndarray, gain: float, offset: float) -> np.ndarray:
-    """The warped picture through gain and offset; where it is clipped at white it agrees with anything brighter."""
+    """Apply gain and offset to the warped picture. A pixel clipped at white takes the reference's value if brighter."""
     table = np.clip(np.round(gain * _LEVELS + offset), 0, 255).astype(np.uint8)
     if (table == _LEVELS).all():
         return warped
-    through = cv2.addWeighted(warped, gain, warped, 0, offset)  # as the table, in less time
+    through = cv2.addWeighted(warped, gain, warped, 0, offset)  # the same result as the table, in less time
     if table[255] < WHITE:
-        # A clipped pixel only says that the place was at least so bright.
+        # The true brightness of a clipped pixel is unknown; it is only at least as high.
         cut = cv2.threshold(warped, WHITE - 1, 255, cv2.THRESH_BINARY)[1]
         cv2.copyTo(cv2.max(through, reference), cut, through)
     return through
 
 
 def median_above(values: np.ndarray, mask: np.ndarray, least: float, enough: int = 500) -> float:
-    """The larger of `least` and the median of uint8 values where a mask is set; `least` if that is hardly anywhere."""
+    """Return the median of values under a mask, at least `least`; `least` if at most `enough` pixels are set."""
     count = cv2.countNonZero(mask)
     if count <= enough:
         return least
     above = cv2.threshold(values, int(least), 255, cv2.THRESH_BINARY)[1]
     if 2 * cv2.countNonZero(cv2.bitwise_and(above, mask, dst=above)) < count:
-        return least  # the usual case, at a fraction of a histogram's cost
+        return least  # this is the usual case, and far cheaper than a histogram
     so_far = np.cumsum(cv2.calcHist([values], [0], mask, [256], [0, 256]).ravel())
     low, high = np.searchsorted(so_far, [(count + 1) // 2, count // 2 + 1])
     return max(least, (int(low) + int(high)) / 2)
 
 
 def regional_medians(values: np.ndarray, mask: np.ndarray, least: float, most: float) -> np.ndarray:
-    """(R, C) float32 medians of regions of REGION_PX, at least `least`, and at most `most`, the whole picture's.
+    """Return the (R, C) float32 medians of values in regions of REGION_PX, clipped to least..most.
 
-    values, mask: (h, w) of every SAMPLED-th row and column. A region in which the mask is hardly set has `least`: what
-    little it shows must not be hidden by the noise of others. Outliers among the regions are smoothed away.
+    values, mask: (h, w), every SAMPLED-th row and column. most: median of the whole picture. A region of which the mask
+    covers at most 10 % has the value `least`, so that the noise of other regions does not hide its targets. A median
+    filter removes outliers among the regions.
     """
     side = REGION_PX // SAMPLED
     rows, columns = (-(-length // side) for length in values.shape)
@@ -297,16 +299,16 @@ def regional_medians(values: np.ndarray, mask: np.ndarray, least: float, most: f
 
 
 def ellipse(side: int) -> np.ndarray:
-    """The morphological element."""
+    """Return the elliptical structuring element with this side."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
 def close_mask(mask: np.ndarray, side: int) -> np.ndarray:
-    """Close a mask with an ellipse: the result of OpenCV bit for bit, computed only around set pixels."""
+    """Close a mask with an ellipse. The result equals OpenCV's, but is computed only around set pixels."""
     if side <= 1:
         return mask
     out = np.zeros_like(mask)
-    # Dilation does not reach the edge of these boxes, nor what is set in another one.
+    # The boxes are so far apart that the dilation reaches neither a box's edge nor the pixels of another box.
     for box in occupied(mask, side + 2):
         x, y, width, height = box
         part = np.s_[y : y + height, x : x + width]

@@ -1,4 +1,4 @@
-"""`dddas calibrate`: what ranging needs to know of a camera, from people in its pictures."""
+"""`dddas calibrate`: the camera data that ranging needs, from people in the camera's pictures."""
 
 import math
 from pathlib import Path
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.config import Settings
 
-BODY_HEIGHTS_M = 0.1, 10.0  # of a person, or of what stands in for one
-UNROUNDED = ("longitude_deg", "latitude_deg", "east_m", "north_m")  # keys that are written with all their digits
+BODY_HEIGHTS_M = 0.1, 10.0  # of a person, or of an object used instead
+UNROUNDED = ("longitude_deg", "latitude_deg", "east_m", "north_m")  # keys that are written with all digits
 FOCAL_KEYS = ("focal_px", "focal_v_px", "hfov_deg", "focal_sigma")
 
 Found = tuple[dict[str, float], list[str]]
@@ -71,7 +71,7 @@ def calibrate(
     if pixels and table is not None:
         raise InputError("--pixels and a table were given; give the person's heights in one way")
     if not pixels and table is None:
-        raise InputError("nothing to calibrate by: give --distance with --pixels, or a table (see --help)")
+        raise InputError("calibration needs --distance with --pixels, or a table (see --help); got neither")
     if table is not None and has_measurements(table):
         if distance is not None:
             raise InputError(f"{table} has its own distances, and --distance was given as well; leave one out")
@@ -106,7 +106,7 @@ def calibrate(
 
 
 def _read_heights(table: Path) -> "np.ndarray":
-    """The heights of one person's whole boxes, px. Raises InputError for several people in a frame."""
+    """Return the heights of one person's whole boxes, px. Raise InputError for several people in a frame."""
     import numpy as np
 
     from torchvision_dddas.io.detection_tables import read_detections

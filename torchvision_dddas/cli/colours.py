@@ -1,4 +1,4 @@
-"""`dddas colours`: the ranges of colour by which landmarks are found, from pictures that show them."""
+"""`dddas colours`: find the colour ranges of landmarks from pictures that show them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -65,7 +65,7 @@ def colours(
 
 
 def parse_box(text: str) -> tuple[str, Box]:
-    """The name and the box of NAME=X,Y,WIDTH,HEIGHT. Raises InputError for anything else."""
+    """Return the name and the box of NAME=X,Y,WIDTH,HEIGHT. Raise InputError for anything else."""
     name, _, numbers = text.rpartition("=")
     cells = numbers.split(",")
     if not name.strip() or len(cells) != 4 or not all(cell.strip().isdecimal() and len(cell) < 8 for cell in cells):
@@ -75,7 +75,7 @@ def parse_box(text: str) -> tuple[str, Box]:
 
 
 def parse_names(text: str | None) -> list[str]:
-    """Names between commas. Raises InputError for an empty one."""
+    """Return names separated by commas. Raise InputError for an empty name."""
     names = [name.strip() for name in text.split(",")] if text is not None else []
     if "" in names:
         raise InputError(f"--names must be names with commas between, such as red,blue,yellow,magenta, got '{text}'")
@@ -95,7 +95,7 @@ def _check(count: int | None, names: list[str], box_names: list[str]) -> None:
 
 
 def _describe(found: "CalibratedColours", pictures: int) -> list[str]:
-    """A line for each colour, and a note if its range marks more than the landmark."""
+    """Return a line for each colour, and a note if its range marks more than the landmark."""
     lines, ranges = [], found.ranges
     for name, low, high, group, more in zip(
         ranges.names, ranges.low, ranges.high, found.groups, found.others, strict=True

@@ -1,4 +1,4 @@
-"""All commands of `dddas`, and how they end. Heavy imports wait until a command needs them."""
+"""All commands of `dddas`, and their exit codes. Slow imports are postponed until a command needs them."""
 
 import atexit
 import io
@@ -9,10 +9,15 @@ from typing import Annotated
 
 import typer
 
+from torchvision_dddas.cli.advise import advise
+from torchvision_dddas.cli.bench import bench
 from torchvision_dddas.cli.calibrate import calibrate
+from torchvision_dddas.cli.calibrate_flight import calibrate_flight
+from torchvision_dddas.cli.citation import citation
 from torchvision_dddas.cli.colours import colours
 from torchvision_dddas.cli.compare import compare
 from torchvision_dddas.cli.confirm import confirm
+from torchvision_dddas.cli.convert import convert
 from torchvision_dddas.cli.demo import demo
 from torchvision_dddas.cli.detect import detect
 from torchvision_dddas.cli.evaluate import evaluate
@@ -36,6 +41,7 @@ from torchvision_dddas.cli.simulate import simulate
 from torchvision_dddas.cli.sweep import sweep
 from torchvision_dddas.cli.track import track
 from torchvision_dddas.cli.tune import tune
+from torchvision_dddas.cli.views import views
 from torchvision_dddas.io.interrupts import KEPT, StopSignals, ignore_signals, is_stop, raising_signals
 from torchvision_dddas.runtime import VERSION
 
@@ -47,8 +53,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    *(run, detect, people, track, confirm, calibrate, colours),
-    *(evaluate, compare, sweep, tune, simulate, export, demo, settings),
+    *(advise, run, detect, people, track, views, confirm, calibrate, calibrate_flight, colours),
+    *(convert, evaluate, compare, sweep, tune, simulate, export, demo, bench, settings, citation),
 ):
     app.command()(command)
 app.add_typer(locate, name="locate")
@@ -79,7 +85,7 @@ def run_command_line() -> None:
         os._exit(say_stopped(number, KEPT if kept else ""))
 
     signals = raising_signals(end)
-    atexit.register(ignore_signals)  # Python takes the handlers away before it has ended
+    atexit.register(ignore_signals)  # Python removes the handlers before it has ended
     try:
         code = close_output(output, _run(signals))
     except KeyboardInterrupt:  # after the end of the command
@@ -89,23 +95,23 @@ def run_command_line() -> None:
 
 def _run(signals: StopSignals) -> int:
     try:
-        signals.__enter__()  # never left: a second signal may come while Python ends
+        signals.__enter__()  # never left, because a second signal may come while Python ends
         code = app(standalone_mode=False) or 0
-        # Before the command begins, Typer takes any signal for Ctrl-C and says nothing.
+        # Before the command begins, Typer treats any signal as Ctrl-C and prints nothing.
         is_said = code != 128 + signal.SIGINT or isinstance(code, Ended)
         return int(code) if is_said else say_stopped(signals.noticed or signal.SIGINT, "")
-    except (KeyboardInterrupt, typer.Abort) as error:  # outside a command, while Python still loads
+    except (KeyboardInterrupt, typer.Abort) as error:  # outside a command, for example while Python loads
         return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
     except SystemExit as error:
         return error.code if isinstance(error.code, int) else FAULT
     except Exception as error:
         if is_stop(error):
             return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
-        # A word of the command line that will not do; Typer keeps the class of these errors to itself.
+        # A wrong word of the command line. Typer does not export the class of these errors.
         if not hasattr(error, "format_message"):
             say_fault()
             return FAULT
-        if len(sys.argv) < 2 or not error.format_message():  # a group of commands, none of which was named
+        if len(sys.argv) < 2 or not error.format_message():  # a group of commands without a command
             error.show()  # type: ignore[attr-defined]
         else:
             say(f"{' '.join(error.format_message().split()).rstrip('.')}; see dddas --help")

@@ -1,4 +1,4 @@
-"""`dddas compare`: two studies of the same clips, and whether what changed is beyond noise."""
+"""`dddas compare`: compare two studies of the same clips, and test whether changes exceed the noise."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -24,19 +24,23 @@ def compare(
     second: Annotated[Path, typer.Argument(metavar="B", help="The folder of another study of the same clips.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also write an HTML page, such as compare.html.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Also write an HTML page, such as compare.html, with its tables and figures."
+        ),
     ] = None,
 ) -> None:
     """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
     from torchvision_dddas.io.atomic_files import refuse_folder, save_file
     from torchvision_dddas.io.output import finite, read_run_record
+    from torchvision_dddas.io.report.figure_files import save_figures
+    from torchvision_dddas.io.report.table_files import save_tables
     from torchvision_dddas.lab.evaluation.studies.cache import read_scores
     from torchvision_dddas.lab.evaluation.studies.comparison import (
-        MEANING,
         compare_studies,
         comparison_report,
         differing_settings,
-        entries_of,
+        pooled_changes,
         settings_lines,
     )
 
@@ -47,11 +51,24 @@ def compare(
     found = compare_studies(*studies) | {"settings": differing}
     if out is not None:
         refuse_folder(out)
-        save_file(out, comparison_report(finite(found)).encode())
+        page = comparison_report(finite(found))
+        save_file(out, page.encode())
+        save_figures(out.parent / f"{out.stem}-figures", page)
+        pooled = {task: pooled_changes(changes, "A", "B") for task, changes in finite(found)["tasks"].items()}
+        save_tables(out.parent / f"{out.stem}-tables", pooled)
     if as_json:
         echo(json.dumps(finite(found), indent=2))
         return
-    print_lines([f"A: {found['first']}", f"B: {found['second']}", *settings_lines(found["settings"])])
+    print_lines(settings_lines(found["settings"]))
+    show_comparison(found)
+    print_lines([f"note: {note}" for note in found["notes"]])
+
+
+def show_comparison(found: Mapping[str, Any], pooled_only: bool = False) -> None:
+    """Print the tables of a comparison. pooled_only: leave out single clips, and what the verdicts mean."""
+    from torchvision_dddas.lab.evaluation.studies.comparison import MEANING, entries_of
+
+    print_lines([f"A: {found['first']}", f"B: {found['second']}"])
     console = open_console()
     for task, changes in found["tasks"].items():
         pooled = [(f"{group} {name}", entry) for group, name, entry in entries_of(changes["pooled"])]
@@ -61,7 +78,7 @@ def compare(
             (f"{clip}: {group} {name}", entry)
             for clip, groups in changes["clips"].items()
             for group, name, entry in entries_of(groups)
-            if entry["change"]
+            if entry["change"] and not pooled_only
         ]
         clips.sort(key=lambda row: row[1]["over_frames"]["p_holm"] if row[1]["over_frames"] else 2.0)
         if clips:
@@ -70,8 +87,8 @@ def compare(
             echo(f"{len(clips) - MOST_CLIPS} more rows: --json")
         if changes["same"]:
             echo(f"the same in both to the last digit: {', '.join(changes['same'])}")
-    console.print(MEANING, highlight=False)
-    print_lines([f"note: {note}" for note in found["notes"]])
+    if not pooled_only:
+        console.print(MEANING, highlight=False)
 
 
 def _table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> "Table":
@@ -80,7 +97,12 @@ def _table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> "Table"
     table = Table(title=title)
     table.add_column("measure", overflow="fold")
     pooled = any("over_clips" in entry for _, entry in rows)
-    for column in ("A", "B", "change", "95 % interval", *(("p, clips", "p, frames") if pooled else ("p",))):
+    tests = (
+        ("clips:\np, corrected", "frames:\np, corrected", "effect\nsize", "clips\nneeded")
+        if pooled
+        else ("p, corrected",)
+    )
+    for column in ("A", "B", "change", "95 % interval", *tests):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("says")
     for name, entry in rows:
@@ -92,7 +114,8 @@ def _table(title: str, rows: Sequence[tuple[str, Mapping[str, Any]]]) -> "Table"
             format_figure(entry["second"]),
             format_figure(entry["change"], "+"),
             "–" if span is None else f"{span[0]:+.3f} to {span[1]:+.3f}",
-            *(f"{way['p_holm']:.3f}" if way else "–" for way in ways),
+            *(f"{way['p']:.3f}, {way['p_holm']:.3f}" if way else "–" for way in ways),
+            *((format_figure(entry["effect_size"]), format_figure(entry["clips_needed"])) if pooled else ()),
             entry["says"],
         )
     return table

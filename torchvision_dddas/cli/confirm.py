@@ -1,4 +1,4 @@
-"""`dddas confirm`: which blobs seen from the air are people, by those recognized from the ground."""
+"""`dddas confirm`: classify blobs seen from the air by the people recognized from the ground."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -94,7 +94,7 @@ def confirm(
             vehicles = _read_vehicles(people, cameras, poses, notes)
             if not cameras:
                 notes.append("without --camera the vehicles' views are unknown: no blob can be found not human")
-            if identities is None:  # a table of positions does not say it, and evidence of two blobs must not add up
+            if identities is None:  # identities are unknown, and evidence of two blobs must not add up
                 notes.append("every row is judged alone; if target numbers last, give --identities to add up evidence")
             found = confirm_positions(table, vehicles, settings, interval, bool(identities), rate)
         elif cameras or poses:
@@ -114,7 +114,7 @@ def confirm(
 
 
 def _has_positions(blobs: Path, people: Sequence[Path]) -> bool:
-    """Whether all tables hold positions; False if all hold boxes. Raises InputError if they differ."""
+    """Return whether all tables hold positions; False if all hold boxes. Raise InputError if they differ."""
     from torchvision_dddas.io.detection_tables import read_header
 
     headers = {path: read_header(path) for path in (blobs, *people)}
@@ -122,7 +122,7 @@ def _has_positions(blobs: Path, people: Sequence[Path]) -> bool:
     for path, here in is_ground.items():
         if here != is_ground[blobs]:
             if empty := [name for name in (blobs, path) if not headers[name]]:
-                raise InputError(f"{empty[0]} is empty; wanted a first line that names frame,target,east_m,north_m")
+                raise InputError(f"{empty[0]} is empty; give a first line that names frame,target,east_m,north_m")
             raise InputError(
                 f"{blobs} has {KINDS[is_ground[blobs]]}, {path} has {KINDS[here]}; give positions.csv for all "
                 "(dddas locate), or boxes of the same pictures for all"
@@ -133,7 +133,7 @@ def _has_positions(blobs: Path, people: Sequence[Path]) -> bool:
 def _read_vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
-    """The tables with their cameras: one each, or all of them for a single table. Raises InputError otherwise."""
+    """Read the tables with their cameras: one each, or all for a single table. Raise InputError otherwise."""
     from torchvision_dddas.control import Vehicle
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.ground_tables import read_positions
@@ -156,7 +156,7 @@ def _read_vehicles(
 
 
 def _names(people: Sequence[Path]) -> list[str]:
-    """A different name for each table: its file's, or its folder's if all files have one name."""
+    """Return a unique name for each table: its file's, or its folder's if all files have the same name."""
     names = [path.stem for path in people]
     if len(set(names)) < len(names):
         names = [path.resolve().parent.name for path in people]

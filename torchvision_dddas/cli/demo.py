@@ -27,7 +27,7 @@ def demo(
     with kept, progress("filming", round(length.seconds * length.rate_hz), quiet) as tick:
         clip = film_clip(out / "clip", tick=tick)
     lines = detect_clip(str(clip / "frames"), out, load_config(), "auto", DetectionRecorder.saved, quiet=quiet)
-    report = score(clip / "masks", out, None, out)
+    report = score(clip / "masks", out, out)
     if not quiet:
         show(report)
     lines.append(f"Look at {out / 'overlay.mp4'}; the clip and its true masks are in {clip}")

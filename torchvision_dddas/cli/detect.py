@@ -49,7 +49,7 @@ def detect(
     """
     from torchvision_dddas.io.output import DetectionRecorder, parse_save
 
-    settings, names = load_settings(config, set_, ignore), parse_save(save, DetectionRecorder.saved)
+    settings, names = load_settings(config, set_, ignore, quiet), parse_save(save, DetectionRecorder.saved)
     done: list[str] = []
     with noting(lambda: f"all of {', '.join(done)} is kept", lambda: done):
         for clip, folder in zip(inputs, folders_for(inputs, out), strict=True):
@@ -67,22 +67,17 @@ def detect_clip(
     rate_hz: float | None = None,
     quiet: bool = False,
 ) -> list[str]:
-    """Detect in one clip and write under a folder; returns the closing lines. Raises InputError for bad input."""
+    """Detect in one clip, write under a folder, and return the closing lines. Raise InputError for bad input."""
     from torchvision_dddas import open_video
-    from torchvision_dddas.detection import detect_motion, load_engine, with_logged_focal
+    from torchvision_dddas.detection import detect_motion, load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.output import DetectionRecorder, clip_facts
-    from torchvision_dddas.io.telemetry import read_telemetry
-    from torchvision_dddas.pipeline import clip_notes
+    from torchvision_dddas.pipeline import clip_notes, note_uncovered, prepare_detection
 
     refuse_own_input([Path(clip)], [folder / name for name in DetectionRecorder.files], "folder with --out")
     with DetectionRecorder(folder, save) as output:
         source = open_video(clip, rate_hz=rate_hz, full_scale=settings.levels.given)
-        parameters = settings.aerial
-        flight = None
-        if telemetry is not None:
-            flight = read_telemetry(telemetry, parameters.clock_offset_s, clip, parameters.time_zone, parameters.order)
-        settings, more = with_logged_focal(settings, flight, source.size)
+        settings, flight, notes = prepare_detection(telemetry, settings, source, clip)
         engine = load_engine(backend, settings)
         facts = {
             "input": clip,
@@ -92,8 +87,8 @@ def detect_clip(
             "settings": settings.model_dump(),
         }
         record = output.begin(facts, source.rate_hz)
-        record.notes += [*(flight.notes if flight is not None else ()), *more]
-        scenes = detect_motion(source, settings, engine, flight)
+        record.notes += notes
+        scenes = note_uncovered(detect_motion(source, settings, engine, flight), flight, record.notes)
         record_results(output, record, scenes, source.name, source.count, quiet, source)
         record.notes += clip_notes(source, 1, settings)
     saved = {"masks": "masks/", "overlay": "overlay.mp4"}

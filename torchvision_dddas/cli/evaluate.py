@@ -53,8 +53,15 @@ def evaluate(
         typer.Argument(help="Masks (a folder of numbered PNGs), a file of boxes or tracks, or a folder of such clips."),
     ] = None,
     result: Annotated[
-        Path | None,
-        typer.Argument(help="What dddas detect or track wrote, MOTChallenge text, or a folder of such by clip name."),
+        list[Path] | None,
+        typer.Argument(
+            help="What dddas detect or track wrote, MOTChallenge text, or a folder of such by clip name. Several: of "
+            "several methods, compared with the first."
+        ),
+    ] = None,
+    names: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,...", help="Names of the methods, one per RESULT. [default: of their files]"),
     ] = None,
     dataset: Annotated[
         Path | None,
@@ -69,6 +76,10 @@ def evaluate(
     cache: CacheFolder = None,
     prune_cache: Annotated[
         float | None, typer.Option(metavar="DAYS", min=0, help="Afterwards remove kept results unused for so long.")
+    ] = None,
+    keep: Annotated[
+        str | None,
+        typer.Option(metavar="KIND,...", help="Also write what was found into kept/: tracks, detections, masks."),
     ] = None,
     config: Config = None,
     set_: Overrides = None,
@@ -89,45 +100,62 @@ def evaluate(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for metrics.json. [default: RESULT or its folder; dddas-study with --dataset]"),
+        typer.Option(
+            help="Folder for the files. [default: RESULT or its folder; dddas-study with --dataset or several RESULT]"
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean.
 
+    Several results of the same clips become a study each, which dddas compare takes, with a report, tables and figures
+    of all: intervals, and tests of each against the first.
     With --dataset, the clips of whole data sets are run and scored, and metrics.json, report.html and run.json are
-    written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --config, --set and --backend are
-    for --dataset only.
+    written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --keep, --config, --set and
+    --backend are for --dataset only.
     """
     if dataset is None:
         study: dict[str, object] = {"--clips": clips, "--jobs": jobs, "--scheduler": scheduler, "--cache": cache}
-        study |= {"--worker-silent": worker_silent}
+        study |= {"--worker-silent": worker_silent, "--keep": keep}
         study |= {"--prune-cache": prune_cache, "--config": config, "--set": set_ or None, "--backend": backend}
         refuse_options(study, "is for a study; give --dataset FILE too")
-        if truth is None or result is None:
+        if truth is None or not result:
             raise InputError(
                 "evaluate needs TRUTH and RESULT, or --dataset FILE, the TOML of a study; see dddas evaluate --help"
             )
         check_interval(interval)
-        folder = out or (result.parent if result.is_file() else result)
-        report = score(truth, result, first_frame, folder, interval or 1, (ignored or Ignored.dropped).value)
+        how: dict[str, Any] = {"first_frame": first_frame, "interval": interval or 1}
+        how["ignoring"] = (ignored or Ignored.dropped).value
+        if len(result) > 1 or names is not None:
+            _evaluate_methods(out or Path("dddas-study"), truth, result, _split(names), how, quiet)
+            return
+        folder = out or (result[0].parent if result[0].is_file() else result[0])
+        report = score(truth, result[0], folder, **how)
         if not quiet:
             show(report)
             echo(f"{folder / 'metrics.json'}: the same with its counts")
         return
     from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
     from torchvision_dddas.lab.evaluation.studies.jobs import SILENT_S, Workers
+    from torchvision_dddas.lab.evaluation.studies.kept import check_kinds, keep_found
     from torchvision_dddas.lab.evaluation.studies.runner import write_study
 
-    refuse_options({"TRUTH": truth, "--first-frame": first_frame, "--ignored": ignored}, "is of no use with --dataset")
+    kinds = _split(keep)
+    check_kinds(kinds)
+    refuse_options(
+        {"TRUTH": truth, "--names": names, "--first-frame": first_frame, "--ignored": ignored},
+        "is of no use with --dataset",
+    )
     check_jobs(jobs, scheduler)
     check_interval(interval, 1000)
     folder, base, used = out or Path("dddas-study"), dataset.parent, split_patterns(clips, "--clips")
     spec = change_spec(dataset, config, set_ or [], backend and backend.value, interval)
     with Workers(jobs, scheduler, worker_silent or SILENT_S) as workers, show_progress(quiet) as (begin, advance):
         results, measures = write_study(folder, spec, base, workers, cache, used, advance, begin)
+    lacking = keep_found(folder / "kept", results, kinds)
     if not quiet:
         _show_study(results, measures, folder)
+    print_lines([f"note: {line}" for line in lacking], quiet)
     if prune_cache is not None:
         place = cache or cache_folder()
         count, size = Cache(place).prune(prune_cache)
@@ -152,25 +180,50 @@ def change_spec(
 def score(
     truth: Path,
     result: Path,
-    first_frame: int | None,
     out: Path,
+    *,
+    first_frame: int | None = None,
     interval: int = 1,
-    ignored: Literal["dropped", "removed"] = "dropped",
+    ignoring: Literal["dropped", "removed"] = "dropped",
 ) -> dict[str, Any]:
     """Evaluate, and write metrics.json into a folder. Raises InputError."""
     from torchvision_dddas.io.atomic_files import save_file
     from torchvision_dddas.io.output import finite
     from torchvision_dddas.lab.evaluation.evaluate import evaluate
 
-    report = evaluate(truth, result, first_frame, interval, ignored)
+    report = evaluate(truth, result, first_frame, interval, ignoring)
     save_file(out / "metrics.json", (json.dumps(finite(report), indent=2) + "\n").encode())
     return report
+
+
+def _split(text: str | None) -> list[str]:
+    return [] if text is None else [word.strip() for word in text.split(",")]
+
+
+def _evaluate_methods(
+    folder: Path, truth: Path, results: Sequence[Path], names: Sequence[str], how: Mapping[str, Any], quiet: bool
+) -> None:
+    """Write the studies of several methods and their comparison, and print the measures of all clips together."""
+    from torchvision_dddas.cli.compare import show_comparison
+    from torchvision_dddas.lab.evaluation.studies.methods import name_results, write_methods
+
+    found = write_methods(folder, truth, name_results(results, names), **how)
+    if quiet:
+        return
+    if len(results) == 1:
+        for task, measures in next(iter(found["methods"].values()))["tasks"].items():
+            show(measures, f"{task}: ", MOST_CLIPS)
+    for comparison in found["comparisons"]:
+        show_comparison(comparison, pooled_only=True)
+    print_lines([f"note: {note}" for note in found["notes"]])
+    echo(f"{folder}: report.html, comparison.json, tables/, figures/, and a study of each method")
 
 
 def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None) -> None:
     """Print a table for each group of measures: "clips" by name, "pooled" (with "intervals" in a study) and "mean".
 
-    prefix: of titles. most: clips in a table, the worst of them if there are more. Without it, the notes follow.
+    prefix: stands before each title. most: the largest number of clips in a table; the worst ones are shown. Without it
+    all clips are shown, and the notes follow.
     """
     from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 

@@ -1,4 +1,4 @@
-"""How a command ends: its exit code, one line on stderr for what went wrong, and a standard output that fails."""
+"""How a command ends: its exit code, one line on stderr for an error, and a failing standard output."""
 
 import io
 import os
@@ -13,17 +13,17 @@ from torchvision_dddas.errors import InputError, without_secrets
 from torchvision_dddas.io.interrupts import is_stop
 
 FAULT, BAD_INPUT, NOTHING_LOCATED, OUTPUT_FAILED = 1, 2, 3, 74
-"""Exit codes: a fault of the program; bad input; targets and no place of any, though all else is done; standard output
-that cannot be written (EX_IOERR of sysexits.h).
+"""Exit codes: a fault of the program; bad input; targets but no place of any, although all else succeeded; standard
+output that cannot be written (EX_IOERR of sysexits.h).
 """
 
 
 class Ended(int):
-    """The exit code of a command that a signal ended, and that said so."""
+    """The exit code of a command that was ended by a signal and has reported it."""
 
 
 def say(text: object) -> None:
-    """Print a line on stderr, without passwords; nothing where that is closed or full."""
+    """Print a line on stderr, without passwords; do nothing if stderr is closed or full."""
     with suppress(OSError, ValueError):
         print(f"dddas: {' '.join(str(InputError(text)).split())}", file=sys.stderr, flush=True)
 
@@ -35,19 +35,19 @@ def say_fault() -> None:
 
 
 def say_stopped(number: int, kept: str) -> Ended:
-    """Say which signal ended the command and what is kept; the exit code, as a shell has it."""
+    """Report which signal ended the command and what is kept, and return the exit code, as a shell does."""
     say(f"{'interrupted' if number == SIGINT else f'ended by {Signals(number).name}'}; {kept or 'nothing was kept'}")
     return Ended(128 + number)
 
 
 def describe_kept(error: BaseException) -> str:
-    """What the notes of an exception say of what is kept."""
+    """Return the notes of an exception, which say what is kept."""
     return "; ".join(getattr(error, "__notes__", ()))
 
 
 @contextmanager
 def noting(words: Callable[[], str], has: Callable[[], Any] = lambda: True) -> Iterator[None]:
-    """Note on a signal that ends the block what is kept of it, if there is anything."""
+    """If a signal ends the block, add a note on what is kept, if there is anything."""
     try:
         yield
     except BaseException as error:
@@ -57,15 +57,15 @@ def noting(words: Callable[[], str], has: Callable[[], Any] = lambda: True) -> I
 
 
 class StandardOutput(io.FileIO):
-    """Standard output whose reader may go away, or whose disk may be full: that costs its text and not the results.
+    """Standard output whose reader may disappear, or whose disk may be full: only its text is lost, not the results.
 
-    failure: the first error, None if all was written.
+    failure: the first error, None if everything was written.
     """
 
     failure: OSError | None = None
 
     def write(self, content: Any) -> int:
-        """Write, or note that it cannot be."""
+        """Write, or record the failure."""
         try:
             return super().write(content)
         except OSError as error:
@@ -74,14 +74,14 @@ class StandardOutput(io.FileIO):
 
 
 def open_output() -> StandardOutput:
-    """Put a StandardOutput in the place of sys.stdout. A terminal that cannot show × or ≥ shows a question mark.
+    """Replace sys.stdout by a StandardOutput. A terminal that cannot show × or ≥ shows a question mark.
 
-    A closed standard input or error leads to nowhere: no other file may be opened with its number.
+    A closed standard input or error is redirected to the null device, so that no other file gets its number.
     """
     if sys.stdin is None:
         sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (open until the process ends)
     before = sys.stdout
-    if before is None:  # closed: nothing else may be opened with its number, and all that is written fails
+    if before is None:  # closed: reserve its number, and let every write fail
         raw = StandardOutput(os.open(os.devnull, os.O_RDONLY), "w")
         encoding, is_terminal = "utf-8", False
     else:
@@ -96,9 +96,9 @@ def open_output() -> StandardOutput:
 
 
 def close_output(output: StandardOutput, code: int) -> int:
-    """Write what is left; the exit code, which says so if standard output failed and nothing worse happened."""
+    """Write the rest, and return the exit code, which reports a failed standard output if nothing worse happened."""
     sys.stdout.flush()
     if output.failure is None or code not in (0, NOTHING_LOCATED):
         return code
-    say(f"standard output cannot be written: {output.failure.strerror}; what was printed is lost, files are whole")
+    say(f"standard output cannot be written: {output.failure.strerror}; printed text is lost, files are whole")
     return code or OUTPUT_FAILED

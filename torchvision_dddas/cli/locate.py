@@ -1,5 +1,6 @@
 """`dddas locate`: positions of targets on the ground, seen from the air or by cameras on the ground."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +20,7 @@ from torchvision_dddas.cli.options import (
     Rate,
     Telemetry,
     check_rate,
+    load_settings,
     print_lines,
     report_errors,
 )
@@ -37,8 +39,18 @@ CameraFile = Annotated[
 Elevation = Annotated[
     Path | None, typer.Option("--dem", metavar="FILE", help="Heights of the ground, a GeoTIFF. [default: level ground]")
 ]
+Geoid = Annotated[
+    Path | None,
+    typer.Option(
+        "--geoid", metavar="FILE", help="Heights of the geoid, a GeoTIFF (aerial.geoid). [default: EGM96, to 1 m]"
+    ),
+]
 Background = Annotated[
     Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo under the map, a GeoTIFF.")
+]
+
+OwnClip = Annotated[
+    str | None, typer.Option("--clip", metavar="CLIP", help="The clip itself, for its rate and its picture size.")
 ]
 
 locate = typer.Typer(help="Find where targets stand on the ground.", no_args_is_help=True)
@@ -57,9 +69,8 @@ def aerial(
     telemetry: Telemetry = None,
     camera: CameraFile = None,
     dem: Elevation = None,
-    clip: Annotated[
-        str | None, typer.Option(metavar="CLIP", help="The clip itself, for its rate and its picture size.")
-    ] = None,
+    geoid: Geoid = None,
+    clip: OwnClip = None,
     background: Background = None,
     box_format: BoxFormat = None,
     out: Out = Path("dddas-positions"),
@@ -77,7 +88,6 @@ def aerial(
     Writes positions.csv, fixes.csv (the pose of each picture), maps, a report and run.json under --out.
     """
     from torchvision_dddas import open_video
-    from torchvision_dddas.config import load_config
     from torchvision_dddas.geo import check_table, frames_to_locate, is_outside
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.camera_files import read_camera_keys
@@ -89,7 +99,7 @@ def aerial(
     if landmarks is None and telemetry is None:
         raise InputError("locating from the air needs --telemetry FILE or --landmarks FILE; got neither")
     given = AerialInput(landmarks, telemetry, camera, dem, background)
-    settings, names = load_config(config, set_ or []), parse_save(save, AerialRecorder.saved)
+    settings, names = load_settings(config, set_, geoid=geoid), parse_save(save, AerialRecorder.saved)
     check_rate(rate)
     inputs = [table, *given.files, *([Path(clip)] if clip else [])]
     refuse_own_input(inputs, [out / name for name in AerialRecorder.files], "folder with --out")
@@ -121,10 +131,75 @@ def aerial(
                 "file for this size?"
             )
         count = len(frames_to_locate(read, locator.site.landmarks))
-        record_results(output, record, locator.locate_table(read, times_s), "locate", count, quiet)
+        record_results(output, record, locator.locate_table(read, times_s=times_s), "locate", count, quiet)
     files = [name for name in AerialRecorder.files if (out / name).exists()]
     first = f"{record.frames} frames, {record.targets} detections"
     print_located(closing_lines([first, *position_lines(record)], record, out, files), record, out, quiet)
+
+
+@locate.command(context_settings={"ignore_unknown_options": True})
+@report_errors
+def pixel(
+    picture: Annotated[str, typer.Argument(metavar="PICTURE", help="A still picture, or a clip (with --telemetry).")],
+    pixels: Annotated[list[str], typer.Argument(metavar="U,V...", help="Pixels, right and down, as 640,360.")],
+    time_s: Annotated[float, typer.Option("--time", metavar="S", help="Seconds since a clip's first frame.")] = 0.0,
+    telemetry: Telemetry = None,
+    landmarks: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A CSV of landmarks: their places, and their pixels.")
+    ] = None,
+    camera: CameraFile = None,
+    dem: Elevation = None,
+    geoid: Geoid = None,
+    config: Config = None,
+    set_: Overrides = None,
+    rate: Rate = None,
+) -> None:
+    """Locate the ground that pixels of a still picture, or of a clip at one time, show.
+
+    Without --telemetry and --landmarks, the EXIF and XMP of the picture give its camera's place, height and angles.
+    Prints a line for each pixel; the ellipse holds the true place with a probability of 95 %.
+    """
+    import numpy as np
+
+    from torchvision_dddas import open_video
+    from torchvision_dddas.io.maps.ground_tracks import semi_axes
+    from torchvision_dddas.pipeline import AerialInput, read_locator
+
+    try:
+        uv = np.array([[float(number) for number in word.split(",")] for word in pixels]).reshape(len(pixels), 2)
+    except ValueError:
+        uv = np.full((1, 2), np.nan)
+    if not np.isfinite(uv).all():
+        raise InputError(f"a pixel must be u,v, such as 640,360; got {' '.join(pixels)}")
+    source = open_video(picture, rate_hz=rate, single=True)
+    count, rate_hz = source.count, source.rate_hz
+    if telemetry is None and landmarks is None:
+        if count != 1:
+            raise InputError(f"{picture} is a clip; give its --telemetry FILE or --landmarks FILE")
+        telemetry = Path(picture)
+    if not 0 <= time_s <= (count or math.inf) / rate_hz:
+        raise InputError(f"--time {time_s:g} lies outside of {picture}, which lasts {(count or 0) / rate_hz:g} s")
+    if (outside := ((uv < -0.5) | (uv > np.array(source.size) - 0.5)).any(axis=1)).any():
+        u, v = uv[outside.argmax()]
+        raise InputError("{:g},{:g} lies outside of {}, of {}x{} px".format(u, v, picture, *source.size))
+    given, settings = AerialInput(landmarks, telemetry, camera, dem), load_settings(config, set_, geoid=geoid)
+    locator, notes = read_locator(given, settings, source.size, rate_hz, "onboard", None, "clip", picture)
+    found = locator.locate_pixels(uv, time_s=time_s)
+    axes_m, _ = semi_axes(found.covariance_m2)
+    lines = []
+    for k, (u, v) in enumerate(uv.tolist()):
+        if not np.isfinite(found.east_north_m[k]).all():
+            lines.append(f"{u:g},{v:g}: no place; it lies above the horizon or near it, or beyond the ground's heights")
+            continue
+        place = "{:.3f} m east, {:.3f} m north".format(*found.east_north_m[k])
+        if found.lonlat_deg is not None:
+            place = "latitude {1:.7f}, longitude {0:.7f}".format(*found.lonlat_deg[k])
+        if math.isfinite(found.above_sea_m[k]):
+            place += f", {found.above_sea_m[k]:.1f} m above the sea"
+        lines.append(f"{u:g},{v:g}: {place}; with 95 % within {axes_m[k, 0]:.1f} x {axes_m[k, 1]:.1f} m")
+    print_lines([*lines, *(f"note: {note}" for note in notes)])
+    if not np.isfinite(found.east_north_m).any():
+        raise typer.Exit(NOTHING_LOCATED)
 
 
 @locate.command()
@@ -164,9 +239,11 @@ def ground(
     refuse_own_input([*tables, *camera, *poses], [out / name for name in GroundRecorder.files], "folder with --out")
     with GroundRecorder(out) as output:
         cameras = [read_camera(file) for file in camera]
-        read = [read_detections(path, box_format, one.size_px) for path, one in zip(tables, cameras, strict=True)]
+        read = [
+            read_detections(path, order=box_format, size=one.size_px) for path, one in zip(tables, cameras, strict=True)
+        ]
         where = [read_poses(file) for file in poses] if poses else [None] * len(tables)
-        locator = GroundLocator(cameras, settings, poses=where, rate_hz=rate)
+        locator = GroundLocator(cameras, settings=settings, poses=where, rate_hz=rate)
         frames = locator.locate_tables(read)
         facts = {
             "input": list(tables),
@@ -179,7 +256,11 @@ def ground(
         names = [f"{name}-{n}" if names.count(name) > 1 else name for n, name in enumerate(names, 1)]
         record = output.begin(facts, names, locator.origin_deg is not None)
         missing = (describe_missing(file, pose) for file, pose in zip(camera, where, strict=True))
-        record.notes += [*(note for table in read for note in table.notes), *(note for note in missing if note)]
+        record.notes += [
+            *(note for table in read for note in table.notes),
+            *(note for note in missing if note),
+            *locator.notes,
+        ]
         record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
             record.notes.append("the tables have no rows: nobody to locate")
@@ -195,7 +276,7 @@ def ground(
 
 
 def print_located(lines: Sequence[str], record: "RunRecord", folder: Path, quiet: bool) -> None:
-    """Print closing lines. Where there were targets and none was located, end with NOTHING_LOCATED and say why."""
+    """Print closing lines. If there were targets but none was located, say why and end with NOTHING_LOCATED."""
     from torchvision_dddas.io.output import NONE_LOCATED
 
     cause = next((note for note in record.notes if record.targets and note.startswith(NONE_LOCATED)), "")
@@ -206,7 +287,7 @@ def print_located(lines: Sequence[str], record: "RunRecord", folder: Path, quiet
 
 
 def position_lines(record: "RunRecord") -> list[str]:
-    """How many positions there are and by which method, and which frames could not be located or were repaired."""
+    """Return the number of positions by method, and the frames that could not be located or were repaired."""
     counts: dict[str, Any] = {"positions": 0, "by": {}, **record.counts}
     by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")
     lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
@@ -218,7 +299,7 @@ def position_lines(record: "RunRecord") -> list[str]:
         if spans := counts.get(what):
             lines.append(f"note: {words}, {_describe_longest(spans)}")
     for name, kept in counts.get("landmarks", {}).items():
-        # No landmark is used in a frame that could not be located; such frames do not count against this one.
+        # Frames that could not be located use no landmark, so they do not count against this landmark.
         tried = kept["used"] + kept["left_out"]
         if kept["left_out"] > 0.5 * tried:
             lines.append(

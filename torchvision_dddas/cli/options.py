@@ -1,4 +1,4 @@
-"""What all commands share: options, checks of them, exit codes, and errors as one line on stderr."""
+"""Common parts of all commands: options, their checks, exit codes, and errors as one line on stderr."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -85,12 +85,12 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors."
 
 
 def echo(text: str, err: bool = False) -> None:
-    """Print text on stdout or stderr; what would steer the terminal, as names may, is shown by its number."""
+    """Print text on stdout or stderr; control characters, as names may contain, are shown by their number."""
     typer.echo(printable(text), err=err)
 
 
 def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, and a signal into 128 and its number."""
+    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, a signal into 128 plus its number."""
 
     @functools.wraps(command)
     def guarded(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
@@ -141,7 +141,7 @@ def check_jobs(jobs: int | None, scheduler: str | None = None) -> None:
 
 
 def parse_size(text: str, low: int, high: int) -> tuple[int, int]:
-    """(width, height) of `640x480`. Raises InputError for anything else."""
+    """Return (width, height) of `640x480`. Raise InputError for anything else."""
     width, _, height = text.lower().partition("x")
     if not all(side.isdecimal() and len(side) < 7 and low <= int(side) <= high for side in (width, height)):
         raise InputError(f"--size must be WIDTHxHEIGHT in pixels from {low} to {high}, such as 640x480, got '{text}'")
@@ -149,7 +149,7 @@ def parse_size(text: str, low: int, high: int) -> tuple[int, int]:
 
 
 def split_patterns(text: str | None, option: str, what: str = "clip") -> list[str]:
-    """The patterns of names that an option gives between commas. Raises InputError if it was given without any."""
+    """Return the patterns of names in an option, separated by commas. Raise InputError if there are none."""
     words = [word.strip() for word in (text or "").split(",") if word.strip()]
     if text is not None and not words:
         example = "'bms_*'" if what == "clip" else "'difference.*'"
@@ -157,9 +157,29 @@ def split_patterns(text: str | None, option: str, what: str = "clip") -> list[st
     return words
 
 
-def load_settings(config: str | None, overrides: Sequence[str] | None, ignore: Path | None) -> "Settings":
-    """The settings of --config, --set and --ignore. Raises InputError for what is wrong in them."""
+def note_patrol(config: str | None, quiet: bool) -> None:
+    """Explain that the default replaces the configuration `patrol`. Raise InputError if it has no effect."""
+    names = (config or "").split(",")
+    if "patrol" in names and (plain := {"fast", "half", "source", "two_frames"}.intersection(names)):
+        raise InputError(
+            f"patrol has no effect beside {min(plain)}, which has no settings for tiny people; leave it out"
+        )
+    if "patrol" in names and not quiet:
+        words = "with telemetry, which tells how large people are, it is the same as the default"
+        echo(f"dddas: --config patrol takes people to be about 4 px large (gates.person_px); {words}", err=True)
+
+
+def load_settings(
+    config: str | None,
+    overrides: Sequence[str] | None,
+    ignore: Path | None = None,
+    quiet: bool = False,
+    geoid: Path | None = None,
+) -> "Settings":
+    """Return the settings of --config, --set, --ignore and --geoid. Raise InputError for faults in them."""
     from torchvision_dddas.config import load_config, with_parameters
 
-    settings = load_config(config, overrides or [])
-    return settings if ignore is None else with_parameters(settings, {"difference.ignore": str(ignore)})
+    note_patrol(config, quiet)
+    files = {"difference.ignore": ignore, "aerial.geoid": geoid}
+    given = {name: str(path) for name, path in files.items() if path is not None}
+    return with_parameters(load_config(config, overrides or []), given)

@@ -1,4 +1,4 @@
-"""`dddas people`: people, by their shape, moving or not."""
+"""`dddas people`: find people by their shape, moving or not."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -96,7 +96,7 @@ def people(
 
 
 def _notes(record: "RunRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:
-    """What the user should know of a table that said where to search."""
+    """Return notes for the user on a table that determined where to search."""
     if table.last > source.last:
         return [f"the clip ended after frame {source.last}, {name} goes on to {table.last}"]
     if nowhere := record.counts["searched"]["frames_nowhere"]:

@@ -1,4 +1,4 @@
-"""How far a command is, on stderr, and what it prints of its clips: folder names, closing lines."""
+"""Progress of a command on stderr, and its output on clips: folder names, closing lines."""
 
 import re
 import sys
@@ -26,7 +26,7 @@ EVERY_S = 5.0
 
 @contextmanager
 def progress(name: str, count: int | None, quiet: bool) -> Iterator[Callable[[], None]]:
-    """Show a bar on a terminal, elsewhere a line every few seconds; yields a function to call after each frame.
+    """Show a bar on a terminal, or a line every few seconds elsewhere; yield a function to call after each frame.
 
     count: frames in all; None if the end is not known.
     """
@@ -67,9 +67,9 @@ def progress(name: str, count: int | None, quiet: bool) -> Iterator[Callable[[],
 
 @contextmanager
 def show_progress(quiet: bool) -> "Iterator[Hooks]":
-    """How far a study is: a bar on a terminal, elsewhere a line for each clip and every few seconds.
+    """Show the progress of a study: a bar on a terminal, or elsewhere a line for each clip and every few seconds.
 
-    Yields functions to call with the plan of the study, and with each of its events.
+    Yield functions to call with the plan of the study, and with each of its events.
     """
     total = done = frames = 0
     start = printed = time.monotonic()
@@ -115,7 +115,7 @@ def show_progress(quiet: bool) -> "Iterator[Hooks]":
 
 
 def _bar(text: str, clock: str) -> "Progress":
-    """A bar with a text and a clock, the name of one of rich's columns, behind it."""
+    """Make a bar with a text and, behind it, a clock, which is the name of one of rich's columns."""
     from rich import progress
 
     columns = (
@@ -129,13 +129,13 @@ def _bar(text: str, clock: str) -> "Progress":
 
 
 def print_now(line: str) -> None:
-    """Print a line on stderr at once; nothing where that is closed or full."""
+    """Print a line on stderr at once; do nothing if stderr is closed or full."""
     with suppress(OSError, ValueError):
         print(printable(line), file=sys.stderr, flush=True)
 
 
 def open_console(width: int = 120, stderr: bool = False) -> "Console":
-    """Standard output or error; so many columns wide if it is no terminal. Names cannot steer the terminal."""
+    """Open standard output or error, of the given width if it is no terminal. Names cannot control the terminal."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -157,7 +157,7 @@ def record_results(
     quiet: bool = False,
     source: "Source | None" = None,
 ) -> None:
-    """Write every result and show how far the clip is; the source's reading problems are recorded even if it fails."""
+    """Write every result and show progress. The source's reading problems are recorded even if the run fails."""
     repeats = 0
     try:
         with progress(name, count, quiet) as tick:
@@ -180,12 +180,12 @@ def record_results(
 
 
 def folders_for(inputs: Sequence[str], out: Path) -> list[Path]:
-    """Where the results of each input go: `out` itself, or one folder per input in it if there are several."""
+    """Return the folder for each input: `out` itself, or one folder for each of several inputs inside it."""
     return [out] if len(inputs) == 1 else [out / name for name in clip_names(inputs)]
 
 
 def clip_names(inputs: Sequence[str]) -> list[str]:
-    """A different folder name for each input: its own name, or its parent's if it is only `frames` or a pattern."""
+    """Return a unique folder name for each input: its own name, or its parent's for `frames` or a pattern."""
     names: list[str] = []
     for clip in inputs:
         path = Path(clip.rstrip("/"))
@@ -204,12 +204,14 @@ def clip_names(inputs: Sequence[str]) -> list[str]:
 
 
 def closing_lines(first: str | Sequence[str], record: "RunRecord", folder: Path, files: Sequence[str]) -> list[str]:
-    """What a command prints at its end: counts, reading problems, notes, and the files that it wrote into a folder."""
+    """Return a command's closing lines: counts, reading problems, notes, and the files written into a folder."""
     lines = [first] if isinstance(first, str) else list(first)
     if count := len(record.problems):
         lines.append(
             f"{count} problem{'s' * (count != 1)} while reading, the first: {record.problems[0]} (all in run.json)"
         )
+    if record.scale is not None:
+        lines.append(record.scale.line())
     last = f"{folder}: {', '.join(files)}"
     if missing := record.counts.get("frames_without_position"):
         last += f"; {missing} of {record.frames} frames without a position, run.json gives the causes"

@@ -10,11 +10,12 @@ from urllib.parse import quote
 import typer
 
 from torchvision_dddas.cli.exits import Ended
-from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, position_lines, print_located
+from torchvision_dddas.cli.locate import Background, CameraFile, Elevation, Geoid, position_lines, print_located
 from torchvision_dddas.cli.options import (
     CLIP,
     REPORTS,
     Backend,
+    BoxFormat,
     Config,
     EngineOption,
     Ignore,
@@ -24,6 +25,7 @@ from torchvision_dddas.cli.options import (
     Rate,
     check_interval,
     load_settings,
+    note_patrol,
     print_lines,
     refuse_options,
     report_errors,
@@ -32,6 +34,7 @@ from torchvision_dddas.cli.progress import closing_lines, progress, record_resul
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
+    from torchvision_dddas.geo import Zones
     from torchvision_dddas.io.output import RunRecord
 
 SIMULATED = "sim:"
@@ -57,6 +60,7 @@ def run(
     ] = None,
     camera: CameraFile = None,
     dem: Elevation = None,
+    geoid: Geoid = None,
     background: Background = None,
     interval: Annotated[int, typer.Option(metavar="D", help="Track at every D-th frame: 1, 1+D, ...")] = 1,
     out: Out = Path("dddas-run"),
@@ -72,6 +76,39 @@ def run(
     ] = None,
     rate: Rate = None,
     ignore: Ignore = None,
+    detections: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Boxes and classes of your own detector. [default: find what moves]"),
+    ] = None,
+    box_format: BoxFormat = None,
+    detector: Annotated[
+        Path | None,
+        typer.Option(metavar="MODEL", help="An ONNX file of a YOLO or DETR: its boxes and classes in place of movers."),
+    ] = None,
+    provider: Annotated[
+        str | None, typer.Option(metavar="NAME", help="What runs --detector: cpu, cuda, openvino, ... [default: cpu]")
+    ] = None,
+    score: Annotated[float | None, typer.Option(help="The least score of --detector's boxes. [default: 0.25]")] = None,
+    classes: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A line for each class of --detector. [default: as MODEL says]")
+    ] = None,
+    movers: Annotated[
+        bool, typer.Option("--movers", help="Find what moves beside --detector or --detections: boxes get speeds.")
+    ] = False,
+    zones: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="GeoJSON or KML of areas and lines: who enters, leaves, dwells, crosses."),
+    ] = None,
+    ground: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE", help="The TOML of a ground platform: its clip, camera and poses. May be repeated."
+        ),
+    ] = None,
+    aerial: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="The TOML of a further UAV: its clip, its telemetry. May be repeated."),
+    ] = None,
     scene: Annotated[
         list[str] | None,
         typer.Option(
@@ -109,12 +146,14 @@ def run(
     Places come from what the vehicle reports (--telemetry), from landmarks of known place (--landmarks), or from both.
 
     Writes the tables of `dddas detect`, `dddas track` and `dddas locate aerial`, landmarks.csv (where they were seen),
-    overlay.mp4, maps, a report and run.json under --out; of a simulation also crowds.csv (crowds as ground vehicles see
-    them).
+    overlay.mp4, maps, a report and run.json under --out; with --ground also confirmed.csv
+    and fused.csv; of a simulation also crowds.csv (crowds as ground vehicles see them).
     """
+    from torchvision_dddas.geo import Zones
     from torchvision_dddas.pipeline import AerialInput
 
     check_interval(interval)
+    placed = None if zones is None else Zones(zones)
     clip = _with_password(clips[0], password_file)
     logs = telemetries or []
     telemetry = logs[0] if logs else None
@@ -122,18 +161,24 @@ def run(
         raise InputError(f"{len(clips)} clips were given; wanted one with --live, and one sim:SCENARIO")
     if len(clips) == 1 < len(logs):
         raise InputError(f"one clip and {len(logs)} logs; give one --telemetry")
+    platforms = {"--ground": ground[0] if ground else None, "--aerial": aerial[0] if aerial else None}
+    given_boxes = {"--detections": detections, "--detector": detector, "--movers": movers or None}
     if live:
         others = {"--save": save, "--scene": scene, "--background": background, "--seed": seed}
+        others |= given_boxes
         refuse_options(others, "is of no use with --live, which draws and steers nothing")
     else:
         others = {"--emit": emit, "--serve": serve, "--people": people or None, "--wait": wait or None}
         refuse_options(others, "is for a run that keeps up with a camera; give --live too")
-    beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--background": background}
+    beside = {"--colours": colours, "--camera": camera, "--dem": dem, "--geoid": geoid, "--background": background}
     if clip.startswith(SIMULATED) and not live and not Path(clip).exists():
         inputs = {"--landmarks": landmarks, "--telemetry": telemetry, "--rate": rate, "--ignore": ignore, **beside}
+        inputs |= {**given_boxes, **platforms}
         inputs["--interval"] = None if interval == 1 else interval
         refuse_options(inputs, f"is of no use with {clip}: it comes from the simulated vehicles")
-        _fly(clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, quiet)
+        _fly(
+            clip.removeprefix(SIMULATED), out, config, set_ or [], scene or [], seed, backend.value, save, quiet, placed
+        )
         return
     if scene or seed is not None:
         raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
@@ -141,29 +186,77 @@ def run(
         refuse_options({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
     if landmarks is None and telemetry is None:
         refuse_options(beside, "is of no use without --telemetry FILE or --landmarks FILE: nothing would be located")
+    if detections is None and detector is None:
+        refuse_options(
+            {"--movers": movers or None}, "is for --detector or --detections; a run finds what moves by itself"
+        )
+    elif detections is not None and detector is not None:
+        raise InputError("--detections and --detector were both given; give one of them")
+    elif not movers:
+        refuse_options({"--ignore": ignore}, "is for the search for what moves; give --movers too, or leave it out")
+    if detector is None:
+        of_detector = {"--provider": provider, "--score": score, "--classes": classes}
+        refuse_options(of_detector, "is for --detector MODEL; give it too")
+    if detections is None and box_format is not None:
+        raise InputError("--box-format is for --detections FILE; give it too")
     given = None
     if landmarks is not None or telemetry is not None:
         given = AerialInput(landmarks, telemetry, camera, dem, background, colours)
-    settings = load_settings(config, set_, ignore)
+    settings = load_settings(config, set_, ignore, quiet, geoid)
     if live:
         from torchvision_dddas.live import run_live
 
         code = run_live(
-            out, clip, given, telemetry, interval, settings, backend.value, emit or (), serve, people, rate, quiet, wait
+            out,
+            clip,
+            given,
+            telemetry,
+            interval,
+            settings,
+            backend.value,
+            emit or (),
+            serve,
+            people,
+            rate,
+            quiet,
+            wait,
+            placed,
+            ground or (),
+            aerial or (),
         )
         raise typer.Exit(Ended(code))  # its last line says where the results are
     from torchvision_dddas import open_video
+    from torchvision_dddas.detection import OnnxDetector
     from torchvision_dddas.io.atomic_files import refuse_own_input
+    from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.joined_clips import JoinedSource
     from torchvision_dddas.io.output import PipelineRecorder, clip_facts, parse_save
-    from torchvision_dddas.pipeline import Pipeline, assemble_files, clip_notes, locator_facts, map_site
+    from torchvision_dddas.pipeline import Pipeline, assemble_files, clip_notes, locator_facts, map_site, open_uav
 
     names = parse_save(save, PipelineRecorder.saved)
-    files = [*(given.files if given is not None else ()), *logs]
+    beside_clip = [path for path in (zones, detections, detector, classes) if path is not None]
+    network = None
+    if detector is not None:
+        network = OnnxDetector(
+            detector, provider=provider or "cpu", score=0.25 if score is None else score, classes=classes
+        )
+    team = None
+    if ground or aerial:
+        from torchvision_dddas.control import GroundTeam
+
+        further = [open_uav(path, settings, backend.value) for path in aerial or ()]
+        team = GroundTeam(ground or (), settings, backend.value, further)
+        beside_clip += team.files
+        if twice := {Path(name).resolve() for name in clips} & {file.resolve() for file in team.files}:
+            raise InputError(f"{twice.pop()} is the clip of the run and of a platform; give each its own")
+    files = [*(given.files if given is not None else ()), *logs, *beside_clip]
     refuse_own_input([*map(Path, clips), *files], [out / name for name in PipelineRecorder.files], "folder with --out")
     with PipelineRecorder(out, names) as output:
         opened = [open_video(name, rate_hz=rate, full_scale=settings.levels.given) for name in (clip, *clips[1:])]
         source = opened[0] if len(opened) == 1 else JoinedSource(opened, logs)
+        table = None if detections is None else read_for_clip(detections, box_format, source)
+        checked = network.notes if network is not None else []
+        checked = checked if table is None else check_table(table, interval, source)
         ready = assemble_files(given, telemetry, settings, source, backend.value, clip)
         facts: dict[str, Any] = {
             "input": clip if len(clips) == 1 else clips,
@@ -175,13 +268,42 @@ def run(
         if ready.watch is not None and given is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
             site = map_site(ready.watch.locator, background)
-        facts |= {"telemetry": logs if len(logs) > 1 else telemetry, "settings": ready.settings.model_dump()}
-        record = output.begin(facts, source.rate_hz / interval, source.size, site)
-        record.notes += ready.notes
+        if placed is not None:
+            placed.check(site is not None, None if site is None else site.origin_deg)
+        if team is not None:
+            team.check(site is not None, *((site.origin_deg, site.start_utc_s) if site is not None else (None,)))
+        facts |= {
+            **{key: paths for key, paths in (("ground", ground), ("aerial", aerial)) if paths},
+            "telemetry": logs if len(logs) > 1 else telemetry,
+            "zones_file": zones,
+            "detections_file": detections,
+            **({"detector": network.facts} if network is not None else {}),
+            **({"movers": True} if movers else {}),
+            "settings": ready.settings.model_dump(),
+        }
+        record = output.begin(facts, source.rate_hz / interval, source.size, site, placed.zones if placed else ())
+        boxes = network or table
+        finds_movers = boxes is None or movers
+        if not finds_movers:
+            record.scale = None  # it is that of the search for what moves
+        record.notes += [*ready.notes, *checked]
         count = None if source.count is None else -(-source.count // interval)
-        pipeline = Pipeline.from_assembly(ready, interval)
-        record_results(output, record, pipeline(source), source.name, count, quiet, source)
-        record.notes += [*pipeline.notes, *clip_notes(source, interval, ready.settings)]
+        pipeline = Pipeline.from_assembly(ready, interval=interval, detector=boxes, movers=movers)
+        results = pipeline(source) if team is None else team.mark(pipeline(source))
+        results = results if placed is None else placed.mark(results)
+        try:
+            record_results(output, record, results, source.name, count, quiet, source)
+        finally:  # an interrupted run tells too what its platforms did
+            if team is not None:
+                record.counts["platforms"] = team.facts
+        record.notes += [
+            *pipeline.notes,
+            *(placed.notes if placed else ()),
+            *(team.notes if team else ()),
+            *(clip_notes(source, interval, ready.settings) if finds_movers else ()),
+        ]
+        if table is not None and table.last > source.last:
+            record.notes.append(f"the clip ended after frame {source.last}, the table goes on to {table.last}")
     lines = _summary(record, out, site is not None, "overlay" in names)
     if given is None:
         print_lines(lines, quiet)
@@ -217,14 +339,16 @@ def _fly(
     backend: str,
     save: str | None,
     quiet: bool,
+    zones: "Zones | None",
 ) -> None:
     from torchvision_dddas.io.output import parse_save
     from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
     from torchvision_dddas.lab.simulation import SimulatedRunRecorder
 
+    note_patrol(config, quiet)
     names = parse_save(save, SimulatedRunRecorder.saved)
     show = partial(progress, quiet=quiet)
-    record, score = run_scenario(out, scenario, config, overrides, scene, seed, backend, names, show)
+    record, score = run_scenario(out, scenario, config, overrides, scene, seed, backend, names, show, zones)
     first, *others = _summary(record, out, True, "overlay" in names)
     lines = [first, *score.lines(), *others]
     if "truth" in names:

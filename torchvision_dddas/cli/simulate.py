@@ -1,4 +1,4 @@
-"""`dddas simulate`: a scenario as files: what the instruments in the air and on the ground give, and the truth."""
+"""`dddas simulate`: write a scenario as files: data of the instruments in the air and on the ground, and the truth."""
 
 from functools import partial
 from pathlib import Path
@@ -38,7 +38,7 @@ def simulate(
     ] = "frames,masks,ground",
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a team above and on a piece of desert, and write what its instruments give, and what is true.
+    """Simulate a team above and on a piece of desert, and write the data of its instruments and the truth.
 
     Writes frames/, telemetry.csv, landmarks.csv, colours.toml, camera.toml and dem.tif for `dddas run`,
     ground/ for `dddas people` and `dddas locate ground`, truth/ for `dddas evaluate`, scenario.toml and run.json.
@@ -57,7 +57,7 @@ def simulate(
 
 
 def _summary(record: "RunRecord", folder: Path, scenario: "Scenario") -> list[str]:
-    """Counts, events, notes, and the next command."""
+    """Return counts, events, notes, and the next command."""
     events = record.counts["events"]
     lines = [f"{record.frames} frames of {scenario.camera.width_px}×{scenario.camera.height_px}, {len(events)} events"]
     lines += [f"  {event['time_s']:6.1f} s  {event['what']}" for event in events[:12]]
@@ -68,7 +68,8 @@ def _summary(record: "RunRecord", folder: Path, scenario: "Scenario") -> list[st
     lines.append(f"{folder}: {', '.join([*files, 'tables', 'scenario.toml', 'run.json'])}")
     if (folder / "frames").exists():
         names = ("landmarks.csv", "telemetry.csv", "colours.toml", "camera.toml", "dem.tif")
-        options = [f"--{name.partition('.')[0]} {folder / name}" for name in names if (folder / name).exists()]
+        given = names if scenario.team.ugvs else names[1:]  # without vehicles there are no landmarks in the file
+        options = [f"--{name.partition('.')[0]} {folder / name}" for name in given if (folder / name).exists()]
         rate = f" --rate {scenario.clip.rate_hz:g}" if scenario.clip.rate_hz != 10 else ""
         lines.append(f"Next: dddas run {folder / 'frames'} {' '.join(options)}{rate}")
     return lines

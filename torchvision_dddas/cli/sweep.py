@@ -73,12 +73,13 @@ def sweep(
     config: Config = None,
     set_: Overrides = None,
     backend: StudyBackend = None,
-    out: Annotated[Path, typer.Option(help="Folder for sweep.json and best.toml.")] = Path("dddas-sweep"),
+    out: Annotated[Path, typer.Option(help="Folder for report.html, sweep.json and best.toml.")] = Path("dddas-sweep"),
     quiet: Quiet = False,
 ) -> None:
-    """Try parameters on whole data sets, all points of a grid or as Optuna proposes; writes sweep.json and best.toml.
+    """Try parameters on whole data sets, all points of a grid or as Optuna proposes.
 
-    Results are kept as those of dddas evaluate --dataset: a repeated sweep continues where it stopped.
+    Writes report.html, sweep.json and best.toml. Results are kept as those of dddas evaluate --dataset: a repeated
+    sweep continues where it stopped.
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.atomic_files import claimed
@@ -99,7 +100,9 @@ def sweep(
     used, left = split_patterns(clips, "--clips"), split_patterns(holdout, "--holdout")
     tuned, held = sweeps.split_clips(spec, dataset.parent, used, left)
     search: dict[str, Any] = {"grid": grid} if optuna is None else {"optuna": optuna, "range": range_, "seed": seed}
-    record = sweeps.SweepRecord(out, settings, goal, search, tuned, held)
+    notes = sweeps.parameter_notes([*points, *ranges], settings)
+    print_lines([f"note: {note}" for note in notes], quiet)
+    record = sweeps.SweepRecord(out, settings, goal, search, tuned, held, notes=notes)
     printed = time.monotonic()
 
     def on_progress(done: int, total: int) -> None:
@@ -185,7 +188,7 @@ def _show(record: "SweepRecord") -> None:
     if record.on_held is not None:
         before, after = (format_value(value) for value, _ in record.on_held)
         lines.append(f"Held out ({', '.join(record.held)}): {after} with the best, {before} before.")
-    print_lines([*lines, f"{record.folder}: sweep.json, best.toml (for --config)"])
+    print_lines([*lines, f"{record.folder}: report.html, sweep.json, best.toml (for --config), tables/, figures/"])
 
 
 def _format(value: object) -> str:

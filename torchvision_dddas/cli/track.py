@@ -1,4 +1,4 @@
-"""`dddas track`: identities of targets, from frame to frame."""
+"""`dddas track`: give targets identities that last from frame to frame."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +17,7 @@ from torchvision_dddas.cli.options import (
     Overrides,
     Quiet,
     Rate,
+    Telemetry,
     check_interval,
     load_settings,
     print_lines,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from torchvision_dddas.config import Settings
     from torchvision_dddas.detection import Engine
     from torchvision_dddas.types import DetectionTable, Source, TrackedFrame
+    from torchvision_dddas.types import Telemetry as Flown
 
 
 @report_errors
@@ -47,6 +49,7 @@ def track(
     save: Annotated[
         str | None, typer.Option(metavar="NAMES", help="overlay, all or none; the tables are always written.")
     ] = None,
+    telemetry: Telemetry = None,
     rate: Rate = None,
     ignore: Ignore = None,
     quiet: Quiet = False,
@@ -54,35 +57,42 @@ def track(
     """Give targets lasting identities: those detected in a clip, or those of a table, with or without its clip.
 
     Writes tracks.txt (MOTChallenge), tracks.csv, run.json, and if there is a clip overlay.mp4 and appearance.csv (why
-    the association looked at appearance, or not) under --out. With a clip --backend chooses the engine of detection and
-    registration, and with --config paper of the source's histograms and affinities; the default association has none in
-    torch.
+    the association used appearance, or not) under --out. With a clip, --backend chooses the engine of detection and
+    registration, and with --config paper that of the source's histograms and affinities; the default association
+    does not run in torch.
     """
     from torchvision_dddas import open_video
     from torchvision_dddas.detection import load_engine
     from torchvision_dddas.io.atomic_files import refuse_own_input
     from torchvision_dddas.io.detection_tables import check_table, read_for_clip
     from torchvision_dddas.io.output import TrackRecorder, clip_facts, parse_save
-    from torchvision_dddas.pipeline import clip_notes
+    from torchvision_dddas.pipeline import clip_notes, prepare_detection
     from torchvision_dddas.types import is_sampled
 
-    settings, names = load_settings(config, set_, ignore), parse_save(save, TrackRecorder.saved)
+    settings, names = load_settings(config, set_, ignore, quiet), parse_save(save, TrackRecorder.saved)
     if clip is None and detections is None:
         raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
     check_interval(interval)
+    if telemetry is not None and (clip is None or detections is not None):
+        raise InputError("--telemetry tells sizes to the detection in a clip; give INPUT, and leave --detections out")
     if clip is None and save and names:
         raise InputError("--save overlay needs a clip to draw on; give INPUT, or leave --save out")
     names = () if clip is None else names
-    inputs = [Path(name) for name in (clip, detections) if name is not None]
+    inputs = [Path(name) for name in (clip, detections, telemetry) if name is not None]
     refuse_own_input(inputs, [out / name for name in TrackRecorder.files], "folder with --out")
     with TrackRecorder(out, names) as output:
         source = open_video(clip, rate_hz=rate, full_scale=settings.levels.given) if clip is not None else None
         table = read_for_clip(detections, box_format, source) if detections is not None else None
         notes = check_table(table, interval, source) if table is not None else []
+        flight = None
+        if source is not None and clip is not None:
+            settings, flight, more = prepare_detection(telemetry, settings, source, clip)
+            notes += more
         engine = load_engine(backend.value, settings) if source is not None else None
         facts = {
             "input": clip,
             "detections": detections,
+            "telemetry": telemetry,
             "clip": source and clip_facts(source),
             "rows": None
             if table is None
@@ -98,7 +108,7 @@ def track(
         record_results(
             output,
             record,
-            _track(table, source, engine, settings, interval, backend.value),
+            _track(table, source, engine, settings, interval, backend.value, flight, record.notes),
             source.name if source is not None else str(detections),
             None if last is None else -(-last // interval),
             quiet,
@@ -123,8 +133,11 @@ def _track(
     settings: "Settings",
     interval: int,
     backend: str,
+    flight: "Flown | None",
+    notes: list[str],
 ) -> "Iterator[TrackedFrame]":
     from torchvision_dddas.detection import detect_motion
+    from torchvision_dddas.pipeline import note_uncovered
     from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 
     if source is None or engine is None:
@@ -132,5 +145,5 @@ def _track(
         return track_table(table, settings, interval)
     if table is not None:
         return track_clip(source, table, engine, settings, interval, backend)
-    scenes = detect_motion(source, settings, engine)
+    scenes = note_uncovered(detect_motion(source, settings, engine, flight), flight, notes)
     return track_scenes(scenes, settings, interval, source.size, backend=backend, rate_hz=source.rate_hz)

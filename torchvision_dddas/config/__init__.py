@@ -1,4 +1,4 @@
-"""Every parameter: its default, unit, range and meaning; TOML files and `group.parameter=value` overrides."""
+"""All parameters with default, unit, range and meaning, and their input by TOML files and overrides."""
 
 from torchvision_dddas.config.detection import (
     EVIDENCE_CAP,
@@ -8,13 +8,12 @@ from torchvision_dddas.config.detection import (
     DifferenceParameters,
     HistoryParameters,
     IntervalParameters,
-    PersistenceParameters,
     RegistrationParameters,
     SmallParameters,
     TrackletParameters,
     exposure_step,
 )
-from torchvision_dddas.config.geo import AerialParameters, GroundParameters, LandmarkParameters
+from torchvision_dddas.config.geo import AerialParameters, FusionParameters, GroundParameters, LandmarkParameters
 from torchvision_dddas.config.group import Group, parameter
 from torchvision_dddas.config.loader import (
     config_folder,
@@ -38,6 +37,7 @@ from torchvision_dddas.config.settings import (
     check_settings,
     describe_parameter,
     is_set,
+    is_tiny,
     range_of,
     uses_tracklets,
 )
@@ -51,6 +51,7 @@ __all__ = [
     "AerialParameters",
     "ConfirmParameters",
     "DifferenceParameters",
+    "FusionParameters",
     "GroundParameters",
     "Group",
     "HistoryParameters",
@@ -60,7 +61,6 @@ __all__ = [
     "PaperParameters",
     "Parameter",
     "PeopleParameters",
-    "PersistenceParameters",
     "RegistrationParameters",
     "Settings",
     "SmallParameters",
@@ -78,6 +78,7 @@ __all__ = [
     "format_toml",
     "is_file",
     "is_set",
+    "is_tiny",
     "load_config",
     "nearest",
     "parameter",

@@ -1,4 +1,4 @@
-"""Parameters of the detection of moving targets, and the constants of its maps."""
+"""Parameters of the detection of moving targets, and constants of its maps."""
 
 import math
 from typing import Annotated, Literal
@@ -8,25 +8,25 @@ from pydantic import Field
 from torchvision_dddas.config.group import Group, Odd, parameter
 
 EVIDENCE_SCALE, EVIDENCE_CAP = 16.0, 240
-"""Evidence is kept in 8-bit maps: in sixteenths of the local noise, clipped at 15 noise units."""
+"""Evidence is stored in 8-bit maps, in steps of 1/16 of the local noise, clipped at 15 noise units."""
 
 HALF = 127
-"""Above this level a smoothed silhouette of 0 and 255 is set."""
+"""A smoothed silhouette of 0 and 255 is set above this level."""
 
 WHITE = 248
-"""From this grey level on a pixel may be clipped."""
+"""Pixels with at least this grey level may be clipped."""
 
 EXPOSURE_PIXELS = 5000
-"""The exposure of a warped picture is fitted to some so many pixels."""
+"""Approximate number of pixels to which the exposure of a warped picture is fitted."""
 
 
 def exposure_step(shape: tuple[int, ...]) -> int:
-    """Every so many-th row and column of a picture, (H, W), shows the exposure well enough."""
+    """Return the step of the rows and columns of a picture, (H, W), that are used to fit the exposure."""
     return max(math.isqrt(shape[0] * shape[1] // EXPOSURE_PIXELS), 1)
 
 
 class RegistrationParameters(Group):
-    """How the background's motion between two frames is found (appendix B, steps S1 to S3)."""
+    """Registration: the background's motion between two frames (appendix B, steps S1 to S3)."""
 
     model: Literal["homography", "affine"] = parameter(
         "homography", "model of the background's motion; affine is the earlier baseline"
@@ -46,31 +46,31 @@ class RegistrationParameters(Group):
     iterations: int = parameter(30, "largest number of Lucas-Kanade steps per level", "steps", 1, 100)
     epsilon_px: float = parameter(0.01, "Lucas-Kanade stops when a step is shorter than this", "px", 1e-4, 1)
     forward_backward_px: float = parameter(
-        1.0, "largest error of a point tracked forth and back; 0 switches the check off", "px", 0, 20
+        1.0, "largest error of a point tracked forward and back; 0 switches the check off", "px", 0, 20
     )
     ransac_px: float = parameter(2.0, "a point this close to the model's prediction is an inlier", "px", 0.1, 20)
     hypotheses: int = parameter(128, "number of models that RANSAC draws", "models", 8, 4096)
     redetect_frames: int = parameter(
-        5, "detect keypoints every so many frames, and track the inliers in between (onboard)", "frames", 1, 60
+        5, "frames between detections of keypoints; the inliers are tracked in between (onboard)", "frames", 1, 60
     )
     halved_corners: bool = parameter(False, "detect keypoints at half resolution: faster, less accurate")
     halved: bool = parameter(False, "register frames at half resolution: faster, half as accurate (onboard)")
     direct: bool = parameter(
-        False, "register a frame with each frame that it is compared with, as the source does; else steps are chained"
+        False, "register a frame directly to each compared frame, as the source does; false chains successive steps"
     )
     min_inliers: int = parameter(20, "with fewer inliers the registration is unreliable", "points", 4, 5000)
-    min_inlier_share: float = parameter(0.4, "with a smaller share of inliers registration is unreliable", "-", 0, 1)
+    min_inlier_share: float = parameter(0.4, "with a smaller inlier share the registration is unreliable", "-", 0, 1)
 
     def cell_side(self, width: int, height: int) -> int:
-        """Side in pixels of the cells with one keypoint each that keeps their number within the budget."""
+        """Return the side in pixels of the grid cells, such that one keypoint a cell is within the budget."""
         return max(self.cell_px, math.ceil(math.sqrt(width * height / self.keypoints)))
 
 
 class IntervalParameters(Group):
-    """The detection interval and the rule that steers it (appendix B, eq. 2)."""
+    """The detection interval and the rule that controls it (appendix B, eq. 2)."""
 
     rule: bool = parameter(True, "adapt the interval to altitude, speed and frame rate; false keeps `frames`")
-    frames: int = parameter(3, "interval at the start; the only one if `rule` is false", "frames", 1, 60)
+    frames: int = parameter(3, "interval at the start, and throughout if `rule` is false", "frames", 1, 60)
     minimum_frames: int = parameter(3, "shortest interval that the rule may choose", "frames", 1, 60)
     maximum_frames: int = parameter(8, "longest interval that the rule may choose", "frames", 1, 60)
     reference_altitude_m: float = parameter(20.0, "altitude at which the interval is one frame", "m", 1, 1000)
@@ -88,18 +88,18 @@ class IntervalParameters(Group):
     )
     cost: float = parameter(
         1.0,
-        "time of a look, in frames at the reference rate (O in eq. 2); 0: measured, as by `run --live` if not set",
+        "computing time of a look, in frames at the reference rate (O in eq. 2); 0: measured (default of run --live)",
         "frames",
         0,
         10,
     )
     memory_frames: int = parameter(
-        9, "looks over which the medians of the background flow and of a look's time are taken", "frames", 1, 100
+        9, "number of looks in the medians of the background flow and of a look's time", "frames", 1, 100
     )
 
 
 class DifferenceParameters(Group):
-    """What makes a pixel foreground (appendix B, step S4)."""
+    """The difference of frames that makes a pixel foreground (appendix B, step S4)."""
 
     kind: Literal["normalized", "to_reference", "between_later", "to_next"] = parameter(
         "normalized",
@@ -109,42 +109,42 @@ class DifferenceParameters(Group):
     )
     near_frames: Annotated[tuple[Annotated[int, Field(ge=1, le=30)], ...], Field(min_length=1)] = parameter(
         (1, 2),
-        "distances to the neighbours on both sides; without a wide pair the longest follows the interval, this at 3",
+        "distances to the neighbours on both sides; without a wide pair the longest is multiplied by interval / 3",
         "frames",
     )
-    wide_frames: int = parameter(6, "distance of the pair of frames that fills large targets; 0: off", "frames", 0, 60)
+    wide_frames: int = parameter(6, "distance of the wide pair, which fills large targets; 0: off", "frames", 0, 60)
     noise_levels: float = parameter(4.0, "noise of a flat region (normalized)", "grey levels", 0.1, 50)
     gradient_share: float = parameter(0.12, "share of the local gradient that counts as registration noise", "-", 0, 2)
     threshold: float = parameter(3.5, "larger differences are foreground; in noise units if normalized", "-", 0.1, 255)
     peak: float = parameter(7.0, "smallest peak difference of a target, same unit as the threshold", "-", 0, 255)
     blur_px: Odd = parameter(5, "Gaussian kernel of the smoothing, odd; 1 switches it off", "px", 1, 31)
     blur_of: Literal["difference", "silhouette"] = parameter(
-        "difference", "smooth the difference before the threshold, or as the source does the silhouette after it"
+        "difference", "smooth the difference before the threshold, or the silhouette after it, as the source does"
     )
     border_px: int = parameter(4, "width of the strip along a warped frame's border that is ignored", "px", 0, 50)
     halved: bool = parameter(False, "compare frames at half resolution: faster, coarser outlines (onboard)")
-    ignore: str = parameter("", "a picture of the frames' size; what is not black in it is left out, such as text")
+    ignore: str = parameter("", "mask picture of the frames' size: pixels that are not black are ignored")
 
 
 class TrackletParameters(Group):
-    """Targets by what candidates do over several looks; needs the normalized difference."""
+    """Judging targets by tracklets, which follow candidates over several looks; needs the normalized difference."""
 
-    on: bool = parameter(True, "judge targets by tracklets, and find those that blobs miss")
-    accept: float = parameter(-1.0, "least score of a tracklet that is a target, a log odds", "-", -10, 10)
+    on: bool = parameter(True, "judge targets by tracklets, and find targets that blobs miss")
+    accept: float = parameter(-1.0, "smallest score (log odds) of a tracklet that counts as a target", "-", -10, 10)
 
 
 class MorphologyParameters(Group):
-    """How the silhouette is cleaned (appendix B, step S5)."""
+    """Cleaning of the silhouette (appendix B, step S5)."""
 
-    erode_px: int = parameter(3, "ellipse that erodes the silhouette: precision for recall; 1: off", "px", 1, 31)
-    dilate_px: int = parameter(1, "ellipse that dilates it afterwards: recall for precision; 1: off", "px", 1, 101)
+    erode_px: int = parameter(3, "ellipse that erodes the silhouette; larger: fewer false pixels; 1: off", "px", 1, 31)
+    dilate_px: int = parameter(1, "ellipse that then dilates it; larger: fewer missed pixels; 1: off", "px", 1, 101)
     close_px: int = parameter(25, "ellipse that closes gaps between fragments of one target; 1: off", "px", 1, 101)
-    close_m: float = parameter(0.0, "with telemetry: largest gap to close, at most close_px; 0: close_px", "m", 0, 100)
+    close_m: float = parameter(0.0, "with telemetry: largest gap to close, up to close_px; 0: close_px", "m", 0, 100)
     hull: bool = parameter(True, "replace every blob by its convex hull")
 
 
 class RefineParameters(Group):
-    """Redrawing a target's outline by its motion and its colours."""
+    """Refinement of a target's outline by its motion and its colours."""
 
     on: bool = parameter(True, "refine outlines; false keeps the blobs of the morphology")
     spatial_px: float = parameter(90.0, "distance over which evidence spreads where colours are constant", "px", 1, 500)
@@ -153,30 +153,14 @@ class RefineParameters(Group):
     shadow_share: float = parameter(0.01, "shadows are removed from blobs up to this share of the picture", "-", 0, 1)
 
 
-class PersistenceParameters(Group):
-    """What a blob must show over time to be a target: moving as one, steadily, unlike its surroundings."""
-
-    on: bool = parameter(True, "test blobs by flow and persistence; false accepts every blob")
-    flow_share: float = parameter(0.3, "share of a blob's core that moves steadily to pass the flow test", "-", 0, 1)
-    sure_share: float = parameter(0.7, "a large blob with at least this share needs no further frames", "-", 0, 1)
-    links: int = parameter(3, "frames of five (two before, itself, two after) that must show a blob", "frames", 1, 5)
-    passes: int = parameter(2, "number of these frames in which it must pass the flow test", "frames", 0, 5)
-    large_share: float = parameter(0.02, "a blob of this share of the picture needs one link, no flow test", "-", 0, 1)
-    weak_links: int = parameter(4, "`links` for a blob that only the wide pair of frames shows", "frames", 1, 5)
-    weak_passes: int = parameter(3, "`passes` for a blob that only the wide pair of frames shows", "frames", 0, 5)
-    trusted_blobs: int = parameter(
-        4, "with at most this many blobs per frame one link is enough: parallax causes many", "blobs", 0, 1000
-    )
-
-
 class SmallParameters(Group):
     """Small slow targets: weak evidence over a longer gap, confirmed by steady travel."""
 
     on: bool = parameter(True, "detect small slow targets while the interval is long enough")
-    from_interval: int = parameter(3, "shortest interval at which they are detected", "frames", 1, 60)
+    from_interval: int = parameter(3, "shortest interval at which small targets are detected", "frames", 1, 60)
     gap_frames: int = parameter(6, "distance to the neighbours on both sides, at most the interval", "frames", 1, 30)
     gap_move_px: float = parameter(
-        1.4, "with telemetry: a walker moves by this over the gap, unless gap_frames is set; 0: gap_frames", "px", 0, 30
+        1.4, "with telemetry: walkers move by this over the gap, unless gap_frames is set; 0: gap_frames", "px", 0, 30
     )
     threshold: float = parameter(6.0, "smallest difference of a candidate", "grey levels", 1, 255)
     noise_ratio: float = parameter(
@@ -185,9 +169,9 @@ class SmallParameters(Group):
     close_px: int = parameter(13, "ellipse that joins the parts of a candidate; 1 switches it off", "px", 1, 31)
     min_area_px: int = parameter(12, "smallest area of a candidate", "px", 1, 10_000)
     max_box_px: int = parameter(1500, "largest box area of a candidate", "px", 10, 1_000_000)
-    max_candidates: int = parameter(80, "with more candidates in a frame none is tracked", "blobs", 1, 10_000)
-    max_blobs: int = parameter(4, "with more large blobs than this, parallax is tested for", "blobs", 0, 1000)
-    parallax_px: float = parameter(0.15, "residual of inliers that means parallax: no small targets then", "px", 0, 10)
+    max_candidates: int = parameter(80, "in frames with more candidates none is tracked", "blobs", 1, 10_000)
+    max_blobs: int = parameter(4, "with more large blobs than this, the parallax test is applied", "blobs", 0, 1000)
+    parallax_px: float = parameter(0.15, "larger inlier residuals mean parallax: no small targets", "px", 0, 10)
     gate_px: float = parameter(4.0, "largest distance of a candidate from the track's prediction", "px", 0.5, 50)
     hits: int = parameter(10, "frames with a candidate that a track needs to be confirmed", "frames", 2, 60)
     min_travel_px: float = parameter(3.0, "smallest distance that a confirmed track has travelled", "px", 0, 100)
@@ -199,7 +183,7 @@ class HistoryParameters(Group):
     """The motion history, its gradient and the segmentation by motion (appendix B, step S5)."""
 
     on: bool = parameter(True, "motion history: heading and speed without flow, and splits of touching targets")
-    duration_frames: float = parameter(6.0, "how long a silhouette stays in the history", "frames", 1, 120)
+    duration_frames: float = parameter(6.0, "time for which a silhouette stays in the history", "frames", 1, 120)
     delta_min_frames: float = parameter(0.5, "smallest difference of time stamps with a gradient", "frames", 0, 60)
     delta_max_frames: float = parameter(4.0, "largest difference of time stamps with a gradient", "frames", 0, 120)
     segmentation_threshold_frames: float = parameter(
@@ -208,14 +192,20 @@ class HistoryParameters(Group):
 
 
 class GateParameters(Group):
-    """Which blobs can be targets; the bounds in metres hold when telemetry is given (appendix A)."""
+    """Bounds for targets. The bounds in metres apply if telemetry is given (appendix A)."""
 
     min_area_px: int = parameter(300, "smallest foreground area of a target", "px", 1, 1_000_000)
     min_size_m: float = parameter(0.2, "smallest length of a target on the ground", "m", 0, 100)
     max_size_m: float = parameter(25.0, "largest length of a target on the ground", "m", 0.1, 1000)
     max_speed_m_s: float = parameter(60.0, "largest speed of a target over ground", "m/s", 0.1, 500)
-    focal_px: float = parameter(1000.0, "focal length: a bound in px is m x focal length / altitude", "px", 10, 100_000)
+    focal_px: float = parameter(1000.0, "focal length: a bound in px is m x focal length / distance", "px", 10, 100_000)
     expected_size_m: float = parameter(
-        1.7, "size of a typical small target: sets the smallest area if telemetry is given", "m", 0.05, 100
+        1.7, "size of a typical small target; with telemetry it sets the smallest area", "m", 0.05, 100
+    )
+    tiny_px: float = parameter(
+        7.0, "people smaller than this (side of a square) get the settings for tiny people; 0: never", "px", 0, 1000
+    )
+    person_px: float = parameter(
+        0.0, "size of people in the picture if telemetry does not give it; 0: unknown", "px", 0, 1000
     )
     expected_share: float = parameter(0.1, "smallest foreground share of the expected target's square", "-", 0.01, 1)

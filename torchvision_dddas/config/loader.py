@@ -1,4 +1,4 @@
-"""Settings from TOML files and `group.parameter=value` overrides."""
+"""Read settings from TOML files and `group.parameter=value` overrides."""
 
 import re
 import tomllib
@@ -16,14 +16,18 @@ from torchvision_dddas.errors import InputError, printable
 
 
 def load_config(
-    config: str | Path | None = None, overrides: Sequence[str] = (), base: Mapping[str, object] | None = None
+    config: str | Path | None = None, overrides: Sequence[str] = (), *, base: Mapping[str, object] | None = None
 ) -> Settings:
-    """The defaults, changed by base, then by a TOML file and then by `group.parameter=value` overrides.
+    """Return the default settings, changed first by base, then by TOML files, and then by the overrides.
 
-    config: the name of a shipped configuration (`source`, `fast`), a TOML file, or several between commas, of which a
-    later one overrides those before. base: `{"group.parameter": value}`.
-    Raises InputError with one line: no such file, bad TOML, unknown parameter (with the nearest names), value out of
-    range.
+    config: the name of a shipped configuration (`source`, `fast`), a TOML file, or several of them separated by commas;
+    later ones override earlier ones. overrides: `group.parameter=value`. base: `{"group.parameter": value}`.
+    Raises InputError with one line for a missing file, bad TOML, an unknown parameter (with the nearest names), and a
+    value out of range.
+
+    >>> settings = td.load_settings("fast", ["gates.min_area_px=80"])
+    >>> settings.registration.keypoints, settings.gates.min_area_px
+    (200, 80)
     """
     settings = with_parameters(Settings(), base or {})
     several = isinstance(config, str) and "," in config and not is_file(Path(config))
@@ -34,9 +38,9 @@ def load_config(
 
 
 def with_parameters(settings: Settings, values: Mapping[str, object], origin: str = "") -> Settings:
-    """A copy of the settings with `{"group.parameter": value}` changed and everything checked again.
+    """Return a copy of the settings with changed values, `{"group.parameter": value}`, and check all values again.
 
-    origin: where the values come from, put before the message. Raises InputError for an unknown parameter or a bad
+    origin: source of the values, which error messages start with. Raises InputError for an unknown parameter or a bad
     value.
     """
     before = f"{origin}: " if origin else ""
@@ -54,12 +58,12 @@ def with_parameters(settings: Settings, values: Mapping[str, object], origin: st
 
 
 def config_names() -> list[str]:
-    """The shipped configurations that `--config` takes by name."""
+    """Return the names of the shipped configurations, which `--config` accepts."""
     return sorted(path.stem for path in config_folder().glob("*.toml"))
 
 
 def config_folder() -> Path:
-    """Of the shipped ones: inside the package when installed from a wheel; at the top of the tree in a checkout."""
+    """Return the folder of shipped configurations: in the package of a wheel, or at the top of a checkout."""
     package = Path(__file__).resolve().parents[1]
     return next((p for p in (package / "configs", package.parent / "configs") if p.is_dir()), package / "configs")
 
@@ -79,19 +83,19 @@ def _config_file(config: str | Path) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; a name that no file can have has none."""
+    """Return whether the file exists. It is False for names that are invalid for a file."""
     try:
         return path.is_file()
-    except OSError:  # too long, or in a folder that may not be entered
+    except OSError:  # the name is too long, or the folder may not be entered
         return False
 
 
 def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
-    """What a TOML file holds. what: what the file is, for messages. Raises InputError with file and line."""
+    """Read a TOML file. what: the kind of file, for messages. Raises InputError with file and line."""
     name = f"{what} {path}".strip()
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
-        # The parser takes time as the square of a key's length.
+        # The time of the parser grows with the square of a key's length.
         if any(line.count(".") > _MOST_DOTS and _has_long_key(line) for line in text.splitlines()):
             raise ValueError(f"a key has more than {_MOST_DOTS} dots")
         return tomllib.loads(text)
@@ -99,7 +103,7 @@ def read_toml(path: str | Path, what: str = "") -> dict[str, Any]:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except RecursionError:
         raise InputError(f"{name} is not valid TOML: its brackets are nested too deeply") from None
-    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
+    except ValueError as error:  # the text is not UTF-8 or not TOML, or has a number of thousands of digits
         raise InputError(f"{name} is not valid TOML: {str(error).split(';')[0]}") from None
 
 
@@ -107,7 +111,7 @@ _MOST_DOTS = 100
 
 
 def _has_long_key(line: str) -> bool:
-    """Whether a line has a key of endless parts, a.b.c, and not only many numbers with a point."""
+    """Return whether a line has a key with too many parts, a.b.c, and not only many decimal numbers."""
     run = 0
     for part in line.split("."):
         run = run + 1 if (word := part.strip()) and not set(word) & set(" ,=\t") else 0
@@ -117,9 +121,10 @@ def _has_long_key(line: str) -> bool:
 
 
 def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    r"""TOML text of plain values, lists and tables, which read_toml reads as the same. comments: lines above it.
+    r"""Return TOML text of plain values, lists and tables, which read_toml can read back. comments: lines above it.
 
-    TOML has no half characters (lone surrogates, as in names of files that are no UTF-8): they become text, \udc80.
+    TOML cannot contain lone surrogates, which stand for bytes of file names that are not UTF-8. They become text such
+    as \udc80.
     """
     text = tomli_w.dumps(_whole_characters(content), indent=1)
     while (shorter := _ARRAY.sub(lambda found: "[" + ", ".join(re.split(r",\n *", found[1])[:-1]) + "]", text)) != text:
@@ -128,7 +133,7 @@ def format_toml(content: Mapping[str, Any], comments: Sequence[str] = ()) -> str
     return "".join(f"# {line}\n" for line in lines) + ("\n" if comments else "") + text
 
 
-# An array without further arrays in it, one element a line, as tomli_w writes it.
+# An array without nested arrays, with one element on each line, as tomli_w writes it.
 _ARRAY = re.compile(r"\[\n +((?:[^\n]*,\n *)+?)\]")
 
 
@@ -141,32 +146,34 @@ def _whole_characters(value: Any) -> Any:
 
 
 def _flat(content: dict[str, Any], origin: str) -> dict[str, object]:
-    """`{group: {parameter: value}}` → `{"group.parameter": value}`."""
+    """Convert `{group: {parameter: value}}` to `{"group.parameter": value}`."""
     flat: dict[str, object] = {}
     for group, parameters in content.items():
         if not isinstance(parameters, dict):
             hint = nearest(group, [name for name, _ in parameter_fields()])
-            raise InputError(f"{origin}: '{group}' stands outside a [group]; {hint}")
+            raise InputError(f"{origin}: '{group}' is outside of a [group]; {hint}")
         flat |= {f"{group}.{name}": value for name, value in parameters.items()}
     return flat
 
 
 def parse_override(text: str) -> tuple[str, object]:
-    """`group.parameter=value` as name and value. Raises InputError where it is none."""
+    """Split `group.parameter=value` into name and value. Raises InputError for text of another form."""
     name, equals, value = (part.strip() for part in text.partition("="))
     if not equals or not name or not value:
-        raise InputError(f"'{text}' is no override; wanted group.parameter=value, such as registration.keypoints=500")
+        raise InputError(
+            f"'{text}' is not an override; wanted group.parameter=value, such as registration.keypoints=500"
+        )
     try:
         return name, tomllib.loads(f"value = {value}")["value"]
-    except (ValueError, RecursionError):  # the latter for brackets without end, which no parameter takes
+    except (ValueError, RecursionError):  # RecursionError comes from too many brackets, which no parameter takes
         try:
-            return name, float(value)  # TOML takes 0.3, but not .3
+            return name, float(value)  # TOML accepts 0.3 but not .3
         except ValueError:
-            return name, value  # a bare word: a choice such as affine
+            return name, value  # a bare word, for a choice such as affine
 
 
 def nearest(name: str, known: list[str], where: str = "`dddas settings` lists them all") -> str:
-    """Names that look like it, by their whole or by the parameter alone; otherwise where to find the list."""
+    """Return a hint with similar names, compared as a whole or by the parameter alone, or else `where`."""
     key = name.rpartition(".")[2]
     same = [full for full in known if full.rpartition(".")[2] == key]
     alike = get_close_matches(key, [full.rpartition(".")[2] for full in known], n=2)
@@ -176,16 +183,16 @@ def nearest(name: str, known: list[str], where: str = "`dddas settings` lists th
 
 
 def _explain(error: ValidationError, fields: Mapping[str, FieldInfo]) -> str:
-    """One line for the first thing that is wrong: parameter, value, wanted range and unit."""
+    """Describe the first error in one line: parameter, value, allowed range and unit."""
     first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"][:2])
-    if name not in fields:  # a rule across two parameters of one group
+    if name not in fields:  # the error is from a rule about several parameters of a group
         return f"{name}: {str(first['msg']).removeprefix('Value error, ')}"
     return describe_error(name, first["input"], fields[name])
 
 
 def describe_error(name: str, value: object, field: FieldInfo) -> str:
-    """What a parameter must be, by its range and unit, and what it is instead."""
+    """Say which range and unit a parameter must have, and which value it got."""
     words, comma, odd = range_of(field).partition(",")
     if field.annotation in (int, float):
         words = f"{'a whole number ' if field.annotation is int else ''}between {words.replace(' to ', ' and ')}"

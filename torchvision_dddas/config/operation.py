@@ -1,4 +1,4 @@
-"""Parameters of confirmation from the ground, steering, live runs and grey levels."""
+"""Parameters of confirmation from the ground, of steering, of live runs and of 16-bit grey levels."""
 
 from pydantic import model_validator
 
@@ -6,35 +6,41 @@ from torchvision_dddas.config.group import Group, parameter
 
 
 class ConfirmParameters(Group):
-    """When people seen from the ground decide what a blob seen from the air is: two fidelities (appendix A, III-B)."""
+    """Confirmation of blobs seen from the air by people seen from the ground: two fidelities (appendix A, III-B)."""
 
     gate_probability: float = parameter(
-        0.99, "share of people inside the gate of their own blob, by both covariances", "-", 0.5, 0.9999
+        0.99, "share of people inside the gate of their blob, which both covariances define", "-", 0.5, 0.9999
     )
-    spread_m: float = parameter(0.5, "sigma of people around their blob's position, maybe a crowd's", "m", 0, 20)
+    spread_m: float = parameter(
+        0.5, "standard deviation of people around the position of their blob, which may be a crowd", "m", 0, 20
+    )
     unknown_sigma_m: float = parameter(2.0, "standard deviation of positions without covariance", "m", 0.01, 100)
-    inside_sigmas: float = parameter(2.0, "a blob is well inside a view if this many of its sigmas are", "-", 0, 10)
+    inside_sigmas: float = parameter(2.0, "margin of a blob inside a view, in its standard deviations", "-", 0, 10)
     body_width_m: float = parameter(0.6, "nearer objects within this distance of the line of sight occlude", "m", 0, 10)
-    least_score: float = parameter(0.5, "people of a lower probability say nothing about their blob", "-", 0.5, 1)
+    least_score: float = parameter(0.5, "people of a lower probability are no evidence about their blob", "-", 0.5, 1)
     detection_rate: float = parameter(
-        0.7, "share of a person's observations in which one is recognized", "-", 0.01, 0.999
+        0.7, "share of observations of people in which a person is recognized", "-", 0.01, 0.999
     )
-    false_rate: float = parameter(0.05, "share of other blobs' observations with a person recognized", "-", 0.001, 0.99)
-    crowd_share: float = parameter(0.5, "in pictures: detection rate in a crowd's blob over that of one", "-", 0, 1)
+    false_rate: float = parameter(
+        0.05, "share of observations of other blobs with a recognized person", "-", 0.001, 0.99
+    )
+    crowd_share: float = parameter(
+        0.5, "in pictures: detection rate of people in a crowd, relative to that of a single person", "-", 0, 1
+    )
     prior: float = parameter(0.5, "share of blobs that are people", "-", 0.01, 0.99)
     fresh: float = parameter(0.3, "weight of a vehicle's repeated observation: its errors are correlated", "-", 0, 1)
     limit: float = parameter(7.0, "largest absolute log-odds, so that later observations still count", "-", 0.5, 50)
     share: float = parameter(
-        0.5, "in pictures: smallest intersection of a person's and a blob's box, over the smaller box", "-", 0.01, 1
+        0.5, "in pictures: smallest intersection of a person and a blob, as a share of the smaller box", "-", 0.01, 1
     )
 
 
 class SteeringParameters(Group):
-    """How what is found steers where the instruments go and look, in a run whose source can be steered."""
+    """Control of the vehicles by the results, in a run whose source can be steered."""
 
     on: bool = parameter(True, "steer the vehicles; false flies as planned")
     sampling: bool = parameter(False, "process every k-th frame, k from the interval rule; needs a clip in order")
-    sampling_share: float = parameter(0.5, "k as a share of the rule's interval before its bounds", "-", 0.01, 10)
+    sampling_share: float = parameter(0.5, "k divided by the rule's interval (before its bounds)", "-", 0.01, 10)
     least_move_px: float = parameter(3.0, "a walker moves by at least this between processed frames", "px", 0, 100)
     maximum_every: int = parameter(8, "largest k, however slow the scene", "frames", 1, 60)
     follow: bool = parameter(True, "the UAV keeps the crowds in view; false flies as planned")
@@ -55,14 +61,14 @@ class LiveParameters(Group):
     queue_frames: int = parameter(2, "frames that may wait; beyond that the oldest is dropped", "frames", 1, 64)
     deadline_ms: float = parameter(80.0, "largest latency from camera to results without look-ahead", "ms", 1, 60_000)
     shed: bool = parameter(True, "reduce the load when processing is too slow; false drops frames instead")
-    load: float = parameter(0.85, "largest share of the time between frames that processing may take", "-", 0.1, 1)
+    load: float = parameter(0.85, "largest processing time, as a share of the time between frames", "-", 0.1, 1)
     calm_s: float = parameter(5.0, "time with spare capacity after which the load is raised again", "s", 0.1, 600)
     least_keypoints: int = parameter(80, "smallest number of keypoints under load", "-", 16, 10_000)
     maximum_every: int = parameter(8, "process at least one of this many frames under load", "frames", 1, 60)
     stall_s: float = parameter(5.0, "a stream without frames for this long counts as lost", "s", 0.1, 600)
     retry_s: float = parameter(0.5, "first delay before a lost stream is opened again; then it doubles", "s", 0.01, 600)
     retry_most_s: float = parameter(5.0, "longest delay before a lost stream is opened again", "s", 0.01, 3600)
-    lost_s: float = parameter(40.0, "a camera lost for so long ends the run (exit code 70); 0: never", "s", 0, 86_400)
+    lost_s: float = parameter(40.0, "a camera lost for this time ends the run (exit code 70); 0: never", "s", 0, 86_400)
     watchdog_s: float = parameter(30.0, "a step that takes longer counts as hung; 0: no watchdog", "s", 0, 3600)
     status_s: float = parameter(2.0, "time between two writes of the status and the results", "s", 0.1, 600)
 
@@ -74,12 +80,12 @@ class LiveParameters(Group):
 
 
 class LevelParameters(Group):
-    """How pictures of 16 bits, as those of thermal cameras, become pictures of 8 bits."""
+    """Conversion of 16-bit pictures, such as those of thermal cameras, to 8 bits."""
 
-    black: int = parameter(0, "value that becomes black; both 0: black and white follow the clip", "counts", 0, 65535)
+    black: int = parameter(0, "value that becomes black; both 0: taken from the clip", "counts", 0, 65535)
     white: int = parameter(0, "value that becomes white", "counts", 0, 65535)
 
     @property
     def given(self) -> tuple[int, int] | None:
-        """Black and white as `open_video` takes them; None where the clip gives them."""
+        """Black and white for `open_video`; None if they are taken from the clip."""
         return (self.black, self.white) if self.white else None

@@ -8,7 +8,7 @@ from torchvision_dddas.config.group import Group, parameter
 
 
 class PeopleParameters(Group):
-    """Recognizing people by HOG and a linear SVM (appendix A, III-B): which windows are scored, and what they yield."""
+    """Detection of people by HOG and a linear SVM (appendix A, III-B): descriptor, pyramid, suppression and search."""
 
     classifier: str = parameter("opencv", "opencv: OpenCV's default people detector; or a file with a linear SVM")
     graphs: str = parameter("shipped", "onboard: shipped, or a folder of ONNX graphs made by `dddas export`")
@@ -37,8 +37,12 @@ class PeopleParameters(Group):
         "nms", "nms keeps the best of overlapping windows; opencv averages groups; none keeps all"
     )
     overlap: float = parameter(0.4, "nms: bodies with a larger intersection over union are the same person", "-", 0, 1)
-    contained: float = parameter(0.7, "nms: so are bodies that share more of the smaller one; 1: off", "-", 0, 1)
-    settle: float = parameter(0.75, "nms: a box is the mean of windows that overlap the best by this", "-", 0, 1)
+    contained: float = parameter(
+        0.7, "nms: bodies that share a larger part of the smaller one are also the same person; 1: off", "-", 0, 1
+    )
+    settle: float = parameter(
+        0.75, "nms: a box is the mean of the windows with at least this intersection over union", "-", 0, 1
+    )
     group: int = parameter(2, "opencv: groups of at most this many windows are dropped", "windows", 0, 100)
     group_distance: float = parameter(0.2, "opencv: edges within this distance, in box sizes, form a group", "-", 0, 1)
     height_share: float = parameter(0.738, "body height divided by window height", "-", 0.1, 1)
@@ -50,7 +54,11 @@ class PeopleParameters(Group):
         "everywhere", "search the whole picture, or regions where people are expected and the rest in turns"
     )
     rescan_frames: int = parameter(
-        10, "regions: frames in which the whole picture is searched once, some levels in each", "frames", 1, 10_000
+        10,
+        "regions: frames over which a search of the whole picture is spread, some levels in each",
+        "frames",
+        1,
+        10_000,
     )
     look_share: float = parameter(
         1.0,
@@ -65,7 +73,7 @@ class PeopleParameters(Group):
     @model_validator(mode="after")
     def _cells_fill_blocks_and_blocks_the_window(self) -> "PeopleParameters":
         if self.block_px % self.cell_px:
-            raise ValueError(f"block_px = {self.block_px} is no multiple of cell_px = {self.cell_px}")
+            raise ValueError(f"block_px = {self.block_px} is not a multiple of cell_px = {self.cell_px}")
         for name in ("window_width_px", "window_height_px"):
             more = getattr(self, name) - self.block_px
             if more < 0 or more % self.block_stride_px:
@@ -77,7 +85,7 @@ class PeopleParameters(Group):
 
     @property
     def blocks(self) -> tuple[int, int]:
-        """Blocks of a window, (across, down)."""
+        """Number of blocks of a window, (across, down)."""
         across, down = (
             (side - self.block_px) // self.block_stride_px + 1 for side in (self.window_width_px, self.window_height_px)
         )
@@ -85,13 +93,13 @@ class PeopleParameters(Group):
 
     @property
     def features(self) -> int:
-        """Numbers of the descriptor of one window."""
+        """Length of the descriptor of one window."""
         across, down = self.blocks
         return across * down * (self.block_px // self.cell_px) ** 2 * self.bins
 
     @property
     def descriptor(self) -> dict[str, object]:
-        """What the descriptor is, as files of classifiers tell it; lengths in px, the window as (width, height)."""
+        """The layout of the descriptor with the keys of classifier files; lengths in px, window as (width, height)."""
         return {
             "window": (self.window_width_px, self.window_height_px),
             "cell": self.cell_px,

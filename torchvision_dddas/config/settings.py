@@ -1,4 +1,4 @@
-"""All parameters by group, and the table that describes them."""
+"""All parameters by group, and the table of their descriptions."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,13 +13,18 @@ from torchvision_dddas.config.detection import (
     HistoryParameters,
     IntervalParameters,
     MorphologyParameters,
-    PersistenceParameters,
     RefineParameters,
     RegistrationParameters,
     SmallParameters,
     TrackletParameters,
 )
-from torchvision_dddas.config.geo import AerialParameters, CrowdParameters, GroundParameters, LandmarkParameters
+from torchvision_dddas.config.geo import (
+    AerialParameters,
+    CrowdParameters,
+    FusionParameters,
+    GroundParameters,
+    LandmarkParameters,
+)
 from torchvision_dddas.config.group import Group, odd
 from torchvision_dddas.config.operation import ConfirmParameters, LevelParameters, LiveParameters, SteeringParameters
 from torchvision_dddas.config.people import PeopleParameters
@@ -28,14 +33,22 @@ from torchvision_dddas.errors import InputError
 
 
 class Settings(Group):
-    """All parameters, by group."""
+    """All parameters, by group; `help(td.Settings().difference)` describes those of a group.
+
+    Settings do not change: `td.load_settings` makes others.
+
+    >>> settings = td.load_settings("fast", ["difference.threshold=15"])
+    >>> settings.difference.threshold
+    15.0
+    >>> settings.refine
+    RefineParameters(on=False)
+    """
 
     registration: RegistrationParameters = RegistrationParameters()
     interval: IntervalParameters = IntervalParameters()
     difference: DifferenceParameters = DifferenceParameters()
     morphology: MorphologyParameters = MorphologyParameters()
     refine: RefineParameters = RefineParameters()
-    persistence: PersistenceParameters = PersistenceParameters()
     tracklets: TrackletParameters = TrackletParameters()
     small: SmallParameters = SmallParameters()
     history: HistoryParameters = HistoryParameters()
@@ -45,6 +58,7 @@ class Settings(Group):
     people: PeopleParameters = PeopleParameters()
     ground: GroundParameters = GroundParameters()
     confirm: ConfirmParameters = ConfirmParameters()
+    fusion: FusionParameters = FusionParameters()
     landmarks: LandmarkParameters = LandmarkParameters()
     aerial: AerialParameters = AerialParameters()
     crowds: CrowdParameters = CrowdParameters()
@@ -55,7 +69,7 @@ class Settings(Group):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One row of the table of parameters, ready to print."""
+    """A row of the table of parameters, as it is printed."""
 
     name: str
     default: object
@@ -65,50 +79,58 @@ class Parameter:
 
 
 def all_parameters() -> list[Parameter]:
-    """Every parameter in the order of the groups, for `dddas settings` and the README."""
+    """Return the rows of all parameters in the order of the groups, for `dddas settings`."""
     return [describe_parameter(name, field) for name, field in parameter_fields()]
 
 
 def describe_parameter(name: str, field: FieldInfo) -> Parameter:
-    """The row of one parameter."""
+    """Return the row of one parameter."""
     return Parameter(name, field.default, unit_of(field), range_of(field), field.description or "")
 
 
 def changes(settings: Settings) -> dict[str, object]:
-    """The parameters that differ from their defaults: `{"group.parameter": value}`."""
+    """Return the parameters that differ from their defaults: `{"group.parameter": value}`."""
     now = {name: getattr(getattr(settings, name.split(".")[0]), name.split(".")[1]) for name, _ in parameter_fields()}
     return {name: now[name] for name, field in parameter_fields() if now[name] != field.default}
 
 
 def is_set(settings: Settings, name: str) -> bool:
-    """Whether somebody has set a parameter, `group.parameter`: its value counts then, also where it is the default."""
+    """Return whether a parameter, `group.parameter`, was set explicitly, even to its default."""
     group, key = name.split(".")
     return key in getattr(settings, group).model_fields_set
 
 
 def uses_tracklets(settings: Settings) -> bool:
-    """Whether targets are judged by tracklets: these need evidence in units of noise."""
+    """Return whether targets are judged by tracklets, which need evidence in units of noise."""
     return settings.tracklets.on and settings.difference.kind == "normalized"
 
 
+def is_tiny(size_px: float, tiny_px: float, kind: str) -> bool:
+    """Return whether people of this size, 0 if unknown, need the settings for tiny people.
+
+    These settings have thresholds in noise units. tiny_px, kind: `gates.tiny_px` and `difference.kind`.
+    """
+    return 0 < size_px < tiny_px and kind == "normalized"
+
+
 def parameter_fields() -> Iterator[tuple[str, FieldInfo]]:
-    """Every parameter by its full name."""
+    """Yield every parameter's full name and its field."""
     for group, holder in Settings.model_fields.items():
         for name, field in type(holder.default).model_fields.items():
             yield f"{group}.{name}", field
 
 
 def unit_of(field: FieldInfo) -> str:
-    """The unit of a parameter; empty where it has none."""
+    """Return the unit of a parameter, or ""."""
     extra = field.json_schema_extra
     return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else ""
 
 
 def range_of(field: FieldInfo) -> str:
-    """In words: `true or false`, `homography or affine`, `50 to 5000`, `3 to 15, odd`, `a list of 1 to 30`."""
+    """Return the range in words: `true or false`, `homography or affine`, `50 to 5000`, `3 to 15, odd`."""
     kind, rules = field.annotation, list(field.metadata)
     many = get_origin(kind) is tuple
-    if many:  # the rules of a list's elements hang on the elements
+    if many:  # the rules for a list's elements are stored with the elements
         kind, *inner = get_args(get_args(kind)[0]) or get_args(kind)[:1]
         rules += [rule for entry in inner for rule in (entry.metadata if isinstance(entry, FieldInfo) else [entry])]
     if kind is bool:
@@ -116,7 +138,7 @@ def range_of(field: FieldInfo) -> str:
     if kind is str:
         return "a name or a file"
     if get_origin(kind) is Literal:
-        return " or ".join(str(choice) for choice in get_args(kind))
+        return " or ".join(str(choice) or "nothing" for choice in get_args(kind))
     low = next((rule.ge for rule in rules if getattr(rule, "ge", None) is not None), None)
     high = next((rule.le for rule in rules if getattr(rule, "le", None) is not None), None)
     words = f"{low} to {high}" + (", odd" if any(getattr(rule, "func", None) is odd for rule in rules) else "")
@@ -124,7 +146,7 @@ def range_of(field: FieldInfo) -> str:
 
 
 def check_settings(settings: Any) -> Settings:
-    """The settings that a class was given, the defaults for None. Raises InputError for anything else."""
+    """Return the given settings, or the defaults for None. Raises InputError for another type."""
     if settings is not None and not isinstance(settings, Settings):
         made = f": td.load_settings({settings!r}) makes them" if isinstance(settings, str | Path) else ""
         raise InputError(f"settings must be of type Settings, got {type(settings).__name__}{made}")

@@ -1,4 +1,4 @@
-"""The closed loop: reports come in, results go out as commands to the aerial vehicle and the ground vehicles."""
+"""The closed loop: it takes the vehicles' reports, and returns commands to the aerial and the ground vehicles."""
 
 import time
 from collections import deque
@@ -24,7 +24,7 @@ from torchvision_dddas.detection import (
     look_cost,
     pixels_per_metre,
 )
-from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, load_solver, to_local
+from torchvision_dddas.geo import AerialLocator, LandmarkWatch, Site, build_site, geoid_of, load_solver, to_local
 from torchvision_dddas.geometry import shift_origin
 from torchvision_dddas.people import load_scorer
 from torchvision_dddas.types import (
@@ -48,24 +48,24 @@ from torchvision_dddas.types import (
     Telemetry,
 )
 
-# Reports this old are dropped: in a long run they would only cost time.
+# Reports older than this are dropped, because they would slow down a long run.
 _MEMORY_S = 15.0
-# Vehicles get new goals this often at most: results are a second old, and vehicles do not turn faster.
+# Shortest time between new goals of the vehicles: results are a second old, and vehicles do not turn faster.
 _PERIOD_S = 0.2
-# After a target was lost every frame is processed for this time.
+# After the loss of a target every frame is processed for this time.
 _ALERT_S = 4.0
-# Fewer frames are processed only this time after the last change.
+# The number of processed frames is reduced only if its last change is at least this time ago.
 _CALM_S = 3.0
-# A registration is weak if a smaller share of its points agrees.
+# A registration is weak if a smaller share of its points are inliers.
 _WEAK = 0.5
 
 
 class Instrument(Protocol):
-    """A source of frames that can be steered, such as the simulator, and the reports of its vehicles.
+    """A source of frames and of vehicle reports whose vehicles can be steered, such as the simulator.
 
-    camera: the aerial one. colours: of the landmarks. elevation: of the ground, in metres about origin_deg, longitude
-    and latitude. sun_rad: azimuth and height of the sun, None where unknown. plate_m: height of the landmarks' colours
-    above ground.
+    camera: the aerial camera. colours: colours of the landmarks. elevation: elevation of the ground, in metres relative
+    to origin_deg, (longitude, latitude). sun_rad: azimuth and elevation of the sun, None if unknown. plate_m: height of
+    the landmarks' coloured plates above ground.
     """
 
     name: str
@@ -84,20 +84,20 @@ class Instrument(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
     def steer(self, command: Command) -> None:
-        """Follow a command from the next frame on; places in degrees."""
+        """Follow a command from the next frame on. Its positions are in degrees."""
 
     def landmarks(self) -> Landmarks:
-        """All that ground vehicles reported until now, in degrees."""
+        """Return all reports of the ground vehicles up to now, in degrees."""
 
     def telemetry(self) -> Telemetry:
-        """All that the aerial vehicle reported of itself until now, in degrees."""
+        """Return all reports of the aerial vehicle up to now, in degrees."""
 
     def pictures(self) -> list[GroundPicture]:
-        """The pictures of ground vehicles since the last call."""
+        """Return the pictures that ground vehicles took since the last call."""
 
 
 class StartedSource:
-    """A source whose first frame has been read, so that its vehicles have reported; otherwise unchanged."""
+    """A source whose first frame has been read, so that its vehicles have reported. All else is the source's own."""
 
     def __init__(self, source: Instrument) -> None:
         self._source, self._frames = source, iter(source)
@@ -114,24 +114,26 @@ class StartedSource:
 
 
 def build_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool = True) -> "Mission":
-    """The closed loop around a source whose first frame has been read: it has reports by then.
+    """Build the closed loop around a source whose first frame has been read, so that it has reports.
 
-    by_landmarks: whether the ground vehicles' markers are looked for; else telemetry alone gives the camera's pose.
-    Raises InputError where the reports are not sufficient.
+    by_landmarks: search for the ground vehicles' markers; otherwise only telemetry gives the camera's pose.
+    Raises InputError if the reports are not sufficient.
     """
     settings = fit_settings(settings, source)
     landmarks, telemetry, elevation = source.landmarks(), source.telemetry(), source.elevation
     if np.isfinite(landmarks.place).all(axis=1).any():
         site = build_site(landmarks, telemetry)
-    else:  # about the source's own origin while no ground vehicle has reported
+    else:  # use the source's own origin until a ground vehicle has reported
         origin = source.origin_deg
         site = Site(to_local(landmarks, origin), to_local(telemetry, origin), origin)
     if site.origin_deg is not None:
         elevation = shift_origin(elevation, -geometry.east_north(np.array([source.origin_deg]), site.origin_deg)[0])
+    geoid_m = geoid_of(np.zeros((1, 2)), site.origin_deg, settings.aerial.geoid)
     site = replace(site, elevation=elevation, sun_rad=source.sun_rad)
+    site = replace(site, geoid_m=geoid_m, plane_above_sea_m=elevation.base_m)
     locator = AerialLocator.from_site(site, source.camera, settings, load_solver(backend), source.rate_hz, True)
     colours = source.colours if by_landmarks and len(source.colours) else None
-    watch = LandmarkWatch(locator, colours, backend)
+    watch = LandmarkWatch(locator, colours)
     confirmation, steering = None, None
     if len(source.colours):
         confirmation = GroundConfirmation(settings, load_scorer(settings.people, backend))
@@ -142,7 +144,7 @@ def build_mission(source: Instrument, settings: Settings, backend: str, by_landm
 
 
 def fit_settings(settings: Settings, source: Instrument) -> Settings:
-    """The settings with the source's own focal length and height of markers, unless they are set."""
+    """Return the settings with the source's focal length and height of markers, unless the user has set them."""
     own: dict[str, object] = {}
     if not is_set(settings, "gates.focal_px"):
         own["gates.focal_px"] = float(source.camera.focal_px[0])
@@ -152,7 +154,7 @@ def fit_settings(settings: Settings, source: Instrument) -> Settings:
 
 
 class Mission:
-    """The state of a run that steers. settings: as by `fit_settings`."""
+    """The state of a run that steers its vehicles. settings: from `fit_settings`."""
 
     def __init__(
         self,
@@ -168,7 +170,7 @@ class Mission:
         self._monitor = SensorMonitor(watch.locator.site.landmarks.names, source.rate_hz)
 
     def take_reports(self, scene: Scene) -> None:
-        """Take over what was reported meanwhile; call it before the scene is located."""
+        """Take the reports up to now. Call this before the scene is located."""
         locator, frame = self.watch.locator, scene.frame
         landmarks, telemetry = self.source.landmarks(), self.source.telemetry()
         landmarks = landmarks[landmarks.frame >= frame.number - _MEMORY_S * self.source.rate_hz]
@@ -178,20 +180,20 @@ class Mission:
         self._monitor.check_reports(self.source.last, landmarks, telemetry)
         if frame.image.any():  # an all-black picture stands for a missing one
             flight, metres_per_px = locator.telemetry_at(frame.time_s), float("nan")
-            if flight is not None:  # on level ground in the middle of the picture
+            if flight is not None:  # the scale of level ground in the centre of the picture
                 metres_per_px = float(flight.distance_m / self.source.camera.focal_px[0])
             self._monitor.check_picture(frame, scene.step, metres_per_px)
         if self._confirmation is not None:
             self._confirmation.take(self.source.pictures())
 
     def notices(self) -> list[Notice]:
-        """The sensor failures and recoveries noticed since the last call."""
+        """Return the sensor failures and recoveries noticed since the last call."""
         return self._monitor.notices()
 
     def steer(self, result: FrameResult, step: Registration | None) -> FrameResult:
-        """Confirm the targets of a frame by the ground vehicles' pictures, and command the vehicles.
+        """Confirm the targets of a frame by the ground vehicles' pictures, and send commands to the vehicles.
 
-        step: how the background moved up to the frame.
+        step: the background's motion from the frame before to this frame; None if unknown.
         """
         located = result.locations
         if located is None:
@@ -232,10 +234,10 @@ class Mission:
 
 
 class Steering:
-    """Commands the vehicles and decides which frames are processed. Call it with located frames in order."""
+    """Commands the vehicles and decides which frames are processed. Pass located frames in order to `update`."""
 
     def __init__(self, settings: Settings, camera: Camera, rate_hz: float, vehicles: Sequence[str]) -> None:
-        """camera: of the aerial vehicle. vehicles: names of the ground vehicles, as the landmarks have them."""
+        """Start without targets. camera: the aerial one. vehicles: names of the ground vehicles, as in Landmarks."""
         self.settings, self.camera, self.rate_hz = settings, camera, rate_hz
         self._predictor, self._log = TargetPredictor(camera), AdjustmentLog()
         self._uav, self._team = UavSteering(settings, self._log), UgvTeam(settings, vehicles, self._log)
@@ -244,10 +246,10 @@ class Steering:
         self._every, self._every_changed_s, self._last_frame = 1, -np.inf, 0
         self._alert_s, self._alert = -np.inf, ""
         self._by_ground: list[int] = []  # targets that only ground vehicles see
-        self._costs: deque[float] = deque(maxlen=settings.interval.memory_frames)  # seconds that looks took
+        self._costs: deque[float] = deque(maxlen=settings.interval.memory_frames)  # computing time of looks, s
 
     def begin(self, flight: Flight | None) -> Command:
-        """The command before anything is found: process as many frames as show a walker at this altitude."""
+        """Return the first command: process every k-th frame, so that a walker moves visibly in between."""
         parameters = self.settings.steering
         if parameters.sampling and flight is not None and flight.altitude_m > 0:
             self._every = int(np.clip(round(self._least_every(flight)), 1, parameters.maximum_every))
@@ -255,7 +257,7 @@ class Steering:
         return self._command
 
     def missing(self, located: AerialLocations) -> Prediction:
-        """The known targets that a frame did not locate; call it before `update`."""
+        """Return the known targets that a frame did not locate. Call this before `update`."""
         return self._predictor.missing(located)
 
     def update(
@@ -268,11 +270,12 @@ class Steering:
         step: Registration | None = None,
         crowds: GroundCrowds | None = None,
     ) -> tuple[Command, tuple[Adjustment, ...]]:
-        """The command after a frame was located, its places in local metres, and what of it is new with its causes.
+        """Return the command after a frame was located, in local metres, and the adjustments with their causes.
 
-        confirmed: row = that of located.positions. now_s: of the newest frame read; the located one is older. marks,
-        flight: what ground vehicles and the aerial vehicle report now, in local metres, altitude above up = 0; None
-        while silent. step: how the background moved up to the located frame. crowds: seen from the ground at it.
+        confirmed: its rows are rows of located.positions. now_s: time of the newest frame read, which is later than the
+        located frame. marks, flight: current reports of the ground vehicles and of the aerial vehicle, in local metres,
+        altitude above up = 0; None while silent. step: the background's motion to the located frame. crowds: crowds
+        seen from the ground at that frame.
         """
         parameters = self.settings.steering
         self._log.begin(located.frame)
@@ -304,15 +307,15 @@ class Steering:
         return self._command, self._log.made()
 
     def _note_ground(self, prediction: Prediction, crowds: GroundCrowds | None) -> None:
-        """Log how many targets ground vehicles alone see, when that changes."""
+        """Log the number of targets that only ground vehicles see, when it changes."""
         before, self._by_ground = self._by_ground, prediction.target[prediction.by_ground].tolist()
         if new := [target for target in self._by_ground if target not in before]:
             assert crowds is not None
             row = crowds.target.tolist().index(new[0])
             (east, north), speed = crowds.east_north_m[row], float(np.linalg.norm(crowds.velocity_m_s[row]))
             cause = f"target {new[0]} is not located from the air: {crowds.people[row]} of its people seen by "
-            cause += f"{crowds.seen_by[row].replace(';', ' and ')} about ({east:.0f}, {north:.0f}) m"
-            cause += f", going at {speed:.1f} m/s" if np.isfinite(speed) else ""
+            cause += f"{crowds.seen_by[row].replace(';', ' and ')} around ({east:.0f}, {north:.0f}) m"
+            cause += f", moving at {speed:.1f} m/s" if np.isfinite(speed) else ""
         else:
             gone = next((target for target in before if target not in self._by_ground), 0)
             cause = f"target {gone} is {'located from the air again' if gone in prediction.target else 'lost'}"
@@ -330,13 +333,13 @@ class Steering:
         flight: Flight | None,
         step: Registration | None,
     ) -> None:
-        """Of how many frames one is processed."""
+        """Choose k, so that one of k frames is processed."""
         frame, parameters, interval = located.frame, self.settings.steering, self.settings.interval
         between, self._last_frame = max(frame - self._last_frame, 1), frame
         self._costs.append(sum(located.seconds.values()))
         cost, measured = look_cost(self._costs, interval)
         lost = np.flatnonzero(prediction.wanted & (prediction.missed == MISSED))
-        if located.fix.pose is not None and len(lost):  # a target that left the picture is not lost
+        if located.fix.pose is not None and len(lost):  # a target outside the picture does not count as lost
             lost = lost[inside(prediction.east_north_m[lost], located.fix.pose, self.camera) > 0]
         if len(lost):
             self._alert_s, self._alert = now_s + _ALERT_S, f"target {prediction.target[lost[0]]} was lost"
@@ -353,7 +356,7 @@ class Steering:
                 why = f"background flow {step.flow_px / between:.2f} px a frame"
             else:
                 return
-            # A target that is missed for a moment still counts.
+            # A target that was missed in few frames still counts.
             seen = prediction.missed <= MISSED
             speed, size = prediction.speed_m_s[seen], 2 * prediction.radius_m[seen]
             wanted, limit = every_wanted(wanted, self.rate_hz, speed, size, parameters)

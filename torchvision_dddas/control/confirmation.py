@@ -1,9 +1,9 @@
-"""People recognized from the ground decide which blobs seen from the air are human (appendix A, III-B).
+"""Decide by people recognized from the ground which blobs seen from the air are human (appendix A, III-B).
 
-A blob with a person inside its gate is human; one well within a ground camera's view, near enough that a person would
-have been recognized there, and with none near is not; of any other nothing is known. Observations of several vehicles
-and frames add up as log-odds. Beyond the source, which names the idea: the gate is of both covariances, views have an
-extent and can be hidden, and detection and false-alarm rates weigh the evidence.
+A blob with a person inside its gate is human. A blob is not human if it is well within a ground camera's view, near
+enough to recognize a person, and no person is near. Nothing is known about other blobs. Observations of several
+vehicles and frames add up as log-odds. The source gives only the idea. Ours are: a gate from both covariances, views
+with limits and occlusion, and evidence weighted by detection and false-alarm rates.
 """
 
 import math
@@ -23,12 +23,12 @@ HUMAN, NOT_HUMAN, UNSEEN = "human", "not_human", "unseen"
 
 
 @dataclass(frozen=True)
-class View:
-    """Where a camera on the ground would recognize people.
+class GroundView:
+    """The area in which a ground camera can recognize people.
 
-    east_north_m: where it stands, (2,). heading_rad: clockwise from north. half_rad: half the horizontal angle of view.
-    near_m, far_m: between them a body fits into the picture and is as large as the classifier needs. The sigmas are
-    standard deviations of the pose.
+    east_north_m: (2,) position of the camera. heading_rad: clockwise from north. half_rad: half the horizontal angle of
+    view. near_m, far_m: the distances between which a body fits into the picture and is large enough for the
+    classifier. position_sigma_m, heading_sigma_rad: standard deviations of the pose.
     """
 
     east_north_m: np.ndarray
@@ -42,11 +42,11 @@ class View:
 
 def field_of_view(
     camera: Camera, east_north_m: np.ndarray, heading_rad: float, people: PeopleParameters, ground: GroundParameters
-) -> View:
-    """The view of a camera that stands at a place, by the body heights in pixels that the people settings can find."""
+) -> GroundView:
+    """Return the view of a camera at a position, with distances from the body heights that the settings can detect."""
     height_m, (width_px, height_px) = ground.body_height_m, camera.size_px
     aside_px = min(camera.centre_px[0] + 0.5, width_px - 0.5 - camera.centre_px[0])
-    return View(
+    return GroundView(
         np.asarray(east_north_m, float),
         heading_rad,
         math.atan(max(aside_px, 0.0) / camera.focal_px[0]),
@@ -59,13 +59,14 @@ def field_of_view(
 
 @dataclass(frozen=True)
 class GroundObservation:
-    """What one vehicle saw of the blobs in one frame, one row a blob.
+    """The observation of N blobs and M people by one vehicle in one frame, with one row for each blob.
 
-    looked: (N,) bool, whether it tells anything: a person at the blob, or a clear view of it and none near.
-    people: (N,) int64, recognized at it; a blob may be a crowd. nearest_m, nearest_sigmas: (N,) to the nearest person,
-    infinite without any; in boxes NaN. best: (N,) highest probability of those at it, 0 without any; where it is below
-    confirm.least_score they are in doubt, and so is the blob. places: (N,) people that fit into the blob side by side,
-    1 or more; None: one each. blob: (M,) int64, the blob of each probable person, -1 for others.
+    looked: (N,) bool, whether the observation is evidence: a person at the blob, or a clear view of it without a
+    person. people: (N,) int64, number of people recognized at the blob, which may be a crowd. nearest_m,
+    nearest_sigmas: (N,) distance to the nearest person, infinite without people; NaN if the observation is of boxes.
+    best: (N,) highest probability of the people at the blob, 0 without people; below confirm.least_score the blob stays
+    in doubt. places: (N,) number of people that fit side by side into the blob, at least 1; None: one each. blob: (M,)
+    int64, the blob of each probable person, -1 for others.
     """
 
     looked: np.ndarray
@@ -83,13 +84,14 @@ def observe_ground(
     person_m: Float[np.ndarray, "M 2"],
     person_m2: Float[np.ndarray, "M 2 2"],
     score: Float[np.ndarray, "M"],
-    views: Sequence[View],
+    views: Sequence[GroundView],
     parameters: ConfirmParameters,
 ) -> GroundObservation:
-    """One frame on the ground: places and covariances (NaN: unknown) of the blobs and of one vehicle's people.
+    """Return the observation of one frame from positions and covariances of the blobs and of one vehicle's people.
 
-    A person is at the blob that is nearest in standard deviations, if within its gate. A blob whose gate holds only
-    improbable people, or those of another blob, is in doubt. views: of the cameras that found these people.
+    NaN covariances are unknown. A person belongs to the blob that is nearest in standard deviations, if it is within
+    the blob's gate. A blob whose gate contains only improbable people, or people of another blob, is in doubt. views:
+    views of the cameras that found these people.
     """
     blob_m, person_m = np.asarray(blob_m, float).reshape(-1, 2), np.asarray(person_m, float).reshape(-1, 2)
     unknown_m2 = parameters.unknown_sigma_m**2 * np.eye(2)
@@ -99,7 +101,7 @@ def observe_ground(
         for covariance in covariances
     )
     apart = person_m[None] - blob_m[:, None]
-    # A micrometre at least: where nothing is unsure, no distance could be told in standard deviations.
+    # The spread is at least a micrometre, because the sum of the covariances must not be zero.
     both = blob_m2[:, None] + person_m2[None] + max(parameters.spread_m, 1e-6) ** 2 * np.eye(2)
     sigmas = np.sqrt((apart * np.linalg.solve(both, apart[..., None])[..., 0]).sum(-1))
     inside = sigmas <= math.sqrt(-2 * math.log(1 - parameters.gate_probability))  # chi-square of two degrees of freedom
@@ -121,11 +123,11 @@ def observe_picture(
     least_px: float = 0.0,
     aspect: float = 0.4,
 ) -> GroundObservation:
-    """One picture in which both were found: boxes x, y, width, height of the blobs and of the people.
+    """Return the observation of one picture from boxes (x, y, width, height) of its blobs and its people.
 
-    A person is at the blob with the highest IoU among those that share enough with them, measured by the smaller box: a
-    blob may be a crowd, or a part of a body. least_px: a body less tall is not recognized, so that nothing is known of
-    blobs less tall without a person. aspect: of a body, width over height.
+    A person belongs to the blob with the highest IoU among the blobs whose intersection with the person is a large
+    enough share of the smaller box, because a blob may be a crowd or a part of a body. least_px: smallest height of a
+    body that is recognized; a smaller blob without a person stays unknown. aspect: width over height of a body.
     """
     blob_px, person_px = np.asarray(blob_px, float).reshape(-1, 4), np.asarray(person_px, float).reshape(-1, 4)
     common = shared_px(blob_px[:, None], person_px)
@@ -140,9 +142,10 @@ def observe_picture(
 
 @dataclass
 class Beliefs:
-    """Log-odds of being human, by target; as frames go by. Targets and vehicles are named by whatever tells them apart.
+    """The log-odds that targets are human, updated frame by frame. Targets and vehicles are named by unique keys.
 
-    Two looks of one vehicle at one target err alike, so all but the first weigh `fresh` only.
+    Errors of one vehicle's repeated looks at a target are correlated, so all looks but the first have the weight
+    `fresh`.
     """
 
     parameters: ConfirmParameters
@@ -150,7 +153,7 @@ class Beliefs:
     _seen: set[tuple[Hashable, Hashable]] = field(default_factory=set)
 
     def add(self, targets: Sequence[Hashable], observations: Iterable[tuple[Hashable, GroundObservation]]) -> None:
-        """Learn from the observations, (vehicle, observation), of one frame; targets: the name of each row."""
+        """Add the observations of one frame, as pairs (vehicle, observation). targets: the name of each row."""
         for vehicle, seen in observations:
             weights = evidence(seen, self.parameters)
             for row in np.flatnonzero(seen.looked).tolist():
@@ -161,22 +164,23 @@ class Beliefs:
                 self._odds[key] = float(np.clip(odds, -self.parameters.limit, self.parameters.limit))
 
     def probability(self, target: Hashable) -> float:
-        """That a target is human; the prior where nothing was seen of it."""
+        """Return the probability that a target is human; the prior if it was not observed."""
         return 1 / (1 + math.exp(-self._odds.get(target, _log_odds(self.parameters.prior))))
 
     def kind(self, target: Hashable) -> str:
-        """human, not_human or unseen."""
+        """Return the kind of a target: human, not_human or unseen."""
         if target not in self._odds:
             return UNSEEN
         return HUMAN if self.probability(target) >= 0.5 else NOT_HUMAN
 
 
 def evidence(seen: GroundObservation, parameters: ConfirmParameters) -> Float[np.ndarray, "N"]:
-    """What a look adds to the log-odds, (N,); 0 without a look.
+    """Return (N,) what an observation adds to the log-odds; 0 without a look.
 
-    With d and f the detection and false-alarm rates: ln (1 - d)/(1 - f) where nobody is; for a person the odds of their
-    own probability, and ln d/f at most: a probability of 1 is no proof. Each further place in a blob as wide as several
-    people where nobody is says ln (1 - c d)/(1 - f), c = crowd_share: one chance hit makes no crowd of a car.
+    d and f are the detection and false-alarm rates. Without a person the value is ln (1 - d)/(1 - f). With a person it
+    is the log-odds of the person's probability, at most ln d/f, because a probability of 1 is not a proof. In a blob
+    as wide as several people, each place without a person adds ln (1 - c d)/(1 - f), where c = crowd_share, so that a
+    chance detection does not turn a car into a crowd.
     """
     d, f = parameters.detection_rate, parameters.false_rate
     sure = 1 / (1 + f / d)  # the probability whose odds are d/f
@@ -197,9 +201,10 @@ def _assigned(
     score: Float[np.ndarray, "M"],
     parameters: ConfirmParameters,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each person to the nearest blob whose gate they are in.
+    """Assign each person to the nearest blob whose gate contains the person.
 
-    (N,) probable people, (N,) the highest score of any, (M,) the blob of each probable person, -1 for others.
+    Return (N,) the number of probable people, (N,) the highest score of all people, and (M,) the blob of each probable
+    person, -1 for others.
     """
     people, best = np.zeros(len(distance), np.int64), np.zeros(len(distance))
     blob = np.full(distance.shape[1], -1)
@@ -216,19 +221,19 @@ def _assigned(
 
 
 def _is_clear(
-    blob_m: np.ndarray, blob_m2: np.ndarray, person_m: np.ndarray, view: View, parameters: ConfirmParameters
+    blob_m: np.ndarray, blob_m2: np.ndarray, person_m: np.ndarray, view: GroundView, parameters: ConfirmParameters
 ) -> Bool[np.ndarray, "N"]:
-    """Whether a view shows a blob: it is `inside_sigmas` of the standard deviations within, and nothing hides it.
+    """Return (N,) whether a view shows each blob with certainty: it is well inside the view, and nothing occludes it.
 
-    The deviations are the blob's and the camera's. Another blob or a person hides a blob if it stands before it, nearer
-    the camera by a body's width at least.
+    Well inside means by `inside_sigmas` standard deviations of the blob and the camera. Another blob or a person
+    occludes a blob if it is in front of it, nearer to the camera by at least a body's width.
     """
     apart = blob_m - view.east_north_m
     distance = np.maximum(np.linalg.norm(apart, axis=1), 1e-6)
     along = apart / distance[:, None]
     across = np.stack([along[:, 1], -along[:, 0]], axis=1)
     spread = blob_m2 + view.position_sigma_m**2 * np.eye(2)
-    # Rounded covariances may be a little below 0 along an axis.
+    # Rounding may make variances along an axis slightly negative.
     variances = (np.einsum("ni,nij,nj->n", axis, spread, axis) for axis in (along, across))
     radial, lateral = (np.sqrt(np.maximum(variance, 0)) for variance in variances)
     bearing = np.arctan2(along[:, 0], along[:, 1]) - view.heading_rad
@@ -245,7 +250,7 @@ def _is_clear(
 
 @dataclass(frozen=True)
 class Vehicle:
-    """One table of people, and the cameras that found them with their poses; without, no views are known."""
+    """A table of people, and the cameras that found them, with their poses. Without cameras no views are known."""
 
     name: str
     people: Positions
@@ -261,11 +266,12 @@ def confirm_positions(
     lasting: bool = True,
     rate_hz: float | None = None,
 ) -> Iterator[Confirmation]:
-    """Blobs and people on the ground. The vehicles looked at frames 1, 1 + interval, ...
+    """Confirm blobs by people on the ground, and yield a confirmation for each frame.
 
-    lasting: whether a target's number is an identity, so that looks add up over frames.
-    Metres are local ones that all tables share; where cameras stand at degrees, or there are none, and all tables have
-    degrees, these count. Raises InputError for places of different kinds, and poses that do not cover the frames.
+    interval: the vehicles looked at frames 1, 1 + interval, ... lasting: whether a target's number is an identity, so
+    that looks add up over frames. Positions are in local metres that all tables share. If all tables have degrees, and
+    the cameras stand at degrees or there are none, the degrees are used.
+    Raises InputError for positions of different kinds, and for poses that do not cover the frames.
     """
     origin = _origin(blobs, vehicles)
     blob_m, *persons_m = (
@@ -274,7 +280,7 @@ def confirm_positions(
     )
     frames = np.unique(blobs.frame)
     frames = frames[(frames - 1) % interval == 0]
-    views: list[dict[int, list[View]]] = [defaultdict(list) for _ in vehicles]  # by frame
+    views: list[dict[int, list[GroundView]]] = [defaultdict(list) for _ in vehicles]  # by frame
     for vehicle, seen in zip(vehicles, views, strict=True):
         for camera, table in zip(vehicle.cameras, vehicle.poses, strict=True):
             stood, poses = poses_at(camera, table, frames, rate_hz)
@@ -295,7 +301,7 @@ def confirm_positions(
 def confirm_pictures(
     blobs: DetectionTable, people: Sequence[DetectionTable], names: Sequence[str], settings: Settings, interval: int = 1
 ) -> Iterator[Confirmation]:
-    """Blobs and people of the same pictures, as `dddas people` found them at frames 1, 1 + interval, ..."""
+    """Confirm blobs by people that `dddas people` found in the same pictures, at frames 1, 1 + interval, ..."""
     parameters = settings.people
     least_px = smallest_body_px(parameters)
     body_height_px = parameters.height_share * parameters.window_height_px
@@ -328,7 +334,7 @@ def _frames(
         seen = list(observations(number, rows)) if (number - 1) % interval == 0 else []
         if twice := {name for name in targets if targets.count(name) > 1}:
             raise InputError(
-                f"target {min(map(str, twice))} is twice in frame {number}; a target is there once a frame"
+                f"target {min(map(str, twice))} is twice in frame {number}; give each target once in a frame"
             )
         beliefs.add(targets, seen)
         yield summarize(number, rows, targets, beliefs, seen)
@@ -341,7 +347,7 @@ def summarize(
     beliefs: Beliefs,
     seen: Sequence[tuple[str, GroundObservation]],
 ) -> Confirmation:
-    """What is believed of the targets of a frame. rows: their places in their table; seen: who looked in this frame."""
+    """Return the confirmation of a frame's targets. rows: their rows in the table. seen: (vehicle, observation)."""
     count = len(targets)
     unknown = (np.full(count, np.nan) for _ in range(3))
     nothing = GroundObservation(np.zeros(count, bool), np.zeros(count, np.int64), *unknown)
@@ -368,7 +374,7 @@ def _rows(frame: np.ndarray, number: int) -> slice:
 
 
 def _origin(blobs: Positions, vehicles: Sequence[Vehicle]) -> tuple[float, float] | None:
-    """Longitude and latitude of the common metres' origin; None where the tables' own metres are common."""
+    """Return (longitude, latitude) of the common origin for metres; None if the tables already share their metres."""
     tables = [blobs, *(vehicle.people for vehicle in vehicles)]
     geographic = {
         camera.geographic
@@ -388,8 +394,8 @@ def _origin(blobs: Positions, vehicles: Sequence[Vehicle]) -> tuple[float, float
         )
     if not geographic and 0 < len(lacking) < len(tables):
         raise InputError(
-            "some tables have longitude_deg and latitude_deg, others local metres alone, whose origin nothing tells; "
-            "give all in one kind, as one kind of landmarks and cameras makes them"
+            "some tables have longitude_deg and latitude_deg, others only local metres with an unknown origin; "
+            "make all tables with the same kind of landmarks and cameras"
         )
     if geographic == {False} or lacking or not len(blobs):
         return None

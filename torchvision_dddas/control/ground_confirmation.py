@@ -1,4 +1,4 @@
-"""Pictures from ground vehicles: people found in them confirm which targets are human, and show where crowds are."""
+"""Use people in pictures from ground vehicles to confirm which targets are human, and to locate crowds."""
 
 import math
 from dataclasses import replace
@@ -14,23 +14,22 @@ from torchvision_dddas.geo import range_people
 from torchvision_dddas.people import WindowScorer, detect_people
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundCrowds, GroundPicture, Poses
 
-# Nobody runs faster.
+# Targets that move faster than this are not people.
 _RUNNING_M_S = 4.0
-# Bounds of body heights and of the camera's heading, in standard deviations.
+# Range of body heights and of the camera's heading, in standard deviations.
 _SIGMAS = 2.0
-# Targets are within one of where they are said to be: most of it is that of the middle within the outline, and the
-# whole outline is searched, with so much about it.
+# Margin around a target's radius and one standard deviation of its position that is also searched.
 _MARGIN_M = 0.5
-# The ground between rises or falls as steeply, and the camera nods as far.
+# Tolerance for the slope of the ground and for the camera's pitch.
 _SLOPE_RAD = math.radians(5)
-# Half the width of a body's box over its height: a region holds whole boxes.
+# Half the width of a body's box divided by its height. Regions are wide enough for whole boxes.
 _HALF_WIDE = 0.17
-# Standard deviation of the predicted place of a target that the air did not locate.
+# Standard deviation of the predicted position of a target that was not located from the air.
 _PREDICTED_M = 1.0
 
 
 class GroundConfirmation:
-    """What is believed of each target, and where its people are, as pictures from the ground come in."""
+    """Keeps the probability that each target is human, and the positions of its people, from ground pictures."""
 
     def __init__(self, settings: Settings, scorer: WindowScorer) -> None:
         self._settings, self._scorer = settings, scorer
@@ -38,16 +37,16 @@ class GroundConfirmation:
         self._waiting: list[GroundPicture] = []
 
     def take(self, pictures: list[GroundPicture]) -> None:
-        """Pictures of the frames to come, as targets are located some frames later."""
+        """Store pictures until the targets of their frames are located, which is some frames later."""
         self._waiting += pictures
 
     def confirm(
         self, located: AerialLocations, extent_m: np.ndarray, missing: Prediction | None = None
     ) -> tuple[Confirmation, GroundCrowds]:
-        """The confirmation of a frame's targets, by the pictures taken at it and before, and the crowds seen at it.
+        """Return the confirmation of a frame's targets by all pictures so far, and the crowds seen at the frame.
 
-        extent_m: (P,) radius of each located target: its people mount about its middle. missing: targets that were not
-        located in the frame, as predicted for it: they are looked for, and nothing is concluded where nobody is.
+        extent_m: (P,) radius of each located target, within which its people stand. missing: predicted targets that
+        were not located in the frame. People are searched there too, but the absence of people is not evidence.
         """
         positions = located.positions
         targets, count = positions.target, len(positions)
@@ -82,12 +81,12 @@ class GroundConfirmation:
         extent_m: np.ndarray,
         velocity_m_s: np.ndarray,
     ) -> tuple[GroundObservation, np.ndarray]:
-        """What a picture says of targets, and (M, 2) the places of its people."""
+        """Return the observation of targets in a picture, and the (M, 2) positions of its people."""
         settings, camera = self._settings, picture.camera
         heading, place = camera.heading_rad, np.array([camera.place], float)
         if origin_deg is not None:
             place = geometry.east_north(place, origin_deg)
-        # Locations from the air give where to search, and how large people are there.
+        # Locations from the air define the regions to search, and the size of people there.
         regions = expected_regions(target_m, covariance, extent_m, camera, place[0], heading, settings.ground)
         (people,) = detect_people([picture.image], self._scorer, settings.people, [regions])
         n = len(people)
@@ -96,7 +95,7 @@ class GroundConfirmation:
         seen = range_people(people.box_px, people.cut, camera, poses, here, settings.ground)
         known = seen.by != "bearing"
         view = field_of_view(camera, place[0], heading, settings.people, settings.ground)
-        # People of a crowd stand within it, not at its middle: half its radius is about their standard deviation.
+        # The people of a crowd are spread over its radius, with a standard deviation of about half the radius.
         spread = covariance + (extent_m[:, None, None] / 2) ** 2 * np.eye(2)
         person_m, person_m2 = seen.east_north_m[known], seen.covariance_m2[known]
         scores = people.score[known]
@@ -105,14 +104,14 @@ class GroundConfirmation:
 
 
 def _of_first(count: int, seen: GroundObservation) -> GroundObservation:
-    """What was seen of the first targets."""
+    """Return the observation of the first `count` targets."""
     rows = {name: getattr(seen, name)[:count] for name in ("looked", "people", "nearest_m", "nearest_sigmas", "best")}
     return replace(seen, **rows)
 
 
 def drop_fast_targets(seen: GroundObservation, velocity_m_s: np.ndarray) -> GroundObservation:
-    """The look without the people at targets faster than people, (N, 2): they stand beside its way."""
-    fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False where unknown
+    """Drop the people at targets that move too fast to be people. velocity_m_s: (N, 2) of the targets."""
+    fast = np.linalg.norm(velocity_m_s, axis=1) > _RUNNING_M_S  # False for an unknown velocity
     blob = np.where(np.isin(seen.blob, np.flatnonzero(fast)), -1, seen.blob)
     return replace(seen, looked=seen.looked & ~(fast & (seen.people > 0)), blob=blob)
 
@@ -126,10 +125,10 @@ def expected_regions(
     heading_rad: float,
     parameters: GroundParameters,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(R, 4) boxes in the picture within which bodies of the targets in view lie, and (R, 2) heights of these, in px.
+    """Return (R, 4) boxes in the picture that contain the bodies of targets in view, and the (R, 2) body heights, px.
 
-    place_m (N, 2), covariance_m2 (N, 2, 2), radius_m (N,): of the targets. camera_m (2,): where the camera stands, by
-    the same origin. In the form that `people.pyramid.within` takes; a target outside the picture has no region.
+    place_m (N, 2), covariance_m2 (N, 2, 2), radius_m (N,): of the targets. camera_m (2,): position of the camera, with
+    the same origin. The result is in the form of `people.pyramid.within`. A target outside the picture has no region.
     """
     regions: list[list[float]] = []
     heights: list[tuple[float, float]] = []
@@ -149,12 +148,12 @@ def expected_regions(
         left, right = (middle_u + focal_u * math.tan(angle) for angle in (low, high))
         if right < 0 or left > width or abs(off) - half > math.pi / 2:
             continue
-        # Along the axis, over the part of the target that is in view.
+        # Range of depths along the optical axis over the visible part of the target.
         far = (away + reach) * math.cos(min(max(0.0, low), high))
         near = max((away - reach) * math.cos(max(abs(low), abs(high))), nearest_m)
         if far <= near:
             continue
-        # A head above the eye's height is highest when near, one below it when far.
+        # A head above the camera is highest in the picture if near; a head below the camera is highest if far.
         top = horizon - focal_v * (_SLOPE_RAD + max((tall[1] - eye) / near, 0.0))
         bottom = horizon + focal_v * (_SLOPE_RAD + eye / near)
         heights.append((focal_v * tall[0] / far, focal_v * tall[1] / near))

@@ -1,9 +1,10 @@
-"""Crowds by the people that ground vehicles see: their centroids and predicted courses (appendix A, III-B).
+"""Centroids and velocities of crowds from the people that ground vehicles see (appendix A, III-B).
 
-The source averages the places of the people that a vehicle sees, so that the vehicle can predict where the crowd will
-be. Here the looks of several vehicles at several moments count together. A vehicle sees who is on its own side of a
-crowd, and its receiver is off: both move the means of its looks alike. So each vehicle has a mean of its own, all share
-one velocity, found by least squares, and the centroid is the mean of the vehicles' means, moved on to the present.
+The source averages the positions of the people that a vehicle sees, to predict where the crowd will be. Here the looks
+of several vehicles at several times are combined. A vehicle sees the people on its side of a crowd, and its receiver
+has an error; both shift the means of all its looks by the same amount. Therefore each vehicle has its own mean, and all
+share one velocity, which is fitted by least squares. The centroid is the mean of the vehicles' means, extrapolated to
+the current time.
 """
 
 from dataclasses import dataclass
@@ -12,15 +13,15 @@ import numpy as np
 
 from torchvision_dddas.types import Float, GroundCrowds, Int
 
-# Looks this old count: vehicles take pictures of what is sure every 5 s.
+# Looks up to this age are used. Vehicles take pictures of targets that are sure every 5 s.
 _MEMORY_S = 6.0
-# Sum of the squared times of looks, about the mean of each vehicle's, from which on they tell a velocity.
+# A velocity is fitted if the squared times of the looks, relative to each vehicle's mean time, sum to at least this.
 _LEAST_S2 = 2.0
 
 
 @dataclass(frozen=True)
-class _Look:
-    """The people of one crowd in one picture. place_m: (2,) their mean."""
+class _CrowdLook:
+    """The people of one crowd in one picture. place_m: (2,) their mean position. people: their number."""
 
     time_s: float
     vehicle: str
@@ -29,19 +30,19 @@ class _Look:
 
 
 class CrowdLooks:
-    """The looks of the last seconds, by target. Feed it pictures in order of their frames."""
+    """The looks of the last seconds, by target. Add pictures in order of their frames."""
 
     def __init__(self) -> None:
-        self._looks: dict[int, list[_Look]] = {}
+        self._looks: dict[int, list[_CrowdLook]] = {}
 
     def add(self, time_s: float, vehicle: str, target: Int[np.ndarray, "M"], place_m: Float[np.ndarray, "M 2"]) -> None:
-        """Add a picture: of which target each of its people is, below 1 of none, and where they stand."""
+        """Add a picture. target: (M,) the target of each person, below 1 for none. place_m: (M, 2) their positions."""
         for name in np.unique(target[target > 0]).tolist():
             mine = place_m[target == name]
-            self._looks.setdefault(name, []).append(_Look(time_s, vehicle, mine.mean(axis=0), len(mine)))
+            self._looks.setdefault(name, []).append(_CrowdLook(time_s, vehicle, mine.mean(axis=0), len(mine)))
 
     def crowds(self, time_s: float) -> GroundCrowds:
-        """The crowds of which a picture was added at this time."""
+        """Return the crowds that were seen in a picture added at this time."""
         self._looks = {
             name: looks
             for name, all_looks in self._looks.items()
@@ -59,8 +60,8 @@ class CrowdLooks:
         )
 
 
-def _centroid_and_velocity(looks: list[_Look], time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """(2,) and (2,), the velocity NaN where the looks do not tell it; then only those of the last second count."""
+def _centroid_and_velocity(looks: list[_CrowdLook], time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return a crowd's centroid (2,) and velocity (2,). If the velocity is unknown (NaN), use the last second only."""
     names = sorted({look.vehicle for look in looks})
     by_vehicle = [[look for look in looks if look.vehicle == name] for name in names]
     since = [np.array([look.time_s - time_s for look in own]) for own in by_vehicle]

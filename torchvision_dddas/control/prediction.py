@@ -1,4 +1,4 @@
-"""The targets predicted for now: what steers must not wait until the frame on its way is settled."""
+"""Predict the targets for the current time, because steering cannot wait until the newest frame is settled."""
 
 from dataclasses import dataclass
 
@@ -6,33 +6,35 @@ import numpy as np
 
 from torchvision_dddas.types import AerialLocations, Camera, Confirmation, GroundCrowds, Table
 
-# A target counts only after this many locations over this time: most false alarms are gone by then.
+# A target is established after this many locations over this time. Most false alarms end earlier.
 _SIGHTINGS, _LASTING_S = 3, 0.8
-# Gain of the filter of places and velocities, and the distance from which a place is taken as it is: the blob of
-# a crowd swings about as parts of it are detected or not.
+# Gain of the filter for positions and velocities, which is small because the blob of a crowd shifts as parts of it are
+# detected or not. A position further than _FAR_M from its prediction is taken without filtering.
 _BELIEVED, _FAR_M = 0.4, 5.0
-# Speeds above which a target is fast and below which it is so no more; a fast target must be this surely human.
+# A target is fast above _RUNNING_M_S, until it is below _WALKING_M_S. A fast target is wanted only if the probability
+# that it is human is at least _SURE.
 _RUNNING_M_S, _WALKING_M_S, _SURE = 4.5, 3.5, 0.95
-# A lost target is kept for the first time, and moved on by its velocity for the second.
+# A lost target is kept for _KEPT_S, and extrapolated by its velocity for LOST_S.
 _KEPT_S, LOST_S = 8.0, 3.0
-# A lost target is dropped where another one is within this distance: it goes on as that one.
+# A lost target is dropped if a located target is within this distance and the radius: it continues under that identity.
 _RENAMED_M = 3.0
-# A target is given up below the first probability of being human, and taken up again above the second.
+# A target is given up if its probability of being human is at most _GIVEN_UP, and taken up again at _TAKEN_UP.
 _GIVEN_UP, _TAKEN_UP = 0.2, 0.5
 MISSED = 2
-"""A target is lost once this many frames in a row do not show it."""
-# Half of a target's width where no box gives it.
+"""Number of successive frames without a target after which the target counts as lost."""
+# Radius of a target whose box is unknown.
 _RADIUS_M = 1.0
 
 
 @dataclass(frozen=True)
 class Prediction(Table):
-    """The established targets as predicted for now, one row a target.
+    """The established targets, predicted for the current time, with one row for each target.
 
-    target: (N,) int64. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of its box over the ground.
-    probability: (N,) of being human. unseen: (N,) bool, no ground vehicle could tell. wanted: (N,) bool, human or
-    unseen. lost_s: (N,) since the air last located it, by the clock of the frames. missed: (N,) of the latest frames.
-    steady: (N,) bool, its velocity is known. by_ground: (N,) bool, it was last seen from the ground, not from the air.
+    target: (N,) int64 identities. east_north_m, velocity_m_s: (N, 2). radius_m: (N,) half the width of the box on the
+    ground. probability: (N,) that the target is human. unseen: (N,) bool, no ground vehicle has observed it. wanted:
+    (N,) bool, the target is to be followed. lost_s: (N,) time of the located frame minus that of the target's last
+    location from the air. missed: (N,) number of latest frames without the target. steady: (N,) bool, its velocity is
+    known. by_ground: (N,) bool, it was seen last from the ground and not from the air.
     """
 
     target: np.ndarray
@@ -52,18 +54,18 @@ class Prediction(Table):
 
     @property
     def is_human(self) -> np.ndarray:
-        """(N,) bool, ground vehicles saw it and take it for human."""
+        """(N,) bool, ground vehicles have observed the target, and it is probably human."""
         return ~self.unseen & (self.probability >= _TAKEN_UP)
 
     @property
     def speed_m_s(self) -> np.ndarray:
-        """(N,) over the ground."""
+        """(N,) speed over the ground."""
         return np.linalg.norm(self.velocity_m_s, axis=1)
 
 
 @dataclass
-class _Target:
-    """A target as it was last located. human: it is or may be."""
+class _PredictedTarget:
+    """A target at its last location. human: the target is human or may be human."""
 
     place_m: np.ndarray
     velocity_m_s: np.ndarray
@@ -81,7 +83,7 @@ class _Target:
     located_s: float = 0.0
 
     def update(self, place_m: np.ndarray, velocity_m_s: np.ndarray, radius_m: float, time_s: float) -> None:
-        """Take over where the air located it."""
+        """Update the target by a location from the air."""
         self.correct(place_m, velocity_m_s, time_s)
         self.radius_m += _BELIEVED * (radius_m - self.radius_m)
         self.missed, self.sightings, self.by_ground = 0, self.sightings + 1, False
@@ -100,7 +102,7 @@ class _Target:
 
     @property
     def established(self) -> bool:
-        """Whether it was located often and long enough."""
+        """Whether the target was located often enough and over a long enough time."""
         return self.sightings >= _SIGHTINGS and self.seen_s - self.first_s >= _LASTING_S - 1e-6
 
     @property
@@ -109,16 +111,17 @@ class _Target:
 
 
 class TargetPredictor:
-    """The targets of the latest frames. Feed it frames in order."""
+    """Predicts the targets of the latest frames. Pass frames in order to `update`."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._known: dict[int, _Target] = {}
+        self._known: dict[int, _PredictedTarget] = {}
 
     def missing(self, located: AerialLocations) -> Prediction:
-        """The established targets that are lost for longer than their course is trusted, as expected at a frame's time.
+        """Return the established targets that have been lost for longer than LOST_S, predicted for a frame's time.
 
-        Call it before `update`. A shorter gap is bridged better by the course than by what vehicles see.
+        Call this before `update`. Shorter gaps are left out, because extrapolation is then more accurate than the
+        observations of ground vehicles.
         """
         seen, here = located.positions.target, located.positions.east_north_m
         expected = self._predict(located.time_s, located.time_s)
@@ -136,16 +139,18 @@ class TargetPredictor:
         now_s: float,
         crowds: GroundCrowds | None = None,
     ) -> Prediction:
-        """The targets as expected at now_s, after a frame was located.
+        """Add a located frame, and return the targets predicted for now_s.
 
-        confirmed: row = that of its positions. crowds: seen from the ground at the frame. Their rows of `steers` are
-        taken for targets that the air did not locate, which knows a place better.
+        confirmed: its rows are rows of the frame's positions. crowds: crowds seen from the ground at the frame. Their
+        rows with `steers` update targets that were not located from the air; locations from the air are more accurate.
         """
         time_s, targets = located.time_s, located.positions.target.tolist()
         for row, radius in enumerate(self._radii_m(located).tolist()):
             place = located.positions.east_north_m[row]
             if np.isfinite(place).all():
-                known = self._known.setdefault(targets[row], _Target(place, np.zeros(2), radius, time_s, time_s))
+                known = self._known.setdefault(
+                    targets[row], _PredictedTarget(place, np.zeros(2), radius, time_s, time_s)
+                )
                 known.update(place, located.velocity_m_s[row], radius, time_s)
         if confirmed is not None:
             for row, kind, probability in zip(confirmed.row, confirmed.kind, confirmed.probability, strict=True):
@@ -198,7 +203,7 @@ class TargetPredictor:
                 del self._known[target]
 
     def _radii_m(self, located: AerialLocations) -> np.ndarray:
-        """(P,) half the mean side of each located target's box, over the ground."""
+        """Return (P,) half the mean side of each located target's box, in metres on the ground."""
         pose, places = located.fix.pose, located.positions.east_north_m
         if pose is None:
             return np.full(len(places), _RADIUS_M)
@@ -209,5 +214,5 @@ class TargetPredictor:
 
 
 def _is_renamed(place_m: np.ndarray, radius_m: float, here_m: np.ndarray) -> bool:
-    """Whether a target (2,) that is not located goes on as one that is, of those at (N, 2)."""
+    """Return whether a target (2,) that was not located is so near to a located one (N, 2) that it is the same."""
     return len(here_m) > 0 and bool(np.linalg.norm(here_m - place_m, axis=1).min() < _RENAMED_M + radius_m)

@@ -8,19 +8,19 @@ from torchvision_dddas.config import Settings, SteeringParameters
 from torchvision_dddas.detection import WALKER_M_S
 from torchvision_dddas.types import Adjustment
 
-# Of so many frames one is processed: no parameter, but named like one in the record.
+# Name of k in "one of k frames is processed". It is not a parameter, but the record names it like one.
 SAMPLING = "sampling.every"
-# What load shedding changes.
+# The names that load shedding changes.
 SHED = ("registration.keypoints", "people.look_share", SAMPLING)
-# Between two processed frames a target moves by this share of its size at most.
+# Largest motion of a target between two processed frames, as a share of its size.
 _MOVED_SHARE = 0.5
-# How wide a person shows with a shadow: who comes into the picture is at least that.
+# Assumed width of a person with a shadow, for people who enter the picture.
 _WALKER_M = 1.0
-# If a frame takes this many times its budget, the load is lowered to the minimum at once.
+# If a frame takes more than this many times its budget, the load is lowered to the minimum at once.
 _FAR_OVER = 2.0
 # The load is raised again only if the expected time is at most this share of the budget. Otherwise it would oscillate.
 _SPARE = 0.9
-# Expected cost of twice the keypoints, or of a wider search, as a multiple of the present cost.
+# Expected cost with twice the keypoints, or with a wider search, as a multiple of the current cost.
 _DEARER = 1.4
 # Smallest share of the windows that a search for people takes.
 _LEAST_SHARE = 0.002
@@ -31,36 +31,36 @@ _MOST_PATIENCE = 16.0
 def every_wanted(
     interval: float, rate_hz: float, speed_m_s: np.ndarray, size_m: np.ndarray, parameters: SteeringParameters
 ) -> tuple[float, str]:
-    """Of how many frames one should be processed, before rounding and bounds; in words what limits it beside the rule.
+    """Return k, so that one of k frames should be processed, before rounding and bounds, and its limit in words.
 
-    interval: as the rule gives it, before its bounds; sampling_share of it is taken. speed_m_s, size_m: (N,) of the
-    targets that are known. Between two frames none may move by more than half its size: the two places then still share
-    half of it, and are nearer to each other than to any other target, since two that part are a size apart. Where none
-    is known, so that a walker who comes into the picture is found.
+    interval: detection interval from the rule, before its bounds; k is sampling_share of it. speed_m_s, size_m: (N,) of
+    the known targets. k is limited so that no target moves by more than half its size between two processed frames.
+    Its two positions then overlap by half, and are nearer to each other than to any other target. Without a known
+    target, k is limited by the motion of a walker who enters the picture. The text is "" if only the rule limits k.
     """
     wanted = parameters.sampling_share * interval
     known = np.isfinite(speed_m_s) & np.isfinite(size_m) & (size_m > 0)
     if not known.any():
         most = max(float(np.floor(_MOVED_SHARE * _WALKER_M * rate_hz / WALKER_M_S)), 1.0)
-        return (most, "; nothing is found yet") if most < min(wanted, parameters.maximum_every) else (wanted, "")
+        return (most, "; no target is known yet") if most < min(wanted, parameters.maximum_every) else (wanted, "")
     speed_m_s, size_m = speed_m_s[known], size_m[known]
     frames = _MOVED_SHARE * size_m * rate_hz / np.maximum(speed_m_s, 1e-3)
     k = int(frames.argmin())
     if frames[k] >= min(wanted, parameters.maximum_every):
         return wanted, ""
-    # Whole frames, so that it holds.
-    return max(float(np.floor(frames[k])), 1.0), f"; a target of {size_m[k]:.1f} m goes at {speed_m_s[k]:.1f} m/s"
+    # Round down, so that the limit holds.
+    return max(float(np.floor(frames[k])), 1.0), f"; a target of {size_m[k]:.1f} m moves at {speed_m_s[k]:.1f} m/s"
 
 
 def every_least(pixels_per_metre: float, rate_hz: float, parameters: SteeringParameters) -> float:
-    """Of how many frames one is processed at the least: between two of them a walker must move far enough to show."""
+    """Return the smallest k (one of k frames is processed) for which a walker moves by least_move_px."""
     return parameters.least_move_px * rate_hz / (WALKER_M_S * pixels_per_metre)
 
 
 def sampled(
     frame: int, now: int, wanted: float, why: str, parameters: SteeringParameters
 ) -> tuple[int, tuple[Adjustment, ...]]:
-    """Of how many frames one is processed from here on, and the record of its change; steady as `adjust_interval`."""
+    """Return k (process one of k frames) from this frame on, and its change; hysteresis as in `adjust_interval`."""
     new = int(np.clip(round(min(wanted, 1e6)), 1, parameters.maximum_every))
     if new == now or (abs(new - now) == 1 and abs(wanted - now) < 0.75):
         return now, ()
@@ -72,10 +72,11 @@ def sampled(
 
 @dataclass(frozen=True)
 class Load:
-    """How much less than everything is processed, because it takes too long: a rung of `rungs`, 0 is everything.
+    """The current level of load shedding.
 
-    spare_s: since when there is time for more; None while there is none. eased_s: when more was last processed again.
-    patience: by how much longer than calm_s time must be spare, because it was not enough the last time.
+    rung: index into `rungs`, 0 for the full load. spare_s: time since which there has been spare time, None without
+    spare time. eased_s: time at which the load was last raised. patience: factor on calm_s, the time for which there
+    must be spare time before the load is raised; it grows if the load had to be lowered soon after it was raised.
     """
 
     rung: int = 0
@@ -85,10 +86,10 @@ class Load:
 
 
 def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
-    """The levels of load, from full to least: the same parameters by name in each, `sampling.every` the last.
+    """Return the levels of load from full to least. All have the same parameters by name; `sampling.every` is the last.
 
-    First keypoints are halved, then, where people are searched for in regions, a search takes a smaller share of the
-    windows, both of which make a frame cheaper; then only every 2nd, 3rd, ... picture is processed.
+    First the keypoints are halved. Then, if people are searched for in regions, a search takes a smaller share of the
+    windows. Both make a frame cheaper. Then only every 2nd, 3rd, ... picture is processed.
     """
     live, search = base.live, base.people
     narrows = people and search.search == "regions"
@@ -105,12 +106,13 @@ def rungs(base: Settings, people: bool = False) -> list[dict[str, float]]:
 def shed(
     frame: int, now: Load, cost_s: float, apart_s: float, now_s: float, base: Settings, people: bool = False
 ) -> tuple[Load, tuple[Adjustment, ...]]:
-    """How much is processed from here on, and the record of what changed.
+    """Return the level of load from this frame on, and the record of changes.
 
-    cost_s: what a frame takes, as things are; apart_s: from picture to picture, 0: they wait. now_s: by any clock.
-    Less: a rung, when frames take more than `live.load` of the time between them, or a picture more than its deadline;
-    all that makes a frame cheaper, and as many pictures as it takes, when it is more than twice as much. More: when it
-    is expected to fit for calm_s on end; for twice as long each time that it did not last.
+    cost_s: computing time of a frame at the current level. apart_s: time between pictures; 0 if pictures wait, as in a
+    file. now_s: time by any clock. The load is lowered by one level if frames take more than `live.load` of the time
+    between them, or a picture takes longer than its deadline. If frames take more than twice that share, all levels
+    that make a frame cheaper are applied at once, and as many pictures are skipped as necessary. The load is raised if
+    the next level is expected to fit for calm_s without a break; this time doubles whenever a raise did not last.
     """
     parameters, ladder = base.live, rungs(base, people)
     at, last = min(now.rung, len(ladder) - 1), len(ladder) - 1
@@ -128,7 +130,7 @@ def shed(
     if shares[at] > parameters.load or slow:
         far = shares[at] > _FAR_OVER * parameters.load
         to = max(at, cheapest) if far else min(at + 1, last)
-        # How many pictures can be had is known, what a cheaper frame costs is not.
+        # The effect of skipping pictures is known, so apply as many levels as needed. That of cheaper frames is not.
         while (far or at >= cheapest) and shares[to] > parameters.load and to < last:
             to += 1
         undone = now_s - now.eased_s < 2 * now.patience * parameters.calm_s
@@ -139,7 +141,7 @@ def shed(
         return new, record(to, limit)
     spare = _SPARE * parameters.load
     to = at
-    if at > cheapest:  # how much more often it may be is known
+    if at > cheapest:  # the cost of processing more pictures is known, so several levels may be raised at once
         to = next(i for i in range(cheapest, at + 1) if i == at or shares[i] <= spare)
     elif at and _DEARER * cost_s * 1000 <= parameters.deadline_ms and _DEARER * shares[at] <= spare:
         to = at - 1
@@ -154,7 +156,7 @@ def shed(
 
 
 class AdjustmentLog:
-    """The values in force by name, and the adjustments of the present frame."""
+    """The current values by name, and the adjustments of the current frame."""
 
     def __init__(self) -> None:
         self.frame = 0
@@ -162,29 +164,29 @@ class AdjustmentLog:
         self._made: list[Adjustment] = []
 
     def begin(self, frame: int) -> None:
-        """All that is set from here on happened at this frame."""
+        """Start recording adjustments for this frame."""
         self.frame, self._made = frame, []
 
     def set(self, parameter: str, new: float, cause: str, old: float = 0.0, least: float = 0.0) -> None:
-        """Write a value down where it differs by more than `least` from the one in force; old: the one at first."""
+        """Record a new value if it differs by more than `least`. old: the value before the first call."""
         now = self._values.setdefault(parameter, old)
         if abs(new - now) > least:
             self._values[parameter] = new
             self._made.append(Adjustment(self.frame, parameter, float(now), float(new), cause))
 
     def know(self, parameter: str, value: float) -> None:
-        """A value that another line reports."""
+        """Set a current value without an adjustment, because another adjustment states it."""
         self._values[parameter] = value
 
     def add(self, adjustments: tuple[Adjustment, ...]) -> None:
-        """Take over what another rule wrote."""
+        """Add the adjustments of another rule."""
         self._made.extend(adjustments)
 
     def made(self) -> tuple[Adjustment, ...]:
-        """The adjustments of the present frame, in order."""
+        """Return the adjustments of the current frame, in order."""
         return tuple(self._made)
 
 
 def count_of(n: int, what: str) -> str:
-    """1 target, 2 targets."""
+    """Return a count with its noun: 1 target, 2 targets."""
     return f"{n} {what}" + ("" if n == 1 else "s")

@@ -1,4 +1,4 @@
-"""What the system itself notices to go wrong: vehicles that fall silent or leap, pictures that repeat or jerk."""
+"""Detect failures of sensors: vehicles whose reports stop or leap, and pictures that repeat or jerk."""
 
 import math
 from dataclasses import dataclass
@@ -7,20 +7,21 @@ import numpy as np
 
 from torchvision_dddas.types import Frame, Landmarks, Registration, Telemetry
 
-# A vehicle without reports for this time is silent, if reports came faster before.
+# A vehicle is silent if it has not reported for this time, or for _SLOWER times the usual time between its reports if
+# that is longer.
 _SILENT_S = 2.0
-# For rare reports, silence is this many times the usual time between them.
 _SLOWER = 3.0
-# A report further from the last one than the vehicle could have driven, by this much, is a leap.
+# A report is a leap if its distance from the last one exceeds the sum of _LEAP_M, _LEAP_SIGMAS standard deviations, and
+# the distance that a vehicle drives at _FASTEST_M_S.
 _LEAP_M, _LEAP_SIGMAS, _FASTEST_M_S = 3.0, 6.0, 5.0
-# A change of the ground's velocity in the picture's middle above this, against the median of the second time, is a
-# jerk, as by a gust.
+# A jerk, for example by a gust, is a change of the ground's velocity in the picture's centre by more than _JERK_M_S
+# from the median of the last _USUAL_S.
 _JERK_M_S, _USUAL_S = 4.0, 2.0
 
 
 @dataclass(frozen=True)
 class Notice:
-    """Something that was noticed, at a frame."""
+    """A failure or a recovery of a sensor, noticed at a frame."""
 
     frame: int
     time_s: float
@@ -28,10 +29,10 @@ class Notice:
 
 
 class SensorMonitor:
-    """Compares what comes in with what came before. Ask it once a scene."""
+    """Compares reports and pictures with earlier ones. Call its checks once for each scene."""
 
     def __init__(self, names: tuple[str, ...], rate_hz: float) -> None:
-        """names: of the ground vehicles. rate_hz: frames a second."""
+        """Start without reports. names: names of the ground vehicles. rate_hz: frames a second."""
         self._names, self._rate_hz = names, rate_hz
         self._picture: np.ndarray | None = None
         self._repeated = 0
@@ -42,31 +43,31 @@ class SensorMonitor:
         self._notices: list[Notice] = []
 
     def notices(self) -> list[Notice]:
-        """What was noticed since this was last asked, in the order of frames."""
+        """Return the notices since the last call, in the order of frames."""
         new, self._notices = sorted(self._notices, key=lambda notice: notice.frame), []
         return new
 
     def check_reports(self, now: int, landmarks: Landmarks, telemetry: Telemetry) -> None:
-        """What all vehicles said until frame `now`; places in local metres."""
+        """Check the reports of all vehicles up to frame `now`. Positions are in local metres."""
         placed = np.isfinite(landmarks.place).all(axis=1)
         for which, name in enumerate(self._names):
             own = landmarks.landmark == which
             rows = np.flatnonzero(own & ~landmarks.planned & (landmarks.frame <= now) & placed)
             when_s = (landmarks.frame[rows] - 1) / self._rate_hz
             ahead = (own & landmarks.planned & (landmarks.frame > now)).any()
-            bridge = "its plan stands in for it" if ahead else "nothing stands in for it"
+            bridge = "its planned waypoints are used" if ahead else "it has no planned waypoints"
             self._check_silence(
-                now, name, when_s, f"{name} reports no place", bridge, f"{name} reports its place again"
+                now, name, when_s, f"{name} reports no position", bridge, f"{name} reports its position again"
             )
             self._check_leaps(which, now, when_s, landmarks.place[rows], landmarks.sigma_m[rows])
         when_s = telemetry.time_s[np.isfinite(telemetry.place).all(axis=1)]
-        silent, bridge = "the UAV says nothing of itself", "landmarks alone tell its place"
+        silent, bridge = "the UAV sends no telemetry", "only landmarks give its position"
         self._check_silence(now, "uav", when_s, silent, bridge, "the UAV reports again")
 
     def check_picture(self, frame: Frame, step: Registration | None, metres_per_px: float) -> None:
-        """The next picture that was read. step: how the ground moved in it since the one before.
+        """Check the next picture. step: the background's motion since the picture before.
 
-        metres_per_px: on the ground below its middle; NaN where unknown.
+        metres_per_px: scale on the ground in the picture's centre, NaN if unknown.
         """
         same = self._picture is not None and np.array_equal(self._picture, frame.image)
         self._picture = frame.image
@@ -76,13 +77,13 @@ class SensorMonitor:
                 self._say(frame.number, "the picture repeats the one before: the camera is frozen")
         elif self._repeated:
             count = f"{self._repeated} picture{'s' if self._repeated > 1 else ''}"
-            self._say(frame.number, f"the camera sees again: {count} repeated the one before")
-            self._repeated = 0  # what moved meanwhile came at once
+            self._say(frame.number, f"the camera works again: {count} repeated the one before")
+            self._repeated = 0  # do not check for a jerk here, because this step covers all of the frozen time
         elif step is not None and step.reliable and math.isfinite(metres_per_px):
             self._check_jerk(frame, step, metres_per_px)
 
     def _check_silence(self, now: int, who: str, when_s: np.ndarray, silent: str, bridge: str, back: str) -> None:
-        """Who was silent for long, or is heard again. when_s: times of all its reports."""
+        """Notice whether a vehicle falls silent or reports again. when_s: times of all its reports."""
         now_s = (now - 1) / self._rate_hz
         last_s = float(when_s[-1]) if len(when_s) else 0.0
         usual_s = float(np.median(np.diff(when_s))) if len(when_s) > 2 else 0.0
@@ -94,7 +95,7 @@ class SensorMonitor:
             self._say(now, f"{silent} for {now_s - last_s:.1f} s: {bridge}")
 
     def _check_leaps(self, which: int, now: int, when_s: np.ndarray, place_m: np.ndarray, sigma_m: np.ndarray) -> None:
-        """Reports that are further from the one before than the vehicle can have driven."""
+        """Notice reports that are further from the report before than the vehicle can have driven."""
         for time_s, place, sigma in zip(when_s.tolist(), place_m, np.nan_to_num(sigma_m).tolist(), strict=True):
             before_s, before = self._last.get(which, (-math.inf, place))
             if time_s <= before_s:
@@ -105,7 +106,7 @@ class SensorMonitor:
             self._last[which] = time_s, place
 
     def _check_jerk(self, frame: Frame, step: Registration, metres_per_px: float) -> None:
-        """Whether the picture's middle moves in another way than it did for a while."""
+        """Notice a sudden change of the ground's velocity in the picture's centre."""
         middle = np.array([(frame.image.shape[1] - 1) / 2, (frame.image.shape[0] - 1) / 2, 1.0])
         moved = step.later_from_earlier @ middle
         speed = (moved[:2] / moved[2] - middle[:2]) * metres_per_px * self._rate_hz / (frame.skipped + 1)

@@ -1,4 +1,4 @@
-"""Where the aerial vehicle should look and fly: the crowds stay in its picture, and landmarks enough to locate them."""
+"""Choose the view and the altitude of the aerial vehicle: keep crowds, and enough landmarks, in its picture."""
 
 import numpy as np
 
@@ -7,42 +7,42 @@ from torchvision_dddas.control.footprint import CameraMount
 from torchvision_dddas.control.prediction import Prediction
 from torchvision_dddas.control.rules import AdjustmentLog, count_of
 
-# Landmarks that a picture needs for its fix.
+# Number of landmarks that a picture needs for its fix.
 NEEDED = 4
-# Margin of the targets inside the picture, as a share of its half: at least; after a climb; and
-# so that it may come down again.
+# Margins of the targets inside the picture, as shares of half the picture: the smallest, the one after a climb, and the
+# one required for a descent.
 _LEAST, _AIMED, _EASY = 0.1, 0.2, 0.35
-# The same for landmarks.
+# Smallest margin of landmarks.
 _LANDMARK = 0.08
-# The picture's middle is drawn along once the targets are further off than this share of its half.
+# The view moves when the targets are further from the picture's centre than this share of half the picture.
 _LEASH = 0.12
-# It crosses half the picture in this time at the fastest, or goes this many times as fast as the targets: a picture
-# that sweeps over the ground shows nothing that moves.
+# Highest speed of the view: half the picture in _CROSSING_S, or _FASTER times the targets' speed. In a picture that
+# sweeps over the ground no motion is detected.
 _CROSSING_S, _FASTER = 5.0, 1.5
 # Targets should stay in the picture for this time.
 _AHEAD_S = 3.0
-# One step of altitude, and the time between a change and a step down.
+# Factor of one step of altitude, and the time between a change of altitude and a step down.
 _STEP, _SETTLED_S = 1.1, 5.0
-# Without targets it climbs two steps each time after the first, and returns to the team after the second.
+# Without targets the UAV climbs by two steps every _WIDEN_S, and returns to the team after _GIVEN_UP_S.
 _WIDEN_S, _GIVEN_UP_S = 4.0, 30.0
-# Smallest size of a body of the expected size, which limits the altitude.
+# Smallest size in the picture of a target of expected_size_m. It limits the altitude.
 _LEAST_PX = 6.0
-# A move of the picture's middle by this share of its half is logged.
+# A motion of the view by at least this share of half the picture is logged.
 _NOTED = 0.5
 
 
 class UavSteering:
-    """Commanded view and altitude of the aerial vehicle; None: as by itself."""
+    """Computes the commanded view and altitude of the aerial vehicle; None leaves them to the vehicle."""
 
     def __init__(self, settings: Settings, log: AdjustmentLog) -> None:
         self.settings, self._log = settings, log
         self.look_at: np.ndarray | None = None
         self.altitude_m: float | None = None
-        self.home_m = 0.0  # its altitude at the start
-        self._home_at: np.ndarray | None = None  # where it looked when it was steered first
+        self.home_m = 0.0  # altitude at the start
+        self._home_at: np.ndarray | None = None  # centre of the view at the first command
         self._now_s = 0.0
-        self._moved_s = -np.inf  # when the altitude was changed last
-        self._found_s: float | None = None  # when a target was predicted last
+        self._moved_s = -np.inf  # time of the last change of altitude
+        self._found_s: float | None = None  # time at which a target was predicted last
         self._group: set[int] = set()
 
     def update(
@@ -53,9 +53,9 @@ class UavSteering:
         ground_in_middle: np.ndarray | None,
         now_s: float,
     ) -> None:
-        """Update view and altitude by the predicted targets and the places (V, 2) of the team's vehicles.
+        """Update view and altitude by the predicted targets and the positions (V, 2) of the team's vehicles.
 
-        ground_in_middle: (2,) the ground in the middle of the picture. Nothing is asked where the view is not known.
+        ground_in_middle: (2,) ground position in the centre of the picture. Without a mount nothing is commanded.
         """
         lapse_s, self._now_s = now_s - self._now_s, now_s
         if mount is None:
@@ -74,40 +74,43 @@ class UavSteering:
         self._found_s = now_s
         rows = self._choose(prediction, rows, mount)
         points, velocity = prediction.east_north_m[rows], prediction.velocity_m_s[rows]
-        # Where they are and where they will be: climbing takes time.
+        # Aim at the current and the future positions of the targets, because climbing takes time.
         goal, height, why = self._aim(np.r_[points, points + _AHEAD_S * velocity], team_m, altitude, mount)
         east, north = points.mean(axis=0)
-        why = f"{count_of(len(rows), 'target')} about ({east:.0f}, {north:.0f}) m: {why}"
+        why = f"{count_of(len(rows), 'target')} around ({east:.0f}, {north:.0f}) m: {why}"
         self._climb(height, altitude, mount, why)
         speed = float(np.linalg.norm(velocity.mean(axis=0)))
         self._look(goal, mount.half_m(self.altitude_m or altitude), speed, lapse_s, why)
 
     def followed(self, prediction: Prediction) -> np.ndarray:
-        """The targets that are followed: the group in the picture, or all that is wanted."""
+        """Return the rows of the targets to follow: the chosen group, or all wanted targets if it is gone."""
         rows = np.flatnonzero(prediction.wanted)
         held = rows[np.isin(prediction.target[rows], list(self._group))]
         return held if len(held) else rows
 
     def highest_m(self, mount: CameraMount) -> float:
-        """How high it may go: by the settings, twice the altitude at the start, and while bodies measure enough."""
+        """Return the highest allowed altitude, at which a target of the expected size still measures _LEAST_PX.
+
+        It is also limited by the settings, or else by twice the initial altitude.
+        """
         limit = self.settings.steering.maximum_altitude_m or 2 * self.home_m
         size_m = self.settings.gates.expected_size_m
         return float(max(self.home_m, min(limit, size_m * float(np.mean(mount.camera.focal_px)) / _LEAST_PX)))
 
     def _choose(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount) -> np.ndarray:
-        """All that is wanted, where it can be in one picture; else the group that weighs most, not lightly another."""
+        """Return all wanted targets if they fit into one picture, else the heaviest group, with hysteresis."""
         highest, places = self.highest_m(mount), prediction.east_north_m
         groups = [rows]
         if mount.centre(places[rows], highest)[1] < _LEAST:
             groups = []
             for seed in rows.tolist():
-                # A target and those nearest to it, as long as all are in one picture.
+                # A group is a target and its nearest neighbours, as long as all fit into one picture.
                 group = [seed]
                 for row in rows[np.argsort(np.linalg.norm(places[rows] - places[seed], axis=1), kind="stable")]:
                     if row != seed and mount.centre(places[[*group, row]], highest)[1] >= _LEAST:
                         group.append(int(row))
                 groups.append(np.array(group))
-        # Recognized people count more than targets that no vehicle has seen yet, and large crowds more than small ones.
+        # Recognized people weigh more than targets that no vehicle has seen yet, and large crowds more than small ones.
         weights = prediction.probability * np.maximum(prediction.radius_m, 0.5)
         members = [set(prediction.target[group].tolist()) for group in groups]
         held = max(len(self._group & group) for group in members)
@@ -122,7 +125,7 @@ class UavSteering:
     def _aim(
         self, points: np.ndarray, team_m: np.ndarray, altitude: float, mount: CameraMount
     ) -> tuple[np.ndarray, float, str]:
-        """Where to look so that targets and four landmarks are in the picture; the altitude it takes; why."""
+        """Return the position to look at and the altitude that show targets and landmarks, and the reason in words."""
         needed, highest, height = min(NEEDED, len(team_m)), self.highest_m(mount), altitude
         while True:
             place = _between(points, team_m, needed, height, mount, _LEAST if height == altitude else _AIMED)
@@ -132,7 +135,7 @@ class UavSteering:
                 lower = max(height / _STEP, self.home_m)
                 can = lower < 0.99 * height and self.altitude_m is not None
                 if can and _between(points, team_m, needed, lower, mount, _EASY) is not None:
-                    return place, lower, "fit easily from lower, too"
+                    return place, lower, "they also fit well from a lower altitude"
                 return place, height, f"in the picture with {needed} landmarks" if needed else "in the picture"
             if height >= highest - 1e-6:
                 break
@@ -149,7 +152,7 @@ class UavSteering:
         self._log.set("uav.altitude_m", round(height, 1), why, old=round(mount.altitude_m, 1))
 
     def _look(self, goal: np.ndarray, half: float, speed: float, lapse_s: float, why: str) -> None:
-        """Draw the middle of the picture along, once the goal is further off than the leash."""
+        """Move the view towards the goal if the goal is further away than the leash."""
         assert self.look_at is not None
         before, apart = self.look_at, goal - self.look_at
         distance = float(np.linalg.norm(apart))
@@ -163,10 +166,10 @@ class UavSteering:
     def _search(
         self, prediction: Prediction, team_m: np.ndarray, altitude: float, mount: CameraMount, lapse_s: float
     ) -> None:
-        """Without targets: wait where the last one was, see more from higher, and at last go back to the team."""
+        """Without targets, wait over the last one, then climb to see more, and at last return to the team."""
         gone_s = np.inf if self._found_s is None else self._now_s - self._found_s
         if self._group & set(prediction.target.tolist()):
-            why = f"target {min(self._group)} goes on, but is not human"
+            why = f"target {min(self._group)} is still there, but is not human"
         elif gone_s > _GIVEN_UP_S:
             why = f"no target for {_GIVEN_UP_S:.0f} s"
         else:
@@ -184,7 +187,10 @@ class UavSteering:
 def _between(
     points: np.ndarray, team_m: np.ndarray, needed: int, altitude: float, mount: CameraMount, margin: float
 ) -> np.ndarray | None:
-    """The place nearest the targets' middle that shows them and so many landmarks; None where there is none."""
+    """Return the position nearest the targets' centre that shows them and `needed` landmarks, or None.
+
+    margin: smallest margin of the targets inside the picture.
+    """
     middle, within = mount.centre(points, altitude)
     if within < margin:
         return None

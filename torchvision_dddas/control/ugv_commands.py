@@ -1,6 +1,6 @@
-"""The orders of the ground vehicles: stations that move with the crowd, closer looks, and when a picture is wanted.
+"""Compute the orders of the ground vehicles: stations that move with the crowd, closer looks, and picture requests.
 
-Stations are on a ring about the crowd, never on one line; vehicles look at targets in doubt.
+Stations lie on a ring around the crowd, so that they are never on one line. Vehicles look at targets in doubt.
 """
 
 from collections.abc import Sequence
@@ -15,52 +15,53 @@ from torchvision_dddas.control.rules import AdjustmentLog, count_of
 from torchvision_dddas.geometry import cheapest
 from torchvision_dddas.types import LandmarkObservations, Order
 
-# Vehicles on the ring that locating needs.
+# Number of vehicles on the ring that location from the air needs.
 _NEEDED = 4
-# No vehicle comes nearer to the border of a crowd than this: from above they would be one blob.
+# Smallest distance of a vehicle from the edge of a crowd. Nearer vehicles would merge with the crowd's blob from above.
 _KEEP_OFF_M = 5.0
-# A station is this far within the aerial picture, as a share of its half.
+# Smallest margin of a station inside the aerial picture, as a share of half the picture.
 _WITHIN = 0.2
-# Turns of the ring that are tried; the assignment changes where the total way shrinks below this share, and ways are
-# longer than this share of the ring's radius.
+# Number of rotations of the ring that are tried. The assignment changes only if the total distance to drive falls below
+# _BETTER of the current one, and the mean distance is at least _NEAR of the ring's radius.
 _TURNS, _BETTER, _NEAR = 12, 0.75, 0.5
-# A vehicle that reports no place still counts for this time: planned waypoints bridge dropouts.
+# A vehicle that reports no position still counts for this time, because planned waypoints bridge dropouts.
 _SILENT_S = 10.0
-# A vehicle that was near becomes far beyond this many times near_m.
+# A vehicle that was near its goal counts as far from it beyond this multiple of near_m.
 _FAR = 1.5
-# A target is sure above the first probability until it falls below the second; then only every n-th picture is taken.
+# A target is sure above the probability _SURE, until it falls below _UNSURE. Of a sure target only every _SELDOM-th
+# picture is taken.
 _SURE, _UNSURE, _SELDOM = 0.95, 0.9, 5
-# A vehicle sent to a target stays for the first time at most; the target is left alone for the second.
+# A vehicle sent to a target without a result returns after _TRIED_S, and no vehicle is sent there for _LET_BE_S.
 _TRIED_S, _LET_BE_S = 15.0, 30.0
-# A vehicle looks at a target for this time at least.
+# Shortest time for which a vehicle looks at a target.
 _LOOK_S = 2.0
-# The ring is at most this many times station_m wide: vehicles are sent to targets further away.
+# Largest radius of the ring in units of station_m. Vehicles are sent to targets further away.
 _WIDEST = 1.5
-# Stations are around the crowd as predicted this much later.
+# Stations lie around the crowd as predicted for this much later.
 _LEAD_S = 1.0
 
 
 @dataclass(frozen=True)
 class _Ring:
-    """Places about a middle. turn_rad: of the first, clockwise from north."""
+    """Positions on a circle. turn_rad: bearing of the first position, clockwise from north."""
 
     middle_m: np.ndarray
     radius_m: float
     turn_rad: float = 0.0
 
     def places(self, count: int) -> np.ndarray:
-        """(count, 2), evenly about the middle: any three of them make a triangle."""
+        """Return (count, 2) evenly spaced positions on the circle, no three of which lie on a line."""
         bearing = self.turn_rad + 2 * np.pi * np.arange(count) / count
         return self.middle_m + self.radius_m * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
 
     def ways(self, team_m: np.ndarray) -> np.ndarray:
-        """(V, V) metres from each vehicle to each place."""
+        """Return the (V, V) distances in metres from each vehicle to each of V positions."""
         return np.linalg.norm(team_m[:, None] - self.places(len(team_m))[None], axis=2)
 
 
 @dataclass
 class _Vehicle:
-    """State of one vehicle, and its orders."""
+    """The state of a ground vehicle, and its orders."""
 
     place_m: np.ndarray
     heard_s: float
@@ -74,7 +75,7 @@ class _Vehicle:
 
 
 class UgvTeam:
-    """The ground vehicles, by name."""
+    """Computes the orders of the ground vehicles."""
 
     def __init__(self, settings: Settings, vehicles: Sequence[str], log: AdjustmentLog) -> None:
         self.parameters, self.names, self._log = settings.steering, tuple(vehicles), log
@@ -86,7 +87,7 @@ class UgvTeam:
         self._now_s = 0.0
 
     def hear(self, marks: LandmarkObservations, now_s: float) -> np.ndarray:
-        """Take over the places that the team reports; returns those (V, 2) of the present vehicles."""
+        """Take the reported positions of the team, and return the positions (V, 2) of vehicles that are not silent."""
         self._now_s = now_s
         for row, place in zip(marks.landmark.tolist(), marks.east_north_m, strict=True):
             if 0 <= row < len(self.names) and np.isfinite(place).all():
@@ -98,16 +99,16 @@ class UgvTeam:
             why = f"{self.names[row]} silent for {_SILENT_S:.0f} s"
             self._log.set("team.vehicles", len(self._known), why, old=before)
         if before == len(self._known):
-            self._log.set("team.vehicles", before, "all that report", old=before)
+            self._log.set("team.vehicles", before, "number of vehicles that report", old=before)
         self._known = dict(sorted(self._known.items()))
         return np.array([vehicle.place_m for vehicle in self._known.values()]).reshape(-1, 2)
 
     def orders(self, prediction: Prediction, rows: np.ndarray, mount: CameraMount | None) -> tuple[Order, ...]:
-        """Orders for each vehicle that was heard; none without targets. rows: the targets that are followed."""
+        """Return orders for all vehicles that are not silent; none without targets. rows: the targets to follow."""
         if not len(rows) or not self._known:
             self._ring = None
             return ()
-        # Around the followed targets, a little later.
+        # Stations lie around the positions of the followed targets a little later.
         later = prediction.east_north_m[rows] + _LEAD_S * prediction.velocity_m_s[rows]
         middle = later.mean(axis=0) if mount is None else mount.centre(later, mount.altitude_m)[0]
         self._send(prediction)
@@ -128,7 +129,7 @@ class UgvTeam:
         team_m: np.ndarray,
         mount: CameraMount | None,
     ) -> np.ndarray:
-        """(V, 2) the goals of those on the ring and of those sent to look."""
+        """Return the (V, 2) goals of the vehicles on the ring and of the vehicles sent to targets."""
         parameters, vehicles = self.parameters, list(self._known.values())
         reach = np.linalg.norm(prediction.east_north_m[rows] - middle, axis=1) + prediction.radius_m[rows]
         radius = float(np.clip(reach.max() + _KEEP_OFF_M, parameters.station_m, _WIDEST * parameters.station_m))
@@ -142,10 +143,10 @@ class UgvTeam:
             self._on_ring = names
             goals[on] = self._ring.places(len(on))[self._place_of]
             about = f"{count_of(len(rows), 'target')} at ({middle[0]:.0f}, {middle[1]:.0f}) m"
-            self._log.set("team.ring_m", round(radius, 1), f"{count_of(len(on), 'vehicle')} about {about}", least=2.0)
+            self._log.set("team.ring_m", round(radius, 1), f"{count_of(len(on), 'vehicle')} around {about}", least=2.0)
         for k, vehicle in enumerate(vehicles):
             if vehicle.sent_to >= 0:
-                # A place from which it sees the target well, on its own side of it.
+                # Choose a position from which the vehicle sees the target well, on the vehicle's side of the target.
                 row = int(np.flatnonzero(prediction.target == vehicle.sent_to)[0])
                 place = prediction.east_north_m[row] + _LEAD_S * prediction.velocity_m_s[row]
                 apart = team_m[k] - place
@@ -154,7 +155,7 @@ class UgvTeam:
         tied = on if len(vehicles) > _NEEDED else list(range(len(vehicles)))
         if mount is None:
             return goals
-        # Those outside the aerial picture of the middle are drawn towards it until they are well within.
+        # Move stations that lie outside the aerial picture towards its centre until they are well inside.
         drawn = goals[tied]
         for share in np.linspace(1.0, 0.3, 8):
             outside = mount.inside(drawn, middle, mount.altitude_m) < _WITHIN
@@ -165,7 +166,7 @@ class UgvTeam:
         return goals
 
     def _send(self, prediction: Prediction) -> None:
-        """Send vehicles to targets that cannot be seen from the ring, and call back those that have seen enough."""
+        """Send vehicles to targets that cannot be seen from the ring, and call back vehicles that have seen enough."""
         now_s, needs = self._now_s, _need(prediction)
         row_of = {target: row for row, target in enumerate(prediction.target.tolist())}
         for v, vehicle in self._known.items():
@@ -177,7 +178,7 @@ class UgvTeam:
             elif not prediction.unseen[row] and needs[row] < 1 - _UNSURE:
                 why = f"target {vehicle.sent_to}: {_describe(prediction, row)}"
             elif now_s - vehicle.sent_s > _TRIED_S:
-                why = f"target {vehicle.sent_to} told nothing for {_TRIED_S:.0f} s"
+                why = f"target {vehicle.sent_to} was not recognized within {_TRIED_S:.0f} s"
                 self._let_be[vehicle.sent_to] = now_s
             if why:
                 vehicle.sent_to = -1
@@ -202,7 +203,7 @@ class UgvTeam:
             away_m = {v: float(np.linalg.norm(vehicle.place_m - place)) for v, vehicle in idle.items()}
             v = min(away_m, key=lambda vehicle: away_m[vehicle])
             if away_m[v] - prediction.radius_m[row] < 0.8 * self.parameters.look_m:
-                continue  # somebody sees it already
+                continue  # a vehicle is near enough to see the target already
             idle[v].sent_to, idle[v].sent_s = target, now_s
             why = f"{far_m[row]:.0f} m from the nearest station: {_describe(prediction, row)}"
             self._log.set(f"{self.names[v]}.sent_to", target, why)
@@ -212,24 +213,24 @@ class UgvTeam:
         vehicle, parameters, name = self._known[v], self.parameters, self.names[v]
         away = float(np.linalg.norm(station - vehicle.place_m))
         vehicle.near = away < parameters.near_m * (_FAR if vehicle.near else 1.0)
-        # It must not fall behind a crowd that walks faster than it should go near it.
+        # The vehicle must not fall behind a crowd that moves faster than slow_m_s.
         slow = round(min(max(parameters.slow_m_s, 1.1 * drift_m_s), max(parameters.fast_m_s, parameters.slow_m_s)), 1)
         speed = slow if vehicle.near else parameters.fast_m_s
-        why = f"{away:.0f} m from its station, the crowd goes at {drift_m_s:.1f} m/s"
+        why = f"{away:.0f} m from its station, the crowd moves at {drift_m_s:.1f} m/s"
         self._log.set(f"{name}.speed_m_s", speed, why, least=1.0)
         row = self._watch(v, prediction)
         return Order(name, goal, speed, prediction.east_north_m[row], self._is_pictured(v, prediction, row))
 
     def _watch(self, v: int, prediction: Prediction) -> int:
-        """The row of the target that a vehicle looks at.
+        """Return the row of the target that a vehicle should look at.
 
-        Those in reach before others; of these the one most in need, and of equals the nearest.
+        Targets in reach come first; among them the target most in need of a look, and among equals the nearest.
         """
         vehicle, name = self._known[v], self.names[v]
         distance = np.linalg.norm(prediction.east_north_m - vehicle.place_m, axis=1)
         beyond, held = distance - prediction.radius_m, prediction.target == vehicle.watches
-        doubt = np.round(_need(prediction) * 4) / 4  # what differs by less is alike
-        # A vehicle that changed its mind at each step would see nothing.
+        doubt = np.round(_need(prediction) * 4) / 4  # rounded, so that small differences do not count
+        # Prefer the current target, because a vehicle that switches at every step would see nothing.
         in_reach = beyond <= self.parameters.look_m * np.where(held, 1.1, 1.0)
         row = int(np.argmax(2.0 * in_reach + doubt + 0.2 * held - 1e-3 * np.maximum(beyond, 0)))
         if held.any() and self._now_s - vehicle.watched_s < _LOOK_S:
@@ -249,14 +250,14 @@ class UgvTeam:
         return self.parameters.picture_s * (_SELDOM if vehicle.sure else 1)
 
     def _is_pictured(self, v: int, prediction: Prediction, row: int) -> bool:
-        """Whether it is time for a picture: seldom of what is sure, never of what is out of reach."""
+        """Return whether a picture is due: rarely of a sure target, and never of a target out of reach."""
         vehicle = self._known[v]
         vehicle.sure = _is_sure(prediction, row, vehicle.sure)
         period = self._period_s(vehicle)
         why = f"target {prediction.target[row]}: {_describe(prediction, row)}"
         self._log.set(f"{self.names[v]}.picture_s", period, why, old=self.parameters.picture_s)
         beyond = float(np.linalg.norm(prediction.east_north_m[row] - vehicle.place_m)) - float(prediction.radius_m[row])
-        # One vehicle after the other, each in its part of the period.
+        # Vehicles take pictures one after another, each in its own part of the period.
         shift_s = 1e-6 - v * period / len(self.names)
         turn, last = (int((when_s + shift_s) // period) for when_s in (self._now_s, vehicle.pictured_s))
         if beyond > self.parameters.look_m or turn == last:
@@ -266,9 +267,10 @@ class UgvTeam:
 
 
 def _assign(team_m: np.ndarray, ring: _Ring, now: np.ndarray | None) -> tuple[_Ring, np.ndarray]:
-    """The ring, turned, and which of its places (V,) each of the vehicles at (V, 2) takes, by the shortest ways.
+    """Return the rotated ring, and for each vehicle (V,) the index of its position, for the shortest total distance.
 
-    now: the places in force; they stay as they are unless others save a quarter of ways that are long.
+    team_m: (V, 2) positions of the vehicles. now: (V,) current indices. They are kept unless the distances are
+    long and another assignment shortens them by a quarter.
     """
     count, held = len(team_m), np.inf
     if now is not None:
@@ -286,9 +288,9 @@ def _assign(team_m: np.ndarray, ring: _Ring, now: np.ndarray | None) -> tuple[_R
 
 
 def _keep_off(places_m: np.ndarray, prediction: Prediction, from_m: np.ndarray) -> np.ndarray:
-    """The places (V, 2), those too near a target moved away from it, towards where the vehicle is (V, 2)."""
+    """Move positions (V, 2) that are too near a target away from it. from_m: (V, 2) positions of the vehicles."""
     moved = places_m.copy()
-    for _ in range(3):  # away from one may be nearer to another
+    for _ in range(3):  # repeat, because moving away from one target may bring a position near another
         for place, radius in zip(prediction.east_north_m, prediction.radius_m + _KEEP_OFF_M, strict=True):
             apart = moved - place
             distance = np.linalg.norm(apart, axis=1)
@@ -300,7 +302,7 @@ def _keep_off(places_m: np.ndarray, prediction: Prediction, from_m: np.ndarray) 
 
 
 def _pass_by(places_m: np.ndarray, from_m: np.ndarray, prediction: Prediction) -> np.ndarray:
-    """The next goals (V, 2) on the ways from (V, 2) to places: past a crowd that is in the way, not through it."""
+    """Return the next goals (V, 2) on paths from `from_m` to `places_m` that lead around crowds."""
     goals = places_m.copy()
     for k, (start, goal) in enumerate(zip(from_m, places_m, strict=True)):
         length = nearest = float(np.linalg.norm(goal - start))
@@ -312,18 +314,18 @@ def _pass_by(places_m: np.ndarray, from_m: np.ndarray, prediction: Prediction) -
             ahead, off = float((place - start) @ along), float((place - start) @ aside)
             if 0 < ahead < nearest and abs(off) < radius:
                 nearest = ahead
-                # On the side on which the crowd is not, at its height.
+                # Pass the crowd on the side away from its centre.
                 goals[k] = place - aside * (np.sign(off) or 1.0) * (radius + 1.0)
     return goals
 
 
 def _need(prediction: Prediction) -> np.ndarray:
-    """(N,) what a closer look is worth: 1 for a target not yet seen, else up to 1/2, and 0 where sure."""
+    """Return the (N,) need for a closer look: 1 for a target that was not observed, else 1/2 (in doubt) to 0 (sure)."""
     return np.where(prediction.unseen, 1.0, 0.5 - np.abs(prediction.probability - 0.5))
 
 
 def _is_sure(prediction: Prediction, row: int, now: bool) -> bool:
-    """Whether a target counts as surely human or surely not, and the air sees it; now: whether it did."""
+    """Return whether a target is surely human or surely not, and seen from the air. now: the current answer."""
     surely = abs(float(prediction.probability[row]) - 0.5) + 0.5
     known = not prediction.unseen[row] and prediction.lost_s[row] <= LOST_S
     return bool(known) and surely > (_UNSURE if now else _SURE)
@@ -331,6 +333,6 @@ def _is_sure(prediction: Prediction, row: int, now: bool) -> bool:
 
 def _describe(prediction: Prediction, row: int) -> str:
     if prediction.unseen[row]:
-        return "nobody has seen it"
+        return "not yet seen by a ground vehicle"
     missed = ", missed from the air" if prediction.lost_s[row] > LOST_S else ""
     return f"human with {prediction.probability[row]:.2f}{missed}"

@@ -1,4 +1,4 @@
-"""Moving targets from a moving camera: frames to targets. `MotionDetector` is the way in."""
+"""Detect moving targets in the frames of a moving camera. Start with `MotionDetector`."""
 
 from typing import TYPE_CHECKING
 
@@ -8,22 +8,27 @@ from torchvision_dddas.detection.detector import MotionDetector, Retune, check_l
 from torchvision_dddas.detection.engine import Engine, Foreground
 from torchvision_dddas.detection.interval import (
     WALKER_M_S,
+    DistanceSettings,
     describe_distance,
     interval_from_flow,
     interval_from_telemetry,
     look_cost,
-    pixels_per_metre,
+    settings_at,
     with_logged_focal,
 )
+from torchvision_dddas.detection.onnx_detector import OnnxDetector
+from torchvision_dddas.detection.person_scale import pixels_per_metre
 
 if TYPE_CHECKING:
     from torchvision_dddas.detection.torch_engine import TorchEngine, detect_masks
 
 __all__ = [
     "WALKER_M_S",
+    "DistanceSettings",
     "Engine",
     "Foreground",
     "MotionDetector",
+    "OnnxDetector",
     "Retune",
     "TorchEngine",
     "View",
@@ -39,14 +44,15 @@ __all__ = [
     "look_cost",
     "match_exposure",
     "pixels_per_metre",
+    "settings_at",
     "with_logged_focal",
 ]
 
 
-if not TYPE_CHECKING:  # it would hide wrong names from the type checker
+if not TYPE_CHECKING:  # `__getattr__` would hide wrong names from the type checker
 
     def __getattr__(name):
-        """The names of the torch engine, which is loaded when one of them is first used."""
+        """Load the torch engine when one of its names is first used."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from torchvision_dddas.detection import torch_engine

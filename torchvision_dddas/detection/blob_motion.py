@@ -1,4 +1,4 @@
-"""How blobs move over the registered background, by dense flow; a blob with two motions is split in two."""
+"""Measure by dense flow how blobs move over the registered background, and split blobs that have two motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,42 +8,47 @@ import numpy as np
 
 from torchvision_dddas.detection.blobs import Blob, Box
 
-# Slower motion cannot be told from errors of the registration, px a frame.
+# Slower motion, px a frame, cannot be told from registration errors.
 _MIN_SPEED_PX = 0.5
-# Shares of the speed: disagreement of two flows that is still steady, and difference from the surroundings that counts.
+# As shares of the speed: the largest disagreement of two flows that counts as steady motion, and the smallest
+# difference from the surroundings that counts as motion of its own.
 _STEADY, _UNLIKE = 0.5, 0.25
 _RING_NEAR_PX, _RING_FAR_PX = 5, 15
-# Flow is searched so far around all blobs, px of the half picture: coarse levels of the search need surroundings.
+# Flow is computed in the bounding box of all blobs, extended by this margin (px of the half picture). The coarse
+# levels of the search need the surroundings.
 _SEARCH_PX = 64
-# OpenCV's search works at a quarter of the resolution it is given. In pictures smaller than this it takes a finer
-# scale, and keeps that scale for all later pictures, at five times the time.
+# OpenCV's search works at a quarter of the resolution of its input. For pictures with a shorter side than this, OpenCV
+# switches to a finer scale and keeps that scale for all later pictures, which takes five times as long.
 _FINEST_SCALE, _LEAST_SIDE_PX = 2, 96
-# An affine motion is fitted to so many pixels; it has converged when no term changes by more than this.
+# An affine motion is fitted to at most _SAMPLES pixels. The fit has converged when no term changes by more than
+# _CONVERGED_PX.
 _SAMPLES, _CONVERGED_PX = 300, 0.01
-# A small pull towards pure translation, for slim blobs.
+# A weak regularisation towards pure translation. Slim blobs need it because they do not determine an affine motion.
 _PULL = np.diag([1e-9, 0.02, 0.02])
 
-# A part holds at least this share of the blob's core, and this share of a part is one connected piece.
+# When a blob is split, each part holds at least _MIN_SHARE of the blob's core, and the largest connected piece of a
+# part holds at least _ONE_PIECE of that part.
 _MIN_SHARE, _ONE_PIECE = 0.2, 0.8
-# Two velocities differ clearly by more than this, px a frame, and this share of the faster one.
+# Two velocities differ clearly if their difference exceeds both _CLEARLY_PX (px a frame) and _CLEARLY times the faster
+# speed.
 _CLEARLY_PX, _CLEARLY = 1.0, 0.3
-# Flow falls short in flat insides and thin parts: a part that stands, or moves the same way more slowly, is no second
-# target. (On real clips every split of that kind cut one car or walker in two.)
+# Flow is too small in flat interiors and thin parts. A part that stands still, or moves more slowly in the same
+# direction, is therefore not a second target. (On real clips every split of that kind cut one car or walker in two.)
 _ASIDE_RAD = np.radians(45)
-# This share of a part's pixels misses the part's motion by less than half of the difference.
+# At least this share of a part's pixels must miss the part's motion by less than half the difference of both motions.
 _EXPLAINED = 0.7
 _ROUNDS = 4
 _NO_AFFINE = np.zeros((3, 2))
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A blob's own motion over the registered background.
+class BlobMotion:
+    """The motion of a blob over the registered background.
 
-    velocity_px: (2,) pixels a frame, NaN where unknown. steady: share of its core that moves alike to both neighbours
-    and unlike its surroundings. frame: centre_u, centre_v, scale. affine: for each neighbour (3, 2), the displacement
-    affine[0] + affine[1] (u - centre_u) / scale + affine[2] (v - centre_v) / scale in pixels. missed: share of its core
-    whose motion that does not explain.
+    velocity_px: (2,) pixels a frame, NaN where unknown. steady: share of the blob's core that has the same velocity to
+    both neighbour frames and a different one from the surroundings. frame: centre_u, centre_v, scale. affine: (3, 2)
+    for each neighbour frame; the displacement in pixels is affine[0] + affine[1] (u - centre_u) / scale + affine[2]
+    (v - centre_v) / scale. missed: share of the core whose flow the affine motion does not explain.
     """
 
     velocity_px: np.ndarray
@@ -54,9 +59,9 @@ class Motion:
 
 
 class DenseFlow:
-    """Dense inverse search at half resolution (Kroeger et al. 2016), OpenCV's fastest preset.
+    """Compute dense flow at half resolution by dense inverse search (Kroeger et al. 2016) with OpenCV's fastest preset.
 
-    A class because OpenCV's object keeps its buffers from frame to frame.
+    This is a class because OpenCV's object reuses its buffers from frame to frame.
     """
 
     def __init__(self) -> None:
@@ -65,13 +70,14 @@ class DenseFlow:
     def __call__(
         self, grey: np.ndarray, others: Sequence[np.ndarray], boxes: Sequence[Box] | None = None
     ) -> list[np.ndarray]:
-        """(H/2, W/2, 2) displacements in full-resolution pixels from a grey picture to each of the others.
+        """Return (H/2, W/2, 2) displacements in full-resolution pixels from a grey picture to each of the others.
 
-        boxes: where they are wanted, by default everywhere; they are 0 further away.
+        boxes: compute the flow only in and around these boxes, and set it to 0 elsewhere. By default compute it
+        everywhere.
         """
         height, width = (max(side // 2, 1) for side in grey.shape)
         flows = [np.zeros((height, width, 2), np.float32) for _ in others]
-        if min(height, width) < 16:  # smaller than the search's patches
+        if min(height, width) < 16:  # the picture is smaller than the patches of the search
             return flows
         left, top, right, bottom = 0, 0, width, height
         if boxes is not None:
@@ -94,16 +100,16 @@ class DenseFlow:
 
 
 def _widen(first: int, end: int, size: int) -> tuple[int, int]:
-    """A span of at least _LEAST_SIDE_PX, as far as the picture has it."""
+    """Widen a span to at least _LEAST_SIDE_PX, or to the whole side if the picture is smaller."""
     first = max(min(first, end - _LEAST_SIDE_PX), 0)
     return first, min(max(end, first + _LEAST_SIDE_PX), size)
 
 
-def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Motion]:
-    """The motion of each blob from two flow fields (half resolution) to frames that are `offsets` away."""
+def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[BlobMotion]:
+    """Return the motion of each blob from two flow fields (half resolution) to frames that are `offsets` away."""
     if not blobs:
         return []
-    # Of every blob the places of its core that are sampled, in shares of its size, and their displacements.
+    # For every blob: the sampled positions of its core as shares of its size, and their displacements.
     places, valid = np.zeros((len(blobs), 2, _SAMPLES)), np.zeros((len(blobs), _SAMPLES))
     displacements, around = np.zeros((len(blobs), 2, _SAMPLES, 2)), np.zeros((len(blobs), 1, 2))
     frames, per_frame = [(0.0, 0.0, 1.0)] * len(blobs), 1 / np.array(offsets)[:, None, None]
@@ -134,15 +140,15 @@ def measure_motions(blobs: Sequence[Blob], flows: Sequence[np.ndarray], offsets:
     missed_share = (valid * missed).sum(axis=1) / count
     motion[~valid.any(axis=1)] = np.nan
     return [
-        Motion(motion[i, 0], float(steady[i]), (fits[i, 0], fits[i, 1]), frames[i], float(missed_share[i]))
+        BlobMotion(motion[i, 0], float(steady[i]), (fits[i, 0], fits[i, 1]), frames[i], float(missed_share[i]))
         for i in range(len(blobs))
     ]
 
 
 def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-    """Masks of the blob at half resolution: (left, top), and (H, W) of its core and of the ring around it.
+    """Return (left, top) and two (H, W) masks at half resolution: the blob's core, and the ring around the blob.
 
-    shape: (rows, columns) of the half picture. Where no pixel of the core is left, the core is all of the blob.
+    shape: (rows, columns) of the half picture. If no core pixel is left, the first mask holds the whole blob.
     """
     x, y, width, height = blob.box
     (rows, columns), far = shape, _RING_FAR_PX
@@ -158,25 +164,26 @@ def _at_half(blob: Blob, shape: tuple[int, int]) -> tuple[tuple[int, int], np.nd
 
 
 def _sample(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of a sample of the pixels set in a mask."""
+    """Return the rows and columns of at most `_SAMPLES` of the pixels that are set in a mask."""
     row, column = np.nonzero(mask)
     sample = _choose_samples(len(row))
     return row[sample], column[sample]
 
 
 def _choose_samples(count: int) -> np.ndarray:
-    """Places of at most `_SAMPLES` of so many, evenly spread."""
+    """Return at most `_SAMPLES` evenly spread indices below `count`."""
     chosen = min(count, _SAMPLES)
     return np.arange(chosen) * count // max(chosen, 1)
 
 
 def fit_robust_affine(places: np.ndarray, flow_px: np.ndarray, valid: np.ndarray, rounds: int = 5) -> np.ndarray:
-    """(..., 3, 2) affine motions of (..., 2, N) places and (..., N, 2) displacements.
+    """Fit (..., 3, 2) affine motions to (..., 2, N) positions and (..., N, 2) displacements.
 
-    Iteratively reweighted least squares, all at once. valid: (..., N), 1 for the places that count and 0 for the rest.
+    All motions are fitted at once by iteratively reweighted least squares. valid: (..., N), 1 for positions to use,
+    0 for the others.
     """
     columns = _columns(places)
-    # Half of the valid displacements are below their median.
+    # Invalid displacements sort last, so that the median lies at half the number of the valid ones.
     ordered = np.sort(np.where(valid[..., None] > 0, flow_px, np.inf), axis=-2)
     middle = (valid.sum(axis=-1).astype(int) // 2)[..., None, None]
     median = np.take_along_axis(ordered, np.broadcast_to(middle, (*ordered.shape[:-2], 1, 2)), axis=-2)
@@ -196,12 +203,12 @@ def fit_robust_affine(places: np.ndarray, flow_px: np.ndarray, valid: np.ndarray
 
 
 def _columns(places: np.ndarray) -> np.ndarray:
-    """(..., 3, N): 1, u, v of (..., 2, N) places."""
+    """Return (..., 3, N) columns 1, u, v for (..., 2, N) positions."""
     return np.concatenate([np.ones_like(places[..., :1, :]), places], axis=-2)
 
 
 def _miss(columns: np.ndarray, flow_px: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """(..., N) by how much an affine motion misses each displacement."""
+    """Return (..., N) distances between the displacements and those that an affine motion predicts."""
     return _length(flow_px - columns.swapaxes(-1, -2) @ affine)
 
 
@@ -210,12 +217,12 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 
 def _clear_miss(affine: np.ndarray) -> np.ndarray:
-    """(...) a displacement that an affine motion, (..., 3, 2), misses by more than this is not explained by it."""
+    """Return (...) the largest residual, px, up to which (..., 3, 2) affine motions explain a displacement."""
     return np.maximum(_CLEARLY_PX / 2, _CLEARLY / 2 * _length(affine[..., 0, :]))
 
 
-def split_by_flow(blob: Blob, motion: Motion, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Blob]:
-    """The blob, or the two targets that touch in it, from two flow fields (half resolution) `offsets` frames away."""
+def split_by_flow(blob: Blob, motion: BlobMotion, flows: Sequence[np.ndarray], offsets: tuple[int, int]) -> list[Blob]:
+    """Return the blob, or two parts if two targets touch in it. flows: half resolution, to frames `offsets` away."""
     if motion.missed < _MIN_SHARE:
         return [blob]
     x, y, width, height = blob.box
@@ -228,28 +235,28 @@ def split_by_flow(blob: Blob, motion: Motion, flows: Sequence[np.ndarray], offse
     second = find_second_motion(velocity, core)
     if second is None:
         return [blob]
-    # Every pixel of the mask goes to the nearer part.
+    # Assign every pixel of the mask to the nearer part.
     away = [cv2.distanceTransform((~part).astype(np.uint8), cv2.DIST_L2, 5) for part in (core & ~second, second)]
     nearer = cv2.resize(away[0] - away[1], (width, height)) > 0
     return [blob.cut(~nearer), blob.cut(nearer)]
 
 
 def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray | None:
-    """Which core pixels move by the second of two motions, (H, W) bool; None where one motion explains the core.
+    """Return an (H, W) bool mask of the core pixels that have the second of two motions; None if one motion suffices.
 
-    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. Where one affine motion misses too much, two are fitted,
-    first to two clusters of the flow, and every pixel goes to the one that fits it better.
+    velocity_px: (H, W, 2) pixels a frame. core: (H, W) bool. If one affine motion leaves too many pixels unexplained,
+    fit two motions, starting from two clusters of the flow, and assign every pixel to the motion that fits it better.
     """
     row, column = np.nonzero(core)
     if len(row) < 40:
         return None
     scale = max(float(np.ptp(row)), float(np.ptp(column)), 1.0)
     places, flow = np.stack([column - column.mean(), row - row.mean()]) / scale, velocity_px[row, column]
-    # The two motions are sought in a sample.
+    # Fit the two motions to a sample of the pixels.
     sample = _choose_samples(len(row))
     columns, some = _columns(places), places[:, sample]
     some_columns, some_flow = columns[:, sample], flow[sample]
-    # Plain least squares as well: the robust fit hardly follows a body that turns or grows.
+    # Also try plain least squares, because the robust fit follows a body that turns or grows only slowly.
     robust = fit_robust_affine(some, some_flow, np.ones(len(some_flow)))
     for one in (robust, np.linalg.lstsq(some_columns.T, some_flow, rcond=None)[0]):
         if (_miss(some_columns, some_flow, one) > _clear_miss(one)).mean() < _MIN_SHARE:
@@ -284,7 +291,7 @@ def find_second_motion(velocity_px: np.ndarray, core: np.ndarray) -> np.ndarray 
 
 
 def _find_second_cluster(flow_px: np.ndarray) -> np.ndarray:
-    """(N,) bool, the second of two clusters of (N, 2) vectors: two means, started at the outermost vectors."""
+    """Return (N,) bool, the second of two clusters of (N, 2) vectors, by two-means from the outermost vectors."""
     start = flow_px[np.linalg.norm(flow_px - np.median(flow_px, axis=0), axis=1).argmax()]
     means = [flow_px[np.linalg.norm(flow_px - start, axis=1).argmax()], start]
     second = np.ones(len(flow_px), bool)

@@ -1,7 +1,7 @@
-"""From a mask to blobs: labelling, area and peak gates, convex hulls, fragments of one target."""
+"""Find blobs in a mask: label its regions, gate them by area and peak, and fill convex hulls."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ Box = tuple[int, int, int, int]
 
 
 def box_slices(box: Box, left: int = 0, top: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of a box, x, y, width, height, in a picture whose first pixel is at (left, top)."""
+    """Return the row and column slices of a box (x, y, width, height) in a picture that starts at (left, top)."""
     x, y, width, height = box
     return slice(y - top, y - top + height), slice(x - left, x - left + width)
 
@@ -22,19 +22,17 @@ class Blob:
     """A connected region of the core mask.
 
     box: x, y, width, height in pixels. mask: (height, width) bool, the region (or its convex hull) inside the box.
-    core: (height, width) bool, the pixels that are certain. peak: its largest evidence. weak: only the wide pair shows
-    it, in which parallax shows too.
+    core: (height, width) bool, the pixels with evidence above the threshold. peak: the largest evidence of the region.
     """
 
     box: Box
     mask: np.ndarray
     core: np.ndarray
     peak: float
-    weak: bool = False
 
     @property
     def area_px(self) -> int:
-        """Pixels of the mask."""
+        """Number of pixels of the mask."""
         return int(self.mask.sum())
 
     @property
@@ -44,7 +42,7 @@ class Blob:
         return np.array([x + (width - 1) / 2, y + (height - 1) / 2])
 
     def cut(self, share: np.ndarray) -> "Blob":
-        """The part of the blob that lies in `share`, (height, width) bool of its box."""
+        """Return the part of the blob inside `share`, a (height, width) bool mask of its box."""
         mask = self.mask & share
         left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))
         window = np.s_[top : top + height, left : left + width]
@@ -54,10 +52,10 @@ class Blob:
 
 @dataclass(frozen=True)
 class Region:
-    """A connected region of enough area and evidence, as OpenCV or the torch engine's device finds it.
+    """A connected region that passes the area and peak gates, found by OpenCV or on the torch engine's device.
 
-    box: x, y, width, height. mask: (height, width) bool. evidence: (height, width) uint8 of the box. peak: the largest
-    evidence of the region.
+    box: x, y, width, height. mask: (height, width) bool. evidence: (height, width) uint8 inside the box. peak: the
+    largest evidence of the region.
     """
 
     box: Box
@@ -69,17 +67,17 @@ class Region:
 def find_blobs(
     core: np.ndarray, evidence: np.ndarray, threshold: float, min_area_px: int, peak: float, hull: bool, scale: int = 1
 ) -> list[Blob]:
-    """Connected regions (8 neighbours) of `core` with enough area and a high enough peak of evidence.
+    """Return the connected regions (8 neighbours) of `core` that have enough area and a high enough peak of evidence.
 
-    core, evidence: (H, W) uint8. Pixels of a region whose evidence is above `threshold` are certain. hull: fill convex
-    hulls; a hull that contains another one replaces it. scale: side of a map's pixel in pixels of the picture, in which
-    areas and blobs are given.
+    core, evidence: (H, W) uint8. threshold: evidence above which a pixel belongs to the blob's core. hull: fill convex
+    hulls; a hull that contains another one replaces it. scale: side of a map pixel in picture pixels; areas and blobs
+    are in picture pixels.
     """
     return make_blobs(find_regions(core, evidence, min_area_px, peak, scale), threshold, hull, scale)
 
 
 def find_regions(core: np.ndarray, evidence: np.ndarray, min_area_px: int, peak: float, scale: int = 1) -> list[Region]:
-    """The regions of `find_blobs`, in pixels of the maps, by OpenCV."""
+    """Find with OpenCV the regions that `find_blobs` turns into blobs. Their boxes are in map pixels."""
     regions = []
     for part in occupied(core, 2):
         labels, stats = label_parts(core[box_slices(part)])
@@ -96,16 +94,17 @@ def find_regions(core: np.ndarray, evidence: np.ndarray, min_area_px: int, peak:
 
 
 def label_parts(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The connected parts (8 neighbours) of a (H, W) uint8 mask: their labels from 1 on, (H, W), and (N, 5) int32.
+    """Label the connected parts (8 neighbours) of a (H, W) uint8 mask, and return (H, W) labels and (N, 5) int32 rows.
 
-    A row is x, y, width, height and area. OpenCV's default algorithm takes two to three times as long here.
+    Labels start at 1. A row is x, y, width, height and area. OpenCV's default algorithm takes two to three times as
+    long as the one used here.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(mask, 8, cv2.CV_32S, cv2.CCL_GRANA)
     return labels, stats[1:]
 
 
 def make_blobs(regions: Iterable[Region], threshold: float, hull: bool, scale: int = 1) -> list[Blob]:
-    """The blobs of regions, as `find_blobs` gives them."""
+    """Turn regions into blobs. The arguments are those of `find_blobs`."""
     blobs = []
     for part in regions:
         box, region, certain = part.box, part.mask, part.mask & (part.evidence > threshold)
@@ -130,41 +129,10 @@ def _contains(larger: Blob, box: Box) -> bool:
     return bool(larger.mask[y : y + box[3], x : x + box[2]].mean() > 0.9)
 
 
-def leave_touching(others: list[Blob], found: list[Blob], shape: tuple[int, ...]) -> list[Blob]:
-    """The others, as weak ones, that share no pixel with those found. shape: (height, width) of the picture."""
-    taken = np.zeros(shape, bool)
-    for blob in found:
-        taken[box_slices(blob.box)] |= blob.mask
-    return [replace(blob, weak=True) for blob in others if not taken[box_slices(blob.box)][blob.mask].any()]
-
-
 def fill_hull(region: np.ndarray) -> np.ndarray:
-    """The convex hull of the true pixels of a (h, w) mask, as a mask of the same shape."""
+    """Return the convex hull of the true pixels of a (h, w) mask, as a mask of the same shape."""
     canvas = region.astype(np.uint8)
     outlines, _ = cv2.findContours(canvas, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if outlines:
         cv2.fillConvexPoly(canvas, cv2.convexHull(np.concatenate(outlines)), 1)
     return canvas > 0
-
-
-def group_fragments(boxes_px: np.ndarray, velocities_px: np.ndarray) -> list[list[int]]:
-    """Indices of boxes that are fragments of one target.
-
-    boxes_px: (N, 4) x, y, width, height. velocities_px: (N, 2) pixels a frame; a box of NaN stays alone. Two fragments
-    are at most a fifth of the larger one's size apart along either axis, overlap along one of them by half of the
-    smaller one, move by more than 1 px a frame, and differ in velocity by at most a fifth of it.
-    """
-    low, size = boxes_px[:, :2], boxes_px[:, 2:]
-    speed = np.hypot(*velocities_px.T)
-    groups: list[list[int]] = []
-    for i in range(len(boxes_px)):
-        gap = np.maximum(low[i], low[:i]) - np.minimum(low[i] + size[i], low[:i] + size[:i])
-        overlap = (-gap / np.minimum(size[i], size[:i])).max(axis=1)
-        near = (gap <= 0.2 * np.maximum(size[i], size[:i])).all(axis=1) & (overlap > 0.5)
-        faster = np.maximum(speed[i], speed[:i])
-        alike = (np.hypot(*(velocities_px[i] - velocities_px[:i]).T) <= 0.2 * faster) & (faster > 1.0)
-        fragments = set(np.flatnonzero(near & alike).tolist())
-        joined = [group for group in groups if fragments.intersection(group)]
-        groups = [group for group in groups if group not in joined]
-        groups.append(sorted([*(k for group in joined for k in group), i]))
-    return sorted(groups)

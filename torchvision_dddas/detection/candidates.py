@@ -1,7 +1,8 @@
-"""What may be a target in one look: connected parts of several silhouettes of its evidence, and what they look like.
+"""Find target candidates in one look (a frame and its window): connected parts of several silhouettes of the evidence.
 
-One silhouette misses most targets: small ones need no closing, large even ones a wide one, slow ones frames further
-apart, faint ones a low threshold. Which of these parts are targets is decided later, on tracklets (`tracklets`).
+A single silhouette misses most targets. Small targets need no closing, large uniform targets need a wide closing, slow
+targets need frames further apart, and faint targets need a low threshold. Which candidates are targets is decided later
+by their tracklets (`tracklets`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,13 +19,17 @@ from torchvision_dddas.detection.blobs import Blob, box_slices, label_parts
 from torchvision_dddas.geometry import occupied, shared_px
 
 Evidence = Sequence[np.ndarray | None]
-"""The maps of evidence by how far apart the compared frames are: nearest, further, widest; (H, W) uint8 or None."""
+"""Four evidence maps, (H, W) uint8 or None each.
+
+The first three come from the nearest, the further and the widest pair of compared frames. The fourth is the larger
+difference of the nearest and the widest pair in grey levels; four grey levels count as one noise unit.
+"""
 
 
 class Silhouette(NamedTuple):
-    """Where the largest of some maps is above a threshold. gaps: indices of maps. threshold: noise units.
+    """The mask where the maximum over some evidence maps exceeds a threshold.
 
-    erode_px, close_px: sides of the ellipses that clean it.
+    gaps: indices of the maps. threshold: noise units. erode_px, close_px: sides of the ellipses that clean the mask.
     """
 
     gaps: tuple[int, ...]
@@ -33,54 +38,59 @@ class Silhouette(NamedTuple):
     close_px: int
 
 
-# Of nine silhouettes that a prototype chose one after the other, so that some part overlaps each target of the open
-# clips, these six lose the least.
+LEVELS = 3
+"""Index of the grey-level map among the evidence maps."""
+
+# This set was chosen by F1 and hits on the open clips, with data sets left out: dropping one more silhouette costs F1
+# or hits, and adding one gains little. The last silhouette uses grey levels: it shows bright or dark targets on ground
+# that itself differs from frame to frame.
 SILHOUETTES = (
     Silhouette((0, 1), 3.5, 3, 1),
-    Silhouette((0, 1), 2.5, 3, 15),
     Silhouette((1,), 5.0, 3, 1),
     Silhouette((2,), 7.0, 1, 5),
     Silhouette((0, 1), 5.0, 1, 15),
-    Silhouette((0, 1, 2), 2.5, 1, 25),
+    Silhouette((LEVELS,), 5.0, 3, 25),
 )
 LOOK_WEIGHTS = {
-    "peak2": 1.032,
-    "around": 3.428,
-    "around2": -3.41,
-    "size": 1.081,
-    "size2": -0.073,
-    "grows2": -0.119,
-    "inside_over_around": 1.555,
-    "constant": -12.333,
+    "peak2": 0.918,
+    "around": 3.408,
+    "around2": -2.63,
+    "size": 1.175,
+    "size2": -0.09,
+    "levels_over_around": 1.74,
+    "constant": -12.689,
 }
-"""Weights of what one look shows, see `describe_look`."""
+"""Weights of the features that `describe_look` computes."""
 
-# _LEAST_EVIDENCE is added to evidence before its logarithm is taken. Surroundings count as restless as _QUIET at least:
-# the weights were learned on clips with noise, and a picture without noise must not be judged worse for that.
+# _LEAST_EVIDENCE is added to the evidence before its logarithm is taken. The logarithm of the evidence around a
+# candidate counts as at least _QUIET: the weights were learned on noisy clips, and a picture without noise must not be
+# judged worse.
 _LEAST_EVIDENCE = 0.5
 _QUIET = np.log(_LEAST_EVIDENCE + 0.7)
-# Candidates with a smaller score, and all but the likeliest so many, are left out, since following them takes time.
-_LEAST_SCORE, _MOST_CANDIDATES = -3.0, 60
+# Candidates with a score below _LEAST_SCORE are dropped, and at most _MOST_CANDIDATES of the rest are kept, because
+# following candidates takes time.
+_LEAST_SCORE, _MOST_CANDIDATES = -3.0, 40
 
 _LEAST_AREA_PX, _LEAST_PEAK = 20, 5.0
-# At most so many parts of a silhouette are kept, the largest ones. Two parts with a larger IoU than this are one.
+# Of each silhouette, the _MOST_PARTS largest parts are kept. Two parts with an IoU above _ALIKE count as the same one.
 _MOST_PARTS, _ALIKE = 30, 0.85
-# Closings from this side on are done at half the resolution.
+# Closings with at least this side are computed at half the resolution.
 _HALVED_FROM_PX = 9
-_HALF_SET = 60  # level of a halved mask: one of its four pixels is set, or more
-_LARGE_PX = 2**31 // 256  # the sum of more pixels does not fit into 32 bits
+_HALF_SET = 60  # a halved mask is above this level if at least one of its four pixels is set
+_LARGE_PX = 2**31 // 256  # the sum over more pixels than this does not fit into 32 bits
 _PATCH_PX = 12
-_PATCH_NOISE = 20.0  # grey levels x pixels: a patch without contrast is like nothing
+_PATCH_NOISE = 20.0  # added to a patch's norm, so that a patch without contrast matches no other patch
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """The N candidates of one look, and G maps of evidence.
+    """The N candidates of one look, measured on G evidence maps.
 
-    box_px: (N, 4) x, y, width, height. silhouette: (N,) index of the first silhouette that shows it, -1: a blob. fill:
-    (N,) share of the box that its part covers. peak: (N,) largest evidence, noise units. inside, around: (N, G) mean
-    evidence in the box and in a frame about it, noise units; 0 where there is no map. patch: (N, P) grey levels of the
-    box without their mean, of about unit length. score: (N,) log odds that it is a target, by this look alone.
+    box_px: (N, 4) x, y, width, height. silhouette: (N,) index of the first silhouette that shows the candidate, -1 for
+    a blob; blobs come first. fill: (N,) share of the box that the candidate's pixels cover. peak: (N,) largest
+    evidence, noise units. inside, around: (N, G) mean evidence in the box and in a margin around it, noise units; 0
+    where a map is missing. patch: (N, P) grey levels of the box minus their mean, scaled to about unit length. score:
+    (N,) log odds that the candidate is a target, from this look alone.
     """
 
     box_px: np.ndarray
@@ -97,7 +107,7 @@ class Candidates:
 
 
 def find_candidates(evidence: Evidence, grey: np.ndarray, blobs: Sequence[Blob]) -> Candidates:
-    """The candidates of one look. grey: (H, W) uint8, its picture. blobs: come first, in their order."""
+    """Return the candidates of one look. grey: (H, W) uint8 picture. blobs: they become the first candidates."""
     found = [np.array([[*blob.box, blob.mask.mean(), blob.peak / EVIDENCE_SCALE, -1] for blob in blobs]).reshape(-1, 7)]
     silhouettes = _Silhouettes(evidence)
     for index, silhouette in enumerate(SILHOUETTES):
@@ -117,7 +127,7 @@ def find_candidates(evidence: Evidence, grey: np.ndarray, blobs: Sequence[Blob])
 
 
 class _Silhouettes:
-    """The silhouettes of one look's evidence, which share their steps."""
+    """Computes the silhouettes of one look's evidence, and caches the intermediate results that they share."""
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = {gap: picture for gap, picture in enumerate(evidence) if picture is not None}
@@ -125,7 +135,7 @@ class _Silhouettes:
         self._cores: dict[tuple[tuple[int, ...], float, int], np.ndarray] = {}
 
     def parts(self, silhouette: Silhouette) -> np.ndarray | None:
-        """(N, 6) x, y, width, height, fill, peak in noise units of its connected parts; None: no map shows it."""
+        """Return (N, 6) x, y, width, height, fill, peak (noise units) of a silhouette's parts; None without a map."""
         gaps = tuple(gap for gap in silhouette.gaps if gap in self.evidence)
         if not gaps:
             return None
@@ -134,7 +144,7 @@ class _Silhouettes:
             core = cv2.threshold(OpenCVOperations().halve(core), _HALF_SET, 255, cv2.THRESH_BINARY)[1]
             scale, close_px = 2, halve_side(close_px)
         core = close_mask(core, close_px)
-        # Only where something is set: most of a picture is empty.
+        # Label only the parts of the picture where something is set: most of a picture is empty.
         found = [label_parts(core[box_slices(box)])[1] + (*box[:2], 0, 0, 0) for box in occupied(core, 2)]
         stats = np.concatenate([np.zeros((0, 5), int), *found]) * (scale, scale, scale, scale, scale**2)
         stats = stats[stats[:, 4] >= _LEAST_AREA_PX]
@@ -161,32 +171,30 @@ class _Silhouettes:
 def describe_look(
     box: np.ndarray, fill: np.ndarray, peak: np.ndarray, inside: np.ndarray, around: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What one look shows, (N,) each, by the names of LOOK_WEIGHTS. The arguments are those of `Candidates`."""
-    outside = np.log(_LEAST_EVIDENCE + around.max(axis=1))
-    restless = np.maximum(outside, _QUIET)
+    """Return the features of candidates, (N,) each, by name in LOOK_WEIGHTS. Arguments: fields of `Candidates`."""
+    restless = np.maximum(np.log(_LEAST_EVIDENCE + around[:, :LEVELS].max(axis=1)), _QUIET)
     size = 0.5 * np.log(box[:, 2:].prod(axis=1)) * fill
-    grows = np.minimum(inside[:, -1] / (inside[:, 0] + 0.3), 5)
+    levels, levels_around = (np.log(_LEAST_EVIDENCE + maps[:, LEVELS]) for maps in (inside, around))
     return {
         "peak2": np.log(peak) ** 2,
         "around": restless,
         "around2": (restless - _QUIET) ** 2,
         "size": size,
         "size2": size**2,
-        "grows2": grows**2,
-        "inside_over_around": np.log(_LEAST_EVIDENCE + inside.max(axis=1)) - outside,
+        "levels_over_around": levels - levels_around,
     }
 
 
 def weigh(described: Mapping[str, np.ndarray], weights: Mapping[str, float]) -> np.ndarray:
-    """(N,) log odds: the sum of what is described, (N,) each, by its weights, and a constant."""
+    """Return (N,) log odds: the weighted sum of the features, (N,) each, plus the constant."""
     columns = np.array(list(described.values()))
     return weights["constant"] + np.array([weights[name] for name in described]) @ columns
 
 
 def measure_evidence(evidence: Evidence, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean evidence, noise units, in boxes and in the frames about them; (N, G) each, 0 where there is no map.
+    """Return the mean evidence in boxes and in the margins around them, noise units, (N, G) each.
 
-    box: (N, 4) int.
+    The value is 0 where a map is missing. box: (N, 4) int.
     """
     inside, around = np.zeros((2, len(box), len(evidence)))
     wide = np.floor(2 + 0.2 * box[:, 2:]).astype(int)
@@ -202,7 +210,7 @@ def measure_evidence(evidence: Evidence, box: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _sum_boxes(table: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over boxes, cut at the picture's border, by an integral picture; and their areas."""
+    """Return the sums over boxes that are clipped to the picture, from an integral picture, and the boxes' areas."""
     height, width = table.shape[0] - 1, table.shape[1] - 1
     left, top = np.clip(box[:, 0], 0, width), np.clip(box[:, 1], 0, height)
     right, bottom = np.clip(box[:, 0] + box[:, 2], 0, width), np.clip(box[:, 1] + box[:, 3], 0, height)
@@ -211,7 +219,7 @@ def _sum_boxes(table: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _first_of_alike(box: np.ndarray, always: int) -> np.ndarray:
-    """(N,) bool: boxes that overlap none before them nearly wholly, and the first so many in any case."""
+    """Return (N,) bool: whether a box differs from all kept boxes before it. The first `always` boxes are kept."""
     first = np.ones(len(box), bool)
     alike = overlaps(box, box) > _ALIKE
     for i in range(len(box)):
@@ -222,14 +230,14 @@ def _first_of_alike(box: np.ndarray, always: int) -> np.ndarray:
 
 
 def overlaps(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N, M) IoU of boxes (N, 4) and (M, 4) x, y, width, height."""
+    """Return the (N, M) IoU of boxes (N, 4) and (M, 4), each x, y, width, height."""
     both = shared_px(one[:, None], other)
     either = np.prod(one[:, 2:], axis=1)[:, None] + np.prod(other[:, 2:], axis=1)[None] - both
     return both / np.maximum(either, 1e-9)
 
 
 def cut_patches(grey: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(N, P) float32 grey levels of boxes, (N, 4) int, made as large as one another, without their mean."""
+    """Cut (N, 4) int boxes from a picture, and return (N, P) float32 grey levels of equal size, minus their mean."""
     patches: np.ndarray = np.empty((len(box), _PATCH_PX, _PATCH_PX), np.float32)
     for patch, (x, y, width, height) in zip(patches, box.tolist(), strict=True):
         pad = 2 + max(width, height) // 10

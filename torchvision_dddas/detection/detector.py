@@ -1,5 +1,6 @@
-"""The motion detector: frames of a moving camera in, scenes with targets out, a few frames later."""
+"""The motion detector takes frames of a moving camera and returns scenes with targets a few frames later."""
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -13,6 +14,7 @@ from torchvision_dddas.config import Settings, check_settings, uses_tracklets
 from torchvision_dddas.detection.blob_motion import DenseFlow
 from torchvision_dddas.detection.candidates import Candidates
 from torchvision_dddas.detection.engine import Engine
+from torchvision_dddas.detection.fragments import Ground, join_fragments
 from torchvision_dddas.detection.frame_buffer import FrameBuffer, Slot
 from torchvision_dddas.detection.interval import (
     choose_pairs,
@@ -27,15 +29,13 @@ from torchvision_dddas.detection.observation import (
     Target,
     build_detections,
     draw_blobs,
-    draw_candidate,
-    join_fragments,
-    judge_persistence,
+    draw_chosen,
     observe,
 )
 from torchvision_dddas.detection.opencv_engine import OpenCVEngine
-from torchvision_dddas.detection.persistence import SmallTracks, find_small_boxes
 from torchvision_dddas.detection.repeats import RepeatRule
-from torchvision_dddas.detection.tracklet_scores import PERSISTENT, PERSISTENT_SIZED, choose, score_tracklets
+from torchvision_dddas.detection.small_tracks import SmallTracks, find_small_boxes
+from torchvision_dddas.detection.tracklet_scores import BLOB, BLOB_SIZED, BLOB_TINY, choose, score_tracklets
 from torchvision_dddas.detection.tracklets import LOOKS_AFTER, LOOKS_BEFORE, follow
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.images import read_ignored
@@ -43,12 +43,13 @@ from torchvision_dddas.runtime import wants_torch
 from torchvision_dddas.types import Adjustment, Frame, Registration, Scene, Telemetry, as_picture
 
 Retune = Callable[[Frame], tuple[Settings, tuple[Adjustment, ...]]]
-"""Called before a frame is taken: returns the settings from then on, and the record of what changed."""
+"""Called before each frame. It returns the settings from this frame on, and the adjustments that it made."""
 
-_MIN_FRAMES = 3  # that a window needs
-_JUDGED_FRAMES = 5  # that persistence uses: two before and two after the frame
+_MIN_FRAMES = 3  # the fewest frames that make a window
+_JUDGED_FRAMES = 5  # frames that the search for small targets uses: the frame, two before and two after it
 _TORCH_BATCH = 8
-# Repeats of a picture that are held until the next picture comes: of a recording, and where results are waited for.
+# Most repeats of a picture that are held back until a different picture comes: for recordings, and for live sources,
+# whose user waits for the results.
 _MOST_REPEATS, _MOST_REPEATS_LIVE = 1000, 3
 _STILL = Registration(np.eye(3), 0, 0, 0.0, 0.0)
 
@@ -61,19 +62,19 @@ def detect_motion(
     batch: int | None = None,
     retune: Retune | None = None,
 ) -> Iterator[Scene]:
-    """A scene for every frame number of a source, in order; the arguments are those of `MotionDetector`.
+    """Yield a scene for every frame number of a source, in order. The other arguments are those of `MotionDetector`.
 
-    source: frames or images. It may have `rate_hz` (default 10), `count` of its frames, `last` the number of its last
-    frame, read or not, and a method `telemetry` that returns what was reported so far, which replaces a whole log.
-    retune: called before each frame; see `Retune`.
+    source: frames or images. It may have these attributes: `rate_hz` (default 10); `count`, the number of frames;
+    `last`, the number of its last frame, even if that frame could not be read; and a method `telemetry`, which returns
+    the telemetry reported so far and replaces the argument `telemetry`. retune: called before each frame; see `Retune`.
     Raises InputError for fewer than three frames, and for telemetry that does not overlap the source in time.
     """
     rate_hz, count = getattr(source, "rate_hz", 10.0), getattr(source, "count", None)
-    if telemetry is not None and isinstance(count, int) and count:  # that of a list is a method
+    if telemetry is not None and isinstance(count, int) and count:  # the `count` of a list is a method
         telemetry.check_overlap((count - 1) / rate_hz)
-    detector = MotionDetector(settings, backend, rate_hz, telemetry, batch)
+    detector = MotionDetector(settings, backend=backend, rate_hz=rate_hz, telemetry=telemetry, batch=batch)
     live_telemetry = getattr(source, "telemetry", None)
-    if live_telemetry is not None:  # a loop is closed over the source: each frame needs its result at once
+    if live_telemetry is not None:  # the source is controlled by the results, so each frame needs its result at once
         detector._most_repeats = 0
     for image in source:
         frame = detector._as_frame(image)
@@ -90,9 +91,10 @@ def detect_motion(
 
 
 def load_engine(backend: str, settings: Settings) -> Engine:
-    """The engine `torch` or `onboard`, or that of `auto`: onboard for half resolution, which torch does not work at.
+    """Return the engine for a backend: `torch`, `onboard` or `auto`.
 
-    Raises InputError as `wants_torch`, and where torch is asked to work at half resolution.
+    `auto` is torch if it is installed, and onboard for settings at half resolution, which torch does not support.
+    Raises InputError for an unknown or missing backend (see `wants_torch`), and for torch at half resolution.
     """
     if not wants_torch(backend) or (backend == "auto" and (settings.registration.halved or settings.difference.halved)):
         return OpenCVEngine(settings)
@@ -102,51 +104,65 @@ def load_engine(backend: str, settings: Settings) -> Engine:
 
 
 def check_length(frames: int) -> None:
-    """Raises InputError if a clip of so many frames is too short for a window."""
+    """Raise InputError if a clip with this number of frames is too short for a window."""
     if frames < _MIN_FRAMES:
         few = "no frame" if frames == 0 else f"{frames} frame" + "s" * (frames > 1)
-        missing = _MIN_FRAMES - frames
-        raise InputError(f"the clip has {few} that can be read, a window needs {_MIN_FRAMES}: {missing} missing")
+        raise InputError(f"the clip has {few} that can be read; a window needs at least {_MIN_FRAMES}")
 
 
 class MotionDetector:
-    """Finds what moves against the background in the frames of a moving camera.
+    """Finds targets that move against the background in the frames of a moving camera.
 
-    Feed it every frame in order with `update`; it returns the scenes that no later frame can change any more, at most
-    two detection intervals late. `flush` returns the rest at the end. A frame that repeats the one before is no look at
-    the scene: it gets the scene of that one, and counts for no interval.
+    Pass every frame in order to `update`. It returns the scenes that no later frame can change, at most two detection
+    intervals after their frame. At the end `flush` returns the remaining scenes. A frame that repeats the frame before
+    gets a copy of that frame's scene, and does not count in the interval.
+
+    >>> coarse = np.random.default_rng(0).integers(0, 256, (30, 40), np.uint8)
+    >>> ground = coarse.repeat(4, 0).repeat(4, 1)
+    >>> detector, scenes = td.MotionDetector(td.load_settings("fast"), backend="onboard"), []
+    >>> for k in range(6):  # a camera that pans by 1 px a frame
+    ...     scenes += detector.update(np.ascontiguousarray(ground[:, k : k + 128]))
+    >>> len(scenes), detector.delay_frames
+    (4, 2)
+    >>> scenes += detector.flush()
+    >>> len(scenes), float(scenes[2].camera_motion[0, 2].round())
+    (6, -1.0)
     """
 
     def __init__(
         self,
         settings: Settings | None = None,
+        *,
         backend: str | Engine = "auto",
         rate_hz: float = 10.0,
         telemetry: Telemetry | None = None,
         batch: int | None = None,
     ) -> None:
-        """backend: auto, onboard, torch, or an engine. rate_hz: frames a second. telemetry: steers interval and gates.
+        """Set up the detector. backend: auto, onboard, torch, or an engine. rate_hz: frames a second.
 
-        batch: windows given to the engine at once, by default 8 for torch and 1 otherwise. Scenes do not depend on it.
+        telemetry: controls the interval and the gates. batch: windows that the engine computes at once, by default 8
+        for torch and 1 otherwise. The scenes do not depend on it.
         """
         self.settings = check_settings(settings)
         self.engine = load_engine(backend, self.settings) if isinstance(backend, str) else backend
         self.batch = batch or (_TORCH_BATCH if self.engine.name == "torch" else 1)
         if not rate_hz > 0 or not isinstance(telemetry, Telemetry | None):
             got = f"{rate_hz} and {type(telemetry).__name__}"
-            raise InputError(f"rate_hz must be positive and telemetry of td.read_telemetry(path), got {got}")
+            raise InputError(
+                f"rate_hz must be positive and telemetry must come from td.read_telemetry(path), got {got}"
+            )
         self.rate_hz = rate_hz
         self._controller = IntervalController(self.settings, rate_hz, telemetry)
         self._buffer = FrameBuffer()
         self._memory = _memory_frames(self.settings, telemetry is not None)
-        # Frames below these indices are registered, observed, have their targets, are in the history, were returned.
+        # Frames below these indices are registered, are observed, have targets, are in the history, were returned.
         self._registered = self._observed = self._drawn = self._remembered = self._emitted = 0
-        self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest one
-        self._returned = self._last  # of the scenes returned
-        self._skipped = 0  # frames skipped on purpose, or repeated, so far
-        self._passed = 0  # those since the latest slot
+        self._last = Frame(0, 0.0, np.zeros((0, 0), np.uint8))  # the latest frame that came
+        self._returned = self._last  # the frame of the latest scene that was returned
+        self._skipped = 0  # frames so far that were skipped on purpose or are repeats
+        self._passed = 0  # frames since the latest slot that were skipped on purpose or are repeats
         self._repeats, self._most_repeats = RepeatRule(), _MOST_REPEATS
-        self._held: tuple[Adjustment, ...] = ()  # of repeated frames
+        self._held: tuple[Adjustment, ...] = ()  # adjustments that came with repeated frames
         self._ended = False
         self._mask: tuple[str, np.ndarray | None] | None = None
         self._flow = DenseFlow()
@@ -155,36 +171,48 @@ class MotionDetector:
 
     @property
     def interval(self) -> int:
-        """The detection interval in force, frames."""
+        """The current detection interval, frames."""
         return self._controller.interval
 
     @property
+    def delay_frames(self) -> int:
+        """How many frames after its own frame a scene is returned at the interval in force, at most two intervals.
+
+        Batches of several windows make scenes wait for whole batches; the value is the longest wait then. Repeated
+        pictures come on top of it.
+        """
+        used = self._controller.distance.settings
+        batches = math.ceil((look_ahead(self.interval, used) - 1) / self.batch) + 1
+        return self.batch * batches + settling_delay(self.interval, used)
+
+    @property
     def telemetry(self) -> Telemetry | None:
-        """What steers the interval and the gates; it may be replaced between two frames."""
+        """The telemetry that controls the interval and the gates. It may be replaced between two frames."""
         return self._controller.telemetry
 
     @telemetry.setter
     def telemetry(self, telemetry: Telemetry | None) -> None:
         self._controller.telemetry = telemetry
 
-    def update(self, frame: Frame | np.ndarray, adjustments: tuple[Adjustment, ...] = ()) -> list[Scene]:
-        """Take one frame; returns the scenes that are settled by it, oldest first, often none.
+    def update(self, frame: Frame | np.ndarray, *, adjustments: tuple[Adjustment, ...] = ()) -> list[Scene]:
+        """Take one frame, and return the scenes that no later frame can change, oldest first. Often there are none.
 
-        frame: a Frame, or an image (H, W) or (H, W, 3) BGR uint8, which follows the last frame.
-        adjustments: changes of parameters before it, for the record in its scene.
-        Raises InputError for any other image, and for one of another size than the images before.
+        frame: a Frame, or an image (H, W) or (H, W, 3) BGR uint8, which is taken as the next frame.
+        adjustments: changes of parameters before this frame, which its scene records.
+        Raises InputError for an image of another type or shape, and if its size differs from the images before.
         """
         return list(self._settle(self._as_frame(frame), adjustments))
 
     def flush(self, last_number: int = 0) -> list[Scene]:
-        """End the clip; returns all remaining scenes. last_number: of the clip's last frame, read or not.
+        """End the clip, and return all remaining scenes.
 
+        last_number: number of the clip's last frame, even if that frame could not be read.
         Raises InputError if there were fewer than three frames.
         """
         return list(self._settle_rest(last_number))
 
     def change_settings(self, settings: Settings) -> None:
-        """Use other settings from now on. What is kept of small targets and of the motion history stays."""
+        """Use other settings from the next frame on. Small tracks and the motion history are kept."""
         if settings is self.settings:
             return
         self.settings = self.engine.parameters = settings
@@ -197,14 +225,14 @@ class MotionDetector:
         if self._total and size != before:
             raise InputError(
                 f"a frame of {size[0]}x{size[1]} follows frame {self._last.number} of {before[0]}x{before[1]}; all "
-                "frames of a clip must have one size: begin anew with another MotionDetector"
+                "frames of a clip must have one size; use a new MotionDetector for frames of another size"
             )
         if isinstance(frame, Frame):
             return frame if image is frame.image else replace(frame, image=image)
         return Frame(self._last.number + 1, self._last.number / self.rate_hz, image)
 
     def _settle(self, frame: Frame, adjustments: tuple[Adjustment, ...] = ()) -> Iterator[Scene]:
-        """Do the work of `update`, and yield one scene at a time."""
+        """Take one frame as `update` does, but yield one scene at a time."""
         start = time.perf_counter()
         if not self._total:
             self.change_settings(with_logged_focal(self.settings, self.telemetry, frame.image.shape[1::-1])[0])
@@ -213,7 +241,7 @@ class MotionDetector:
         repeats = self._buffer[self._total - 1].repeats if self._total else []
         most = _MOST_REPEATS_LIVE if np.isfinite(frame.taken_s) else self._most_repeats
         if self._repeats.is_repeat(view.grey) and len(repeats) < most:
-            self._last = replace(frame, image=self._last.image)  # one picture for all of them
+            self._last = replace(frame, image=self._last.image)  # all repeats share one picture in memory
             repeats.append(self._last)
             self._passed += frame.skipped + 1
             self._held += adjustments
@@ -223,7 +251,7 @@ class MotionDetector:
             yield from self._advance()
 
     def _ignored(self, size: tuple[int, int]) -> np.ndarray | None:
-        """(H, W) uint8, 255 where pictures of a size are left out; None: nowhere. Raises InputError for a bad mask."""
+        """Return (H, W) uint8, 255 at the pixels that settings exclude, or None. Raises InputError for a bad mask."""
         if self._mask is None or self._mask[0] != self.settings.difference.ignore:
             file = self.settings.difference.ignore
             self._mask = file, read_ignored(Path(file), size) if file else None
@@ -236,8 +264,8 @@ class MotionDetector:
         self._buffer.append(Slot(frame, view, look, passed, self._controller.distance, adjustments, seconds))
 
     def _settle_rest(self, last_number: int = 0) -> Iterator[Scene]:
-        """Do the work of `flush`, and yield one scene at a time."""
-        if 0 < self._total < _MIN_FRAMES:  # a clip of repeated frames: each copy counts as a look
+        """End the clip as `flush` does, but yield one scene at a time."""
+        if 0 < self._total < _MIN_FRAMES:  # the clip has nothing but repeated frames: count each copy as a look
             last, few = self._buffer[self._total - 1], _MIN_FRAMES - self._total
             repeats, last.repeats, self._passed = last.repeats, [], 0
             for frame in repeats[:few]:
@@ -257,14 +285,14 @@ class MotionDetector:
                     self._follow_small(index)
                 self._observed = index + 1
                 self._draw()
-                yield from self._emit()  # after every frame: what is settled must not depend on the batch
+                yield from self._emit()  # after every frame, so that the scenes do not depend on the batch
 
     @property
     def _total(self) -> int:
         return self._buffer.total
 
     def _register(self) -> None:
-        """Register all successive frames that are here."""
+        """Register all successive frames that are in the buffer and not yet registered."""
         slots = self._buffer.span(self._registered, self._total)
         if len(slots) < 2:
             return
@@ -277,7 +305,7 @@ class MotionDetector:
         self._registered += len(steps)
 
     def _find_ready(self) -> list[int]:
-        """Up to `batch` frames whose windows are complete."""
+        """Return the indices of up to `batch` frames whose windows are complete."""
         ready: list[int] = []
         for index in range(self._observed, min(self._observed + self.batch, self._total)):
             slot = self._buffer[index]
@@ -290,7 +318,7 @@ class MotionDetector:
             if not self._ended and self._registered < index + look_ahead(slot.interval, slot.distance.settings):
                 break
             ready.append(index)
-        # Whole batches only while the clip runs: a batching engine takes as long for four windows as for eight.
+        # While the clip runs, return whole batches only: a batching engine takes as long for four windows as for eight.
         return ready if self._ended or len(ready) == self.batch else []
 
     def _observe(self, indices: list[int]) -> None:
@@ -313,7 +341,7 @@ class MotionDetector:
     def _build_window(self, index: int) -> Window | None:
         slot, settings = self._buffer[index], self._buffer[index].distance.settings
         before = self._buffer.step_before(index)
-        if before is not None and not before.reliable:  # a cut or a blank picture: reported once, at this frame
+        if before is not None and not before.reliable:  # report a cut or a blank picture once, at this frame
             slot.cause = before.cause
         parameters = self.settings.difference
         back = index - max(parameters.wide_frames, 2 * slot.interval, 2 * max(parameters.near_frames))
@@ -321,7 +349,7 @@ class MotionDetector:
         near, wide, small = choose_pairs(index, slot.interval, first, last, settings)
         if not near:
             is_cut = slot.step is not None and not slot.step.reliable
-            alone = slot.step.cause if slot.step and is_cut else "too few frames hang together with it"
+            alone = slot.step.cause if slot.step and is_cut else "too few frames are registered to this frame"
             slot.cause = slot.cause or alone
             return None
         used = sorted({i for pair in [*near, wide, small] if pair for i in pair})
@@ -341,7 +369,7 @@ class MotionDetector:
         )
 
     def _motion_between(self, index: int, other: int) -> np.ndarray:
-        """Return the homography (3, 3) of the background between two frames: registered directly, or chained."""
+        """Return the homography (3, 3) of the background between two frames, registered directly or chained."""
         if self.settings.registration.direct:
             (step,) = self.engine.register([(self._buffer[index].view, self._buffer[other].view)])
             if step.reliable:
@@ -352,46 +380,40 @@ class MotionDetector:
         start, observation, boxes = time.perf_counter(), self._buffer[index].observation, []
         if observation.foreground is not None and observation.foreground.small is not None:
             boxes = find_small_boxes(observation.foreground.small, self.settings.small)
-            observation.foreground = replace(observation.foreground, small=None)  # not needed again
+            observation.foreground = replace(observation.foreground, small=None)  # the map is not needed again
         self._small_tracks.step(index, self._buffer.this_from_last(index), boxes)
         self._buffer[index].seconds["small"] = time.perf_counter() - start
 
     def _draw(self) -> None:
-        """Draw the targets of the frames whose following frames, as far as persistence needs them, are observed."""
-        followers = LOOKS_AFTER if uses_tracklets(self.settings) else 2 if self.settings.persistence.on else 0
+        """Draw the targets of all frames for which the later looks that tracklets need are observed."""
+        followers = LOOKS_AFTER if uses_tracklets(self.settings) else 0
         while self._drawn < self._observed and (self._drawn + followers < self._observed or self._all_observed):
             index, start = self._drawn, time.perf_counter()
-            slot, slots, at = self._buffer[index], *self._around(index)
-            observations, steps = [s.observation for s in slots], [s.next_from_this for s in slots]
-            persistent = judge_persistence(observations, steps, at, slot.distance.settings)
-            slot.observation.targets = join_fragments(self._judge(index, persistent))
+            slot = self._buffer[index]
+            slot.observation.targets = self._judge(index)
             slot.observation.window = slot.observation.foreground = None
             slot.seconds["outline"] = time.perf_counter() - start
             self._drawn += 1
 
-    def _judge(self, index: int, persistent: list[bool]) -> list[Target]:
-        """The targets of a frame: the blobs that persist, or what its tracklets show."""
+    def _judge(self, index: int) -> list[Target]:
+        """Return the targets of a frame: the candidates that tracklets accept, or all blobs without tracklets."""
         slot = self._buffer[index]
         observation, settings, candidates = slot.observation, slot.distance.settings, slot.observation.candidates
         if candidates is None:
-            drawn = draw_blobs(observation, np.flatnonzero(persistent).tolist(), settings)
+            drawn = draw_blobs(observation, observation.blobs, observation.motions, settings)
             return [target for parts in drawn for target in parts]
         others = self._looks_about(index)
         tracklets = follow(candidates, others, slot.view.size)
-        scores = score_tracklets(candidates, tracklets, {offset: seen for offset, (seen, _) in others.items()})
-        joined_px = 1.5 * settings.morphology.close_px
-        worth = PERSISTENT if slot.distance.gates is None else PERSISTENT_SIZED
-        chosen = choose(candidates.box_px, scores, persistent, settings.tracklets.accept, joined_px, worth)
-        blobs = [i for i in chosen if i < len(persistent)]
-        targets = [target for parts in draw_blobs(observation, blobs, settings) for target in parts]
-        for i in chosen:
-            if i >= len(persistent):
-                confidence = float(1 / (1 + np.exp(-scores[i])))
-                targets.append(draw_candidate(observation, i, tracklets.velocity_px[i], confidence, settings))
-        return targets
+        worth, close_px = BLOB_SIZED if slot.distance.person_px else BLOB, settings.morphology.close_px
+        if slot.distance.tiny:  # a person is narrower than any closing
+            worth, close_px = BLOB_TINY, 0
+        seen = {offset: there for offset, (there, _) in others.items()}
+        scores = score_tracklets(candidates, tracklets, seen, hits=worth.hits)
+        chosen = choose(candidates, scores, settings.tracklets.accept, close_px, worth)
+        return draw_chosen(observation, chosen, tracklets.velocity_px, scores, self._flow, settings)
 
     def _looks_about(self, index: int) -> dict[int, tuple[Candidates, np.ndarray]]:
-        """The looks that tracklets of a frame may cross: by offset, candidates and the homography from there."""
+        """Return the looks that a frame's tracklets may use: by offset, candidates and the homography to the frame."""
         others = {}
         first, last = self._buffer.linked(index, index - LOOKS_BEFORE, min(index + LOOKS_AFTER, self._observed - 1))
         for other in range(first, last + 1):
@@ -404,13 +426,8 @@ class MotionDetector:
     def _all_observed(self) -> bool:
         return self._ended and self._observed == self._total
 
-    def _around(self, index: int) -> tuple[list[Slot], int]:
-        """The observed frames at most two away, and the place of this one among them."""
-        slots = self._buffer.span(index - 2, min(index + 3, self._observed))
-        return slots, index - max(index - 2, self._buffer.first)
-
     def _emit(self) -> Iterator[Scene]:
-        """The scenes that no later frame can change, and let go of what no window needs again."""
+        """Yield the scenes that no later frame can change, and drop the frames that no later window needs."""
         while self._emitted < self._drawn:
             slot = self._buffer[self._emitted]
             delay = settling_delay(slot.interval, slot.distance.settings)
@@ -423,14 +440,14 @@ class MotionDetector:
                 self._returned = made.frame
                 yield made
             slot.repeats = []
-            # Colour is most of the memory: the scene has it, and windows use the view's only.
+            # Drop the colour picture, which takes most of the memory: the scene keeps it, and windows use the view.
             slot.frame = replace(slot.frame, image=slot.view.grey)
             self._emitted += 1
             self._buffer.drop_colours(self._emitted - 1 - self.settings.difference.wide_frames)
             self._buffer.drop_before(min(self._emitted - LOOKS_BEFORE, self._observed - self._memory))
 
     def _fill_gap(self, until: int, following: Frame | None, interval: int) -> Iterator[Scene]:
-        """Empty scenes for the frame numbers below `until` that could not be read. following: the frame after them."""
+        """Yield empty scenes for unreadable frame numbers below `until`. following: the next frame that was read."""
         before, step_s = self._returned, 1 / self.rate_hz
         if following is not None and before.number:
             step_s = (following.time_s - before.time_s) / (following.number - before.number)
@@ -444,8 +461,8 @@ class MotionDetector:
     def _build_scene(self, slot: Slot, index: int) -> Scene:
         self._controller.add_cost(slot)
         targets = slot.observation.targets
-        targets = targets + self._small_targets(index, targets)
-        if slot.passed:  # what moved from look to look, per frame
+        targets = join_fragments(targets + self._small_targets(index, targets), slot.view.grey, self._grounds(index))
+        if slot.passed:  # convert velocities from px a look to px a frame
             targets = [replace(t, velocity_px=t.velocity_px / (slot.passed + 1)) for t in targets]
         if slot.distance.gates is not None:
             targets = [t for t in targets if slot.distance.gates.admit(t.box[2], t.box[3], t.velocity_px)]
@@ -463,12 +480,21 @@ class MotionDetector:
             core=core,
         )
 
+    def _grounds(self, index: int) -> list[Ground]:
+        """Return the earliest and the latest picture around a frame that are always registered when it is settled."""
+        ahead = max(2 * self._buffer[index].interval, 2)
+        ends = self._buffer.linked(index, index - LOOKS_BEFORE, min(index + ahead, self._registered))
+        others = [other for other in ends if other != index]
+        return [
+            Ground(self._buffer[other].view.grey, other - index, self._buffer.motion(index, other)) for other in others
+        ]
+
     def _small_targets(self, index: int, targets: list[Target]) -> list[Target]:
-        """The confirmed small tracks that this frame shows and no other target covers."""
+        """Return the confirmed small tracks that have a box in this frame and that no other target covers."""
         parameters = self.settings.small
         if not parameters.on:
             return []
-        slots, _ = self._around(index)
+        slots = self._buffer.span(index - 2, min(index + 3, self._observed))
         errors = [slot.step.error_px for slot in slots if slot.step is not None]
         blobs = np.median([len(slot.observation.blobs) for slot in slots])
         if blobs > parameters.max_blobs and errors and np.median(errors) > parameters.parallax_px:
@@ -485,11 +511,11 @@ class MotionDetector:
 
 
 def _memory_frames(settings: Settings, has_telemetry: bool) -> int:
-    """How many frames before the observed one a window may use again."""
+    """Return how many frames before the observed frame later windows may still use."""
     parameters, longest = settings.difference, 2 * max(settings.interval.maximum_frames, settings.interval.frames)
     if parameters.kind in ("between_later", "to_next"):
         return max(longest, _JUDGED_FRAMES)
-    # A wide or small window that looks one way only looks twice as far.
+    # At the ends of a clip a wide or small pair looks in one direction only, and then twice as far.
     small = 0
     if settings.small.on:
         is_any = has_telemetry and small_gap_follows_distance(settings)

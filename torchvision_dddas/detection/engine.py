@@ -1,4 +1,4 @@
-"""Engines, which do the pixel work: their protocol and records, and what they share when they register two frames."""
+"""The protocol and records of engines, which compute on pixels, and the checks of a registration that they share."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from torchvision_dddas.types import Registration
 
 @dataclass(frozen=True)
 class Foreground(Maps[np.ndarray]):
-    """The chain's maps of a window, and what an engine adds; all maps are (H, W) uint8, sets are 255.
+    """The detection chain's maps of a window, and the engine's own results. Maps are (H, W) uint8, masks 0 or 255.
 
-    offsets: the frames of the `warped` neighbours, from the reference. scale: side of a map's pixel in pixels of the
-    frame; above 1 only where the maps are used for nothing but blobs. blobs: where the engine has found them itself.
-    Then evidence, wide and texture hold only what their boxes show, `core` is filled only for a motion history, and
-    `warped` only where flow needs it; all are 0 elsewhere.
+    offsets: frame offsets of the `warped` neighbours from the reference frame. scale: side of a map pixel in frame
+    pixels; above 1 only if the maps serve for blobs alone. blobs: set if the engine itself finds the blobs. Then
+    evidence, wide and texture are filled only inside the blobs' boxes, `core` only if a motion history needs it, and
+    `warped` only if flow needs it; all are 0 elsewhere.
     """
 
     offsets: tuple[int, int] = (0, 0)
@@ -33,29 +33,29 @@ EngineView = TypeVar("EngineView", bound=View)
 
 
 def grey_of(image: np.ndarray) -> np.ndarray:
-    """The grey levels of a picture, (H, W) or (H, W, 3) BGR."""
+    """Return the grey levels (H, W) of a picture, (H, W) or (H, W, 3) BGR."""
     return cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
 
 
 class Engine(Protocol[EngineView]):
-    """What an engine offers. Lists go in and out, so that it may batch.
+    """The operations of an engine. They take and return lists, so that an engine may batch.
 
-    parameters: the settings in force; they may be replaced between two frames.
+    parameters: the current settings. They may be replaced between two frames.
     """
 
     name: str
     parameters: Settings
 
     def prepare(self, image: np.ndarray) -> EngineView:
-        """The view of a frame, with its grey picture."""
+        """Return the view of a frame, with its grey picture."""
         ...
 
     def register(self, pairs: Sequence[tuple[EngineView, EngineView]]) -> list[Registration]:
-        """The background's motion from the first to the second frame of each pair."""
+        """Return the background's motion from the first to the second frame of each pair."""
         ...
 
     def foreground(self, windows: Sequence[Window[EngineView]]) -> list[Foreground]:
-        """What moves in each window's reference frame."""
+        """Return the maps that show moving pixels in each window's reference frame."""
         ...
 
 
@@ -66,10 +66,10 @@ def judge_points(
     size: tuple[int, int],
     parameters: RegistrationParameters,
 ) -> tuple[Registration, np.ndarray]:
-    """The record of a registration, with a cause in words where nothing may be concluded from it; and its inliers.
+    """Judge whether a registration is reliable. Return its record, with the cause if it is not, and its (N,) inliers.
 
-    start, end: (N, 2) tracked keypoints in the earlier and the later frame; fewer than four make it unreliable,
-    whatever the matrix. size: (width, height).
+    start, end: (N, 2) tracked keypoints in the earlier and the later frame. With fewer than four keypoints the
+    registration is unreliable for every matrix. size: (width, height).
     """
     tracked, error_px, flow_px, cause = len(start), float("inf"), float("nan"), ""
     if tracked < 4:
@@ -80,18 +80,18 @@ def judge_points(
         error_px = float(np.median(miss[inliers])) if inliers.any() else error_px
     count = int(inliers.sum())
     if tracked < parameters.min_inliers:
-        cause = f"only {tracked} keypoints could be followed, {parameters.min_inliers} wanted"
+        cause = f"only {tracked} keypoints could be tracked, {parameters.min_inliers} are needed"
     elif count < parameters.min_inliers or count < parameters.min_inlier_share * tracked:
         cause = f"only {count} of {tracked} keypoints agree on one background motion"
     elif not _is_plausible(later_from_earlier, size):
-        cause = "the background motion found is not one of a camera"
+        cause = "no camera motion can produce the background motion that was found"
     else:
         flow_px = background_flow(later_from_earlier, size)
     return Registration(later_from_earlier, tracked, count, error_px, flow_px, not cause, cause), inliers
 
 
 def _is_plausible(later_from_earlier: np.ndarray, size: tuple[int, int]) -> bool:
-    """Whether the outline of the picture stays convex and upright, and its area neither doubles nor halves."""
+    """Return whether a homography keeps the picture's outline convex and upright, and its area within a factor of 2."""
     width, height = size
     corners = transfer(later_from_earlier, np.array([[0, 0], [width, 0], [width, height], [0, height]], float))
     if not np.isfinite(corners).all():

@@ -1,4 +1,4 @@
-"""The frames of a clip that windows may still use: their views, registrations and observations, by index."""
+"""Keep the frames of a clip that later windows may use, with their views, registrations and observations, by index."""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -12,16 +12,18 @@ from torchvision_dddas.detection.observation import Observation
 from torchvision_dddas.geometry import chain
 from torchvision_dddas.types import Adjustment, Frame, Registration
 
-# A picture whose grey levels have a smaller standard deviation is blank: even fog shows more.
+# A picture is blank if its grey levels have a smaller standard deviation; pictures of fog have a larger one.
 _BLANK_LEVELS = 1.0
 
 
 @dataclass
 class Slot:
-    """One frame in flight. look: its number if frames that are skipped on purpose, or repeated, did not count.
+    """A frame in process, with its intermediate results.
 
-    passed: those frames since the slot before. step: registration to the next slot; None while unknown and at the end.
-    interval: 0 until it is chosen. repeats: the frames that repeat this one. cause: why nothing can be found in it.
+    look: the frame's number without the frames that were skipped on purpose or are repeats. passed: number of such
+    frames since the previous slot. step: registration to the next slot; None until it is computed, and for the last
+    slot. interval: detection interval, 0 until it is chosen. repeats: the frames that repeat this frame. cause: why
+    detection is impossible in this frame, else "".
     """
 
     frame: Frame
@@ -39,17 +41,17 @@ class Slot:
 
     @cached_property
     def is_blank(self) -> bool:
-        """Whether the picture shows nothing that could be registered."""
+        """Whether the picture has too little contrast to be registered."""
         return float(self.view.grey[::4, ::4].std()) < _BLANK_LEVELS
 
     @property
     def next_from_this(self) -> np.ndarray | None:
-        """(3, 3) registration to the next frame; None if it is unknown or unreliable."""
+        """The (3, 3) registration to the next frame; None if it is unknown or unreliable."""
         return self.step.later_from_earlier if self.step is not None and self.step.reliable else None
 
 
 class FrameBuffer:
-    """Slots by index; indices count the frames that were read. first, total: the first that is kept, and the end."""
+    """The slots of a clip by index, which counts frames read. first: the oldest index kept. total: frames read."""
 
     def __init__(self) -> None:
         self.first = self.total = 0
@@ -64,19 +66,19 @@ class FrameBuffer:
         self.total += 1
 
     def span(self, first: int, end: int) -> list[Slot]:
-        """The slots from `first` on, as far as they are kept, below `end`."""
+        """Return the slots from `first` to below `end` that are still kept."""
         return [self[index] for index in range(max(first, self.first), end)]
 
     def step_before(self, index: int) -> Registration | None:
-        """The registration from the frame before."""
+        """Return the registration from the frame before, or None."""
         return self[index - 1].step if index > self.first else None
 
     def this_from_last(self, index: int) -> np.ndarray | None:
-        """(3, 3) the registration from the frame before; None if it is unknown or unreliable."""
+        """Return the (3, 3) registration from the frame before; None if it is unknown or unreliable."""
         return self[index - 1].next_from_this if index > self.first else None
 
     def linked(self, index: int, least: int, most: int) -> tuple[int, int]:
-        """The first and last frame, within least..most, that reliable steps link to this one."""
+        """Return the first and last frame, within least..most, that a chain of reliable steps links to this frame."""
         first = last = index
         while first > max(self.first, least) and self.this_from_last(first) is not None:
             first -= 1
@@ -91,7 +93,7 @@ class FrameBuffer:
         return last_from_first if other > index else np.linalg.inv(last_from_first)
 
     def set_steps(self, first: int, steps: list[Registration], seconds: float) -> None:
-        """Keep the registrations of successive frames, which took so many seconds each."""
+        """Store the registrations of successive frames. seconds: computing time of each."""
         for index, step in enumerate(steps, first):
             # Tracking onto a blank picture seems to succeed: keypoints stay where the search began.
             is_blank = self[index].is_blank or self[index + 1].is_blank
@@ -99,12 +101,12 @@ class FrameBuffer:
             self[index].seconds["register"] = seconds
 
     def drop_colours(self, index: int) -> None:
-        """Keep the grey picture of a frame alone, if the frame is kept: colour is most of the memory."""
+        """Drop the colour picture of a frame that is still kept, because colour takes most of the memory."""
         if index >= self.first:
             self[index].view.image = self[index].view.grey
 
     def drop_before(self, index: int) -> None:
-        """Let go of the frames before an index."""
+        """Drop the frames before an index."""
         while self.first < index:
             self._slots.popleft()
             self.first += 1

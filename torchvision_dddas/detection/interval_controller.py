@@ -1,4 +1,4 @@
-"""Which frames are compared: the controller of the detection interval, by telemetry or by the background's flow."""
+"""Control the detection interval by telemetry or by the background flow."""
 
 from collections import deque
 
@@ -7,7 +7,6 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.detection.frame_buffer import FrameBuffer, Slot
 from torchvision_dddas.detection.interval import (
-    DistanceSettings,
     adjust_interval,
     describe_distance,
     follow_distance,
@@ -22,33 +21,29 @@ from torchvision_dddas.types import Flight, Telemetry
 class IntervalController:
     """Chooses each frame's detection interval, and the settings for its distance to the ground.
 
-    telemetry: may be replaced between two frames. interval, distance: those in force.
+    telemetry: may be replaced between two frames. interval, distance: the current interval and distance settings.
     """
 
     def __init__(self, settings: Settings, rate_hz: float, telemetry: Telemetry | None) -> None:
         self.settings, self.rate_hz, self.telemetry = settings, rate_hz, telemetry
-        self.interval, self.distance = settings.interval.frames, DistanceSettings(settings)
+        self.interval, self.distance = settings.interval.frames, settings_at(None, rate_hz, settings)
         self._flows: deque[float] = deque(maxlen=settings.interval.memory_frames)
-        self._costs: deque[float] = deque(maxlen=settings.interval.memory_frames)  # seconds that looks took
+        self._costs: deque[float] = deque(maxlen=settings.interval.memory_frames)  # computing time of looks, s
 
     def change_settings(self, settings: Settings) -> None:
         """Use other settings from now on."""
-        self.settings, distance_m = settings, self.distance.distance_m
-        if distance_m is None:
-            self.distance = DistanceSettings(settings)
-        else:
-            self.distance = settings_at(distance_m, self.rate_hz, settings)
+        self.settings, self.distance = settings, settings_at(self.distance.flight, self.rate_hz, settings)
 
     def add_cost(self, slot: Slot) -> None:
-        """Take what a look took into account."""
+        """Record the computing time of a look."""
         self._costs.append(sum(slot.seconds.values()))
 
     def steer(self, buffer: FrameBuffer, index: int) -> None:
-        """Set the interval and the settings of a frame, and record what changed in its slot."""
+        """Set the interval and the settings of a frame, and record the changes in its slot."""
         slot = buffer[index]
         flight = None if self.telemetry is None else self.telemetry.at(slot.frame.time_s)
-        # A log may say one of altitude and speed without the other, or fall silent for a while. A height of 0 or less,
-        # as on the ground or below a take-off on a hill, tells nothing of the distance to what is seen.
+        # A log may have only the altitude or only the speed, or a gap in time. An altitude of 0 or less, as on the
+        # ground or below the take-off place, does not give the distance to the ground in view.
         high = flight if flight is not None and flight.altitude_m > 0 else None
         number = slot.frame.number
         self.distance, moved = follow_distance(number, self.distance, high, self.rate_hz, self.settings)
@@ -60,7 +55,7 @@ class IntervalController:
         if wanted is not None:
             wanted /= slot.passed + 1
             if left := slot.passed:
-                cause += f", {left} frame{'s' * (left > 1)} before it dropped or left out"
+                cause += f", {left} frame{'s' * (left > 1)} before it dropped or skipped"
                 cause += " or repeated" * (left > slot.frame.skipped)
             _, measured = look_cost(self._costs, self.settings.interval)
             used = self.distance.settings
@@ -69,7 +64,7 @@ class IntervalController:
         slot.interval = self.interval
 
     def _wanted_interval(self, slot: Slot, high: Flight | None) -> tuple[float | None, str]:
-        """The interval by the rule (appendix B, eq. 2), and by what; None where the rule is off or knows nothing."""
+        """Return the interval by the rule (appendix B, eq. 2) and its cause; None if the rule is off or lacks input."""
         parameters = self.settings.interval
         cost, _ = look_cost(self._costs, parameters)
         if not parameters.rule:

@@ -1,7 +1,7 @@
-"""Motion history (appendix B, step S5): when each place last moved, and what follows for blobs.
+"""Motion history (appendix B, step S5): record when each pixel last moved, and derive the motion of blobs.
 
-A blob leaves a trail in the history, which gives its heading and speed. Where its trail falls into regions that point
-clearly different ways, the blob is several targets that touch.
+A blob leaves a trail in the history. The trail gives the blob's heading and speed. If the trail has two regions with
+clearly different headings, the blob is two targets that touch.
 """
 
 from collections import deque
@@ -16,22 +16,22 @@ from torchvision_dddas.detection.blobs import Blob, Box, box_slices
 from torchvision_dddas.geometry import transfer
 
 NEWEST = 255
-# Corners are painted to 1/16 px; further off than this they are beyond any picture.
+# Corners are drawn with a resolution of 1/16 px, and clipped to a distance that lies outside any picture.
 _SHIFT, _FAR_PX = 4, 1e5
-# How far behind a blob its trail is searched, px.
+# Distance around a blob within which its trail is searched, px.
 _REACH_PX = 48
-# A trail shows the motion across its edge only, so one motion can leave two trails that point up to a right angle
-# apart, with noise somewhat more. A larger angle means two motions.
+# A trail shows only the motion component across its edge. One motion can therefore leave two trails whose headings
+# differ by up to a right angle, or a little more with noise. A larger angle means two motions.
 _APART_RAD = np.radians(120)
-# The gradients of flicker do not agree with each other, or it hardly moves (px a frame).
+# Flicker has gradients with less agreement than _MIN_AGREEMENT, or is slower than _MIN_SPEED_PX (px a frame).
 _MIN_AGREEMENT, _MIN_SPEED_PX = 0.5, 0.5
-# Smaller trails (share of all) and smaller parts (share of the blob) are noise.
+# Trails with a smaller share of all trail pixels, and parts with a smaller share of the blob, are noise.
 _MIN_SHARE = 0.2
 
 
 @dataclass
 class _Silhouette:
-    """outlines: (N, 2) corners of its outlines, holes too, one after another. ends: (K,) where each outline ends."""
+    """One past silhouette. outlines: (N, 2) corners of all outlines and holes. ends: (K,) end index of each outline."""
 
     number: int
     outlines: np.ndarray
@@ -40,11 +40,11 @@ class _Silhouette:
 
 
 class MotionHistory:
-    """The silhouettes of the last `duration_frames` of one clip: move it on to every frame in order, then add its own.
+    """The silhouettes of the last `duration_frames` frames of a clip. Call `move` and `add` for every frame in order.
 
-    Stamps are uint8: 255 is now, 254 one frame ago, 0 longer ago than the duration. Outlines are kept with their
-    composed registrations and painted at most once a frame. Warping the stamps at every step would round to whole
-    pixels each time, and a camera that moves by 0.4 px a frame would never move its history.
+    Stamps are uint8: 255 is the current frame, 254 the frame before, 0 is older than the duration. Outlines are kept
+    with their composed registrations and drawn at most once a frame. Warping the stamps at every step would round to
+    whole pixels each time, so that a camera motion of 0.4 px a frame would never move the history.
     """
 
     def __init__(self, duration_frames: float) -> None:
@@ -55,7 +55,7 @@ class MotionHistory:
         self._painted: np.ndarray | None = None
 
     def move(self, number: int, this_from_last: np.ndarray | None) -> None:
-        """Align the history to a frame. this_from_last: (3, 3) from the frame before; None, at a cut, clears it."""
+        """Align the history to a frame. this_from_last: (3, 3) registration; None, at a cut, clears the history."""
         self.number = number
         self._painted = None
         if this_from_last is None:
@@ -66,7 +66,7 @@ class MotionHistory:
             past.now_from_then = this_from_last @ past.now_from_then
 
     def add(self, silhouette: np.ndarray) -> None:
-        """Stamp the (H, W) uint8 silhouette of the current frame, nonzero where something moves."""
+        """Add the silhouette of the current frame, (H, W) uint8, nonzero where something moves."""
         outlines, _ = cv2.findContours(silhouette, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         corners = np.concatenate([np.zeros((0, 2)), *(outline[:, 0] for outline in outlines)])
         ends = np.cumsum([len(outline) for outline in outlines], dtype=int)
@@ -75,12 +75,12 @@ class MotionHistory:
         self._painted = None
 
     def stamps(self, box: Box) -> np.ndarray:
-        """(height, width) uint8 stamps inside a box of the current frame: x, y, width, height."""
+        """Return the (height, width) uint8 stamps inside a box (x, y, width, height) of the current frame."""
         if not self._past:
             return np.zeros(box[:1:-1], np.uint8)
         if self._painted is None:
             self._painted = np.zeros(self._shape, np.uint8)
-            for past in self._past:  # the newest is last and overwrites
+            for past in self._past:  # the newest silhouette is drawn last, over the older ones
                 if len(past.ends):
                     places = np.clip(transfer(past.now_from_then, past.outlines), -_FAR_PX, _FAR_PX)
                     outlines = np.split(np.round(places * 2**_SHIFT).astype(np.int32), past.ends[:-1])
@@ -91,10 +91,11 @@ class MotionHistory:
 def motion_gradient(
     stamps: np.ndarray, delta_min_frames: float, delta_max_frames: float, aperture: int = 3
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Direction of motion (radians, 0 = right, pi/2 = down) and where it is valid, (H, W) each.
+    """Return the direction of motion (radians, 0 = right, pi/2 = down) and where it is valid, (H, W) each.
 
-    The Sobel gradient over aperture x aperture px (odd), valid where the stamps under it span at least
-    delta_min_frames and at most delta_max_frames, as in OpenCV's calcMotionGradient, which the source used.
+    The direction is that of the Sobel gradient over aperture x aperture px (odd). It is valid where the stamps in the
+    aperture span at least delta_min_frames and at most delta_max_frames. OpenCV's calcMotionGradient, which the source
+    used, has the same rule.
     """
     along_u, along_v = (
         cv2.Sobel(stamps, cv2.CV_32F, *order, ksize=aperture, borderType=cv2.BORDER_REPLICATE)
@@ -110,9 +111,10 @@ def motion_gradient(
 def region_orientation(
     orientation_rad: np.ndarray, valid: np.ndarray, stamps: np.ndarray, region: np.ndarray, duration_frames: float
 ) -> tuple[float, float]:
-    """Mean direction of a (H, W) bool region in radians, NaN where it has none, and the agreement on it, 0 to 1.
+    """Return the mean direction of a (H, W) bool region in radians, and the agreement of its gradients, 0 to 1.
 
-    The weighted circular mean of the valid gradients: a stamp weighs 1 when new and 0 after the duration.
+    The mean is the circular mean of the valid gradients, NaN if they cancel out or there are none. The weight of a
+    gradient falls from 1 for a new stamp to 0 at the duration.
     """
     inside = region & valid
     weight = np.clip(1 - (NEWEST - stamps[inside].astype(np.float32)) / duration_frames, 0, 1)
@@ -123,12 +125,12 @@ def region_orientation(
 
 
 def flood_regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float) -> list[np.ndarray]:
-    """(H, W) bool masks of the regions of a flood fill that hold a seed.
+    """Return (H, W) bool masks of the flood-fill regions that contain a seed.
 
-    Neighbours (8) whose stamps differ by at most the threshold are of one region; stamp 0 is of none.
+    Neighbours (8) whose stamps differ by at most the threshold belong to one region. Stamp 0 belongs to no region.
     stamps: (H, W) uint8. seeds: (H, W) bool.
     """
-    # OpenCV's mask is one pixel larger on every side; nonzero is a wall.
+    # OpenCV's mask is one pixel larger on every side; the fill stops where it is nonzero.
     wall = np.pad((stamps == 0).astype(np.uint8), 1, constant_values=1)
     threshold = int(min(threshold_frames, 254))  # stamps are whole frames
     flags = 8 | (2 << 8) | cv2.FLOODFILL_MASK_ONLY
@@ -146,11 +148,11 @@ def flood_regions(stamps: np.ndarray, seeds: np.ndarray, threshold_frames: float
 def split_by_trail(
     blob: Blob, history: MotionHistory, size: tuple[int, int], parameters: HistoryParameters
 ) -> list[tuple[Blob, np.ndarray]]:
-    """The blob with its velocity, or its two parts with theirs where its trail shows two motions.
+    """Return the blob with its velocity, or its two parts with their velocities if the trail shows two motions.
 
-    The history has the current frame's silhouette. size: (width, height) of the picture. velocity: (2,) pixels a frame
-    over the background; NaN for a blob that leaves no usable trail, because it is slower than the trail is broad or
-    faster than its own length a frame.
+    history: must contain the current frame's silhouette. size: (width, height) of the picture. A velocity is (2,)
+    pixels a frame over the background. It is NaN for a blob without a usable trail: one that moves very slowly, or by
+    more than its own length a frame.
     """
     x, y, width, height = blob.box
     left, top = max(x - _REACH_PX, 0), max(y - _REACH_PX, 0)
@@ -175,7 +177,7 @@ def split_by_trail(
     if not trails:
         return [(blob, np.full(2, np.nan))]
     headings = [heading if agreement >= _MIN_AGREEMENT else np.nan for heading, agreement in map(orientation, trails)]
-    # The two trails that point furthest apart, if far enough.
+    # Find the two trails with the largest angle between them above _APART_RAD.
     best, pair = _APART_RAD, None
     for j, i in combinations(range(len(trails)), 2):
         angle = abs(np.angle(np.exp(1j * (headings[i] - headings[j]))))
@@ -193,9 +195,9 @@ def split_by_trail(
 
 
 def _share_out(body: np.ndarray, ways: list[tuple[np.ndarray, float]]) -> np.ndarray:
-    """Each pixel of the body goes to the trail that it lies ahead of; if that holds for both, to the nearer.
+    """Assign each pixel of the body to the trail that it lies ahead of; if it lies ahead of both, to the nearer one.
 
-    ways: trails and their headings.
+    ways: trails and their headings. Returns (2, H, W) bool.
     """
     row, column = np.nonzero(body)
     costs = []
@@ -211,7 +213,7 @@ def _share_out(body: np.ndarray, ways: list[tuple[np.ndarray, float]]) -> np.nda
 
 
 def _velocity(stamps: np.ndarray, body: np.ndarray, trail: np.ndarray, heading: float) -> np.ndarray:
-    """Velocity of a body that left a trail: the area swept a frame, over its breadth across the heading."""
+    """Return a body's velocity: trail area a frame over breadth across the heading; NaN for an unknown heading."""
     if not np.isfinite(heading) or not body.any():
         return np.full(2, np.nan)
     age = NEWEST - stamps[trail].astype(int)

@@ -1,11 +1,11 @@
-"""The engine for one stream on a small CPU: OpenCV on 8-bit pictures, no torch.
+"""The engine for one stream on a small CPU: OpenCV on 8-bit pictures, without torch.
 
-Two frames are registered by grid keypoints, Lucas-Kanade, RANSAC, and refits on the inliers. With
-`registration.redetect_frames` above 1 the inliers of one step are the start points of the next, and its homography
-predicts where they go: a short search is then enough.
+Two frames are registered by grid keypoints, Lucas-Kanade tracking, RANSAC, and refits on the inliers. With
+`registration.redetect_frames` above 1, the inliers of one step are the start points of the next step, and the
+homography of the step predicts their motion, so that a short search is enough.
 
 The engine can work at half the resolution, for a quarter of the cost. A pixel of the half picture is the mean of 2 x 2
-pixels, so that place p there is place 2 p + 1/2 in the whole picture.
+pixels, so that coordinate p in the half picture is 2 p + 1/2 in the whole picture.
 """
 
 from collections.abc import Sequence
@@ -33,26 +33,28 @@ from torchvision_dddas.types import Registration
 _WHOLE_FROM_HALF = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
 _HALF_FROM_WHOLE = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
 
-# The short search around a prediction: pyramid levels above the full resolution. It takes as many steps as the deep one
-# if it needs them, which hardly any does: five at most made false targets of far parallax.
+# Most pyramid levels above the full resolution when the motion is predicted. The number of iterations is not reduced
+# as well: a limit of five iterations gave false targets on distant objects with parallax.
 _SHORT_LEVELS = 1
-# The window of the deep search from a cold start is at least this wide.
+# The Lucas-Kanade window is at least this wide when no earlier step predicts the motion.
 _DEEP_WINDOW_PX = 21
-# Below this share of inliers a short step is done again, deep and from new keypoints.
+# If a step with predicted motion has a smaller share of inliers, it is repeated with new keypoints and all levels.
 _LEAST_SHARE = 0.4
-# Keypoints are detected anew below this share of those detected, or of the coarse cells that they covered.
+# New keypoints are detected when fewer than _LEAST_LEFT of the detected ones are left, or when those left cover fewer
+# than _LEAST_COVER of the cells, in a grid of _COARSE x _COARSE cells, that the detected ones covered.
 _LEAST_LEFT, _LEAST_COVER, _COARSE = 0.6, 0.8, 4
 _STRIP_ROWS = 64
-# Inliers of the refits, in RANSAC's tolerance. On half pictures 0.08 px at the corners with or without the rest.
+# Inlier tolerances of the successive refits, as factors of RANSAC's tolerance. On half pictures two refits suffice: the
+# error at the corners is 0.08 px with two and with four.
 _TOLERANCES, _TOLERANCES_HALVED = (1.5, 1.0, 0.5, 0.5), (1.0, 0.5)
 
 
 @dataclass(frozen=True)
 class Carried:
-    """What a step of the registration leaves to the next one.
+    """The keypoints and the homography that one registration step passes to the next.
 
-    points: (N, 2) float32, its inliers. step: (3, 3) its homography, None before the first step. age: steps since
-    detection. count, cover: points and coarse cells that the detection gave.
+    points: (N, 2) float32, the inliers of the step. step: (3, 3) its homography, None before the first step. age: steps
+    since the keypoints were detected. count, cover: number of keypoints and coarse cells at detection.
     """
 
     points: np.ndarray
@@ -64,13 +66,13 @@ class Carried:
 
 @dataclass
 class OpenCVView(View):
-    """A frame, and what the engine uses again. carried: of the step that ends here, taken by the next one."""
+    """A frame with cached data. carried: keypoints of the step that ends at this frame, for the next step."""
 
     carried: Carried | None = None
 
     @cached_property
     def half(self) -> "OpenCVView":
-        """The view at half its resolution, grey; an odd last row or column is left out."""
+        """The grey view at half its resolution, without an odd last row or column."""
         width, height = (max(side // 2, 1) for side in self.size)
         grey = cv2.resize(self.grey[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
         if self.ignored is None:
@@ -80,7 +82,7 @@ class OpenCVView(View):
 
 
 class OpenCVEngine(Engine[OpenCVView]):
-    """Implements `Engine` one pair and one window at a time."""
+    """Implements `Engine` for one pair and one window at a time."""
 
     name = "onboard"
 
@@ -96,7 +98,7 @@ class OpenCVEngine(Engine[OpenCVView]):
         parameters = self.parameters.registration
         if not parameters.halved:
             return [_register(earlier, later, parameters) for earlier, later in pairs]
-        # Search windows keep their size, and so reach twice as far.
+        # Search windows keep their size in pixels, so that they cover twice the distance in the scene.
         lengths = {"cell_px": max(parameters.cell_px // 2, 4), "ransac_px": parameters.ransac_px / 2}
         lengths["min_distance_px"] = max(parameters.min_distance_px // 2, 1)
         lengths["forward_backward_px"] = parameters.forward_backward_px / 2
@@ -110,22 +112,23 @@ class OpenCVEngine(Engine[OpenCVView]):
 
     def foreground(self, windows: Sequence[Window[OpenCVView]]) -> list[Foreground]:
         """See `Engine.foreground`."""
-        settings = self.parameters
+        given, settings = [window.settings or self.parameters for window in windows], self.parameters
         if not settings.difference.halved:
-            return [find_foreground(window, settings) for window in windows]
-        found = [find_foreground(halve_window(window), halve_settings(settings)) for window in windows]
-        flow = settings.persistence.on or settings.refine.on
-        if not (flow or settings.history.on or settings.small.on):  # blobs alone are found on the half maps as well
+            return [find_foreground(window, own) for window, own in zip(windows, given, strict=True)]
+        halves = [(halve_window(window), halve_settings(own)) for window, own in zip(windows, given, strict=True)]
+        found = [find_foreground(*half) for half in halves]
+        flow = settings.refine.on
+        if not (flow or settings.history.on or settings.small.on):  # finding blobs does not need the whole resolution
             return [replace(half, scale=2) for half in found]
         return [double_maps(half, window.reference.size, flow) for half, window in zip(found, windows, strict=True)]
 
 
 def find_foreground(window: Window[OpenCVView], settings: Settings) -> Foreground:
-    """The chain's maps of a window; of a picture of a single row or column, all are 0."""
+    """Compute the chain's maps of a window. For a picture of a single row or column, all maps are 0."""
     grey = window.reference.grey
-    if min(grey.shape) < 2:  # OpenCV takes a single column for a number
+    if min(grey.shape) < 2:  # OpenCV treats a single column as a scalar
         zero = np.zeros_like(grey)
-        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (zero,), (-1, 1))
+        return Foreground(zero, zero, zero, zero, zero, (grey, grey), (zero,), zero, (-1, 1))
     chain: DetectionChain[OpenCVView, np.ndarray, np.ndarray] = DetectionChain(settings, OpenCVOperations())
     maps, (a, b) = chain.find_foreground(window), window.near[-1]
     return Foreground(**vars(maps) | {"offsets": (window.offsets[a], window.offsets[b])})
@@ -135,7 +138,7 @@ def find_foreground(window: Window[OpenCVView], settings: Settings) -> Foregroun
 
 
 def halve_window(window: Window[OpenCVView]) -> Window[OpenCVView]:
-    """The same window on half pictures."""
+    """Return the same window on half pictures."""
     return replace(
         window,
         reference=window.reference.half,
@@ -147,7 +150,7 @@ def halve_window(window: Window[OpenCVView]) -> Window[OpenCVView]:
 
 
 def halve_settings(settings: Settings) -> Settings:
-    """Settings of the difference whose lengths are those of the half picture, where slopes are twice as steep."""
+    """Return settings for half pictures: halve the lengths in pixels, and the gradient share, as slopes are doubled."""
     difference, morphology, small = settings.difference, settings.morphology, settings.small
     border_px, gradient_share = -(-difference.border_px // 2), difference.gradient_share / 2
     sides = {"blur_px": halve_side(difference.blur_px), "border_px": border_px, "gradient_share": gradient_share}
@@ -162,7 +165,7 @@ def halve_settings(settings: Settings) -> Settings:
 
 
 def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foreground:
-    """The maps of half pictures at the whole size (width, height). flow: whether the warped pictures are needed."""
+    """Enlarge the maps of half pictures to size (width, height). flow: whether the warped pictures are needed."""
     is_needed = half.texture.strides != (0, 0)
     texture = double(cv2.convertScaleAbs(half.texture, alpha=0.5), size) if is_needed else no_texture(size[::-1])
     evidence = double(half.evidence, size)
@@ -175,12 +178,13 @@ def double_maps(half: Foreground, size: tuple[int, int], flow: bool) -> Foregrou
         None if half.small is None else double(half.small, size),
         (double(one, size, smooth=True), double(other, size, smooth=True)) if flow else half.warped,
         tuple(double(pair, size) for pair in half.pairs),
+        None if half.levels is None else double(half.levels, size),
         half.offsets,
     )
 
 
 def double(picture: np.ndarray, size: tuple[int, int], smooth: bool = False) -> np.ndarray:
-    """A picture twice as large, of (width, height); an odd last row or column is repeated."""
+    """Enlarge a picture twofold to size (width, height); an odd last row or column is repeated."""
     twice = picture.shape[1] * 2, picture.shape[0] * 2
     large = cv2.resize(picture, twice, interpolation=cv2.INTER_LINEAR if smooth else cv2.INTER_NEAREST)
     if twice == size:
@@ -193,7 +197,7 @@ def double(picture: np.ndarray, size: tuple[int, int], smooth: bool = False) -> 
 
 
 def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationParameters) -> Registration:
-    """The background's motion from `earlier` to `later`; what the next step needs is left in `later.carried`."""
+    """Register the background of `later` to `earlier`, and store the keypoints for the next step in `later.carried`."""
     carrying = parameters.redetect_frames > 1
 
     def detect(step: np.ndarray | None) -> Carried:
@@ -203,7 +207,7 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
     carried, earlier.carried = earlier.carried if carrying else None, None
     if carried is not None:
-        # Anew where the points carried on are too old, too few, too much in one place, or more than are now allowed.
+        # Detect new keypoints if the carried ones are too old, too few, too clustered, or more than settings allow.
         if (
             carried.age >= parameters.redetect_frames
             or len(carried.points) > parameters.keypoints
@@ -224,7 +228,7 @@ def _register(earlier: OpenCVView, later: OpenCVView, parameters: RegistrationPa
 
 
 def _counts(points: np.ndarray, view: OpenCVView) -> np.ndarray:
-    """(N,) bool: which points (N, 2) of a view, or just beside it, are not left out."""
+    """Return (N,) bool: which points (N, 2) lie outside the ignored area. Points are first clipped to the picture."""
     if view.ignored is None:
         return np.ones(len(points), bool)
     u, v = np.clip(points.round().astype(int), 0, np.array(view.size) - 1).T
@@ -232,15 +236,15 @@ def _counts(points: np.ndarray, view: OpenCVView) -> np.ndarray:
 
 
 def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halved: bool = False) -> np.ndarray:
-    """(N, 2) float32: the strongest corner of each grid cell or of the whole frame, above the quality threshold.
+    """Detect (N, 2) float32 corners above the quality threshold: the strongest of each grid cell, or of the frame.
 
-    halved: search at half the resolution, at a quarter of the cost; the points then lie on even pixels.
+    halved: search at half the resolution, for a quarter of the cost; the points then lie on even pixels.
     """
     height, width = grey.shape
     cell, factor, apart_px = parameters.cell_side(width, height), 1, parameters.min_distance_px
     if halved and min(width, height) > 1:
-        # Half a pixel to the left and top of where the corner stands: a search window does not mind.
-        grey = grey[: height // 2 * 2, : width // 2 * 2]  # an odd side would be stretched, and corners moved
+        # The points lie half a pixel to the left and top of the corners, which does not matter for a search window.
+        grey = grey[: height // 2 * 2, : width // 2 * 2]  # resizing an odd side would stretch it and move the corners
         grey, factor = cv2.resize(grey, (width // 2, height // 2), interpolation=cv2.INTER_AREA), 2
         cell, apart_px = max(cell // 2, 1), max(apart_px // 2, 1)
     if parameters.corners == "frame":
@@ -253,7 +257,7 @@ def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halve
         return np.zeros((0, 2), np.float32)
     corner = measure_corners(grey, parameters.block_px)
     cells = corner[: rows * cell, : columns * cell].reshape(rows, cell, columns * cell)
-    # Down the columns first: that runs along whole rows of memory.
+    # Take the maximum down the columns first, because that reads whole rows of memory.
     best = cells.max(axis=1).reshape(rows, columns, cell)
     column = best.argmax(axis=2) + cell * np.arange(columns)
     value = best.max(axis=2)
@@ -264,7 +268,7 @@ def detect_keypoints(grey: np.ndarray, parameters: RegistrationParameters, halve
 
 
 def measure_corners(grey: np.ndarray, block: int) -> np.ndarray:
-    """(H, W) float32: `cv2.cornerMinEigenVal`, in strips, because it holds six float pictures of what it is given."""
+    """Compute `cv2.cornerMinEigenVal`, (H, W) float32, in strips: OpenCV allocates six float pictures of its input."""
     corner = np.empty(grey.shape, np.float32)
     reach = 1 + block // 2
     for top in range(0, len(grey), _STRIP_ROWS):
@@ -275,7 +279,7 @@ def measure_corners(grey: np.ndarray, block: int) -> np.ndarray:
 
 
 def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
-    """In how many cells of a coarse grid over the picture there are points."""
+    """Return the number of cells, in a coarse grid over the picture, that contain points."""
     cells = np.clip(points * (_COARSE / np.array(size)), 0, _COARSE - 1).astype(int)
     return len(np.unique(cells @ (1, _COARSE)))
 
@@ -283,7 +287,7 @@ def _cover(points: np.ndarray, size: tuple[int, int]) -> int:
 def _register_points(
     earlier: OpenCVView, later: OpenCVView, carried: Carried, parameters: RegistrationParameters
 ) -> tuple[Registration, np.ndarray]:
-    """The registration by the points that are carried, and its inliers' places in the later frame."""
+    """Register two frames by the carried points, and return the record and the inliers' positions in `later`."""
     start = end = carried.points if len(carried.points) >= 4 else carried.points[:0]
     if len(start):
         end, found, missed_px = track_both_ways(*match_exposure(earlier, later), start, parameters, carried.step)
@@ -301,12 +305,13 @@ def track_both_ways(
     parameters: RegistrationParameters,
     predicted: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where the points went, (N, 2) float32, which were found there and on the way back, and by how much that missed.
+    """Track points forward and backward. predicted: (3, 3) homography that gives the start of the search.
 
-    missed_px: (N,) of the start; 0 where the way back is left out. predicted: (3, 3), where to look first.
+    Return the positions in `later`, (N, 2) float32; whether each point was found in both directions, (N,) bool; and its
+    distance from the start after tracking back, (N,) px, 0 if backward tracking is off.
     """
     levels, side, flags = parameters.levels, parameters.window_px, 0
-    guess: Any = None  # OpenCV's stubs know no None here
+    guess: Any = None  # OpenCV's type stubs do not allow None here
     if predicted is not None:
         levels, flags = min(levels, _SHORT_LEVELS), cv2.OPTFLOW_USE_INITIAL_FLOW
         guess = transfer(predicted, start).astype(np.float32)
@@ -317,8 +322,8 @@ def track_both_ways(
     end, found, _ = cv2.calcOpticalFlowPyrLK(earlier, later, start, guess, **search)
     tracked, missed_px = found.ravel() == 1, np.zeros(len(start))
     if parameters.forward_backward_px > 0:
-        # The way back is searched from where it should end, at full resolution: a true match stays there. From nothing
-        # it costs three times as much and moves the homography by 0.03 px at most.
+        # Start backward tracking at the known start points, at full resolution only: a true match stays there. A search
+        # without this start costs three times as much and changes the homography by 0.03 px at most.
         search |= {"maxLevel": 0, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
         back, found, _ = cv2.calcOpticalFlowPyrLK(later, earlier, end, start.copy(), **search)
         tracked &= found.ravel() == 1
@@ -328,9 +333,9 @@ def track_both_ways(
 
 
 def fit_motion(start: np.ndarray, end: np.ndarray, parameters: RegistrationParameters) -> np.ndarray:
-    """RANSAC, then least squares on the inliers of a tightening tolerance: the refits matter most for accuracy.
+    """Fit a (3, 3) motion by RANSAC, then refit it by least squares on the inliers of a shrinking tolerance.
 
-    The identity for fewer than four points, and where RANSAC finds none.
+    The refits matter most for accuracy. Return the identity for fewer than four points, and if RANSAC finds no model.
     """
     if len(start) < 4:
         return np.eye(3)

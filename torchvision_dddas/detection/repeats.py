@@ -1,31 +1,32 @@
-"""Pictures that repeat the one before, as of 30 pictures a second stored at 60, or of 24 stored at 30."""
+"""Find pictures that repeat the picture before, as in clips of 30 pictures a second that are stored at 60."""
 
 from collections import deque
 
 import cv2
 import numpy as np
 
-# Side of the cells over which a difference is averaged: the least target is not lost in them.
+# Side of the cells over which differences are averaged. The smallest target still changes the mean of such a cell.
 _CELL_PX = 8
-# A repeated picture is coded again: its cells differ by up to 11 grey levels where a key frame falls on it, else by 5.
-# Successive pictures of moving cameras differ by 34 and more in some cell, of standing ones before walkers by 37.
+# A repeated picture is encoded again: its cells differ by up to 11 grey levels if it is a key frame, else by up to 5.
+# Successive different pictures differ by at least 34 in some cell for moving cameras, and by 37 for a fixed camera with
+# walkers in view.
 _MOST_LEVELS = 12.0
-# Beside the largest difference of the latest pictures that of a repeated one is small. A standing camera before a still
-# scene shows noise alone, which does not vary so much.
+# A repeat differs by at most _SHARE of the largest difference among the _RECENT latest pictures. A fixed camera on a
+# still scene has noise only, which varies less than that, so that its pictures do not count as repeats.
 _SHARE, _RECENT = 0.25, 12
-# Pictures that differ so much on average differ by more than a repeated one in some cell.
+# If the mean difference of two pictures exceeds this, some cell differs by more than in any repeat.
 _CHANGED_LEVELS = 2.5
 
 
 class RepeatRule:
-    """Compares each picture with the latest one that is no repeat, so that slow changes add up until they show."""
+    """Compares each picture with the latest picture that is not a repeat, so that slow changes add up."""
 
     def __init__(self) -> None:
         self._before: np.ndarray | None = None
         self._differences: deque[float] = deque(maxlen=_RECENT)
 
     def is_repeat(self, grey: np.ndarray) -> bool:
-        """Whether the next picture, uint8 (H, W), repeats the one before."""
+        """Return whether the next picture, (H, W) uint8, repeats the one before."""
         before, self._before = self._before, grey
         if before is None or before.shape != grey.shape:
             return False
@@ -39,7 +40,7 @@ class RepeatRule:
 
 
 def _largest_difference(before: np.ndarray, after: np.ndarray) -> float:
-    """Largest mean difference of a cell, grey levels; 0 where the pictures are equal. Limited for a quick answer."""
+    """Return the largest mean difference of a cell, grey levels; for clearly different pictures a large constant."""
     coarse = np.s_[:: _CELL_PX // 2, :: _CELL_PX // 2]
     if float(cv2.absdiff(before[coarse].copy(), after[coarse].copy()).mean()) > _CHANGED_LEVELS:
         return _MOST_LEVELS / _SHARE

@@ -1,8 +1,8 @@
-"""Blobs found on the engine's device: what OpenCV's `find_regions` finds, and only their boxes come to the host.
+"""Find blobs on the torch engine's device, as `find_regions` does with OpenCV, and copy only their boxes to the host.
 
-Regions are labelled by Kornia's union-find, for all pictures of a batch at once; area, peak and box follow by scatter
-operations. One table of numbers comes to the host, is gated there, and then all pictures that are wanted of the batch
-come in one transfer: crops of the blobs' boxes, and the warped neighbours of frames with blobs, which dense flow needs.
+Kornia's union-find labels the regions of all pictures of a batch at once; scatter operations give their area, peak and
+box. These numbers are copied to the host and gated there. Then one transfer copies all needed pixels: the crops of the
+blobs' boxes, and the warped neighbours of frames with blobs for dense flow.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,16 @@ from torch import Tensor
 
 from torchvision_dddas.chain import Window, evidence_scale
 from torchvision_dddas.config import Settings
-from torchvision_dddas.detection.blobs import Box, Region, box_slices, leave_touching, make_blobs
+from torchvision_dddas.detection.blobs import Box, Region, box_slices, make_blobs
 from torchvision_dddas.detection.engine import Foreground
 
 
 @dataclass(frozen=True)
 class Components:
-    """The connected regions (8 neighbours) of a batch of masks, in the order of their first 2 x 2 blocks.
+    """The R connected regions (8 neighbours) of a batch of masks, in the order of their first 2 x 2 blocks.
 
-    labels: 0, or the region's entry of `label`. The others have one entry a region: picture, box, pixels, peak.
+    labels: at each pixel 0, or the entry of `label` of its region. label, picture, box, area_px, peak: one row for each
+    region; picture is the index in the batch.
     """
 
     labels: Int64[Tensor, "B 1 H W"]
@@ -35,14 +36,14 @@ class Components:
     peak: np.ndarray
 
     def at(self, chosen: np.ndarray) -> "Components":
-        """Some of the regions."""
+        """Return the regions with the given indices."""
         label = self.label[torch.from_numpy(chosen).to(self.label.device)]
         rows = (column[chosen] for column in (self.picture, self.box, self.area_px, self.peak))
         return Components(self.labels, label, *rows)
 
 
 def label_components(mask: Bool[Tensor, "B 1 H W"], evidence: UInt8[Tensor, "B 1 H W"]) -> Components:
-    """All regions of the masks, and their largest evidence."""
+    """Label all regions of the masks, and measure their box, area and largest evidence."""
     labels = connected_components_union_find(mask)
     height, width = mask.shape[-2:]
     place = mask.flatten().nonzero()[:, 0]
@@ -61,38 +62,29 @@ def foregrounds_with_blobs(
     windows: Sequence[Window],
     settings: Settings,
     maps: tuple[Tensor, Tensor, Tensor, Tensor],
-    weak: tuple[Tensor, Tensor] | None,
     small: Tensor | None,
     warped: tuple[Tensor, Tensor],
 ) -> list[Foreground]:
-    """The foregrounds of windows of one structure, with their blobs.
+    """Return the foregrounds of windows of equal structure, with their blobs.
 
-    maps: core, evidence, wide and texture, (B, 1, H, W) uint8 as all others. weak: where the wide evidence is certain
-    at half the resolution, and that evidence, of `DetectionChain.find_weak`; None where no weak blobs are wanted.
-    settings: of windows that have none of their own.
+    maps: core, evidence, wide and texture. They, `small` and `warped` are (B, 1, H, W) uint8. settings: used for
+    windows without settings of their own.
     """
     core, near, wide, texture = maps
     given, unit = [window.settings or settings for window in windows], evidence_scale(settings)
-    searched = [(core, near, 1, [True] * len(windows))]
-    if weak is not None:
-        searched.append((*weak, 2, [window.looks_both_ways for window in windows]))
-    found: list[Components] = []
-    asked: list[Tensor] = []
-    for mask, evidence, scale, wanted in searched:
-        parts = label_components(mask > 0, evidence)
-        least_px = np.array([of_frame.gates.min_area_px for of_frame in given])[parts.picture]
-        least = np.array([of_frame.difference.peak * unit for of_frame in given])[parts.picture]
-        passed = np.array(wanted)[parts.picture] & (parts.area_px * scale**2 >= least_px) & (parts.peak >= least)
-        found.append(parts.at(np.flatnonzero(passed)))
-        asked += _cut_regions(found[-1], evidence) + _cut_boxes(found[-1], [near, wide, texture], scale)[0]
-    shown = np.unique(np.concatenate([parts.picture for parts in found]))
-    for_flow = bool(len(shown)) and (settings.persistence.on or settings.refine.on)
-    for_history = settings.history.on and not (settings.persistence.on or settings.refine.on)
+    parts = label_components(core > 0, near)
+    least_px = np.array([of_frame.gates.min_area_px for of_frame in given])[parts.picture]
+    least = np.array([of_frame.difference.peak * unit for of_frame in given])[parts.picture]
+    parts = parts.at(np.flatnonzero((parts.area_px >= least_px) & (parts.peak >= least)))
+    asked = _cut_regions(parts, near) + _cut_boxes(parts, [near, wide, texture])[0]
+    shown = np.unique(parts.picture)
+    for_flow = bool(len(shown)) and settings.refine.on
+    for_history = settings.history.on and not settings.refine.on
     if for_flow:
         asked += [picture[torch.from_numpy(shown).to(picture.device), 0] for picture in warped]
     asked += [picture[:, 0] for picture in ([core] if for_history else []) + ([] if small is None else [small])]
     arrived = iter(_fetch(asked))
-    crops = [[next(arrived) for _ in range(5)] for _ in found]
+    crops = [next(arrived) for _ in range(5)]
     nothing = np.zeros(core.shape[-2:], np.uint8)
     others = {}
     if for_flow:
@@ -101,27 +93,22 @@ def foregrounds_with_blobs(
     smalls = [None] * len(windows) if small is None else list(next(arrived))
     foregrounds = []
     a, b = windows[0].near[-1]
+    ends = np.cumsum(parts.box[:, 2] * parts.box[:, 3])
     for number, (window, own) in enumerate(zip(windows, given, strict=True)):
         pictures = [np.zeros_like(nothing) for _ in range(3)]
-        regions: list[list[Region]] = []
-        for parts, (_, _, scale, _), cut in zip(found, searched, crops, strict=True):
-            ends = np.cumsum(parts.box[:, 2] * parts.box[:, 3])
-            regions.append([])
-            for k in np.flatnonzero(parts.picture == number).tolist():
-                box, large = _as_box(parts.box[k]), _as_box(parts.box[k] * scale)
-                inside, seen = (_crop(line, int(ends[k]), box) for line in cut[:2])
-                for picture, line in zip(pictures, cut[2:], strict=True):
-                    picture[box_slices(large)] = _crop(line, int(ends[k]) * scale**2, large)
-                regions[-1].append(Region(box, inside > 0, seen, float(parts.peak[k])))
-        threshold, hull = own.difference.threshold * unit, own.morphology.hull
-        blobs = make_blobs(regions[0], threshold, hull)
-        if len(regions) > 1:
-            blobs += leave_touching(make_blobs(regions[1], threshold, hull, scale=2), blobs, nothing.shape)
+        regions: list[Region] = []
+        for k in np.flatnonzero(parts.picture == number).tolist():
+            box = _as_box(parts.box[k])
+            inside, seen = (_crop(line, int(ends[k]), box) for line in crops[:2])
+            for picture, line in zip(pictures, crops[2:], strict=True):
+                picture[box_slices(box)] = _crop(line, int(ends[k]), box)
+            regions.append(Region(box, inside > 0, seen, float(parts.peak[k])))
+        blobs = make_blobs(regions, own.difference.threshold * unit, own.morphology.hull)
         warped_here = others.get(number, (nothing, nothing))
         offsets = window.offsets[a], window.offsets[b]
         one, other, gradient = pictures
         foregrounds.append(
-            Foreground(cores[number], one, other, gradient, smalls[number], warped_here, (), offsets, blobs=blobs)
+            Foreground(cores[number], one, other, gradient, smalls[number], warped_here, offsets=offsets, blobs=blobs)
         )
     return foregrounds
 
@@ -132,23 +119,20 @@ def _as_box(row: np.ndarray) -> Box:
 
 
 def _crop(line: np.ndarray, end: int, box: Box) -> np.ndarray:
-    """The pixels of a box that end at a place of a line of crops."""
+    """Return the pixels of a box, (height, width), from a flat array of crops in which they end at `end`."""
     return line[end - box[2] * box[3] : end].reshape(box[3], box[2])
 
 
 def _cut_regions(parts: Components, evidence: Tensor) -> list[Tensor]:
-    """(P,) uint8 of the pixels in the regions' boxes, box by box: which are the region's, and their evidence."""
+    """Return two (P,) uint8 tensors over the P pixels of the regions' boxes: 1 inside the region, and the evidence."""
     (labels, seen), region = _cut_boxes(parts, [parts.labels, evidence])
     return [(labels == parts.label[region]).to(torch.uint8), seen]
 
 
-def _cut_boxes(parts: Components, pictures: Sequence[Tensor], scale: int = 1) -> tuple[list[Tensor], Tensor]:
-    """(P,) of the pixels in the boxes, box by box, of each picture; and each pixel's region.
-
-    scale: pixels of the pictures that are one of the boxes along either side.
-    """
+def _cut_boxes(parts: Components, pictures: Sequence[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Return the P pixels of the regions' boxes from each picture, (P,) each, and the index of each pixel's region."""
     device, (height, width) = pictures[0].device, pictures[0].shape[-2:]
-    x, y, wide, high = scale * parts.box.T
+    x, y, wide, high = parts.box.T
     sizes = wide * high
     first = (parts.picture * height + y) * width + x
     table = np.stack([sizes, np.cumsum(sizes) - sizes, first, wide])
@@ -160,7 +144,7 @@ def _cut_boxes(parts: Components, pictures: Sequence[Tensor], scale: int = 1) ->
 
 
 def _fetch(pictures: Sequence[Tensor]) -> list[np.ndarray]:
-    """Copies on the host, in one transfer."""
+    """Copy pictures to the host in one transfer."""
     lines = torch.cat([picture.flatten() for picture in pictures]).cpu().numpy()
     ends = np.cumsum([picture.numel() for picture in pictures])[:-1]
     return [line.reshape(picture.shape) for line, picture in zip(np.split(lines, ends), pictures, strict=True)]

@@ -1,4 +1,4 @@
-"""The engine for batches and GPUs: `nn.Registration` and `nn.MotionSegmenter` on many frames and windows."""
+"""The engine for batches and GPUs: it runs `nn.FrameRegistration` and `nn.MotionSegmenter` on many frames."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -23,8 +23,8 @@ from torchvision_dddas.types import Registration
 
 Item = TypeVar("Item")
 
-# Megabytes of pictures in work at once, as floats: eight windows of 640x480. With 6 MB, one window, the default takes
-# 1.15 times as long and `fast` 1.11 times (`python eval/speed.py batches`).
+# Megabytes of float pictures that are processed at once. 72 MB are eight windows of 640x480. With 6 MB (one window) the
+# default configuration takes 1.15 times as long and `fast` 1.11 times (`python eval/speed.py batches`).
 BATCH_MB = {"cpu": 72.0, "cuda": 1600.0}
 _MB_OF_PIXEL = 4e-6
 _POINTS_AT_ONCE = 100_000
@@ -32,9 +32,9 @@ _POINTS_AT_ONCE = 100_000
 
 @dataclass
 class TensorView(View):
-    """A frame, and what the engine computed of it.
+    """A frame with data that the engine has computed. levels: (1, 1, H, W) float32 grey levels.
 
-    levels: (1, 1, H, W) float32. keypoints: (1, N, 2) and (1, N), which are valid. pyramid: of the levels.
+    keypoints: (1, N, 2) positions, and (1, N) whether each is valid. pyramid: the image pyramid of the grey levels.
     """
 
     levels: Tensor | None = None
@@ -43,7 +43,7 @@ class TensorView(View):
 
 
 class TorchEngine(Engine[TensorView]):
-    """Implements `Engine` on all pairs and windows of equal structure at once."""
+    """Implements `Engine`, and computes all pairs and windows of equal structure at once."""
 
     name = "torch"
 
@@ -54,25 +54,26 @@ class TorchEngine(Engine[TensorView]):
         components: Literal["opencv", "torch"] | None = None,
         batch_mb: float | None = None,
     ) -> None:
-        """device: by default the GPU where there is one.
+        """Set up the engine.
 
-        batch_mb: megabytes of pictures that are worked on at once, by default BATCH_MB of the device.
-        components: who labels regions. torch does so on the device, and whole maps stay there; by default OpenCV for
-        the CPU and torch for others. Raises InputError for Apple's MPS and for settings at half resolution.
+        device: by default the GPU if there is one. components: the library that labels regions, by default opencv on
+        the CPU and torch on other devices; with torch whole maps stay on the device. batch_mb: megabytes of pictures
+        that are processed at once, by default BATCH_MB of the device.
+        Raises InputError for Apple's MPS and for settings at half resolution.
         """
         for group in ("registration", "difference"):
             if getattr(settings, group).halved:
-                raise InputError(f"the torch engine has no {group}.halved: take the backend onboard or set it false")
+                raise InputError(f"the torch engine does not support {group}.halved; set it false or use onboard")
         self.parameters = settings
         self.device = torch.device(device or torch_device())
         if self.device.type == "mps":
-            raise InputError("the torch engine needs float64, which mps does not have; give device cpu or cuda")
+            raise InputError("the torch engine needs float64, which mps does not support; use the device cpu or cuda")
         self.batch_mb = batch_mb or BATCH_MB.get(self.device.type, BATCH_MB["cpu"])
         self.components = components or ("opencv" if self.device.type == "cpu" else "torch")
 
     @property
     def segmenter(self) -> MotionSegmenter:
-        """The hard chain of the settings in force, whose numbers are no tensors."""
+        """The hard detection chain of the current settings, without trainable parameters."""
         return MotionSegmenter(self.parameters, tuned=()).to(self.device)
 
     def prepare(self, image: np.ndarray) -> TensorView:
@@ -81,14 +82,14 @@ class TorchEngine(Engine[TensorView]):
 
     @torch.inference_mode()
     def register(self, pairs: Sequence[tuple[TensorView, TensorView]]) -> list[Registration]:
-        """See `Engine.register`. Pyramids, and the keypoints of the earlier frames, are kept in the views."""
+        """See `Engine.register`. Pyramids and the keypoints of the earlier frames are cached in the views."""
         return _apply_in_groups(pairs, lambda pair: (pair[0].size, pair[1].size), self._register)
 
     def _register(self, pairs: list[tuple[TensorView, TensorView]]) -> list[Registration]:
         registration, parameters = self.segmenter.registration, self.parameters.registration
         keypoints = [self._keypoints(earlier) for earlier, _ in pairs]
         matched = []
-        for pair in pairs:  # where exposures differ, one of the two is a view of its own
+        for pair in pairs:  # if exposures differ, one of the two becomes a new view
             greys = zip(pair, match_exposure(*pair), strict=True)
             matched.append([view if grey is view.grey else TensorView(view.image, grey) for view, grey in greys])
         missing = list({id(view): view for pair in matched for view in pair if not view.pyramid}.values())
@@ -123,7 +124,8 @@ class TorchEngine(Engine[TensorView]):
         def structure(window: Window[TensorView]) -> tuple[Any, ...]:
             sizes = tuple(view.size for view in window.neighbours)
             ignored = id(window.reference.ignored)  # one mask for all frames of a setting
-            return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px, ignored
+            given = window.settings or self.parameters
+            return window.reference.size, sizes, window.near, window.wide, window.small, window.close_px, ignored, given
 
         def work(group: list[Window[TensorView]]) -> list[Foreground]:
             width, height = group[0].reference.size
@@ -133,11 +135,11 @@ class TorchEngine(Engine[TensorView]):
         return _apply_in_groups(windows, structure, work)
 
     def _at_once(self, pixels: int) -> int:
-        """How many items of so many pixels are worked on at once."""
+        """Return how many items with this number of pixels are processed at once."""
         return max(1, int(self.batch_mb / (_MB_OF_PIXEL * pixels)))
 
     def batch_of(self, windows: Sequence[Window[TensorView]]) -> Window[Tensor]:
-        """Windows of equal structure as one whose frames are batches."""
+        """Join windows of equal structure into one window whose frames are batches."""
         one = windows[0]
         matrices = torch.from_numpy(np.stack([window.neighbour_from_reference for window in windows])).to(self.device)
         reference = _join([self._levels(window.reference) for window in windows])
@@ -147,28 +149,30 @@ class TorchEngine(Engine[TensorView]):
         return Window(reference, neighbours, matrices, *given, ignored=self._ignored(one.reference))
 
     def _foreground(self, windows: list[Window[TensorView]]) -> list[Foreground]:
-        settings, one, chain = self.parameters, windows[0], self.segmenter.chain()
+        one = windows[0]
+        settings = one.settings or self.parameters
+        chain = MotionSegmenter(settings, tuned=()).to(self.device).chain()
         maps = chain.find_foreground(self.batch_of(windows))
         texture = to_bytes(maps.texture)
-        # Tracklets need whole maps; a window may still have the settings from before a change.
-        is_whole = any(uses_tracklets(window.settings or settings) for window in windows)
-        if self.components == "torch" and not is_whole:
-            is_weak_wanted = settings.persistence.on and any(window.looks_both_ways for window in windows)
-            is_weak_wanted &= min(maps.wide.shape[-2:]) > 1
-            weak = chain.find_weak(maps.wide, one.close_px) if is_weak_wanted else None
+        if self.components == "torch" and not uses_tracklets(settings):  # tracklets need whole maps
             whole = maps.core, maps.evidence, maps.wide, texture
-            return foregrounds_with_blobs(windows, settings, whole, weak, maps.small, maps.warped)
+            return foregrounds_with_blobs(windows, settings, whole, maps.small, maps.warped)
         pictures = (maps.core, maps.evidence, maps.wide, texture, *maps.warped, *maps.pairs)
         rows = zip(*(made[:, 0].cpu().numpy() for made in pictures), strict=True)
-        smalls = [None] * len(windows) if maps.small is None else list(maps.small[:, 0].cpu().numpy())
+        smalls, levels = (
+            [None] * len(windows) if made is None else made[:, 0].cpu().numpy() for made in (maps.small, maps.levels)
+        )
         a, b = one.near[-1]
+        offsets = [(window.offsets[a], window.offsets[b]) for window in windows]
         return [
-            Foreground(core, near, wide, texture, small, (w1, w2), tuple(pairs), (window.offsets[a], window.offsets[b]))
-            for window, (core, near, wide, texture, w1, w2, *pairs), small in zip(windows, rows, smalls, strict=True)
+            Foreground(core, near, wide, texture, small, (w1, w2), tuple(pairs), level, apart)
+            for (core, near, wide, texture, w1, w2, *pairs), small, level, apart in zip(
+                rows, smalls, levels, offsets, strict=True
+            )
         ]
 
     def _keypoints(self, view: TensorView) -> tuple[Tensor, Tensor]:
-        """The view's keypoints and which of them are valid, computed once."""
+        """Return the view's keypoints and which of them are valid, and cache them in the view."""
         if view.keypoints is None:
             points, valid = self.segmenter.registration.keypoints(self._levels(view))
             if (ignored := self._ignored(view)) is not None:
@@ -178,24 +182,24 @@ class TorchEngine(Engine[TensorView]):
         return view.keypoints
 
     def _ignored(self, view: TensorView) -> Tensor | None:
-        """(1, 1, H, W) bool, set where the view is left out."""
+        """Return (1, 1, H, W) bool, true at the pixels that the view ignores, or None."""
         return None if view.ignored is None else torch.from_numpy(view.ignored > 0)[None, None].to(self.device)
 
     def _levels(self, view: TensorView) -> Tensor:
-        """(1, 1, H, W) float32 grey levels, computed once."""
+        """Return the (1, 1, H, W) float32 grey levels of a view, and cache them in the view."""
         if view.levels is None:
             view.levels = torch.from_numpy(view.grey)[None, None].to(self.device).float()
         return view.levels
 
 
 def detect_masks(model: MotionSegmenter, clip: Float[Tensor, "B T C H W"]) -> Bool[Tensor, "B T 1 H W"]:
-    """The masks of `MotionDetector` on the torch engine, with the numbers that a model has learned.
+    """Return the masks of `MotionDetector` on the torch engine with the learned parameters of a model.
 
-    clip: RGB or grey pictures in [0, 1]. Raises InputError as `MotionDetector`.
+    clip: RGB or grey pictures in [0, 1]. Raises InputError for the same input as `MotionDetector`.
     """
     settings, masks = model.tuned_settings(), []
     for pictures in (clip.detach() * 255).round().to(torch.uint8).cpu().numpy():
-        detector = MotionDetector(settings, TorchEngine(settings, clip.device))
+        detector = MotionDetector(settings, backend=TorchEngine(settings, clip.device))
         frames = pictures[:, 0] if clip.shape[2] == 1 else pictures[:, ::-1].transpose(0, 2, 3, 1)
         scenes = [scene for frame in frames for scene in detector.update(np.ascontiguousarray(frame))]
         masks.append(np.stack([scene.mask > 0 for scene in [*scenes, *detector.flush()]]))
@@ -205,7 +209,7 @@ def detect_masks(model: MotionSegmenter, clip: Float[Tensor, "B T C H W"]) -> Bo
 def _apply_in_groups(
     items: Sequence[Item], key: Callable[[Item], Any], work: Callable[[list[Item]], list[Any]]
 ) -> list[Any]:
-    """Do the work on all items of a key at once; results in the order of the items."""
+    """Apply `work` to all items of equal key at once, and return the results in the order of the items."""
     places: dict[Any, list[int]] = defaultdict(list)
     for place, item in enumerate(items):
         places[key(item)].append(place)
@@ -216,5 +220,5 @@ def _apply_in_groups(
 
 
 def _join(pictures: Sequence[Tensor]) -> Tensor:
-    """One batch; a single picture is not copied."""
+    """Join pictures into one batch. A single picture is not copied."""
     return pictures[0] if len(pictures) == 1 else torch.cat(list(pictures))

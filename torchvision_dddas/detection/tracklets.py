@@ -1,10 +1,11 @@
-"""Which candidates are targets: each is followed over the looks before and after, and judged by the whole tracklet.
+"""Follow each candidate over the looks before and after, so that targets can be judged by whole tracklets.
 
-A tracklet starts at a candidate with a guess of its velocity, from a similar candidate one or some looks away. It is
-extended look by look, ground motion removed, to the candidate that fits best its line, size and grey levels; flow is
-not needed, and steps may be longer than the target. Of several guesses the steadiest counts. Two logistic scores, whose
-weights `python eval/tracklets.py` learns, then say how likely a candidate looks like a target by itself, and how
-likely the tracklet is one. Not in the source, which takes each pixel that differs for a target (appendix B, S5).
+A tracklet starts at a candidate with a guess of its velocity, taken from a similar candidate one or three looks away.
+It is extended look by look, after removal of the ground motion, to the candidate that fits its line, size and grey
+levels best. Dense flow is not needed, and steps may be longer than the target. Of several guesses the steadiest
+tracklet is kept. Two logistic scores, whose weights `python eval/tracklets.py` learns, then rate the candidate alone
+and the whole tracklet. This step is ours; the source takes each pixel that differs as part of a target (appendix B,
+S5).
 """
 
 from collections.abc import Mapping
@@ -17,15 +18,15 @@ from torchvision_dddas.geometry import transfer
 
 LOOKS_BEFORE, LOOKS_AFTER = 4, 2
 
-# Velocities are guessed from other looks: their offsets, and how many candidates are taken there, the best ones.
+# Velocities are guessed from other looks: (offset of the look, number of its best candidates to try).
 _GUESSES = ((1, 3), (-1, 3), (3, 1), (-3, 1))
-# The longest step that is guessed: in diagonals of the box, plus some pixels.
+# The longest guessed step is _LONGEST_STEP diagonals of the box plus _LONGEST_STEP_PX.
 _LONGEST_STEP, _LONGEST_STEP_PX = 2.5, 4.0
-# The standard deviation of the centre of a box is this share of its side, plus some pixels.
+# The standard deviation of the centre of a box is _CENTRE_SHARE of its side plus _CENTRE_PX.
 _CENTRE_SHARE, _CENTRE_PX = 0.10, 0.7
-# Squared distance from the line, in units of its own spread, that a link may have.
+# Gate of a link: the largest squared distance from the predicted centre, in units of its variance.
 _LINE_GATE = 9.0
-# Largest ratio of sides of two boxes of one target, as a logarithm, and its spread.
+# Largest logarithm of the ratio of sides of two boxes of one target, and its spread.
 _MOST_GROWTH, _GROWTH_SPREAD = 0.8, 0.35
 _UNLIKE_COST = 6.0
 _BORDER_PX = 3
@@ -35,35 +36,35 @@ _BORDER_PX = 3
 class Tracklets:
     """The best tracklet of each of a look's N candidates.
 
-    members: by offset in looks, (N,) index of its candidate there, -1: none. velocity_px: (N, 2) pixels a look over the
-    ground. The rest are (N,) each. hits: its candidates. travel_px: how far it went. travel: the same in sides of its
-    box. sureness: its speed in units of the speed's own uncertainty. stays: share of the looks in which something like
-    it is still, or already, where it is now, though it should be elsewhere. growth_x, growth_y: mean change of width
-    and height, as logarithms.
+    members: by offset in looks, (N,) index of the tracklet's candidate in that look, -1 without one. velocity_px:
+    (N, 2) pixels a look over the ground. All other fields are (N,). hits: number of candidates in the tracklet.
+    travel_px: distance travelled. sureness: speed divided by its standard deviation. stays: share of the looks, among
+    those in which the target should be elsewhere, that show a similar candidate at the same place. growth_x, growth_y:
+    mean change of width and height, as logarithms.
     """
 
     members: Mapping[int, np.ndarray]
     velocity_px: np.ndarray
     hits: np.ndarray
     travel_px: np.ndarray
-    travel: np.ndarray
     sureness: np.ndarray
     stays: np.ndarray
     growth_x: np.ndarray
     growth_y: np.ndarray
 
     def of(self, rows: np.ndarray) -> "Tracklets":
-        """Those of some rows."""
+        """Return the tracklets of the given rows."""
         members = {offset: index[rows] for offset, index in self.members.items()}
         return Tracklets(members, *(getattr(self, field.name)[rows] for field in fields(self)[1:]))
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """The M candidates of another look, in pixels of this one, beside its own N.
+    """The M candidates of another look, compared with the N candidates of this look, in pixels of this look.
 
-    centre: (M, 2). growth: (2, N, M) logarithms of the ratios of sides. likeness: (N, M) of patches. unlike: (N, M)
-    cost of both, infinite where they cannot be one. there_from_here: (3, 3).
+    centre: (M, 2). growth: (2, N, M) absolute logarithms of the ratios of width and height. likeness: (N, M)
+    correlation of the patches. unlike: (N, M) cost of growth and likeness, infinite for pairs that cannot be one
+    target. there_from_here: (3, 3) homography.
     """
 
     centre: np.ndarray
@@ -74,10 +75,10 @@ class _Seen:
 
 
 def follow(here: Candidates, others: Mapping[int, tuple[Candidates, np.ndarray]], size: tuple[int, int]) -> Tracklets:
-    """The tracklets of a look's candidates.
+    """Return the best tracklet of each candidate of a look.
 
-    others: by offset in looks, the candidates of another look and the homography (3, 3) to this one from it. size:
-    (width, height) of the picture.
+    others: by offset in looks, the candidates of another look and the (3, 3) homography from that look to this one.
+    size: (width, height) of the picture.
     """
     count = len(here)
     seen = {o: _place(here, *others[o], size) for o in sorted(others, key=lambda o: (abs(o), -o))}
@@ -114,7 +115,7 @@ def follow(here: Candidates, others: Mapping[int, tuple[Candidates, np.ndarray]]
     )
     best = np.empty(count, int)
     order = np.argsort(steadiness, kind="stable")
-    best[start[order]] = order  # the last one written is the steadiest
+    best[start[order]] = order  # the last assignment wins, which is the steadiest
     return tracklets.of(best)
 
 
@@ -132,7 +133,7 @@ def _place(here: Candidates, other: Candidates, here_from_there: np.ndarray, siz
 
 
 def _squared_distance(points: np.ndarray, others: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """(N, M) squared distance of points (N, 2) from others (M, 2), along either axis in units squared, (N, 2)."""
+    """Return the (N, M) squared distances of points (N, 2) from others (M, 2), divided per axis by unit (N, 2)."""
     across = others[None, :, 0] - points[:, None, 0]
     down = others[None, :, 1] - points[:, None, 1]
     across *= across
@@ -146,9 +147,10 @@ def _squared_distance(points: np.ndarray, others: np.ndarray, unit: np.ndarray) 
 def _guess(
     here: Candidates, centre: np.ndarray, seen: Mapping[int, _Seen]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Guesses of velocities: (M,) candidates, (M, 2) pixels a look, (M,) looks over which they were taken.
+    """Guess velocities from similar candidates in other looks.
 
-    A candidate that is like none of them stands still.
+    Return M guesses: (M,) index of the candidate, (M, 2) velocity in pixels a look, and (M,) looks over which it was
+    measured. A candidate without a similar one gets velocity 0.
     """
     count = len(here)
     diagonal = np.hypot(*here.box_px[:, 2:].T)[:, None]
@@ -176,9 +178,9 @@ class _Line:
     """Lines of constant velocity through the centres of tracklets, fitted by least squares as centres are added."""
 
     def __init__(self, centre: np.ndarray, velocity: np.ndarray, spread: np.ndarray, over: np.ndarray) -> None:
-        """spread: (M, 2) of a centre, px. over: (M,) looks over which the velocity was guessed."""
+        """Start M lines. spread: (M, 2) of a centre, px. over: (M,) looks over which the velocity was measured."""
         self.centre, self.velocity, self.spread = centre, velocity, spread
-        self.offset_px = np.zeros_like(centre)  # of the line from the candidate's own centre, now
+        self.offset_px = np.zeros_like(centre)  # offset of the line at time 0 from the candidate's own centre
         self._of_velocity = 1.4 * spread / over[:, None]
         count = len(centre)
         self.n, self.sum_t, self.sum_tt = np.ones(count), np.zeros(count), np.zeros(count)
@@ -186,15 +188,15 @@ class _Line:
         self._places: list[tuple[int, np.ndarray, np.ndarray]] = [(0, np.zeros((count, 2)), np.ones(count, bool))]
 
     def at(self, offset: int) -> np.ndarray:
-        """(M, 2) where they are at an offset."""
+        """Return the (M, 2) positions of the lines at an offset in looks."""
         return self.centre + self.offset_px + self.velocity * offset
 
     def variance(self, offset: int) -> np.ndarray:
-        """(M, 2) of a centre beside its prediction, px squared."""
+        """Return the (M, 2) variance of a centre around its prediction, px squared."""
         return 2 * self.spread**2 + (offset * self._of_velocity) ** 2
 
     def add(self, offset: int, centre: np.ndarray, found: np.ndarray) -> None:
-        """Take the centres found at an offset, (M, 2) and (M,) bool."""
+        """Add the centres (M, 2) of the look at an offset to the lines for which `found`, (M,) bool, is set."""
         away = centre - self.centre
         self._places.append((offset, away, found))
         self.n += found
@@ -219,16 +221,16 @@ class _Line:
         return np.sqrt(total / np.maximum(2 * self.n - 4, 1))
 
     def misfit(self) -> np.ndarray:
-        """(M,) root mean square distance of the centres from the line, in units of their spread."""
+        """Return the (M,) root mean square distance of the centres from the line, in units of their spread."""
         return self._root_mean_square(self.spread)
 
     def speed_uncertainty(self) -> np.ndarray:
-        """(M,) pixels a look."""
+        """Return the (M,) standard deviation of the speed, pixels a look."""
         spread_t = np.maximum(self.n * self.sum_tt - self.sum_t**2, 0.5)
         return np.maximum(self._root_mean_square(1.0), 0.5) / np.sqrt(spread_t / self.n)
 
     def span(self) -> np.ndarray:
-        """(M,) looks from the first to the last centre."""
+        """Return the (M,) looks from the first to the last centre."""
         last = np.max([np.where(found, offset, -99) for offset, _, found in self._places], axis=0)
         first = np.min([np.where(found, offset, 99) for offset, _, found in self._places], axis=0)
         return last - first
@@ -252,7 +254,6 @@ def _describe(
         line.velocity,
         line.n,
         speed * span,
-        speed * span / length,
         speed / line.speed_uncertainty(),
         stays / np.maximum(gone_looks, 1),
         _mean_over(members, seen, "growth", start, 0.5, 0),
@@ -268,7 +269,7 @@ def _mean_over(
     missing: float,
     axis: int | None = None,
 ) -> np.ndarray:
-    """(M,) mean over the links of a tracklet of what pairs of candidates have; `missing` without links."""
+    """Return the (M,) mean of a field of `_Seen` over the links of each tracklet; `missing` without links."""
     total, count = np.zeros(len(start)), np.zeros(len(start))
     for offset, index in members.items():
         values, found = getattr(seen[offset], name), index >= 0

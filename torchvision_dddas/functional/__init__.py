@@ -1,6 +1,6 @@
 """Pure functions from tensors to tensors: batched, exportable, mostly differentiable. Needs the extra `torch`.
 
-    import torchvision_dddas.functional as F
+    >>> import torchvision_dddas.functional as F
 
 Images are (B, C, H, W) floats, in [0, 1] unless an argument is called levels (0 .. 255); points are (B, N, 2), (u, v)
 in pixels from the centre of the top left one; matrices are named by direction (reference_from_frame). float32, or

@@ -13,7 +13,13 @@ from torch import Tensor
 def pair_affinity(
     a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"], a_valid: Bool[Tensor, "B N"], b_valid: Bool[Tensor, "B M"]
 ) -> Float[Tensor, "B N M"]:
-    """S = Σ min / Σ max in [0, 1]."""
+    """S = Σ min / Σ max in [0, 1].
+
+    >>> a, b = torch.tensor([[[1.0, 3.0]]]), torch.tensor([[[2.0, 2.0]]])
+    >>> there = torch.ones(1, 1, dtype=torch.bool)
+    >>> F.pair_affinity(a, b, there, there)
+    tensor([[[0.6000]]])
+    """
     return _divide(*_sums(a, b), a_valid[..., :, None] & b_valid[..., None, :])
 
 
@@ -25,7 +31,13 @@ def triplet_affinity(
     b_valid: Bool[Tensor, "B M"],
     c_valid: Bool[Tensor, "B L"],
 ) -> Float[Tensor, "B N M L"]:
-    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first."""
+    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first.
+
+    >>> a, b, c = (torch.tensor([[[1.0, 3.0]]]) for _ in range(3))
+    >>> there = torch.ones(1, 1, dtype=torch.bool)
+    >>> F.triplet_affinity(a, b, c, there, there, there)
+    tensor([[[[1.]]]])
+    """
     valid = a_valid[..., :, None, None] & b_valid[..., None, :, None] & c_valid[..., None, None, :]
     both = zip(_sums(a, b), _sums(b, c), strict=True)
     smaller, larger = (first[..., None] + second[..., None, :, :] for first, second in both)

@@ -15,13 +15,16 @@ from torch.nn import functional
 _CLOSE = 1e-6  # change of any share that ends the rounds
 
 
-def log_partition(score: Float[Tensor, "*B N M"], softness: float, rounds: int = 50) -> Float[Tensor, "*B"]:
+def log_partition(score: Float[Tensor, "*B N M"], softness: float, *, rounds: int = 50) -> Float[Tensor, "*B"]:
     """Bethe's softness · log Σ exp(sum of scores / softness), over all assignments.
 
     score: -inf forbids a pair. softness: above 0, in the unit of the scores; as it vanishes the result becomes the
     score of the best assignment. rounds: of messages, at most. The gradient in the scores is the share of each pair in
     all assignments: at the fixed point messages have no slope, so that they need none. Never above the exact sum
     (Gurvits), and equal to it where one frame has a single target.
+
+    >>> F.log_partition(torch.tensor([[[3.0, 0.0], [0.0, 2.0]]]), 0.01).round(decimals=2)
+    tensor([5.])
     """
     scaled = score / softness
     with torch.no_grad():

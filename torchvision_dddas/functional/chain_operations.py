@@ -42,9 +42,14 @@ Columns = tuple[Tensor, Tensor]
 
 
 class TensorOperations(Operations[Tensor, Tensor, Columns]):
-    """Implements `Operations` for a batch: views are (B, 1, H, W) floats of whole levels, pictures are bytes."""
+    """Implements `Operations` for a batch: views are (B, 1, H, W) floats of whole levels, pictures are bytes.
 
-    def __init__(self, softness: float = 0.0, whole: bool = True, dtype: torch.dtype = torch.float32) -> None:
+    >>> operations = F.TensorOperations(softness=0.1)
+    >>> operations.grey(torch.tensor([[[[17.0, 18.0]]]])).dtype, operations.is_hard
+    (torch.uint8, False)
+    """
+
+    def __init__(self, softness: float = 0.0, *, whole: bool = True, dtype: torch.dtype = torch.float32) -> None:
         """softness: above 0, evidence is made of floats of `dtype`, which have gradients.
 
         whole: round where OpenCV does.
@@ -69,7 +74,7 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
 
     def seen(self, view: Tensor, reference: Tensor, view_from_reference: Tensor, border_px: int) -> Columns:
         size, frame_size = ((picture.shape[-2], picture.shape[-1]) for picture in (reference, view))
-        return seen_columns(view_from_reference, size, frame_size, border_px)
+        return seen_columns(view_from_reference, size, frame_size, border_px=border_px)
 
     def seen_by_both(self, one: Columns, other: Columns, reference: Tensor) -> Tensor:
         return seen_by_both(one, other, reference.shape[-1])
@@ -84,8 +89,8 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         enough = inside.sum((1, 2, 3)) >= _EXPOSURE_LEAST
         return torch.where(enough, gain, 1.0), torch.where(enough, offset * LEVEL, 0.0)
 
-    def fit_level_shares(self, reference: Tensor, other: Tensor) -> Light:
-        return fit_quantiles(level_quantiles(reference), level_quantiles(other))
+    def fit_level_shares(self, reference: Tensor, neighbour: Tensor) -> Light:
+        return fit_quantiles(level_quantiles(reference), level_quantiles(neighbour))
 
     def apply_light(self, reference: Tensor, warped: Tensor, light: Light) -> Tensor:
         gain, offset = (part.to(reference).reshape(-1, 1, 1, 1) for part in light)
@@ -174,7 +179,13 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
 
 
 def close_masks(mask: Tensor, side: int) -> Tensor:
-    """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all."""
+    """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all.
+
+    >>> mask = torch.zeros(1, 1, 9, 9)
+    >>> mask[..., 3:6, [2, 3, 5, 6]] = 1
+    >>> F.close_masks(mask, 3)[0, 0, 4]
+    tensor([0., 0., 1., 1., 1., 1., 1., 0., 0.])
+    """
     kernel = kernel_array("ellipse", side)
     if mask.dtype != torch.uint8 or not may_branch(mask):
         return closing(mask, kernel)

@@ -18,18 +18,25 @@ def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
     """Hue 0 to 180, saturation and value 0 to 255, of blue, green, red in [0, 1]; grey has hue 0 and saturation 0.
 
     OpenCV's for 8-bit pictures, before it rounds; by Kornia's rgb_to_hsv.
+
+    >>> F.bgr_to_hsv(torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1)).flatten()
+    tensor([120.0000, 255.0000, 255.0000])
     """
     hsv = rgb_to_hsv(image.flip(1))
     return hsv * hsv.new_tensor([TURN / (2 * math.pi), FULL, FULL])[:, None, None]
 
 
 def within_ranges(
-    hsv: Float[Tensor, "B 3 H W"], low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"], softness: float = 0.0
+    hsv: Float[Tensor, "B 3 H W"], low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"], *, softness: float = 0.0
 ) -> Float[Tensor, "B K H W"]:
     """How much each pixel belongs to each range of colours: 0 or 1 where softness, in the units of hsv, is 0.
 
     A range whose lowest hue is above its highest goes over 0. The bounds are whole 8-bit levels, and what rounds to
     one of them is inside: it is judged by how far the worst of the three numbers is from half a level beyond.
+
+    >>> red = F.bgr_to_hsv(torch.tensor([0, 0, 1.0]).reshape(1, 3, 1, 1))
+    >>> F.within_ranges(red, torch.tensor([[170.0, 80, 80]]), torch.tensor([[10.0, 255, 255]])).flatten()
+    tensor([1.])
     """
     hue, saturation, value = hsv.unbind(1)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -44,13 +51,14 @@ def within_ranges(
         found.append(torch.minimum(margin, half[k, 2] - (value - middle[k, 2]).abs()))
     if not found:
         return hsv.new_zeros(hsv.shape[0], 0, *hsv.shape[2:])
-    return step(torch.stack(found, 1) + 0.5, softness)
+    return step(torch.stack(found, 1) + 0.5, softness=softness)
 
 
 def rgb_histogram(
     image: Float[Tensor, "B 3 H W"],
     box_px: Float[Tensor, "B N 4"],
     valid: Bool[Tensor, "B N"],
+    *,
     softness: float = 0.0,
     normalize: bool = True,
     largest: tuple[int, int] | None = None,
@@ -66,6 +74,11 @@ def rgb_histogram(
     normalize: each channel adds up to 1; False leaves the counts, and a box of 100 pixels 300 in all.
     largest: (height, width) in pixels that no box exceeds: then only so much is read for each of them, and a larger box
     does not count as valid. None: the whole picture, N times.
+
+    >>> box_px, valid = torch.tensor([[[1.0, 1, 4, 4]]]), torch.ones(1, 1, dtype=torch.bool)
+    >>> histogram, there = F.rgb_histogram(torch.zeros(1, 3, 8, 8), box_px, valid)
+    >>> histogram.shape, histogram[0, 0, [0, 256, 512]], there
+    (torch.Size([1, 1, 768]), tensor([1., 1., 1.]), tensor([[True]]))
     """
     height, width = image.shape[-2:]
     rows, columns = largest or (height, width)

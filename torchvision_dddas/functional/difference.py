@@ -14,6 +14,7 @@ def fit_exposure(
     reference: Float[Tensor, "B C H W"],
     warped: Float[Tensor, "B C H W"],
     inside: Bool[Tensor, "B 1 H W"],
+    *,
     floor: float = 3 / 255,
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
@@ -22,6 +23,11 @@ def fit_exposure(
     whose error is at most max(floor, 3.7 x the median error) and fits them again, until the fit is settled to floor/30,
     a tenth of a grey level. Without inside pixels, or on a frame of one single grey, the gain stays 1 (and the offset
     is the difference of the means).
+
+    >>> warped = torch.rand(1, 1, 32, 32)
+    >>> gain, offset = F.fit_exposure(1.2 * warped + 0.1, warped, torch.ones(1, 1, 32, 32, dtype=torch.bool))
+    >>> gain.round(decimals=2), offset.round(decimals=2)
+    (tensor([1.2000]), tensor([0.1000]))
     """
     wanted, given = reference.flatten(1), warped.flatten(1)
     seen = inside.expand_as(reference).flatten(1)
@@ -59,6 +65,11 @@ def match_exposure(
     """Both pictures, whole grey levels, the darker one in the other's exposure where the two differ clearly.
 
     The twin of `detection.engine.match_exposure`, batched.
+
+    >>> picture = (torch.rand(1, 1, 64, 64) * 100).round()
+    >>> earlier, later = F.match_exposure(picture, 2 * picture)
+    >>> bool((earlier - later).abs().max() < 3)
+    True
     """
     gain, offset = fit_quantiles(level_quantiles(earlier), level_quantiles(later))
     if all_true((gain == 1) & (offset == 0)):
@@ -156,7 +167,11 @@ def _count_at_most(rising: Float[Tensor, "B N"], values: Float[Tensor, "B M"]) -
 
 
 def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
-    """Lower median of the values under the mask; 0 where there are none."""
+    """Lower median of the values under the mask; 0 where there are none.
+
+    >>> F.masked_median(torch.tensor([[1.0, 5, 9]]), torch.tensor([[True, True, False]]))
+    tensor([[1.]])
+    """
     if may_branch(values) and not values.requires_grad:
         # The same in a fifth of the time that torch takes.
         rows = zip(values.numpy(), mask.numpy(), strict=True)
@@ -177,6 +192,9 @@ def noise_weight(
     """One over the noise expected of a pixel, in grey levels: that of a flat region, and a share of the gradient.
 
     texture: 4 x grey levels a pixel, as `mean_gradient` gives it.
+
+    >>> 1 / F.noise_weight(torch.full((1, 1, 1, 1), 40.0), 4.0, 0.12)
+    tensor([[[[4.1761]]]])
     """
     # In place where that keeps the gradient of the parameters.
     return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()

@@ -35,6 +35,9 @@ def gaussian_blur2d(
     Halves are rounded up. Pictures may be of any size. OpenCV's weights for kernels up to 9 differ by up to 0.006.
 
     Raises InputError for an even size, and another border than `reflect` without a sigma.
+
+    >>> F.gaussian_blur2d(torch.ones(1, 1, 8, 8), 5)[0, 0, 4, 4]
+    tensor(1.)
     """
     if sigma is not None:
         blurred: Tensor = filters.gaussian_blur2d(input, kernel_size, sigma, border_type)
@@ -60,7 +63,11 @@ def gaussian_blur2d(
 
 
 def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B C H W"]:
-    """Sum over block x block pixels, mirrored at the edges, anchored where OpenCV's box filter is."""
+    """Sum over block x block pixels, mirrored at the edges, anchored where OpenCV's box filter is.
+
+    >>> F.box_sum(torch.ones(1, 1, 4, 4), 3)[0, 0, 1]
+    tensor([9., 9., 9., 9.])
+    """
     before, after = block // 2, block - 1 - block // 2
     padded = pad_reflect(values, before, after, before, after)
     for dim in (-2, -1):
@@ -72,12 +79,16 @@ def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B 
     return padded
 
 
-def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], block: int = 5) -> Shaped[Tensor, "B 1 H W"]:
+def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], *, block: int = 5) -> Shaped[Tensor, "B 1 H W"]:
     """Mean gradient magnitude over block x block pixels, 4 x grey levels a pixel, for pictures in whole grey levels.
 
     Half of `kornia.filters.sobel` without normalisation, through `box_blur`; rounded to whole numbers and cut off at
     255 before and after the mean, as OpenCV's 8-bit pictures are. Kornia's `sobel` repeats the edge pixel: the rim
     differs. No gradient passes.
+
+    >>> slope = torch.arange(8.0).expand(1, 1, 8, 8)
+    >>> F.mean_gradient(slope)[0, 0, 4, 4]
+    tensor(4.)
     """
     if uses_kornia("gradient", levels.device.type) and not is_traced():
         slope = filters.sobel(levels.detach(), normalized=False, eps=0.0).mul(0.5).round_().clamp_(max=255.0)
@@ -133,7 +144,11 @@ def strip_rows(like: Tensor, height: int, row: int) -> int:
 def pad_reflect(
     image: Shaped[Tensor, "B C H W"], left: int, right: int, top: int, bottom: int
 ) -> Shaped[Tensor, "B C h w"]:
-    """As `torch.nn.functional.pad` in mode `reflect`; where a side is smaller than the border the mirror repeats."""
+    """As `torch.nn.functional.pad` in mode `reflect`; where a side is smaller than the border the mirror repeats.
+
+    >>> F.pad_reflect(torch.arange(3.0).reshape(1, 1, 1, 3), 2, 2, 0, 0).flatten()
+    tensor([2., 1., 0., 1., 2., 1., 0.])
+    """
     height, width = image.shape[-2:]
     if max(left, right) < width and max(top, bottom) < height:
         return functional.pad(image, (left, right, top, bottom), mode="reflect")
@@ -143,7 +158,11 @@ def pad_reflect(
 
 
 def reflect_index(index: Int64[Tensor, "*any"], size: int) -> Int64[Tensor, "*any"]:
-    """The pixel inside 0 .. size - 1 that an index outside mirrors."""
+    """The pixel inside 0 .. size - 1 that an index outside mirrors.
+
+    >>> F.reflect_index(torch.tensor([-2, -1, 0, 3, 4]), 3)
+    tensor([2, 1, 0, 1, 0])
+    """
     period = max(2 * (size - 1), 1)
     folded = index.remainder(period)
     return torch.minimum(folded, period - folded) if size > 1 else torch.zeros_like(index)

@@ -31,6 +31,9 @@ def build_pyramid(
     kornia.geometry.build_pyramid smooths alike, at the same border (`reflect`), then interpolates between pixels; here
     every other pixel is taken, and odd sides are rounded up. Kornia's takes 5 to 11 times as long on a CPU
     (`python eval/speed.py operations`).
+
+    >>> [tuple(level.shape) for level in F.build_pyramid(torch.rand(1, 1, 48, 64), 3)]
+    [(1, 1, 48, 64), (1, 1, 24, 32), (1, 1, 12, 16)]
     """
     pictures = [input]
     for _ in range(max_level - 1):
@@ -43,6 +46,7 @@ def lucas_kanade(
     pyramid_from: Pyramid,
     pyramid_to: Pyramid,
     guess: Float[Tensor, "B N 2"] | None = None,
+    *,
     window_px: int = 21,
     iterations: int = 30,
     epsilon_px: float = 0.01,
@@ -55,6 +59,12 @@ def lucas_kanade(
     guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
     again up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
     texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the frame.
+
+    >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7)
+    >>> start = torch.tensor([[[30.0, 30.0]]])
+    >>> end, found = F.lucas_kanade(start, F.build_pyramid(picture, 2), F.build_pyramid(picture.roll(3, -1), 2))
+    >>> end.round(decimals=1), found
+    (tensor([[[33., 30.]]]), tensor([[True]]))
     """
     place = points if guess is None else guess
     place = place / 2.0 ** (len(pyramid_from) - 1)
@@ -82,12 +92,19 @@ def forward_backward(
     pyramid_from: Pyramid,
     pyramid_to: Pyramid,
     guess: Float[Tensor, "B N 2"] | None = None,
+    *,
     limit_px: float = 1.0,
     **settings: float,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
     """As `lucas_kanade`, with its settings; found only where tracking back returns to within limit_px of the start.
 
     The backward guess uses the predicted displacement, not the known start: otherwise the check would always pass.
+
+    >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7)
+    >>> start = torch.tensor([[[30.0, 30.0]]])
+    >>> end, found = F.forward_backward(start, F.build_pyramid(picture, 2), F.build_pyramid(picture.roll(3, -1), 2))
+    >>> end.round(decimals=1), found
+    (tensor([[[33., 30.]]]), tensor([[True]]))
     """
     there, found = lucas_kanade(points, pyramid_from, pyramid_to, guess, **settings)  # type: ignore[arg-type]
     back_guess = None if guess is None else there - (guess - points)

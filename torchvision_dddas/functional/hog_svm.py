@@ -31,6 +31,9 @@ class Layout:
     window: (width, height). cell and block are squares. stride: from block to block. bins: over half a turn, or a whole
     one if signed. clip: of L2-Hys. gamma: whether square roots of the levels are taken.
     Raises InputError where cells do not fill the block, or blocks the window.
+
+    >>> F.Layout().window, F.Layout(window=(32, 64)).window
+    ((64, 128), (32, 64))
     """
 
     window: tuple[int, int] = (64, 128)
@@ -156,10 +159,13 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
     return reduce(torch.add, shifted).transpose(-3, -2)
 
 
-def hog(bordered: Tensor, layout: Layout, clip: Tensor | None = None) -> Tensor:
+def hog(bordered: Tensor, layout: Layout, *, clip: Tensor | None = None) -> Tensor:
     """(B, F, ny, nx) normalised histograms of every block, F = bins x cells down x cells across.
 
     bordered: as in `gradient`; its inside must hold a block. clip: a number in place of the layout's.
+
+    >>> F.hog(torch.rand(1, 1, 130, 66) * 255, F.Layout()).shape
+    torch.Size([1, 36, 15, 7])
     """
     maps = hats(*gradient(bordered, layout.gamma), layout)  # (B, K, H, W)
     down = _pooled(maps, layout)  # (B, K, cy, ny, W)
@@ -179,6 +185,9 @@ def arrange_weights(weights: Tensor, layout: Layout) -> Tensor:
     """(down x across x F,) weights of a linear SVM in OpenCV's order, as (down, across, F) for `svm_scores`.
 
     OpenCV goes through a window's blocks, and a block's cells, column by column; the bins vary fastest.
+
+    >>> F.arrange_weights(torch.zeros(3780), F.Layout()).shape
+    torch.Size([15, 7, 36])
     """
     across, down = layout.blocks
     cells = layout.cells
@@ -189,6 +198,10 @@ def svm_scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
     """(B, ny - down + 1, nx - across + 1): the SVM's score of the window that begins at each block.
 
     block_map: (B, F, ny, nx). weights: (down, across, F). bias: a number, added.
+
+    >>> F.svm_scores(torch.ones(1, 2, 4, 3), torch.ones(3, 2, 2), torch.tensor(-1.0))
+    tensor([[[11., 11.],
+             [11., 11.]]])
     """
     batch, _, ny, nx = block_map.shape
     down, across, _ = weights.shape

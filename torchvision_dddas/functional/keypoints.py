@@ -16,8 +16,15 @@ from torchvision_dddas.functional.filters import box_sum, in_strips, pad_reflect
 from torchvision_dddas.functional.soft import is_traced
 
 
-def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], block: int = 3) -> Float[Tensor, "B 1 H W"]:
-    """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values."""
+def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], *, block: int = 3) -> Float[Tensor, "B 1 H W"]:
+    """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values.
+
+    >>> picture = torch.zeros(1, 1, 16, 16)
+    >>> picture[..., 8:, 8:] = 1
+    >>> strength = F.corner_min_eigenvalue(picture)[0, 0]
+    >>> bool(strength[8, 8] > strength[8, 14])
+    True
+    """
     if uses_kornia("corners", gray.device.type) and not is_traced():
         return _min_eigenvalue_by_kornia(gray, block)
     return in_strips(lambda strip: _min_eigenvalue(strip, block), gray, 1 + block // 2)
@@ -48,6 +55,7 @@ def _min_eigenvalue(gray: Tensor, block: int) -> Tensor:
 def grid_features(
     gray: Float[Tensor, "B 1 H W"],
     cell_px: int,
+    *,
     quality: float | Float[Tensor, "B"] = 0.01,
     block: int = 3,
     least: float = 1e-7,
@@ -56,8 +64,12 @@ def grid_features(
 
     N is the number of cells that lie in the frame as a whole, which may be none. valid where the cell holds a pixel
     above quality times the frame's maximum, and above `least`: the rounding that a blank picture shows.
+
+    >>> points, score, valid = F.grid_features(torch.rand(1, 1, 64, 64), 16)
+    >>> points.shape, valid.shape
+    (torch.Size([1, 16, 2]), torch.Size([1, 16]))
     """
-    eigen = corner_min_eigenvalue(gray, block)
+    eigen = corner_min_eigenvalue(gray, block=block)
     (height, width), batch = gray.shape[-2:], len(gray)
     rows, columns = height // cell_px, width // cell_px
     if not rows or not columns:
@@ -73,6 +85,7 @@ def grid_features(
 def frame_features(
     gray: Float[Tensor, "B 1 H W"],
     count: int,
+    *,
     quality: float = 0.01,
     min_distance_px: float = 8.0,
     block: int = 3,
@@ -83,8 +96,12 @@ def frame_features(
     A corner is a local maximum (3 x 3) above quality times the frame's maximum and above `least`, away from the frame's
     outermost pixels; it is left out nearer than min_distance_px to a better one that is kept. Of very many corners only
     the best 4 x count are looked at.
+
+    >>> points, valid = F.frame_features(F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7), 20)
+    >>> points.shape, bool(valid.all())
+    (torch.Size([1, 20, 2]), True)
     """
-    eigen = corner_min_eigenvalue(gray, block)
+    eigen = corner_min_eigenvalue(gray, block=block)
     limit = (quality * eigen.amax((1, 2, 3), keepdim=True)).clamp(min=least)
     peak = (eigen == functional.max_pool2d(eigen, 3, 1, 1)) & (eigen > limit)
     inside = torch.zeros_like(peak)

@@ -51,7 +51,15 @@ def kernel_array(shape: Literal["rectangle", "ellipse"], size_px: int | tuple[in
 def structuring_element(
     shape: Literal["rectangle", "ellipse"], size_px: int | tuple[int, int]
 ) -> Shaped[Tensor, "h w"]:
-    """`kernel_array` as a tensor on the CPU."""
+    """`kernel_array` as a tensor on the CPU.
+
+    >>> F.structuring_element("ellipse", 5).int()
+    tensor([[0, 0, 1, 0, 0],
+            [1, 1, 1, 1, 1],
+            [1, 1, 1, 1, 1],
+            [1, 1, 1, 1, 1],
+            [0, 0, 1, 0, 0]], dtype=torch.int32)
+    """
     return torch.from_numpy(kernel_array(shape, size_px))
 
 
@@ -60,6 +68,10 @@ def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: flo
 
     softness: above 0, in the units of the mask, gives softness x log-sum-exp(mask / softness). Values below -1e4 then
     count as -1e4, as in Kornia.
+
+    >>> row = torch.tensor([0.0, 0, 1, 0, 0]).reshape(1, 1, 1, 5)
+    >>> F.dilation(row, torch.ones(1, 3)).flatten()
+    tensor([0., 1., 1., 1., 0.])
     """
     if softness == 0.0:
         return _extremum(tensor, kernel, highest=False)
@@ -70,19 +82,34 @@ def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: flo
 
 
 def erosion(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Minimum where the kernel is not 0. softness: as in `dilation`."""
+    """Minimum where the kernel is not 0. softness: as in `dilation`.
+
+    >>> row = torch.tensor([0.0, 1, 1, 1, 0]).reshape(1, 1, 1, 5)
+    >>> F.erosion(row, torch.ones(1, 3)).flatten()
+    tensor([0., 0., 1., 0., 0.])
+    """
     if softness == 0.0:
         return _extremum(tensor, kernel, highest=True)
     return -dilation(-tensor, kernel, softness=softness)
 
 
 def opening(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Erosion, then dilation: takes away what is smaller than the kernel."""
+    """Erosion, then dilation: takes away what is smaller than the kernel.
+
+    >>> row = torch.tensor([0.0, 1, 0, 1, 1, 1]).reshape(1, 1, 1, 6)
+    >>> F.opening(row, torch.ones(1, 3)).flatten()
+    tensor([0., 0., 0., 1., 1., 1.])
+    """
     return dilation(erosion(tensor, kernel, softness=softness), kernel, softness=softness)
 
 
 def closing(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Dilation, then erosion: fills what is smaller than the kernel."""
+    """Dilation, then erosion: fills what is smaller than the kernel.
+
+    >>> row = torch.tensor([0.0, 1, 0, 1, 0]).reshape(1, 1, 1, 5)
+    >>> F.closing(row, torch.ones(1, 3)).flatten()
+    tensor([1., 1., 1., 1., 1.])
+    """
     return erosion(dilation(tensor, kernel, softness=softness), kernel, softness=softness)
 
 

@@ -87,6 +87,11 @@ def find_homography(
     A pair of weight 0 is as if it were not there, whatever it holds; four pairs are met exactly. valid is False with
     fewer than four pairs of positive weight, when they do not fix eight parameters (collinear), and when one of them
     would lie on or behind the horizon: so it is with three of four points on one line and noise in their partners.
+
+    >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1], [1, 1]]])
+    >>> matrix, valid = F.find_homography(p, 2 * p + 3)
+    >>> F.transform_points(matrix, p).round(decimals=3)[0, 3], valid
+    (tensor([5., 5.]), tensor([True]))
     """
     weight = torch.ones_like(points1[..., 0]) if weights is None else weights
     used = weight > 0
@@ -109,7 +114,13 @@ def find_homography(
 def find_affine(
     p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """Weighted least squares over N pairs; valid is False with fewer than three pairs or when they are collinear."""
+    """Weighted least squares over N pairs; valid is False with fewer than three pairs or when they are collinear.
+
+    >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1]]])
+    >>> matrix, valid = F.find_affine(p, 2 * p + 3, torch.ones(1, 3))
+    >>> F.transform_points(matrix, p).round(decimals=3)[0, 1], valid
+    (tensor([5., 3.]), tensor([True]))
+    """
     wide = _wide(p)
     p_unit, p_mean, p_scale = _hartley(p.to(wide), weight.to(wide))
     q_unit, q_mean, q_scale = _hartley(q.to(wide), weight.to(wide))
@@ -135,6 +146,11 @@ def find_homography_raw(
     of more than four pairs is wrong by decimetres or more even if the pairs are perfect. It is kept to show just that.
     Therefore a pivot counts as zero only if it is zero: any larger tolerance would refuse degrees altogether. valid is
     False then, or with fewer than four pairs; that landmarks lie on one line must be seen elsewhere.
+
+    >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1], [1, 1]]])
+    >>> matrix, valid = F.find_homography_raw(p, 2 * p + 3)
+    >>> F.transform_points(matrix, p).round(decimals=3)[0, 3], valid
+    (tensor([5., 5.]), tensor([True]))
     """
     rows = _equations(p, q)
     if p.shape[1] != 4:
@@ -145,11 +161,14 @@ def find_homography_raw(
 
 
 def draw_samples(
-    generator: torch.Generator, batch: int, hypotheses: int, count: int, size: int = 4
+    generator: torch.Generator, batch: int, hypotheses: int, count: int, *, size: int = 4
 ) -> Int64[Tensor, "B S size"]:
     """Draw `size` different numbers from 0 .. count - 1 for every hypothesis, on the generator's device.
 
     Raises InputError if there are fewer than `size` numbers to draw from.
+
+    >>> F.draw_samples(torch.Generator().manual_seed(0), 1, 128, 50).shape
+    torch.Size([1, 128, 4])
     """
     if count < size:
         raise InputError(f"a hypothesis is drawn from {size} points; got room for {count}. Raise the keypoint budget.")
@@ -165,7 +184,13 @@ def draw_samples(
 
 
 def invert_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The inverse by cofactors: a graph has no `torch.linalg.inv`. A singular matrix gives what is not finite."""
+    """The inverse by cofactors: a graph has no `torch.linalg.inv`. A singular matrix gives what is not finite.
+
+    >>> F.invert_map(torch.diag(torch.tensor([2.0, 4.0, 1.0])))
+    tensor([[0.5000, 0.0000, 0.0000],
+            [0.0000, 0.2500, 0.0000],
+            [0.0000, 0.0000, 1.0000]])
+    """
     a, b, c = matrix.unbind(-2)
     cross = torch.linalg.cross
     columns = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -1)
@@ -177,6 +202,7 @@ def ransac(
     q: Float[Tensor, "B N 2"],
     valid: Bool[Tensor, "B N"],
     samples: Int64[Tensor, "B S size"],
+    *,
     model: PlaneModel = HOMOGRAPHY,
     tolerance_px: float | Float[Tensor, "B"] = 3.0,
     refits: Sequence[float | Tensor] = (3.0, 2.0, 1.0),
@@ -187,6 +213,14 @@ def ransac(
     Hypotheses are ranked by their truncated squared error, which ranks those with equally many inliers. samples: from
     `draw_samples`; numbers are spread over the valid points when some are not. When nothing fits: identity, not valid.
     Raises InputError without any points.
+
+    >>> p = torch.rand(1, 50, 2) * 100
+    >>> q = p + 5
+    >>> q[:, :15] += 40 * torch.rand(1, 15, 2)
+    >>> samples = F.draw_samples(torch.Generator().manual_seed(0), 1, 128, 50)
+    >>> matrix, inliers, reliable = F.ransac(p, q, torch.ones(1, 50, dtype=torch.bool), samples)
+    >>> matrix[0, :2, 2].round(decimals=2), bool(inliers[:, 15:].all())
+    (tensor([5., 5.]), True)
     """
     if not p.shape[1]:
         raise InputError(f"RANSAC needs {model.size} pairs of points, got none")
@@ -216,6 +250,12 @@ def refit_map(
     """The guess, fitted again once per gate to the valid pairs that miss it by less.
 
     A fit counts only if twice the minimal number of points support it.
+
+    >>> p = torch.rand(1, 50, 2) * 100
+    >>> guess = torch.tensor([[[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]])
+    >>> fitted = F.refit_map(p, p + 2, torch.ones(1, 50, dtype=torch.bool), guess, [3.0, 1.0], F.MODELS["homography"])
+    >>> fitted[0, :2, 2].round(decimals=2)
+    tensor([2., 2.])
     """
     matrix = guess
     for gate_px in gates_px:
@@ -230,7 +270,11 @@ def refit_map(
 
 
 def spread_ranks(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
-    """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer."""
+    """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer.
+
+    >>> F.spread_ranks(torch.tensor([[True, False, True, True, False, True]]), 2)
+    tensor([[0, 3]])
+    """
     batch, available = valid.shape
     samples = torch.arange(count, device=valid.device) * available // count
     return _ranks_to_points(valid, samples.expand(batch, 1, -1))[:, 0]
@@ -244,13 +288,17 @@ def normalize_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 
 
 
 def solve_linear(
-    matrix: Float[Tensor, "*batch n n"], right: Float[Tensor, "*batch n m"], tolerance: float | None = None
+    matrix: Float[Tensor, "*batch n n"], right: Float[Tensor, "*batch n m"], *, tolerance: float | None = None
 ) -> tuple[Float[Tensor, "*batch n m"], Bool[Tensor, "*batch"]]:
     """Solve matrix @ x = right for every member of the batch; valid is False where the matrix is singular.
 
     Gaussian elimination with row exchange, the source's own solver (appendix A, IV-B). Written out because
     `torch.linalg.solve` neither exports nor survives a singular member of a batch. A pivot smaller than `tolerance`
     times the matrix's largest entry counts as zero (default: 8 n machine epsilons). Invalid members come back as zeros.
+
+    >>> F.solve_linear(torch.tensor([[2.0, 0], [0, 4]]), torch.tensor([[2.0], [2.0]]))
+    (tensor([[1.0000],
+            [0.5000]]), tensor(True))
     """
     n = matrix.shape[-1]
     if tolerance is None:

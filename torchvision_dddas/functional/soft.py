@@ -11,21 +11,37 @@ from jaxtyping import Float, Int64, Shaped
 from torch import Tensor
 
 
-def step(x: Float[Tensor, "*any"], softness: float = 0.0) -> Float[Tensor, "*any"]:
-    """1 where x > 0 and 0 elsewhere; with softness above 0, in the unit of x, the sigmoid of x / softness."""
+def step(x: Float[Tensor, "*any"], *, softness: float = 0.0) -> Float[Tensor, "*any"]:
+    """1 where x > 0 and 0 elsewhere; with softness above 0, in the unit of x, the sigmoid of x / softness.
+
+    >>> F.step(torch.tensor([-1.0, 1.0])), F.step(torch.tensor([0.0, 1.0]), softness=1.0)
+    (tensor([0., 1.]), tensor([0.5000, 0.7311]))
+    """
     if softness == 0.0:
         return (x > 0).to(x.dtype)
     return torch.sigmoid(x / softness)
 
 
 def straight_through(hard: Shaped[Tensor, "*any"], soft: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """The hard value, bit for bit, with the gradient of the soft one (Bengio et al. 2013)."""
+    """The hard value, bit for bit, with the gradient of the soft one (Bengio et al. 2013).
+
+    >>> soft = torch.tensor(0.3, requires_grad=True)
+    >>> F.straight_through(torch.tensor(1.0), soft).backward()
+    >>> soft.grad
+    tensor(1.)
+    """
     # `hard - soft + soft` would round.
     return _StraightThrough.apply(hard, soft)
 
 
 def round_straight_through(x: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """The nearest whole numbers, halves to even, with the gradient of x itself."""
+    """The nearest whole numbers, halves to even, with the gradient of x itself.
+
+    >>> x = torch.tensor(2.6, requires_grad=True)
+    >>> F.round_straight_through(x).backward()
+    >>> F.round_straight_through(x).item(), x.grad
+    (3.0, tensor(1.))
+    """
     return straight_through(x.detach().round(), x)
 
 
@@ -39,11 +55,14 @@ class _StraightThrough(torch.autograd.Function):
         return None, grads[0]
 
 
-def blend_sizes(size: float | Tensor, operation: Callable[[int], Tensor], lowest: int = 1, pitch: int = 1) -> Tensor:
+def blend_sizes(size: float | Tensor, operation: Callable[[int], Tensor], *, lowest: int = 1, pitch: int = 1) -> Tensor:
     """An operation at a fractional size: its results for the sizes on either side, blended by nearness.
 
     size: one number, or a tensor without axes, to which the gradient goes. lowest, pitch: sizes are lowest, lowest +
     pitch, ...: 1 and 2 for odd ones.
+
+    >>> F.blend_sizes(2.25, lambda size: torch.tensor(float(size)))
+    tensor(2.2500)
     """
     steps = (float(size.detach() if isinstance(size, Tensor) else size) - lowest) / pitch
     below = max(math.floor(steps), 0)
@@ -66,6 +85,7 @@ def gate_regions(
     regions: int,
     min_area_px: float | Tensor,
     peak: float | Tensor,
+    *,
     softness: float = 0.0,
 ) -> Float[Tensor, "B R"]:
     """How far each region passes: the sum of its mask is min_area_px at least, and its highest evidence the peak.
@@ -73,6 +93,11 @@ def gate_regions(
     Regions are labelled on the hard mask, which passes no gradient.
     labels: 0 no region, else 1 to regions; pixels of one label are one region. Softness is a share of either bound, so
     that large and small numbers soften alike. A label that no pixel has does not pass.
+
+    >>> mask = torch.ones(1, 1, 1, 4)
+    >>> labels = torch.tensor([1, 1, 1, 2]).reshape(1, 1, 1, 4)
+    >>> F.gate_regions(mask, 9 * mask, labels, 2, min_area_px=2, peak=7)
+    tensor([[1., 0.]])
     """
     batch = mask.shape[0]
     place = labels.reshape(batch, -1)
@@ -83,19 +108,27 @@ def gate_regions(
     there = highest.isfinite()
     highest = torch.where(there, highest, torch.zeros_like(highest))
     # What equals its bound passes: 1 - step of what is missing.
-    large = 1 - step(1 - area[:, 1:] / min_area_px, softness)
-    high = 1 - step((peak - highest) / torch.clamp(torch.as_tensor(peak), min=1.0), softness)
+    large = 1 - step(1 - area[:, 1:] / min_area_px, softness=softness)
+    high = 1 - step((peak - highest) / torch.clamp(torch.as_tensor(peak), min=1.0), softness=softness)
     return large * high * there
 
 
 def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]) -> Float[Tensor, "B 1 H W"]:
-    """Each pixel's gate; 0 where its label is 0."""
+    """Each pixel's gate; 0 where its label is 0.
+
+    >>> F.gates_of_pixels(torch.tensor([[1.0, 0.5]]), torch.tensor([0, 1, 2]).reshape(1, 1, 1, 3)).flatten()
+    tensor([0.0000, 1.0000, 0.5000])
+    """
     none = gate.new_zeros(gate.shape[0], 1)  # there may be no region at all
     return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
 
 
 def may_branch(on: Tensor) -> bool:
-    """Whether Python may branch on a tensor's values: not on a GPU, which the host would wait for, nor in a trace."""
+    """Whether Python may branch on a tensor's values: not on a GPU, which the host would wait for, nor in a trace.
+
+    >>> F.may_branch(torch.ones(1))
+    True
+    """
     return on.device.type == "cpu" and not is_traced()
 
 
@@ -105,5 +138,9 @@ def all_true(condition: Tensor) -> bool:
 
 
 def is_traced() -> bool:
-    """Whether a graph is being made: then one way is taken for all data."""
+    """Whether a graph is being made: then one way is taken for all data.
+
+    >>> F.is_traced()
+    False
+    """
     return bool(torch.compiler.is_compiling() or torch.jit.is_tracing())  # type: ignore[attr-defined]

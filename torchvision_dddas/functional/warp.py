@@ -41,6 +41,11 @@ def warp_perspective(
     32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
     whole: return bytes, halves rounded up; the pictures are grey levels up to 255. Raises InputError for another
     padding_mode, and for what is no batch of pictures and of as many matrices.
+
+    >>> picture = torch.arange(4.0).expand(1, 1, 4, 4)
+    >>> right = torch.tensor([[[1.0, 0, 1], [0, 1, 0], [0, 0, 1]]])
+    >>> F.warp_perspective(picture, right, (4, 4))[0, 0, 0]
+    tensor([0., 0., 1., 2.])
     """
     check_batch("src", src, "(B, C, H, W)", 4)
     check_batch("M", M, "(B, 3, 3)", 3)
@@ -96,12 +101,17 @@ def seen_columns(
     frame_from_reference: Float[Tensor, "B 3 3"],
     size: tuple[int, int],
     frame_size: tuple[int, int],
+    *,
     border_px: int = 0,
 ) -> tuple[Int32[Tensor, "B h"], Int32[Tensor, "B h"]]:
     """First and last column of every reference row that the frame shows; first > last where it shows none.
 
     size, frame_size: (height, width). A strip border_px wide inside the frame's border counts as outside. The nearest
     frame pixel decides. The frame's outline is convex, so every row sees one run of columns.
+
+    >>> moved = torch.tensor([[[1.0, 0, 2], [0, 1, 0], [0, 0, 1]]])
+    >>> F.seen_columns(moved, (2, 6), (2, 6))
+    (tensor([[0, 0]], dtype=torch.int32), tensor([[3, 3]], dtype=torch.int32))
     """
     height, width = frame_size
     matrix = frame_from_reference.double()
@@ -122,7 +132,12 @@ def seen_columns(
 
 
 def columns_between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], width: int) -> Bool[Tensor, "B 1 h w"]:
-    """The columns from first to last of every row, as a mask."""
+    """The columns from first to last of every row, as a mask.
+
+    >>> F.columns_between(torch.tensor([[1, 2]]), torch.tensor([[2, 1]]), 4)[0, 0].int()
+    tensor([[0, 1, 1, 0],
+            [0, 0, 0, 0]], dtype=torch.int32)
+    """
     columns = torch.arange(width, dtype=first.dtype, device=first.device)
     if is_traced():
         return ((columns >= first[..., None]) & (columns <= last[..., None]))[:, None]
@@ -132,7 +147,13 @@ def columns_between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], wid
 
 
 def seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Bool[Tensor, "B 1 h w"]:
-    """Where two frames are seen. one, other: as `seen_columns` returns them."""
+    """Where two frames are seen. one, other: as `seen_columns` returns them.
+
+    >>> moved = torch.tensor([[[1.0, 0, 2], [0, 1, 0], [0, 0, 1]]])
+    >>> one, other = F.seen_columns(torch.eye(3)[None], (4, 6), (4, 6)), F.seen_columns(moved, (4, 6), (4, 6))
+    >>> F.seen_by_both(one, other, 6)[0, 0, 0].int()
+    tensor([1, 1, 1, 1, 0, 0], dtype=torch.int32)
+    """
     return columns_between(torch.maximum(one[0], other[0]), torch.minimum(one[1], other[1]), width)
 
 
@@ -154,6 +175,9 @@ def resize(
     rounded: input is levels 0 .. 255, the result whole levels, halves up. Of whole levels every sum is a whole number
     of 1/65536 below 256, which float32 holds exactly: the result is OpenCV's on every device. Gradients go
     to the levels, and pass the rounding as if it were not there; not rounded, the result is linear in the levels.
+
+    >>> F.resize(torch.rand(1, 3, 48, 64), (24, 32)).shape
+    torch.Size([1, 3, 24, 32])
     """
     height, width = input.shape[-2:]
     found = _rows(input, *_taps(height, size[0]), rows)

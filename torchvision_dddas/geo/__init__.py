@@ -1,13 +1,23 @@
-"""From the picture to the ground: aerial cameras with telemetry and landmarks, and ranging by cameras on the ground."""
+"""Map pictures to the ground: aerial cameras with telemetry and landmarks, and ranging by cameras on the ground."""
 
 from torchvision_dddas.geo.aerial_locator import AerialLocator, check_table, frames_to_locate, is_outside
 from torchvision_dddas.geo.aerial_targets import Targets, tracked_targets
 from torchvision_dddas.geo.camera_calibration import calibrate_focal_length, calibrate_pose
 from torchvision_dddas.geo.clock_offset import describe_clock_offset
 from torchvision_dddas.geo.colours import CalibratedColours, calibrate_colours, draw_calibration
+from torchvision_dddas.geo.flight_calibration import (
+    OFFSETS,
+    PART_OF_OFFSET,
+    PARTS,
+    FlightErrors,
+    Look,
+    estimate_flight_errors,
+    find_looks,
+)
+from torchvision_dddas.geo.fusion import TargetFusion
 from torchvision_dddas.geo.ground_locator import GroundLocator
-from torchvision_dddas.geo.landmark_faults import passes
-from torchvision_dddas.geo.landmark_trajectories import LandmarkTrajectories
+from torchvision_dddas.geo.heading_offset import describe_heading_offset, find_heading_offset
+from torchvision_dddas.geo.heights import geoid_of
 from torchvision_dddas.geo.landmark_watch import (
     LandmarkWatch,
     WatchedScene,
@@ -16,15 +26,7 @@ from torchvision_dddas.geo.landmark_watch import (
     without_pixels,
 )
 from torchvision_dddas.geo.plane_homography import load_solver
-from torchvision_dddas.geo.pose_estimation import (
-    EXACT_M,
-    Prior,
-    find_pose,
-    focal_prior,
-    independent_expectation,
-    linearize_pose,
-    pose_prior,
-)
+from torchvision_dddas.geo.pose_estimation import pose_prior
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.geo.site import (
     Site,
@@ -36,18 +38,23 @@ from torchvision_dddas.geo.site import (
     resolve_camera,
     to_local,
 )
+from torchvision_dddas.geo.zones import Zones
 
 __all__ = [
-    "EXACT_M",
+    "OFFSETS",
+    "PARTS",
+    "PART_OF_OFFSET",
     "AerialLocator",
     "CalibratedColours",
+    "FlightErrors",
     "GroundLocator",
-    "LandmarkTrajectories",
     "LandmarkWatch",
-    "Prior",
+    "Look",
     "Site",
+    "TargetFusion",
     "Targets",
     "WatchedScene",
+    "Zones",
     "build_site",
     "calibrate_colours",
     "calibrate_focal_length",
@@ -56,19 +63,19 @@ __all__ = [
     "check_table",
     "complete_site",
     "describe_clock_offset",
+    "describe_heading_offset",
     "describe_no_place",
     "describe_unknown_heights",
     "draw_calibration",
-    "find_pose",
-    "focal_prior",
+    "estimate_flight_errors",
+    "find_heading_offset",
+    "find_looks",
     "frames_to_locate",
+    "geoid_of",
     "group_crowds",
     "has_places",
-    "independent_expectation",
     "is_outside",
-    "linearize_pose",
     "load_solver",
-    "passes",
     "pose_prior",
     "range_people",
     "resolve_camera",

@@ -1,4 +1,4 @@
-"""How the pictures of a camera in the air map to the ground, frame by frame, and where that puts the targets."""
+"""Map the pictures of an aerial camera to the ground frame by frame, and place the targets there."""
 
 import math
 import time
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchvision_dddas import geometry
-from torchvision_dddas.config import Settings, check_settings
+from torchvision_dddas.config import Settings, check_settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_targets import (
     Targets,
@@ -49,20 +49,20 @@ from torchvision_dddas.types import (
     Tracks,
 )
 
-# A landmark or a target may show this far beyond the picture's edge, as a share of the picture's side.
+# A landmark or a target may lie this far beyond the picture's edge, as a share of the picture's side.
 _OUTSIDE = 0.25
-# A picture that is repeated for longer locates nothing: what it shows has moved on.
+# A picture that repeats an earlier one for longer than this locates nothing, because the scene has moved on.
 _FROZEN_S = 0.25
 _UNKNOWN = np.full((3, 3), np.nan)
-# By telemetry alone a place whose distance has a standard deviation of a larger share of itself is none.
+# By telemetry alone, a target is left out if the standard deviation of its distance exceeds this share of the distance.
 _VAGUE = 0.2
 
 
 @dataclass(frozen=True)
 class FrameFix:
-    """How one frame maps to the ground, and the landmarks that were used; adjustments and seconds as in Scene.
+    """How one frame maps to the ground, and the landmarks that were used. adjustments and seconds are as in Scene.
 
-    time_s: of the frame; later than fix.time_s if its picture repeats an earlier one.
+    time_s: time of the frame, later than fix.time_s if its picture repeats an earlier one.
     """
 
     fix: Fix
@@ -72,7 +72,7 @@ class FrameFix:
     time_s: float = math.nan
 
     def repeated(self, frame: int, time_s: float) -> "FrameFix":
-        """The same for a frame that repeats the picture; nothing is located by a picture that is too old."""
+        """Return this fix for a frame that repeats the picture; a picture that is too old locates nothing."""
         old_s, fix = time_s - self.fix.time_s, replace(self.fix, frame=frame, changes=())
         if old_s > _FROZEN_S:
             cause = f"the camera is frozen: the picture is that of frame {self.fix.frame}"
@@ -81,10 +81,14 @@ class FrameFix:
 
 
 class AerialLocator:
-    """Locates targets seen from the air, by telemetry, landmarks of known place, or both. Call it with frames in order.
+    """Locate targets seen from the air by telemetry, landmarks of known place, or both. Call it with frames in order.
 
-    >>> locator = AerialLocator(camera, telemetry)
-    >>> places = locator.locate(tracks)
+    >>> camera = td.Camera("uav", (640, 480), (600.0, 600.0), (319.5, 239.5))
+    >>> none = {"heading_rad": np.zeros(2), "roll_rad": np.zeros(2), "place": np.zeros((2, 2)), "geographic": False}
+    >>> log = td.Telemetry([0.0, 1.0], [50.0, 50.0], [5.0, 5.0], pitch_rad=np.full(2, np.pi / 2), **none)
+    >>> locator = td.AerialLocator(camera, log)
+    >>> locator.locate_pixels([[379.5, 179.5]]).east_north_m.round()
+    array([[5., 5.]])
     """
 
     def __init__(
@@ -92,24 +96,24 @@ class AerialLocator:
         camera: Camera | None,
         telemetry: Telemetry | None = None,
         landmarks: Landmarks | None = None,
+        *,
         elevation: Elevation | None = None,
         settings: Settings | None = None,
-        *,
         rate_hz: float = 10.0,
         backend: str = "auto",
         size_px: tuple[int, int] | None = None,
     ) -> None:
-        """Telemetry and landmarks may be in degrees or in local metres, both in one kind.
+        """Take telemetry and landmarks, both in degrees or both in local metres.
 
-        camera: None where the field of view is that of the telemetry or of the settings; then size_px is needed. Its
-        heading, pitch, roll and heights count where the telemetry never says them.
+        camera: None if the telemetry or the settings give the field of view; then size_px is needed. The heading,
+        pitch, roll and heights of the camera are used where the telemetry never gives them.
         elevation: heights in metres about the first landmark, or about the vehicle's first place without landmarks.
         rate_hz: frames a second. backend: auto, onboard or torch.
-        Raises InputError where neither telemetry nor landmarks are given, or they contradict each other.
+        Raise InputError if neither telemetry nor landmarks are given, or if they contradict each other.
         """
         for value, kind in ((camera, Camera), (telemetry, Telemetry), (landmarks, Landmarks), (elevation, Elevation)):
             if value is not None and not isinstance(value, kind):
-                raise InputError(f"AerialLocator got {type(value).__name__} where a {kind.__name__} is wanted")
+                raise InputError(f"AerialLocator expects a {kind.__name__}, got {type(value).__name__}")
         if not rate_hz > 0:
             raise InputError(f"rate_hz must be positive, got {rate_hz}")
         settings = check_settings(settings)
@@ -123,7 +127,7 @@ class AerialLocator:
     def from_site(
         cls, site: Site, camera: Camera, settings: Settings, solver: PlaneSolver, rate_hz: float, focal_known: bool
     ) -> "AerialLocator":
-        """A locator of prepared parts. Raises InputError for aerial.mode = paper with landmarks in metres."""
+        """Make a locator from prepared parts. Raise InputError for aerial.mode = paper with landmarks in metres."""
         locator = cls.__new__(cls)
         locator._begin(site, camera, settings, solver, rate_hz, focal_known)
         return locator
@@ -133,8 +137,8 @@ class AerialLocator:
     ) -> None:
         if settings.aerial.mode == "paper" and site.origin_deg is None:
             raise InputError(
-                "aerial.mode = paper works in degrees of longitude and latitude, and the landmarks are in metres; give "
-                "longitude_deg,latitude_deg, or take another mode"
+                "aerial.mode = paper needs degrees of longitude and latitude, but the landmarks are in metres; give "
+                "longitude_deg,latitude_deg, or use another mode"
             )
         self.camera, self.settings, self.rate_hz, self.focal_known = camera, settings, rate_hz, focal_known
         self.notes: list[str] = []
@@ -145,34 +149,67 @@ class AerialLocator:
         self._ground = surface_of(site.elevation)
 
     def restarted(self) -> "AerialLocator":
-        """The same locator as before its first frame."""
+        """Return this locator in its state before the first frame."""
         return self.from_site(self.site, self.camera, self.settings, self._solver, self.rate_hz, self.focal_known)
 
     def set_site(self, site: Site) -> None:
-        """Take over what landmarks and vehicle have reported by now, in the metres of the site so far."""
+        """Replace the site by one with the latest reports of landmarks and vehicle, in the same local metres."""
         if site.telemetry is not None:
             site = replace(site, telemetry=fit_lens(site.telemetry, self.camera))
         self.site = site
         self._trajectories = LandmarkTrajectories(site.landmarks, self.settings.landmarks, self.rate_hz)
 
     def locate(self, tracks: Tracks | TrackedFrame) -> AerialLocations:
-        """Where the targets of the next frame stand. Raises InputError for anything but Tracks or a TrackedFrame."""
+        """Locate the targets of the next frame. Raise InputError for anything but Tracks or a TrackedFrame."""
         if isinstance(tracks, TrackedFrame):
             targets, frame = tracked_targets(tracks, bool(self.settings.crowds.join_m)), tracks.number
             time_s, motion = None if tracks.frame is None else tracks.frame.time_s, tracks.now_from_before
         elif isinstance(tracks, Tracks):
             targets, frame, time_s, motion = seen_targets(tracks), tracks.frame, None, None
         else:
-            raise InputError(f"locate wants Tracks or a TrackedFrame, got {type(tracks).__name__}")
-        return self.locate_targets(self.fix_frame(frame, self.landmarks_at(frame), time_s), targets, motion=motion)
+            raise InputError(f"locate expects Tracks or a TrackedFrame, got {type(tracks).__name__}")
+        return self.locate_targets(
+            self.fix_frame(frame, self.landmarks_at(frame), time_s=time_s), targets, motion=motion
+        )
+
+    def locate_pixels(self, pixels: np.ndarray | Sequence[Sequence[float]], *, time_s: float = 0.0) -> Positions:
+        """Locate the ground at pixels (N, 2), u and v, of the picture at a time since the clip's first frame.
+
+        Return one position a pixel, NaN if its line of sight meets no ground, or meets it only near the horizon. The
+        result does not depend on frames that were located before, and does not affect later frames.
+        Raise InputError for pixels of another shape, and if telemetry and landmarks cannot place the picture.
+
+        >>> places = locator.locate_pixels([[640, 360]], time_s=12.5)
+        >>> places.lonlat_deg, places.covariance_m2
+        """
+        pixels = np.asarray(pixels, float)
+        if pixels.ndim != 2 or pixels.shape[1] != 2 or not np.isfinite(pixels).all():
+            raise InputError(f"pixels must be finite and of the shape (N, 2), u and v; got {pixels.shape}")
+        settings = with_parameters(self.settings, {"aerial.point": "centre"})
+        parts = self.camera, settings, self._solver, self.rate_hz, self.focal_known
+        one, frame = self.from_site(self.site, *parts), 1 + round(time_s * self.rate_hz)
+        fixed = one.fix_frame(frame, one.landmarks_at(frame), time_s=time_s)
+        if not fixed.fix.by:
+            raise InputError(f"nothing can be located at {time_s:g} s: {fixed.fix.cause}")
+        count, nan = len(pixels), np.full((1, 2), np.nan)
+        number = np.arange(1, count + 1)
+        targets = Targets(np.c_[pixels, np.ones((count, 2))], number, np.zeros(count, bool), np.ones(count))
+        located = one.locate_targets(fixed, targets)
+        found, origin = located.positions, self.site.origin_deg
+        degrees = None if origin is None else nan
+        unknown = nan, nan[..., None] * nan[:, None], np.ones(1), origin, degrees
+        nowhere = Positions(np.array([frame]), np.array([0]), *unknown)
+        row = np.full(count, len(found))
+        row[located.row] = np.arange(len(found))
+        return replace(Positions.concat([found, nowhere])[row], target=number)
 
     def locate_table(
-        self, table: DetectionTable, times_s: Mapping[int, float] | None = None
+        self, table: DetectionTable, *, times_s: Mapping[int, float] | None = None
     ) -> Iterator[AerialLocations]:
-        """Where the targets of a table stand, in each of its frames and in those between that show landmarks.
+        """Locate the targets of a table, in each of its frames and in the frames between that show landmarks.
 
-        times_s: of frames, since the clip's first, where they do not follow each other at a constant rate.
-        Boxes that bridge gaps and detections that no track follows have no place, as in `seen_targets`.
+        times_s: times of frames since the clip's first; needed if the frame rate is not constant.
+        Boxes that bridge gaps and detections without a track get no place, as in `seen_targets`.
         """
         lasting = table.identity > 0 if table.identity is not None else np.zeros(len(table), bool)
         score = np.clip(table.score, 0, 1) if table.probable else np.ones(len(table))
@@ -183,30 +220,32 @@ class AerialLocator:
             feet = None if table.feet_px is None else table.feet_px[rows]
             places = table.box_px[rows], table.targets[rows], lasting[rows], score[rows], feet, table.ours
             targets = Targets(*places, classes=table.classes(rows))
-            fixed = self.fix_frame(frame, self.landmarks_at(frame), (times_s or {}).get(frame))
+            fixed = self.fix_frame(frame, self.landmarks_at(frame), time_s=(times_s or {}).get(frame))
             yield self.locate_targets(fixed, targets)
 
     def time_s(self, frame: int) -> float:
-        """Time of a frame since the clip's first, at the constant rate."""
+        """Return the time of a frame since the clip's first, at the constant rate."""
         return (frame - 1) / self.rate_hz
 
     def time_of(self, fix: Fix) -> float:
-        """Time of the moment that the picture of a fix shows, since the clip's first frame."""
+        """Return when the picture of a fix was taken, in seconds since the clip's first frame."""
         return fix.time_s if math.isfinite(fix.time_s) else self.time_s(fix.frame)
 
     def landmarks_at(self, frame: int) -> LandmarkObservations:
-        """The landmarks of a frame whose place and height are known."""
+        """Return the landmarks of a frame whose place and height are known."""
         marks = self._trajectories.at(frame)
-        if self._ground is None or not len(marks):
+        if not len(marks):
             return marks
-        marks = replace(marks, up_m=marks.up_m + self._ground(marks.east_north_m))
-        # Where the raster has no height, a landmark would be put on a plane that is not the ground's.
+        up_m = np.zeros(len(marks)) if self._ground is None else self._ground(marks.east_north_m)
+        own_m = self._trajectories.elevation_m(frame)[marks.landmark] - self.site.plane_above_sea_m
+        marks = replace(marks, up_m=marks.up_m + np.where(np.isfinite(own_m), own_m, up_m))
+        # Without a height from the raster, a landmark would be put on a plane that is not the ground.
         return marks[np.isfinite(marks.up_m)]
 
     def telemetry_at(self, time_s: float) -> Flight | None:
-        """What the telemetry says, its altitude counted from up = 0; NaN where that is below the ground."""
+        """Return the telemetry at a time, its altitude counted from up = 0; NaN if the altitude is below the ground."""
         telemetry = self.site.telemetry
-        flight = telemetry.at(time_s, telemetry.hold_s) if telemetry is not None else None
+        flight = telemetry.at(time_s, tolerance_s=telemetry.hold_s) if telemetry is not None else None
         if flight is None:
             return None
         below, altitude = 0.0, flight.altitude_m
@@ -217,12 +256,16 @@ class AerialLocator:
                 altitude = flight.above_sea_m - elevation.base_m
         if not altitude > (below if math.isfinite(below) else 0.0):
             altitude = math.nan
-        return replace(flight, altitude_m=altitude)
+        # The offset does not apply to a heading derived from the course: it has no declination and no mounting error.
+        offset_deg, lower_deg = self.settings.aerial.heading_offset_deg, self.settings.aerial.pitch_offset_deg
+        heading_rad = flight.heading_rad + (0.0 if flight.heading_from else math.radians(offset_deg))
+        pitch_rad = flight.pitch_rad + math.radians(lower_deg)
+        return replace(flight, altitude_m=altitude, heading_rad=heading_rad, pitch_rad=pitch_rad)
 
-    def fix_frame(self, frame: int, marks: LandmarkObservations, time_s: float | None = None) -> FrameFix:
-        """How a frame maps to the ground. marks: those of `landmarks_at`, with their places in the picture.
+    def fix_frame(self, frame: int, marks: LandmarkObservations, *, time_s: float | None = None) -> FrameFix:
+        """Map a frame to the ground. marks: the result of `landmarks_at`, with the landmarks' pixels.
 
-        time_s: of the frame, since the clip's first; None: by its number.
+        time_s: time of the frame since the clip's first; None: computed from its number.
         """
         start = time.perf_counter()
         speeds = self._trajectories.speed_m_s(frame)[marks.landmark]
@@ -240,18 +283,19 @@ class AerialLocator:
         self,
         fixed: FrameFix,
         targets: Targets,
+        *,
         adjustments: Sequence[Adjustment] = (),
         seconds: Mapping[str, float] | None = None,
         motion: np.ndarray | None = None,
     ) -> AerialLocations:
-        """Where the targets of a frame stand; those that the fix cannot place are left out.
+        """Locate the targets of a frame, and leave out those that the fix cannot place.
 
-        adjustments, seconds: of the stages before, for the record. motion: (3, 3) pixel homography from the frame
-        located before, None if unknown. By telemetry alone velocities are relative to the ground as the pictures show
-        it: an error of the log that changes from frame to frame moves all that stands still, too.
+        adjustments, seconds: those of the earlier stages, for the record. motion: (3, 3) pixel homography from the
+        frame located before, None if unknown. By telemetry alone, velocities are relative to the ground as the pictures
+        show it, because log errors that change between frames move standing targets too.
         """
         start, fix, origin = time.perf_counter(), fixed.fix, self.site.origin_deg
-        # The covariance relative to the team has a part that is each box's own, and one that all share.
+        # The covariance relative to the team is the sum of a part of each box alone and a part that all boxes share.
         pixels, lift = self.target_points(fix, targets)
         place, by_pixel = locate_pixels(fix, self.camera, pixels, 1.0, lift, self._ground)
         shared = locate_pixels(fix, self.camera, pixels, 0.0, lift, self._ground)[1]
@@ -262,6 +306,12 @@ class AerialLocator:
         place = place[rows]
         own = (by_pixel - shared)[rows] * (point_sigma_px(targets, self.settings.aerial)[rows] ** 2)[:, None, None]
         relative = shared[rows] + own
+        up_m = np.zeros(len(rows)) if self._ground is None else self._ground(place)
+        if fix.pose is not None and (sigma_m := self.settings.aerial.terrain_sigma_m):
+            # For ground one metre higher, the line of sight meets the ground this much nearer to the camera.
+            nearer = (place - fix.pose.place_m[:2]) / (fix.pose.place_m[2] - up_m)[:, None]
+            relative = relative + sigma_m**2 * nearer[:, :, None] * nearer[:, None, :]
+        above_sea_m = self.site.plane_above_sea_m + up_m
         when, target = self.time_of(fix), targets.target[rows]
         carried, level = motion if motion is not None and fix.by == "telemetry" else _UNKNOWN, self._ground is None
         self._speeds.carry(carried, lambda px, up: locate_pixels(fix, self.camera, px, 0.0, up, self._ground)[0], level)
@@ -277,6 +327,7 @@ class AerialLocator:
             None if origin is None else geometry.lonlat(place, origin),
             *(() if targets.classes is None else (column[rows] for column in targets.classes)),
         )
+        positions = replace(positions, above_sea_m=above_sea_m, above_ellipsoid_m=above_sea_m + self.site.geoid_m)
         spent = {**(seconds or {}), **fixed.seconds, "ground": time.perf_counter() - start}
         made = (*adjustments, *fixed.adjustments)
         at_s = fixed.time_s if math.isfinite(fixed.time_s) else when
@@ -285,20 +336,20 @@ class AerialLocator:
         )
 
     def ground_places(self, fix: Fix, pixels: np.ndarray) -> np.ndarray:
-        """(N, 2) local metres of what pixels (N, 2) show of the ground; NaN where a ray meets none."""
+        """Return the (N, 2) local metres of the ground at pixels (N, 2); NaN if a ray does not meet the ground."""
         return locate_pixels(fix, self.camera, pixels, 0.0, 0.0, self._ground)[0]
 
     def ground_radii(self, fix: Fix, box_px: np.ndarray) -> np.ndarray:
-        """(N,) m, radius of the circle with the ground area of the ellipse in each box (N, 4); NaN where unknown."""
+        """Return (N,) m, radii of circles with the ground area of the ellipse in each box (N, 4); NaN if unknown."""
         low, high = box_px[:, :2] - 0.5, box_px[:, :2] + box_px[:, 2:] - 0.5
         corners = low, np.c_[high[:, 0], low[:, 1]], np.c_[low[:, 0], high[:, 1]]
         start, right, below = np.split(self.ground_places(fix, np.concatenate(corners)), 3)
         return np.asarray(np.sqrt(np.linalg.norm(right - start, axis=1) * np.linalg.norm(below - start, axis=1)) / 2)
 
-    def feet_px(self, pixels: np.ndarray, fix: Fix, height_m: float) -> np.ndarray | None:
-        """Pixels (N, 2) of the feet of bodies of a height that are seen together with their shadows.
+    def feet_px(self, fix: Fix, pixels: np.ndarray, height_m: float) -> np.ndarray | None:
+        """Return the foot pixels (N, 2) of bodies of the given height whose foreground includes their shadows.
 
-        None where shadows are not used, or the camera's pose or the sun is not known.
+        Return None if shadows are not used, or if the camera's pose or the sun is unknown.
         """
         sun = self._sun(self.time_of(fix)) if self.settings.aerial.shadows else None
         if sun is None or fix.pose is None:
@@ -308,16 +359,16 @@ class AerialLocator:
         return remove_shadow(pixels, np.c_[near, up_m], fix.pose, self.camera, height_m, shadow_m(sun, height_m))
 
     def target_points(self, fix: Fix, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) that stand for targets under a fix, and their height above the ground (N,) m."""
+        """Return the reference pixels (N, 2) of targets under a fix, and their height above the ground (N,) m."""
         pixels, lift = reference_points(targets, self.settings.aerial, fix.pose is not None)
         if targets.bodies and lift.any():
-            feet = self.feet_px(pixels, fix, self.settings.aerial.target_height_m)
+            feet = self.feet_px(fix, pixels, self.settings.aerial.target_height_m)
             if feet is not None:
                 return feet, np.zeros(len(feet))
         return pixels, lift
 
     def _sun(self, time_s: float) -> tuple[float, float] | None:
-        """Azimuth and height of the sun, rad; None where unknown, and at night."""
+        """Return azimuth and height of the sun, rad; None if unknown or at night."""
         parameters, site = self.settings.aerial, self.site
         if parameters.sun_height_deg > 0:
             return math.radians(parameters.sun_azimuth_deg), math.radians(parameters.sun_height_deg)
@@ -329,26 +380,30 @@ class AerialLocator:
 
 
 def _is_near_horizon(fix: Fix, place: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(N,) bool, whether places lie so near the horizon that how far away they are is no more than a guess."""
-    if fix.pose is None:
+    """Return (N,) bool, whether the sigma of a place's distance from the camera exceeds a fifth of that distance.
+
+    The error of the camera's own place does not count.
+    """
+    if fix.pose is None or fix.covariance is None:
         return np.zeros(len(place), bool)
     away = place - fix.pose.place_m[:2]
     far = np.linalg.norm(away, axis=1)
     along = away / np.maximum(far, 1e-9)[:, None]
-    sigma = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance, along))
+    variance = np.einsum("ni,nij,nj->n", along, covariance - fix.covariance[3:5, 3:5], along)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
     vague: np.ndarray = sigma > _VAGUE * np.hypot(far, fix.pose.place_m[2])
     return vague
 
 
 def frames_to_locate(table: DetectionTable, landmarks: Landmarks) -> list[int]:
-    """The frames of a table, and those between its first and last with landmarks in the picture."""
+    """Return the frames of a table, and those between its first and last with landmarks in the picture."""
     seen = landmarks.frame[np.isfinite(landmarks.image_px).all(axis=1)]
     between = seen[(seen >= table.first) & (seen <= table.last)]
     return np.unique(np.concatenate([table.frame, np.round(between).astype(np.int64)])).tolist()
 
 
 def check_table(table: DetectionTable, locator: AerialLocator) -> None:
-    """Raises InputError where the landmarks cannot place any frame of the table, and says what is missing.
+    """Raise InputError if the landmarks cannot place any frame of the table, and say what is missing.
 
     That is: no place in a picture, one far outside of it, no frame in common, and, without telemetry, fewer than four
     landmarks in every frame or all of them on one line.

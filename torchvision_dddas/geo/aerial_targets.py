@@ -1,4 +1,4 @@
-"""Targets seen from the air: the point in the picture that stands for each, its shadow, and its speed over time."""
+"""Targets seen from the air: their reference pixels, their shadows, and their speeds over time."""
 
 import math
 from collections.abc import Callable
@@ -10,13 +10,13 @@ from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.geometry import project, transfer
 from torchvision_dddas.types import Camera, CameraPose, Float, Int, TrackedFrame, Tracks
 
-# Width of a person from straight above, where no height shows.
+# Width of a person seen from straight above.
 BODY_WIDTH_M = 0.5
-# Below this height of the sun shadows are too long and too weak to count on.
+# With the sun lower than this, shadows are too long and too weak to be used.
 _LOWEST_SUN_RAD = math.radians(8.0)
 _J2000_S = 946_728_000.0  # 2000-01-01 12:00 UTC, in seconds since 1970
-# The velocity filter: acceleration of people and vehicles; standard deviation above which a velocity is unknown; that
-# of a new target; and the gap after which a target starts again.
+# The velocity filter: acceleration of people and vehicles; standard deviation above which a velocity is unknown;
+# standard deviation of a new target's velocity; and the gap after which a target starts again.
 _ACCELERATION_M_S2, _KNOWN_M_S, _FASTEST_M_S, _FORGET_S = 0.5, 1.0, 10.0, 5.0
 
 
@@ -24,10 +24,10 @@ _ACCELERATION_M_S2, _KNOWN_M_S, _FASTEST_M_S, _FORGET_S = 0.5, 1.0, 10.0, 5.0
 class Targets:
     """The boxes of one frame.
 
-    box_px: (N, 4). target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether it is
-    an identity. score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN where unknown; or None.
-    bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v to use instead of the box's centre;
-    None, or NaN in a row: use the centre. classes: names and numbers (N,), as in Detections.
+    box_px: (N, 4). target: (N,) int64, the identity, or the row in the frame from 1. lasting: (N,) bool, whether
+    target is an identity. score: (N,) in [0, 1]. feet_px: (N, 2) u, v of the point between the feet, NaN if unknown; or
+    None. bodies: whether a box's centre is the middle of a body. middle_px: (N, 2) u, v to use instead of the box's
+    centre; None, or NaN in a row: use the centre. classes: names and numbers (N,), as in Detections.
     """
 
     box_px: np.ndarray
@@ -41,9 +41,9 @@ class Targets:
 
 
 def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | None = None) -> Targets:
-    """The targets of a frame that were seen: a box that bridges a gap has an identity, but no place.
+    """Return the targets of a frame that were seen. A box that bridges a gap has an identity, but no place.
 
-    A detection without identity is no target and has no place either.
+    A detection without an identity is not a target and has no place either.
 
     middle_px: (M, 2) of the frame's detections.
     """
@@ -55,14 +55,14 @@ def seen_targets(tracks: Tracks, bodies: bool = False, middle_px: np.ndarray | N
 
 
 def tracked_targets(tracked: TrackedFrame, with_middles: bool) -> Targets:
-    """`seen_targets` of a tracked frame; with_middles: by the mean of the foreground, not by the centre of the box."""
+    """Return `seen_targets` of a tracked frame. with_middles: place targets by the mean of their foreground."""
     return seen_targets(tracked.tracks, True, tracked.detections.middle_px if with_middles else None)
 
 
 def reference_points(targets: Targets, parameters: AerialParameters, posed: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) that stand for the targets, and how high above the ground they lie (N,) m.
+    """Return the pixels (N, 2) that represent the targets, and their height above the ground (N,) m.
 
-    posed: whether the camera's pose is known. Only then is the middle of a body taken at half its height.
+    posed: whether the camera's pose is known. Only then does the middle of a body lie at half its height.
     """
     points = targets.box_px[:, :2] + (targets.box_px[:, 2:] - 1) / 2
     by_feet = parameters.point == "auto" and targets.feet_px is not None
@@ -74,13 +74,13 @@ def reference_points(targets: Targets, parameters: AerialParameters, posed: bool
 
 
 def point_sigma_px(targets: Targets, parameters: AerialParameters) -> np.ndarray:
-    """(N,) standard deviation in pixels, of u and of v each, of the points that stand for the targets."""
+    """Return (N,) standard deviations in pixels of the reference points, the same for u and v."""
     side = np.sqrt(np.maximum(targets.box_px[:, 2] * targets.box_px[:, 3], 0))
     return np.hypot(parameters.target_sigma_px, side * (parameters.own_sigma if targets.bodies else 0.0))
 
 
 def sun_at(longitude_deg: float, latitude_deg: float, utc_s: float) -> tuple[float, float]:
-    """Azimuth of the sun clockwise from north and its height above the horizon, rad, without refraction.
+    """Return the sun's azimuth clockwise from north and its height above the horizon, rad, without refraction.
 
     utc_s: seconds since 1970. Accurate to about 0.02 degrees from 1950 to 2050.
     Source: the low-precision formulas of the Astronomical Almanac.
@@ -100,9 +100,9 @@ def sun_at(longitude_deg: float, latitude_deg: float, utc_s: float) -> tuple[flo
 
 
 def shadow_m(sun_rad: tuple[float, float], height_m: float) -> Float[np.ndarray, "2"]:
-    """East and north from the foot of an upright body to the end of its shadow on level ground.
+    """Return the vector (east, north) from the foot of an upright body to the end of its shadow on level ground.
 
-    sun_rad: azimuth and height. Zero for a sun so low that shadows tell nothing.
+    sun_rad: azimuth and height. Return zeros if the sun is too low for shadows to be used.
     """
     azimuth, up = sun_rad
     if up < _LOWEST_SUN_RAD:
@@ -118,10 +118,11 @@ def remove_shadow(
     height_m: float,
     shadow: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "N 2"]:
-    """Pixels of the feet of bodies whose foreground, body and shadow together, has its mean at middle_px.
+    """Return the foot pixels of bodies from middle_px, the mean of the foreground of body and shadow together.
 
-    From the air a walker's shadow is often larger than the walker. foot_m: about where the feet are. Body and shadow
-    are strips of one width, so each is weighted by its length in the picture; from above at least a body's width shows.
+    From the air a walker's shadow is often larger than the walker. foot_m: rough places of the feet. Body and shadow
+    are strips of equal width, so each is weighted by its length in the picture; seen from above, the body is at least
+    BODY_WIDTH_M long.
     """
     foot = project(foot_m, pose, camera)
     steps_m = (0, 0, height_m), (*shadow, 0), (BODY_WIDTH_M, 0, 0)
@@ -132,25 +133,25 @@ def remove_shadow(
 
 
 class TargetSpeeds:
-    """Velocities of targets over the ground: a constant-velocity Kalman filter each, driven by white acceleration.
+    """Velocities of targets over the ground: one constant-velocity Kalman filter each, driven by white acceleration.
 
-    The measurement noise is that of the pixel. The error of the camera's pose is common to a frame. Where it changes
-    from frame to frame, as where a log is late and the camera turns, `carry` takes it out.
+    The measurement noise is that of the pixel. The error of the camera's pose is common to all targets of a frame. If
+    that error changes between frames, as it does when a log is late and the camera turns, `carry` removes the change.
     """
 
     def __init__(self) -> None:
-        # By identity: time in seconds, (4,) east, north and their velocities, and their covariance (4, 4).
+        # By identity: time in seconds, state (4,) east, north and their velocities, and its covariance (4, 4).
         self._tracks: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}
-        # By identity: (3,) the pixel of the ground where it was seen and the height above it, and (2,) its place.
+        # By identity: (3,) the ground pixel at which it was last seen and the height above ground, and (2,) its place.
         self._seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._latest: tuple[float, dict[int, np.ndarray]] = math.nan, {}  # time and velocities, by identity
 
     def carry(self, motion: np.ndarray, to_ground: Callable[[np.ndarray, np.ndarray], np.ndarray], level: bool) -> None:
-        """Move every target by as much as the next frame moves the ground on which it was seen last.
+        """Shift every target by the shift of the ground at its last pixel between its last frame and the next one.
 
-        motion: (3, 3) pixel homography from the frame before; NaN where it is not known: then the targets stay.
-        to_ground: places (N, 2) of pixels (N, 2) at heights (N,) in the next frame. level: the ground is a plane, as it
-        is for the registration; elsewhere the places are less sure by as much.
+        motion: (3, 3) pixel homography from the frame before; NaN if unknown, then the targets stay. to_ground:
+        function from pixels (N, 2) and heights (N,) to places (N, 2) in the next frame. level: the ground is a plane,
+        as the registration assumes; if not, add the shift to the uncertainty of the places instead.
         """
         before = np.array([seen for seen, _ in self._seen.values()]).reshape(-1, 3)
         after = np.c_[transfer(motion, before[:, :2]), before[:, 2]]
@@ -168,11 +169,11 @@ class TargetSpeeds:
         covariance_m2: Float[np.ndarray, "N 2 2"],
         seen: Float[np.ndarray, "N 3"] | None = None,
     ) -> Float[np.ndarray, "N 2"]:
-        """Velocities of the next frame, m/s east and north; NaN while unknown, or without an identity (below 1).
+        """Return the velocities in the next frame, m/s east and north; NaN if unknown or without identity (below 1).
 
-        covariance_m2: of the errors that are new in every frame; 1 m is taken where it is unknown. seen: pixels u, v of
-        the places and their heights above the ground, for `carry`. A frame of the same time repeats the one before, and
-        its velocities.
+        covariance_m2: of the errors that are new in every frame; 1 m is used where it is unknown. seen: pixels u, v of
+        the places and their heights above the ground, for `carry`. A frame with the same time as the one before gets
+        the same velocities.
         """
         if time_s == self._latest[0]:
             return np.array([self._latest[1].get(name, [math.nan] * 2) for name in identity.tolist()]).reshape(-1, 2)
@@ -189,7 +190,7 @@ class TargetSpeeds:
                 self._tracks[name] = time_s, np.array([*place, 0.0, 0.0]), spread
                 continue
             _, state, spread = self._tracks[name]
-            if lapse > 0:  # else the picture repeats the one before
+            if lapse > 0:  # otherwise the picture repeats the one before
                 state, spread = _corrected(state, spread, lapse, place, noise)
                 self._tracks[name] = time_s, state, spread
             if spread.diagonal()[2:].max() < _KNOWN_M_S**2:
@@ -205,10 +206,10 @@ class TargetSpeeds:
 def _corrected(
     state: np.ndarray, spread: np.ndarray, lapse: float, place: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A target's state and covariance after `lapse` seconds, at which it is seen at a place."""
+    """Return a target's state and covariance after `lapse` seconds and an update with a measured place."""
     move = np.kron([[1.0, lapse], [0.0, 1.0]], np.eye(2))
     drive = np.kron([[lapse**3 / 3, lapse**2 / 2], [lapse**2 / 2, lapse]], np.eye(2)) * _ACCELERATION_M_S2**2
     state, spread = move @ state, move @ spread @ move.T + drive
-    # A place that is said to be exact would leave nothing to invert.
+    # The small term keeps the matrix invertible if a place is stated to be exact.
     gain = spread[:, :2] @ np.linalg.inv(spread[:2, :2] + noise + 1e-12 * np.eye(2))
     return state + gain @ (place - state[:2]), spread - gain @ spread[:2]

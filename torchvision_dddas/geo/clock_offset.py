@@ -1,9 +1,9 @@
-"""How far the clock of a log is off that of its clip: both show how the camera turns.
+"""Find the offset between the clock of a log and that of its clip from the camera's turns, which both record.
 
-The turns over a second by the log are compared with those by the registrations of the clip, for each offset of the
-clocks. Samples of the log stay as they are and the clip is interpolated: the noise of an interpolated log is least
-halfway between two samples, which would draw the offset there. Scale and mean are free in each axis, because a focal
-length may be guessed. The standard deviation follows from the residuals, which need be neither white nor stationary.
+Compare the turns over one second in the log with those from the registrations of the clip, for each clock offset. The
+clip is interpolated at the times of the log, not the reverse: the noise of an interpolated log is smallest halfway
+between two samples, which would pull the offset there. Scale and mean are free in each axis, because a focal length may
+be guessed. The standard deviation is computed from the residuals, which need be neither white nor stationary.
 """
 
 from collections.abc import Sequence
@@ -14,26 +14,26 @@ from torchvision_dddas.geo.aerial_locator import AerialLocator
 from torchvision_dddas.geometry import axes_of
 from torchvision_dddas.types import Elevation, Float, Telemetry
 
-# The offsets that are tried first, their steps, and how many of the best are refined, in so many steps of Gauss-Newton.
+# Offsets tried first: their range and step; how many of the best are refined; and the Gauss-Newton steps for each.
 _REACH_S, _STEP_S, _BEST, _REFINEMENTS = 30.0, 0.1, 6, 5
-# Turns are compared over the first time span, smoothed over the second, and at least so many of them.
+# Turns are compared over _SPAN_S, smoothed over _SMOOTH_S, and at least _LEAST of them are needed.
 _SPAN_S, _SMOOTH_S, _LEAST = 1.0, 0.2, 20
-# Residuals further apart than this are independent, and so are blocks of this length.
+# Residuals further apart than _MEMORY_S are independent, and so are blocks of _BLOCK_S.
 _MEMORY_S, _BLOCK_S, _LEAST_BLOCKS = 3.0, 2.0, 5
-# The clip turns as the log does, but for a wrong focal length.
+# Limits of the ratio of the clip's turns to the log's; a wrong focal length makes them differ.
 _LEAST_SCALE, _MOST_SCALE = 0.5, 2.0
-# All other offsets are less likely by this, as log likelihood: four standard deviations.
+# Required margin in log likelihood over all other offsets: four standard deviations.
 _MARGIN = 8.0
 _TINY = 1e-12
 
 
 def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np.ndarray]]) -> str:
-    """What to set so that log and clip are aligned, in words; empty where they are, or where nothing shows it.
+    """Return a message that says how to align log and clip; empty if they are aligned or the data do not show it.
 
-    seen: time of each frame, s, and (3, 3) pixel homography from the frame before, NaN where it is unknown.
+    seen: time of each frame, s, and (3, 3) pixel homography from the frame before, NaN if unknown.
     """
     telemetry, camera = locator.site.telemetry, locator.camera
-    # A course, or a nose that a gimbal follows, does not turn together with the camera.
+    # A heading from the course, or from the nose of a vehicle with a gimbal, does not turn with the camera.
     if telemetry is None or telemetry.heading_from or len(seen) < _LEAST:
         return ""
     (fu, fv), (u, v) = camera.focal_px, camera.centre_px
@@ -41,7 +41,7 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
     time_s, motion = np.array([time for time, _ in seen]), np.array([motion for _, motion in seen])
     turned = _angles(np.linalg.inv(pixel_from_ray) @ motion @ pixel_from_ray)
     found = find_clock_offset(time_s, turned, telemetry.time_s, logged_turns(telemetry, locator.site.elevation))
-    # When within a frame's interval its picture was taken is not known.
+    # The time of a picture is known only to within half a frame interval.
     if found is None or abs(found[0]) <= max(3 * found[1], float(np.median(np.diff(time_s))) / 2):
         return ""
     offset_s, sigma_s = found[0], max(found[1], 0.001)
@@ -53,23 +53,23 @@ def describe_clock_offset(locator: AerialLocator, seen: Sequence[tuple[float, np
 
 
 def logged_turns(telemetry: Telemetry, elevation: Elevation | None = None) -> Float[np.ndarray, "N 3"]:
-    """How far level ground seems to turn between two samples of the log: by the camera's turn and by its motion.
+    """Return the apparent turn of level ground between two samples of the log, by the camera's turn and motion.
 
-    telemetry: in local metres. Angles about right, down and forward, rad; NaN where unknown.
+    telemetry: in local metres. Return angles about right, down and forward, rad; NaN if unknown.
     """
     height = telemetry.altitude_m
     if elevation is not None:
         height = np.where(np.isfinite(height), height, telemetry.above_sea_m - elevation.base_m)
     axes = axes_of(telemetry.heading_rad, telemetry.pitch_rad, np.nan_to_num(telemetry.roll_rad))
     place = np.column_stack([telemetry.place, height])
-    # Ground of unknown depth counts as infinitely far away.
+    # Ground at unknown depth is treated as infinitely far away.
     shift = np.where(height[:-1, None] > 0, (place[:-1] - place[1:]) / np.maximum(height[:-1, None], _TINY), 0.0)
     plane = axes[:-1] - np.nan_to_num(shift)[:, :, None] * axes[:-1, 2:]
     return np.concatenate([np.full((1, 3), np.nan), _angles(np.swapaxes(axes[1:], 1, 2) @ plane)])
 
 
 def _angles(now_from_before: np.ndarray) -> np.ndarray:
-    """(N, 3) small angles about right, down and forward of homographies (N, 3, 3) between rays of the camera."""
+    """Return (N, 3) small angles about right, down and forward of homographies (N, 3, 3) between camera rays."""
     h = now_from_before / now_from_before[:, 2:, 2:]
     return np.stack([h[:, 1, 2], -h[:, 0, 2], (h[:, 0, 1] - h[:, 1, 0]) / 2], axis=1)
 
@@ -78,16 +78,16 @@ class _Turn:
     """A turn as a function of time: smoothed, and linear between samples."""
 
     def __init__(self, time_s: np.ndarray, steps: np.ndarray, step_s: float, every: int = 1) -> None:
-        """steps: (N, 3) from the sample before, NaN where unknown. step_s: between samples. every: keep every n-th."""
+        """steps: (N, 3) turns from the sample before, NaN if unknown. step_s: their interval. every: keep each n-th."""
         unknown = ~np.isfinite(steps).all(axis=1)
-        # The last column counts the unknown steps, so that nothing is compared across one.
+        # The last column counts the unknown steps, so that turns across an unknown step can be discarded.
         sums = np.cumsum(np.column_stack([np.where(unknown[:, None], 0.0, steps), unknown]), axis=0)
         box = np.ones(2 * round(_SMOOTH_S / step_s / 2) + 1)
         weights = np.convolve(box, box) / len(box) ** 2
         self.time_s, *self._turn = (np.convolve(c, weights, "valid")[::every] for c in (time_s, *sums.T))
 
     def between(self, begin_s: np.ndarray, end_s: np.ndarray) -> np.ndarray:
-        """(N, 3) the turn between times (N,) each; NaN where it is not known."""
+        """Return the (N, 3) turns between times (N,) and (N,); NaN if unknown."""
         ends = ((np.interp(t, self.time_s, c, np.nan, np.nan) for t in (begin_s, end_s)) for c in self._turn)
         *turn, unknown = (end - begin for begin, end in ends)
         return np.where(unknown < 1e-9, turn, np.nan).T
@@ -99,10 +99,10 @@ def find_clock_offset(
     log_s: Float[np.ndarray, "M"],
     logged_rad: Float[np.ndarray, "M 3"],
 ) -> tuple[float, float] | None:
-    """What to add to the times of a log so that its turns are those of the clip, and its standard deviation, s.
+    """Return the time in seconds to add to a log so that its turns match those of the clip, and its standard deviation.
 
-    turned_rad, logged_rad: from the frame or sample before, in the same axes, NaN where unknown. None where no offset
-    stands out, as where the camera does not turn, or turns periodically.
+    turned_rad, logged_rad: turns from the frame or sample before, in the same axes, NaN if unknown. Return None if no
+    offset stands out, for example if the camera does not turn, or turns periodically.
     """
     frame_s, sample_s = (float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in (time_s, log_s))
     if not (frame_s > 0 and sample_s > 0) or min(np.ptp(time_s), np.ptp(log_s)) < 2 * _SPAN_S:
@@ -114,14 +114,14 @@ def find_clock_offset(
     ahead = max(round(_SPAN_S / step_s), 1)
     begin, end = near[:-ahead], near[ahead:]
     logged = log.between(begin, end)
-    logged[end - begin > 1.5 * ahead * step_s] = np.nan  # across a gap
+    logged[end - begin > 1.5 * ahead * step_s] = np.nan  # spans a gap of the log
     least = max(min(np.ptp(time_s), np.ptp(log_s)) / step_s / 2, _LEAST)
 
     def seen(offset_s: float) -> np.ndarray:
         return clip.between(begin + offset_s, end + offset_s)
 
     def refine(offset_s: float) -> tuple[float, float, float, float]:
-        """The likelihood of the best offset near one, that offset, its sigma, and the number of independent turns."""
+        """Return the likelihood of the best offset near one, that offset, its sigma, and the independent turns."""
         sigma_s = count = 0.0
         for _ in range(_REFINEMENTS):
             slope = (seen(offset_s + _STEP_S / 10) - seen(offset_s - _STEP_S / 10)) / (_STEP_S / 5)
@@ -142,10 +142,10 @@ def find_clock_offset(
 
 
 def _fit(logged: np.ndarray, seen: np.ndarray, least: float) -> tuple[float, np.ndarray]:
-    """The likelihood of the turns of a log (N, 3), given those of a clip (N, 3), and their scale (3,).
+    """Return the likelihood of the turns of a log (N, 3), given those of a clip (N, 3), and their scale (3,).
 
-    The logarithm for one turn, with normal residuals whose variance in each axis is not known. least: with fewer turns
-    in common it is 0.
+    It is the logarithm for one turn, with normal residuals of unknown variance in each axis. least: with fewer common
+    turns the likelihood is 0.
     """
     known = np.isfinite(logged + seen).all(axis=1)
     if known.sum() < least:
@@ -159,10 +159,10 @@ def _fit(logged: np.ndarray, seen: np.ndarray, least: float) -> tuple[float, np.
 
 
 def _improve(logged: np.ndarray, seen: np.ndarray, slope: np.ndarray, step_s: float) -> tuple[float, float, float]:
-    """How to change an offset so that turns fit better, its standard deviation, s, and how many turns are independent.
+    """Return the change of an offset that fits the turns better, its standard deviation, s, and the independent turns.
 
-    slope: (N, 3) of what is seen by the offset. The variance is the largest of three: by white residuals, by stationary
-    ones of any correlation, and by blocks, which holds where turns are noisier than rest.
+    slope: (N, 3) derivative of `seen` by the offset. The variance is the largest of three estimates: for white
+    residuals, for stationary residuals of any correlation, and by blocks, which holds if turns are noisier than rest.
     """
     scale, known = _fit(logged, seen, 1)[1], np.isfinite(logged + seen + slope).all(axis=1)
     if (n := int(known.sum())) < _LEAST:

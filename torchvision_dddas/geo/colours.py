@@ -1,6 +1,6 @@
-"""Colours in pictures: masks of ranges of hue, saturation and value, their patches, and ranges found by search."""
+"""Colours in pictures: masks of ranges of hue, saturation and value, their patches, and a search for such ranges."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,70 +10,39 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import cheapest, occupied, shared_px
 from torchvision_dddas.io.colour_files import find_overlaps
 from torchvision_dddas.io.overlay import label, line_width, rectangle
-from torchvision_dddas.runtime import torch_device, wants_torch
 from torchvision_dddas.types import Colours, Table
 
-# Gaps of a patch up to about this wide are closed: an antenna, a seam, a pixel of noise.
+# Gaps in a patch up to about this width are closed: an antenna, a seam, a pixel of noise.
 _CLOSE_PX = 5
 _CLOSE_KERNEL = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_CLOSE_PX, _CLOSE_PX))
-# Pixels processed together: their planes stay in the cache. With one channel at a time this takes 0.6 of the time that
-# cv2.inRange takes on the whole picture, for eight colours at 1080p.
+# Number of pixels processed together, chosen so that their planes stay in the cache. Processing one channel at a time
+# takes 0.6 of the time of cv2.inRange on the whole picture, for eight colours at 1080p.
 _PIXELS = 1 << 17
 
 # Names of hues, in OpenCV's units.
 HUES = {"red": 0, "orange": 13, "yellow": 28, "green": 60, "cyan": 90, "blue": 115, "purple": 136, "magenta": 155}
-# Windows of hue in which patches are searched: half width and step; lowest saturations and value.
+# Hue windows of the search: half width and step; then the lowest saturations and the lowest value.
 _HALF, _STEP = 7, 4
 _SATURATIONS, _VALUE = (80, 120, 160), 50
-# Least fill of a patch's box; its greatest length over width; its greatest share of the picture.
+# Smallest fill of a patch's box; greatest length over width of the box; greatest share of the picture.
 _FILL, _LONG, _MOST = 0.4, 3.0, 0.02
-# A hue that covers a larger share of the picture belongs to the ground.
+# A hue that covers a larger share of the picture than this belongs to the ground.
 _GROUND = 0.05
 # Least difference in hue between colours.
 _APART = 10
-# Area from which size no longer raises the score, and the score of a clear colour.
+# Area above which the size no longer raises the score, and the lowest score of a clear colour.
 _AREA_PX, _CLEAR = 150.0, 0.24
-# Margins of ranges in hue, saturation and value that are tried: the widest that marks least else is taken.
+# Margins in hue, saturation and value. The search takes the widest margin that marks the fewest other patches.
 _MARGINS = ((8, 60, 80), (5, 60, 80), (2, 60, 80), (8, 40, 50), (5, 40, 50), (2, 40, 50), (4, 20, 25), (2, 10, 15))
 _LOWEST = (40, 30)
 _ENDS = (2, 98)
 
-ColourFinder = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""(K, H, W) uint8 masks, as `mask_colours` gives them."""
-
-
-def load_colours(backend: str) -> ColourFinder:
-    """The colour finder of a back end: auto, onboard or torch. Raises InputError for another name.
-
-    torch compares hue and saturation unrounded, on a CPU or GPU. OpenCV's 8-bit conversion is up to 0.64 of a level
-    off, so a pixel next to a bound may be classified differently.
-    """
-    if not wants_torch(backend, auto_with_gpu=False):
-        return mask_colours
-    import torch
-
-    from torchvision_dddas.functional import bgr_to_hsv, within_ranges
-
-    device = torch.device(torch_device())
-
-    def by_torch(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        if image.ndim == 2 or not len(low) or not image.size:
-            return np.zeros((len(low), *image.shape[:2]), np.uint8)
-        with torch.inference_mode():
-            pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None]
-            lowest, highest = (torch.from_numpy(np.array(bound, np.float32)).to(device) for bound in (low, high))
-            found = within_ranges(bgr_to_hsv(pixels.float() / 255), lowest, highest)[0]
-            masks: np.ndarray = (found * 255).byte().cpu().numpy()
-        return masks
-
-    return by_torch
-
 
 def mask_colours(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(K, H, W) uint8, 255 where the BGR image lies within a range of hue, saturation and value, else 0.
+    """Return (K, H, W) uint8, 255 where the BGR image lies within a range of hue, saturation and value, else 0.
 
-    low, high: (K, 3) in OpenCV's units (hue 0 to 180). A range whose lowest hue is above its highest goes over 0. A
-    grey picture has no colours. The values are those of cv2.inRange.
+    low, high: (K, 3) in OpenCV's units (hue 0 to 180). A range whose lowest hue exceeds its highest wraps around 0. A
+    grey picture has no colours. The results equal those of cv2.inRange.
     """
     masks = np.zeros((len(low), *image.shape[:2]), np.uint8)
     if image.ndim == 2 or not len(low) or not image.size:
@@ -95,12 +64,12 @@ def mask_colours(image: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.nda
 
 
 def to_hsv(image: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 hue, saturation, value of a BGR picture."""
+    """Return (H, W, 3) uint8 hue, saturation, value of a BGR picture."""
     return cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
 
 
 def mask_range(hsv: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """(H, W) uint8, 255 where a range holds a pixel; a lowest hue above the highest goes over 0."""
+    """Return (H, W) uint8, 255 for pixels in a range. A range whose lowest hue exceeds its highest wraps around 0."""
     if low[0] <= high[0]:
         return cv2.inRange(hsv, np.asarray(low, float), np.asarray(high, float))
     below = cv2.inRange(hsv, np.asarray(low, float), np.array([180.0, *high[1:]]))
@@ -123,7 +92,7 @@ class Patches(Table):
 
 
 def find_patches(mask: np.ndarray, least_area_px: int) -> Patches:
-    """The patches (8-connected) of a (H, W) uint8 mask with at least an area, after small gaps were closed."""
+    """Close small gaps in a (H, W) uint8 mask, and return its patches (8-connected) of at least the given area."""
     parts = [Patches(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 4)))]
     for left, top, wide, high in occupied(mask, 2 * _CLOSE_PX):
         part = cv2.morphologyEx(mask[top : top + high, left : left + wide], cv2.MORPH_CLOSE, _CLOSE_KERNEL)
@@ -136,9 +105,9 @@ def find_patches(mask: np.ndarray, least_area_px: int) -> Patches:
 
 @dataclass(frozen=True)
 class ColourSample:
-    """A patch of a colour. hue: of most of its pixels. pixels: (P, 3) uint8 hue, saturation, value. score: in [0, 1].
+    """A patch of a colour. hue: its mean hue. pixels: (P, 3) uint8 hue, saturation, value. score: in [0, 1].
 
-    picture: which it is in, counted from 0. box_px: x, y, width, height.
+    picture: index of its picture, from 0. box_px: x, y, width, height.
     """
 
     hue: float
@@ -150,7 +119,7 @@ class ColourSample:
 
 @dataclass(frozen=True)
 class CalibratedColours:
-    """The ranges of K colours, (K,) samples of each, best first, and (K,) how many other patches each range marks."""
+    """The ranges of K colours, (K,) samples of each, best first, and (K,) the number of other patches in each range."""
 
     ranges: Colours
     groups: tuple[tuple[ColourSample, ...], ...]
@@ -166,9 +135,9 @@ def calibrate_colours(
 ) -> CalibratedColours:
     """Find the colours of landmarks in (H, W, 3) uint8 BGR pictures that show all of them.
 
-    count: of colours; None: as many as names, or all that are clear. names: those of HUES go to the nearest colour,
-    others by hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture, instead of a search.
-    Raises InputError for a box without a strong colour, for too few colours, and for two that are too similar.
+    count: number of colours; None: as many as names, or all clear colours. names: those of HUES go to the nearest
+    colour, others in the order of hue. boxes: (name, (x, y, width, height)) of each landmark in the first picture, used
+    instead of a search. Raise InputError for a box without a strong colour, too few colours, or two similar colours.
     """
     hsv = [to_hsv(image) for image in images]
     if boxes:
@@ -186,7 +155,7 @@ def calibrate_colours(
 
 
 def _sample_box(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -> ColourSample:
-    """The saturated colour that most of a box is of."""
+    """Return the most frequent saturated colour of a box."""
     (x, y, wide, high), (height, width) = box_px, hsv.shape[:2]
     if wide < 1 or high < 1 or x + wide > width or y + high > height:
         raise InputError(f"the box {x},{y},{wide},{high} of {name} is not inside the picture, {width} x {height} px")
@@ -201,7 +170,7 @@ def _sample_box(hsv: np.ndarray, name: str, box_px: tuple[int, int, int, int]) -
 
 
 def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) -> list[list[ColourSample]]:
-    """The colours of all pictures, those of one hue together, best first: `count` of them, or those that are clear."""
+    """Find colours in all pictures, group them by hue, and return the best `count` groups, or all clear ones."""
     samples = [sample for number, one in enumerate(hsv) for sample in _find_samples(one, least_area_px, number)]
     groups: list[list[ColourSample]] = []
     for sample in sorted(samples, key=lambda one: -one.score):
@@ -222,10 +191,10 @@ def _search(hsv: Sequence[np.ndarray], least_area_px: int, count: int | None) ->
 
 
 def _find_samples(hsv: np.ndarray, least_area_px: int, picture: int) -> list[ColourSample]:
-    """Compact saturated patches whose hue is rare in the picture, best first, each hue and each place once.
+    """Return compact saturated patches whose hue is rare in the picture, best first, one for each hue and place.
 
-    A patch's score is its share of all pixels of its hue and saturation in the picture and around it: ground and
-    plants, of whatever hue, are in many places.
+    The score of a patch is its share of all pixels of its hue and saturation, in the picture and around the patch.
+    Ground and plants score low because their hues occur in many places.
     """
     found: list[ColourSample] = []
     counts = cv2.calcHist([hsv], [0, 1, 2], None, [180, 256, 2], [0, 180, 0, 256, _VALUE, 256 + 256 - _VALUE])[..., 0]
@@ -240,7 +209,7 @@ def _find_samples(hsv: np.ndarray, least_area_px: int, picture: int) -> list[Col
             if total < least_area_px:
                 continue
             patches = find_patches(mask, least_area_px)
-            # Compact like a vehicle's plate.
+            # Keep patches that are as compact as a vehicle's plate.
             sides = patches.box_px[:, 2:]
             fill = patches.area_px / np.maximum(sides.prod(axis=1), 1)
             long = sides.max(axis=1, initial=1) / np.maximum(sides.min(axis=1, initial=1e9), 1)
@@ -258,14 +227,14 @@ def _find_samples(hsv: np.ndarray, least_area_px: int, picture: int) -> list[Col
 
 
 def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: int, picture: int) -> ColourSample:
-    """The k-th patch of a mask that has so many pixels in all."""
+    """Return the k-th patch of a mask that has `total` pixels in all."""
     x, y, width, height = (int(v) for v in patches.box_px[k])
     seen = hsv[y : y + height, x : x + width][mask[y : y + height, x : x + width] > 0]
     hue = _mean_hue(seen[:, 0])
-    # High for what is rare in the picture and in its surroundings.
+    # The score is high for a colour that is rare in the picture and around the patch.
     around = np.count_nonzero(mask[max(y - height, 0) : y + 2 * height, max(x - width, 0) : x + 2 * width])
     share = (len(seen) / total) ** 0.5 * len(seen) / around * min(patches.area_px[k] / _AREA_PX, 1.0)
-    # The middle of the box is all of it, also what the window of hue and saturation left out.
+    # Add the middle of the box, including pixels that the window of hue and saturation left out.
     inner = hsv[y + height // 4 : y + height - height // 4, x + width // 4 : x + width - width // 4].reshape(-1, 3)
     alike = inner[(np.abs(hue_difference(inner[:, 0], hue)) <= _HALF) & (inner[:, 1] >= _SATURATIONS[0] // 2)]
     score = float(share * seen[:, 1].mean() / 255)
@@ -275,10 +244,10 @@ def _sample(hsv: np.ndarray, mask: np.ndarray, patches: Patches, k: int, total: 
 def build_ranges(
     groups: Sequence[Sequence[ColourSample]], pictures: Sequence[np.ndarray], least_area_px: int
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Lowest and highest hue, saturation and value (K, 3) int64 of each colour, and (K,) how much else they mark.
+    """Return lowest and highest hue, saturation and value (K, 3) int64, and the (K,) other patches in each range.
 
-    pictures: (H, W, 3) uint8 in hue, saturation, value. Hues are widened, up to half the gap to the next colour's, as
-    far as the range marks no more patches beside its own; saturations and values likewise.
+    pictures: (H, W, 3) uint8 in hue, saturation, value. Each range is widened as far as it marks no additional patches;
+    hues are widened by at most half the gap to the next colour's hue.
     """
     middle = [group[0].hue for group in groups]
     ends = []
@@ -288,7 +257,7 @@ def build_ranges(
         ends.append((*away, *np.percentile(pixels[:, 1:], _ENDS[0], axis=0)))
     chosen = []
     for k, (group, (below, above, saturation, value)) in enumerate(zip(groups, ends, strict=True)):
-        # A range of hues may be widened to just under half the gap to the next colour's.
+        # Limit the widening of a hue range to just under half the gap to the next colour's range.
         down, up = 90.0, 90.0
         for j in set(range(len(middle))) - {k}:
             gap = (middle[j] - middle[k]) % 180
@@ -314,7 +283,7 @@ def build_ranges(
 
 
 def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
-    """A name for each hue: the colour names that fit best, or the given names in the order of hues."""
+    """Return a name for each hue: the best fitting colour names, or the given names in the order of hue."""
     if names and not set(names) <= HUES.keys():
         return list(names)
     known = names or list(HUES)
@@ -322,7 +291,7 @@ def _match_names(names: Sequence[str], hues: Sequence[float]) -> list[str]:
     if names:
         return [names[place] for place in cheapest(apart)[1].tolist()]
     words = [known[place] for place in apart.argmin(axis=1).tolist()]
-    # Those of one name are numbered.
+    # Number the colours that share a name.
     return [word if words.count(word) == 1 else f"{word}-{words[: k + 1].count(word)}" for k, word in enumerate(words)]
 
 
@@ -331,17 +300,17 @@ def _mean_hue(hues: np.ndarray) -> float:
 
 
 def hue_difference(hue: np.ndarray | float, other: float) -> np.ndarray:
-    """How far hues are from another, in [-90, 90)."""
+    """Return the differences of hues from another hue, in [-90, 90)."""
     return (np.asarray(hue, float) - other + 90) % 180 - 90
 
 
 def draw_calibration(images: Sequence[np.ndarray], found: CalibratedColours) -> bytes:
-    """A PNG of all pictures, one below the other: grey but where a range marks it, each landmark named.
+    """Return a PNG of all pictures, one below the other, that names each landmark.
 
-    A range is outlined in its colour.
+    Pixels outside all ranges are grey. A range is outlined in its colour.
     """
     ranges = found.ranges
-    # A bright BGR colour for each range: that of the middle of its hues.
+    # Each range gets a bright BGR colour with the hue at the middle of the range.
     low, high = ranges.low[:, 0], ranges.high[:, 0]
     vivid = np.full((1, len(low), 3), 255, np.uint8)
     vivid[0, :, 0] = (low + (high - low) % 180 / 2) % 180

@@ -1,4 +1,4 @@
-"""What a log lacks of the camera's pose: from the camera's file, else the vehicle's nose or the course it flew."""
+"""Fill the parts of the camera's pose that a log lacks, from the camera's file, the vehicle's nose or its course."""
 
 import math
 from dataclasses import replace
@@ -9,11 +9,12 @@ from torchvision_dddas.config import AerialParameters
 from torchvision_dddas.types import Camera, Float, Telemetry
 
 COURSE, NOSE = "the course over ground", "the vehicle's nose"
-"""What a heading is from where the log does not say that of the camera."""
+"""Sources of a heading if the log does not give that of the camera."""
 
-# Half the time spans over which a line is fitted to the places: the shortest that is sure enough counts.
+# Half the time spans over which a line is fitted to the places. The shortest span with a known course is used.
 _HALF_SPANS_S = (1.0, 2.0, 5.0, 10.0)
-# A slower vehicle may fly sideways; a course less sure than this, or one that turns by more within its span, is none.
+# Ignore the course of a slower vehicle, which may fly sideways; ignore courses with a larger standard deviation, and
+# courses that turn by more within their span.
 _LEAST_M_S, _SURE_RAD, _STRAIGHT_RAD = 2.0, math.radians(5.0), math.radians(10.0)
 
 
@@ -24,12 +25,12 @@ def fill_gaps(
     has_ground: bool = False,
     has_landmarks: bool = False,
 ) -> tuple[Telemetry, list[str]]:
-    """The telemetry, completed where it never says a quantity, and what the user should know of that.
+    """Fill quantities that the telemetry never gives, and return notes for the user.
 
-    telemetry: in local metres. camera: as its file says; its heading_rad, pitch_rad, roll_rad and height_m stand for
-    all times, and from takeoff_above_sea_m heights above the sea become heights above ground. has_ground: whether the
-    ground's heights are known, which heights above the sea are counted from then. has_landmarks: these tell the heading
-    better than the nose or the course of the vehicle.
+    telemetry: in local metres. camera: the camera's file; its heading_rad, pitch_rad, roll_rad and height_m apply at
+    all times, and takeoff_above_sea_m turns heights above the sea into heights above ground. has_ground: whether the
+    heights of the ground are known; heights above the sea then count from it. has_landmarks: whether landmarks
+    determine the heading better than the nose or the course of the vehicle.
     """
     notes = list[str]()
     if camera is not None:
@@ -39,13 +40,18 @@ def fill_gaps(
             notes.append(f"the log does not say {', '.join(used)}: {words} from camera {camera.name}")
         is_alike = np.array_equal(telemetry.altitude_m, telemetry.above_sea_m, equal_nan=True)
         if "takeoff_above_sea_m" in used and telemetry.height_zero == "unknown" and is_alike:
-            notes.append("the heights of the log count from the take-off point: above the sea they would lie below it")
+            notes.append("the log's heights count from the take-off point: as heights above the sea they lie below it")
         reasons: dict[str, list[str]] = {}
         for key in (key for key in known_keys(camera) if key not in used):
             reasons.setdefault(_why_unused(key, telemetry), []).append(key)
-        notes += [f"camera {camera.name}: {', '.join(keys)} not used, because {why}" for why, keys in reasons.items()]
+        notes += [
+            f"camera {camera.name}: {', '.join(keys)} not used for the camera's pose, because {why}"
+            for why, keys in reasons.items()
+        ]
         if any(camera.place):
-            notes.append(f"the place of camera {camera.name} is not used: it is that of the vehicle")
+            notes.append(f"the place of camera {camera.name} is not used: the vehicle's place is used")
+        if camera.knows("elevation_m"):
+            notes.append(f"elevation_m of camera {camera.name} is not used: it is for a camera on the ground")
     if _lacks(telemetry, "heading_rad") and not has_landmarks:
         telemetry, more = _take_heading(telemetry, parameters)
         notes += more
@@ -56,12 +62,12 @@ def _why_unused(key: str, telemetry: Telemetry) -> str:
     if key not in ("height_m", "takeoff_above_sea_m"):
         return "the log says it"
     if key == "takeoff_above_sea_m" and _lacks(telemetry, "above_sea_m"):
-        return "the log says no height above the sea"
+        return "the log gives no height above the sea"
     return "the height above ground is known without it"
 
 
 def known_keys(camera: Camera) -> list[str]:
-    """What a camera's file says of the pose of a camera in the air, by its keys."""
+    """Return the keys of the camera's file that describe the pose of a camera in the air."""
     names = ("heading_rad", "pitch_rad", "roll_rad", "height_m", "takeoff_above_sea_m")
     return [name.replace("_rad", "_deg") for name in names if camera.knows(name)]
 
@@ -71,7 +77,7 @@ def _lacks(telemetry: Telemetry, name: str) -> bool:
 
 
 def _take_from_camera(telemetry: Telemetry, camera: Camera, has_ground: bool) -> tuple[Telemetry, list[str]]:
-    """Telemetry with what the camera's file says and the log does not, and the keys that were used."""
+    """Return telemetry with values of the camera's file that the log lacks, and the keys that were used."""
     filled, used = dict[str, np.ndarray](), list[str]()
     count, known = len(telemetry), known_keys(camera)
 
@@ -94,7 +100,7 @@ def _take_from_camera(telemetry: Telemetry, camera: Camera, has_ground: bool) ->
         if "takeoff_above_sea_m" in known and above_sea:
             used.append("takeoff_above_sea_m")
             altitude_m = telemetry.above_sea_m - camera.takeoff_above_sea_m
-            # Heights that would be below the take-off point throughout are counted from it.
+            # If all heights would lie below the take-off point, the log counts them from that point.
             is_from_takeoff = is_open and not (altitude_m > 0).any()
             filled["altitude_m"] = telemetry.above_sea_m if is_from_takeoff else altitude_m
         elif "height_m" in known:
@@ -103,7 +109,7 @@ def _take_from_camera(telemetry: Telemetry, camera: Camera, has_ground: bool) ->
 
 
 def _take_heading(telemetry: Telemetry, parameters: AerialParameters) -> tuple[Telemetry, list[str]]:
-    """Telemetry with the heading of the vehicle's nose or of its course, and a note."""
+    """Return telemetry with the heading of the vehicle's nose or of its course, and a note."""
     sigma_rad = math.radians(parameters.course_sigma_deg)
     with_sigma = f"with a sigma of {parameters.course_sigma_deg:g} degrees"
     if not _lacks(telemetry, "vehicle_heading_rad"):
@@ -125,10 +131,10 @@ def _take_heading(telemetry: Telemetry, parameters: AerialParameters) -> tuple[T
 def course_over_ground(
     time_s: Float[np.ndarray, "N"], place_m: Float[np.ndarray, "N 2"]
 ) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """The direction flown, rad clockwise from north, and the standard deviation of its fit; NaN where not straight.
+    """Return the course, rad clockwise from north, and the standard deviation of its fit; NaN where not straight.
 
-    A line is fitted to the places about each time; their scatter about it, and how far apart they are, say how sure its
-    direction is.
+    A line is fitted to the places around each time. The standard deviation follows from their scatter about the line
+    and from their distances.
     """
     course, sigma = np.full((2, len(time_s)), np.nan)
     rows = np.flatnonzero(np.isfinite(place_m).all(axis=1))
@@ -145,7 +151,7 @@ def course_over_ground(
 
 
 def _fit_course(time: np.ndarray, place: np.ndarray) -> tuple[float, float] | None:
-    """Direction and standard deviation of a straight flight; None where it is slow, unsure or turns."""
+    """Return direction and standard deviation of a straight flight; None if it is slow, uncertain or turns."""
     apart = time - time.mean()
     spread = float(apart @ apart)
     velocity = apart @ (place - place.mean(axis=0)) / spread
@@ -153,12 +159,12 @@ def _fit_course(time: np.ndarray, place: np.ndarray) -> tuple[float, float] | No
     if speed < _LEAST_M_S:
         return None
     missing = place - place.mean(axis=0) - apart[:, None] * velocity
-    # A vehicle that turns leaves its line on one side in the middle and on the other at the ends.
+    # A turning vehicle deviates from its line to one side in the middle and to the other side at the ends.
     across = missing @ np.array([velocity[1], -velocity[0]]) / speed
     bend = apart**2 - spread / len(time)
     turn_rad_s = 2 * float(bend @ across) / float(bend @ bend) / speed
     scatter = float(across @ across) / max(len(time) - 2, 1)
-    # Rounded places jump: how the vehicle went between two of them is not known.
+    # Rounded places jump, and the path between two of them is unknown.
     jumps = np.linalg.norm(np.diff(place, axis=0), axis=1)
     length, jump = speed * float(np.ptp(time)), float(jumps.max())
     rounding = (jump / length) ** 1.5

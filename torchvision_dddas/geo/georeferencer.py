@@ -1,9 +1,9 @@
-"""How the pictures of a clip map to the ground, frame by frame, with slow errors estimated over all frames so far.
+"""Map the pictures of a clip to the ground frame by frame, and estimate slow errors over all frames so far.
 
-The errors of telemetry and of the landmarks' receivers change slowly, so many frames estimate them. Each is an
-Ornstein-Uhlenbeck process plus noise. Together they have the standard deviation that the error is said to have; the
-process decays by a time constant. So the first frame is like a single picture, later ones gain in what is independent,
-pixels and motion, and no confidence grows beyond what slow errors allow.
+The errors of the telemetry and of the landmarks' receivers change slowly, so many frames estimate them. Each error is
+an Ornstein-Uhlenbeck process plus noise. Process and noise together have the stated standard deviation of the error;
+the process decays with a time constant. The first frame is therefore solved like a single picture. Later frames gain
+from what is independent, pixels and motion, and no result becomes more certain than slow errors allow.
 """
 
 from collections.abc import Iterator
@@ -14,6 +14,14 @@ import numpy as np
 
 from torchvision_dddas.config import Settings
 from torchvision_dddas.geo.landmark_faults import LandmarkCheck, check_landmarks, passes, reorder_pixels, try_repairs
+from torchvision_dddas.geo.landmark_misfit import (
+    IN_A_FRAME,
+    OVER_FRAMES,
+    Misfit,
+    measure_misfit,
+    student_factor,
+    widen_errors,
+)
 from torchvision_dddas.geo.plane_homography import (
     LEAST,
     PlaneSolver,
@@ -25,8 +33,8 @@ from torchvision_dddas.geo.plane_homography import (
 from torchvision_dddas.geo.pose_estimation import (
     EXACT_M,
     Expected,
+    PoseSolution,
     Prior,
-    Solution,
     find_pose,
     focal_prior,
     independent_expectation,
@@ -35,17 +43,22 @@ from torchvision_dddas.geo.pose_estimation import (
 from torchvision_dddas.geometry import undistort_pixels
 from torchvision_dddas.types import Camera, Fix, Flight, LandmarkObservations
 
-# A landmark not seen for so many time constants is forgotten.
+# A landmark that was not seen for this many time constants is forgotten.
 _FORGOTTEN = 4.0
-# A receiver whose standard deviation changes by more than this factor works another way: its error is another.
+# A standard deviation that changes by more than this factor marks a receiver in another mode, with a new error.
 _ANOTHER = 1.5
 # Share of the log likelihood of a hypothesis that is kept from frame to frame.
 _KEPT_LIKELIHOOD = 0.95
-# No single frame counts against a hypothesis by more than this: a report may jump.
+# Largest evidence of a single frame against a hypothesis: a report may jump.
 _MOST_EVIDENCE = 15.0
+# Solve a frame again, _AGAIN times at most, while its landmark errors are more than _MORE times the assumed ones.
+_MORE, _AGAIN = 1.1, 4
 _POSE_PARTS = np.array(["heading", "heading", "heading", "place", "place", "altitude", "focal length"])
-# What a camera's file calls them.
+# Keys of these parts in a camera's file.
 _KEYS = {"heading": "heading_deg", "altitude": "height_m or takeoff_above_sea_m", "pitch": "pitch_deg"}
+# Columns of these parts in a table of telemetry.
+_COLUMNS = {"heading": "heading_deg", "pitch": "pitch_deg", "altitude": "altitude_m", "focal length": "hfov_deg"}
+_COLUMNS |= {"place": "longitude_deg,latitude_deg"}
 
 Degrees = tuple[np.ndarray, tuple[float, float]]
 """Longitudes and latitudes of landmarks (n, 2), and of the origin of the local metres."""
@@ -53,11 +66,11 @@ Degrees = tuple[np.ndarray, tuple[float, float]]
 
 @dataclass(frozen=True)
 class ErrorPersistence:
-    """Which share of the errors persists from frame to frame; the rest is new in every frame.
+    """The share of the errors that persists from frame to frame; the rest is new in every frame.
 
-    telemetry: share of the variance of its angles and place; a gimbal shakes, and samples are older than the picture.
-    landmarks: share of the variance of their reports. pace: how many times faster than aerial.correlation_s the
-    persistent part decays; infinite where nothing is kept.
+    telemetry: share of the variance of its angles and place; the rest comes from a shaking gimbal and from samples that
+    are older than the picture. landmarks: share of the variance of their reports. pace: the persistent part decays this
+    many times faster than aerial.correlation_s; infinite if nothing persists.
     """
 
     telemetry: float = 0.9
@@ -65,7 +78,7 @@ class ErrorPersistence:
     pace: float = 1.0
 
 
-# Which errors of a vehicle and its landmarks persist is unknown: the hypothesis that predicts the pictures best counts.
+# It is unknown which errors of a vehicle and its landmarks persist. Use the hypothesis that predicts the pictures best.
 _HYPOTHESES = (
     ErrorPersistence(),
     ErrorPersistence(pace=5.0),
@@ -79,7 +92,7 @@ _HYPOTHESES = (
 
 @lru_cache(maxsize=256)
 def _persistent_share(persistence: ErrorPersistence, size: int) -> np.ndarray:
-    """Share of each standard deviation that persists; that of a focal length does. Cached and read-only."""
+    """Return the share of each standard deviation that persists; 1 for the focal length. Cached and read-only."""
     share = np.full(size, np.sqrt(persistence.landmarks))
     share[:6], share[6] = np.sqrt(persistence.telemetry), 1.0
     share.flags.writeable = False
@@ -88,10 +101,10 @@ def _persistent_share(persistence: ErrorPersistence, size: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class BiasFilter:
-    """Estimate of the errors at a time: truth less report, the seven of the pose first, then two a landmark.
+    """Estimate of the errors at a time: truth minus report, seven for the pose, then two for each landmark.
 
     mean, covariance: (7 + 2m,) with the landmarks `ids` (m,), last seen at `seen_s`. sigma: (7 + 2m,) of each error
-    before any frame; NaN for what the telemetry has never given.
+    before any frame; NaN for quantities that the telemetry has never given.
     """
 
     time_s: float = float("nan")
@@ -103,7 +116,7 @@ class BiasFilter:
     persistence: ErrorPersistence = ErrorPersistence()
 
     def at(self, time_s: float, prior: Prior, marks: LandmarkObservations, correlation_s: float) -> "BiasFilter":
-        """Predict to time_s: decay the errors, add process noise and new landmarks, drop those long unseen."""
+        """Predict to time_s: decay the errors, add process noise and new landmarks, and drop landmarks long unseen."""
         correlation_s /= self.persistence.pace
         gap_s = time_s - self.time_s
         keeps = float(np.exp(-gap_s / correlation_s)) if correlation_s > 0 and gap_s >= 0 else 0.0
@@ -127,17 +140,17 @@ class BiasFilter:
         sigma[before.rows_of(marks.landmark)] = np.repeat(np.maximum(marks.sigma_m, EXACT_M), 2)
         with np.errstate(invalid="ignore"):
             grown = sigma / was
-        # The altitude's sigma may be a share of the altitude, and grows with it.
+        # The altitude's sigma may be a share of the altitude, and then changes with it; so only landmarks are tested.
         grown[7:] = np.where((grown[7:] < _ANOTHER) & (grown[7:] > 1 / _ANOTHER), grown[7:], 0.0)
         factor = np.where(np.isfinite(grown), grown, 0.0) * keeps
         now, was = (np.where(np.isfinite(each * share), each * share, 0.0) for each in (sigma, was))
         covariance = before.covariance * np.outer(factor, factor)
-        # Process noise: what each error has beyond the kept part of its standard deviation.
+        # Process noise: the variance of each error in excess of its decayed part.
         covariance[np.diag_indices(len(was))] += now**2 - (factor * was) ** 2
         return replace(before, time_s=time_s, mean=before.mean * factor, covariance=covariance, sigma=sigma)
 
     def expected(self, prior: Prior, marks: LandmarkObservations) -> Expected:
-        """What to expect of a frame's pose and landmarks; call `at` with that frame's time before."""
+        """Return the expected pose and landmarks of a frame; call `at` with that frame's time before."""
         ours, theirs = self._matching_rows(prior.known, marks)
         size = 7 + 2 * len(marks)
         mean, information = np.zeros(size), np.zeros((size, size))
@@ -149,10 +162,10 @@ class BiasFilter:
     def predict(
         self, marks: LandmarkObservations, used: np.ndarray, shown_px: np.ndarray, slopes: np.ndarray
     ) -> tuple[float, "BiasFilter"]:
-        """Log density of a picture under the prediction, and the filter updated by it.
+        """Return the log density of a picture under the prediction, and the filter updated by the picture.
 
         shown_px: (2m,) pixels of the landmarks used as a linear function of the errors, with slopes (2m, 7 + 2n). The
-        telemetry must give all seven of the pose.
+        telemetry must give all seven parameters of the pose.
         """
         ours, _ = self._matching_rows(np.ones(7, bool), marks)
         variance = np.repeat(marks.pixel_sigma[used], 2) ** 2
@@ -164,8 +177,10 @@ class BiasFilter:
         covariance = self.covariance - white[:, 1:].T @ white[:, 1:]
         return density, self._with(self.mean + white[:, 1:].T @ white[:, 0], covariance, marks.landmark[used])
 
-    def after(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> "BiasFilter":
-        """The filter updated by a frame's solution, including errors that are correlated with those observed."""
+    def after(
+        self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: PoseSolution
+    ) -> "BiasFilter":
+        """Return the filter updated by a frame's solution, including errors correlated with the observed ones."""
         ours, theirs = self._matching_rows(prior.known, marks)
         before = self._in_one_frame(ours)
         gain = np.linalg.solve(before, self.covariance[ours]).T
@@ -174,7 +189,7 @@ class BiasFilter:
         return self._with(mean, self.covariance + gain @ (now - before) @ gain.T, marks.landmark[used])
 
     def forget(self, rows: np.ndarray) -> "BiasFilter":
-        """The filter with some of its errors as before any frame."""
+        """Return the filter with some of its errors reset to their state before any frame."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         mean[rows] = 0
         covariance[rows] = 0
@@ -184,12 +199,12 @@ class BiasFilter:
         return replace(self, mean=mean, covariance=covariance)
 
     def rows_of(self, wanted: np.ndarray) -> np.ndarray:
-        """(2 K,) rows of mean and covariance that hold the two position errors of each of K wanted landmarks."""
+        """Return the (2 K,) rows of mean and covariance with the two position errors of each of K landmarks."""
         row = {identity: 7 + 2 * k for k, identity in enumerate(self.ids.tolist())}
         return np.array([row[identity] + k for identity in wanted.tolist() for k in (0, 1)], int)
 
     def _matching_rows(self, known: np.ndarray, marks: LandmarkObservations) -> tuple[np.ndarray, np.ndarray]:
-        """The rows here, and those in a Solution, of the known parts of the pose and of landmarks."""
+        """Return the rows here and in a Solution of the known parts of the pose and of landmarks."""
         pose = np.flatnonzero(known)
         return np.r_[pose, self.rows_of(marks.landmark)], np.r_[pose, 7 : 7 + 2 * len(marks)]
 
@@ -198,7 +213,7 @@ class BiasFilter:
         return replace(self, mean=mean, covariance=(covariance + covariance.T) / 2, seen_s=seen_s)
 
     def _in_one_frame(self, rows: np.ndarray) -> np.ndarray:
-        """The covariance of errors in a single frame: the persistent part plus what is new in every frame."""
+        """Return the covariance of errors in a single frame: the persistent part plus the part new in every frame."""
         return self.covariance[np.ix_(rows, rows)] + np.diag(self.sigma[rows] ** 2 * (1 - self._share[rows] ** 2))
 
     @property
@@ -207,10 +222,10 @@ class BiasFilter:
 
 
 class Georeferencer:
-    """Finds how each frame of a clip maps to the ground. Call `update` with the frames in order.
+    """Find how each frame of a clip maps to the ground. Call `update` with the frames in order.
 
-    solver: for the plane homography. focal_known: the camera's focal length is given, not guessed. names: of the
-    landmarks, for messages.
+    solver: for the plane homography. focal_known: whether the camera's focal length is given, not guessed. names: names
+    of the landmarks, for messages.
     """
 
     def __init__(
@@ -226,7 +241,8 @@ class Georeferencer:
         hypotheses = _HYPOTHESES if settings.aerial.correlation_s > 0 else _HYPOTHESES[-1:]
         self._filters = [BiasFilter(persistence=hypothesis) for hypothesis in hypotheses]
         self._likelihood = np.zeros(len(hypotheses))
-        # The repair of the last frame: whose pixels landmarks had, and which were left out.
+        self._misfit, self._misfit_s = Misfit(), float("-inf")
+        # The repair of the last frame: which pixels the landmarks had, and which landmarks were left out.
         self._repair: tuple[dict[int, int], list[int]] = {}, []
 
     def update(
@@ -237,10 +253,10 @@ class Georeferencer:
         marks: LandmarkObservations,
         degrees: Degrees | None = None,
     ) -> Fix:
-        """How one frame maps to the ground; by = "" and a cause where it is unknown.
+        """Return how one frame maps to the ground; by = "" and a cause if that is unknown.
 
-        flight: the telemetry at the frame, its place in local metres; None without telemetry. marks: the landmarks,
-        places in local metres; rows without pixel or place do not count. degrees, for aerial.mode = paper.
+        flight: the telemetry at the frame, its place in local metres; None without telemetry. marks: the landmarks with
+        places in local metres; rows without pixel or place are ignored. degrees: only for aerial.mode = paper.
         """
         usable, changes = self._usable(marks)
         if degrees is not None:
@@ -250,14 +266,14 @@ class Georeferencer:
             fix = self._by_pose(frame, time_s, flight, prior, marks[usable])
         else:
             fix = self._by_homography(frame, prior, marks[usable], degrees)
-        # Landmarks that are in the picture but could not be used are excluded.
+        # Mark landmarks that are in the picture but could not be used as excluded.
         shown = usable | np.isfinite(marks.image_px).all(axis=1)
         states = iter(fix.state)
         state = tuple(next(states) if can else "excluded" for can in usable[shown].tolist())
         return replace(fix, landmark=marks.landmark[shown], state=state, changes=changes + fix.changes)
 
     def _usable(self, marks: LandmarkObservations) -> tuple[np.ndarray, tuple[str, ...]]:
-        """The rows with pixel and place, each landmark once; and why others are left out."""
+        """Return the rows with pixel and place, each landmark once, and why the other rows are left out."""
         in_picture = np.isfinite(marks.image_px).all(axis=1)
         placed = np.isfinite(marks.east_north_m).all(axis=1) & np.isfinite(marks.sigma_m)
         unplaced = marks.landmark[in_picture & ~placed].tolist()
@@ -272,6 +288,48 @@ class Georeferencer:
     def _by_pose(
         self, frame: int, time_s: float, flight: Flight | None, prior: Prior | None, marks: LandmarkObservations
     ) -> Fix:
+        """Solve the pose, with landmark errors as large as measured up to this frame."""
+        factor, before = self._misfit.factor(OVER_FRAMES), self._state
+        # Frames within a correlation time share their errors, so they count once.
+        apart_s, correlation_s = time_s - self._misfit_s, self.parameters.correlation_s
+        share = min(apart_s / (2 * correlation_s), 1.0) if correlation_s > 0 else 1.0
+        for _ in range(_AGAIN):
+            self._state = before
+            fix, seen = self._solve_pose(frame, time_s, flight, prior, widen_errors(marks, factor))
+            if seen is None:
+                return fix
+            own = Misfit(seen.squares * factor**2, seen.redundancy)
+            misfit = self._misfit.and_more(own, max(share, 0.0))
+            if misfit.factor(OVER_FRAMES) <= _MORE * factor:
+                break
+            factor = misfit.factor(OVER_FRAMES)
+        self._misfit, self._misfit_s = misfit, time_s
+        redundancy = misfit.redundancy
+        if own.factor(IN_A_FRAME) > _MORE * factor:
+            # Only the landmarks of this frame are worse: widen its ellipses, and those of no other frame.
+            after, self._state, factor, redundancy = self._state, before, own.factor(IN_A_FRAME), own.redundancy
+            fix, _ = self._solve_pose(frame, time_s, flight, prior, widen_errors(marks, factor))
+            self._state = after
+        if factor == 1 or fix.covariance is None:
+            return fix
+        words = f"errors of landmarks taken {factor:.1f} times as large as stated"
+        wider = fix.covariance * student_factor(redundancy)
+        return replace(fix, covariance=wider, cause=f"{fix.cause}; {words}" if fix.cause else words)
+
+    @property
+    def _state(self) -> tuple[list[BiasFilter], np.ndarray, tuple[dict[int, int], list[int]]]:
+        """The state that a frame changes, except for the misfit."""
+        return list(self._filters), self._likelihood, self._repair
+
+    @_state.setter
+    def _state(self, state: tuple[list[BiasFilter], np.ndarray, tuple[dict[int, int], list[int]]]) -> None:
+        filters, self._likelihood, self._repair = state
+        self._filters = list(filters)
+
+    def _solve_pose(
+        self, frame: int, time_s: float, flight: Flight | None, prior: Prior | None, marks: LandmarkObservations
+    ) -> tuple[Fix, Misfit | None]:
+        """Solve the pose with the stated errors, and return the landmarks' misfit; None if it does not tell theirs."""
         if len(marks) or self.names:
             cause = _describe_refusal(frame, prior, marks, self.parameters.least_spread)
         else:
@@ -282,15 +340,15 @@ class Georeferencer:
         best = int(self._likelihood.argmax())
         before = self._filters[best]
         if cause:
-            return no_fix(frame, marks, cause)
+            return no_fix(frame, marks, cause), None
         if prior is None:
-            # Landmarks alone hardly tell a tilt from its mirror. A wrong one would persist in the filter, so clear it.
+            # Landmarks alone hardly distinguish a tilt from its mirror. A wrong one would persist: clear the filter.
             before = before.forget(np.arange(len(before.mean)))
         check, before = self._check(before, prior or bare, marks, None if prior is None else bare)
         solution, cause = check.solution, check.cause
         if solution is None:
             no_pose = f"no pose of the camera shows the landmarks of frame {frame} where the picture has them"
-            return no_fix(frame, marks, cause or no_pose)
+            return no_fix(frame, marks, cause or no_pose), None
         if prior is not None and check.passed and not check.alone:
             self._update_filters(prior, reorder_pixels(marks, check.order), check.used, solution)
             self._filters[best] = before.after(prior, marks, check.used, solution)
@@ -303,7 +361,7 @@ class Georeferencer:
             sigma_deg = np.degrees(np.sqrt(solution.covariance[2, 2]))
             words = f"heading from {flight.heading_from}, sigma {sigma_deg:.0f} degrees"
             cause = f"{cause}; {words}" if cause else words
-        return Fix(
+        fix = Fix(
             frame,
             "pose" if count else "telemetry",
             solution.pose,
@@ -315,9 +373,19 @@ class Georeferencer:
             changes=check.changes,
             cause=cause,
         )
+        return fix, self._landmark_misfit(check, marks) if count else None
 
-    def _update_filters(self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: Solution) -> None:
-        """Compare the prediction of each hypothesis with the picture, and update its filter."""
+    def _landmark_misfit(self, check: LandmarkCheck, marks: LandmarkObservations) -> Misfit | None:
+        """Return how well the landmarks of a frame fit; None if the telemetry fits even less."""
+        assert check.solution is not None
+        seen = measure_misfit(check.solution, reorder_pixels(marks, check.order), check.used)
+        rest, freedom = check.solution.cost - seen.squares, check.solution.freedom - seen.redundancy
+        return None if not check.passed and rest * seen.redundancy > seen.squares * freedom else seen
+
+    def _update_filters(
+        self, prior: Prior, marks: LandmarkObservations, used: np.ndarray, solution: PoseSolution
+    ) -> None:
+        """Compare the prediction of each hypothesis with the picture, and update the filter of each hypothesis."""
         if len(self._filters) == 1 or not (prior.known.all() and used.any()):
             return
         slopes = solution.slopes.copy()
@@ -332,7 +400,7 @@ class Georeferencer:
     def _check(
         self, before: BiasFilter, prior: Prior, marks: LandmarkObservations, bare: Prior | None
     ) -> tuple[LandmarkCheck, BiasFilter]:
-        """The landmarks tested against the filter, and the filter to go on with."""
+        """Test the landmarks against the filter, and return the result and the filter to continue with."""
         gate, n, identities = self.parameters.gate_probability, len(marks), marks.landmark.tolist()
         everyone, itself = np.ones(n, bool), np.arange(n)
         expected = before.expected(prior, marks)
@@ -341,7 +409,7 @@ class Georeferencer:
             self._repair = {}, []
             return LandmarkCheck(first, itself, everyone), before
         names = tuple(self._name(identity) for identity in identities)
-        # The repair of the last frame, where it applies to this frame's landmarks, before all others.
+        # Try the repair of the last frame first, if it applies to this frame's landmarks.
         pixels_of, without = self._repair
         rows = {identity: k for k, identity in enumerate(identities)}
         order = np.array([rows.get(pixels_of.get(identity, identity), -1) for identity in identities], int)
@@ -363,7 +431,7 @@ class Georeferencer:
         return check, bias
 
     def _forgetting(self, before: BiasFilter, marks: LandmarkObservations) -> Iterator[BiasFilter]:
-        """Filters with part of the past forgotten, for a report that jumps within its errors."""
+        """Yield filters with part of the past forgotten, for a report that jumps within its errors."""
         if before.mean.any():
             yield before.forget(np.arange(7))
             for identity in marks.landmark:
@@ -373,17 +441,17 @@ class Georeferencer:
     def _by_homography(
         self, frame: int, prior: Prior | None, marks: LandmarkObservations, degrees: Degrees | None
     ) -> Fix:
-        """By landmarks alone; telemetry, where there is any, only tests their identities and places."""
+        """Fit the homography to landmarks alone; telemetry, if given, only tests their identities and places."""
         parameters, n = self.parameters, len(marks)
         paper = parameters.mode == "paper"
-        # Only a picture of a plane by a lens without distortion is a homography.
+        # Pixels and ground are related by a homography only for a plane seen by a lens without distortion.
         flat = marks if paper else replace(marks, image_px=undistort_pixels(marks.image_px, self.camera))
         if paper or prior is None or not prior.known.all() or n == 0:
             return fix_by_homography(frame, flat, self.solver, parameters.least_spread, degrees, paper)
         names = tuple(self._name(identity) for identity in marks.landmark.tolist())
         expected = independent_expectation(prior, marks.sigma_m)
         check = check_landmarks(marks, self.camera, expected, parameters.gate_probability, names)
-        # Where no change explains the disagreement the telemetry may be wrong: the landmarks are used as reported.
+        # If no repair explains the disagreement, the telemetry may be wrong: use the landmarks as reported.
         kept = reorder_pixels(flat, check.order)[check.used] if check.passed else flat
         fix = fix_by_homography(frame, kept, self.solver, parameters.least_spread)
         state = check.state if check.passed else ("used",) * n
@@ -403,21 +471,23 @@ class Georeferencer:
 
 
 def describe_unknown_pose(flight: Flight | None, prior: Prior | None) -> str:
-    """Why telemetry alone does not tell the pose, in words; empty where it does. A guessed pitch does not count."""
+    """Return why telemetry alone does not give the pose; empty if it does. A guessed pitch does not count."""
     if flight is None or prior is None:
-        return "the telemetry says nothing of this time; give all of it, or set aerial.clock_offset_s"
+        return "the telemetry has no data for this time; give the whole log, or set aerial.clock_offset_s"
     lacking = list(dict.fromkeys(_POSE_PARTS[~prior.known].tolist()))
     if not np.isfinite(flight.pitch_rad):
         lacking.append("pitch")
     if not lacking:
         return ""
     keys = ", ".join(_KEYS[part] for part in lacking if part in _KEYS)
-    helped = f"; {keys} in the camera's file (--camera) can" if keys else ""
+    columns = ", ".join(_COLUMNS[part] for part in lacking)
+    helped = f"; add the column{'s' * (',' in columns)} {columns} to a CSV of it"
+    helped += f", or give {keys} in the camera's file (--camera)" if keys else ""
     return f"the telemetry does not say the camera's {', '.join(lacking)}{helped}"
 
 
 def _describe_refusal(frame: int, prior: Prior | None, marks: LandmarkObservations, least_spread: float) -> str:
-    """Why the pose cannot be determined, in words; empty where it can."""
+    """Return why the pose cannot be determined; empty if it can be."""
     n = len(marks)
     if prior is None:
         if n < LEAST:

@@ -1,10 +1,11 @@
-"""People seen by cameras on the ground to places, frame by frame; several cameras are fused.
+"""Locate people seen by cameras on the ground, frame by frame, and fuse several cameras.
 
-What is common to sightings is estimated with the places, not counted again with each: a vehicle's position, heading,
-pitch, camera height and focal length are common to all that it sees, a person's height to all that see the person. So
-two people seen by the same two vehicles tell how far the vehicles' GPS disagree, and each gains by the other. All is
-linear about the single sightings. Assumed independent: what is new in each sighting, and the vehicles from one another;
-a GPS error common to the whole team is in no covariance here and no fusion takes it away.
+Errors that sightings share are estimated together with the places, and are not counted again with each sighting: the
+position, heading, pitch, camera height and focal length of a vehicle are common to all people that it sees, and the
+height of a person to all vehicles that see the person. Two people seen by the same two vehicles therefore show how far
+the vehicles' GPS disagree, and both places improve. The model is linear about the single sightings. Assumed
+independent: the new errors of each sighting, and the errors of different vehicles. No covariance here contains a GPS
+error common to the whole team, and fusion does not remove it.
 """
 
 import math
@@ -17,6 +18,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, check_settings
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo.heights import geoid_of, median_of
 from torchvision_dddas.geo.ranging import range_people, touches_border
 from torchvision_dddas.types import (
     Camera,
@@ -31,19 +33,21 @@ from torchvision_dddas.types import (
     Sightings,
 )
 
-# Rounds in which each vehicle's sightings are matched again to the others'.
+# Rounds in which the sightings of each vehicle are matched again to those of the others.
 _ROUNDS = 3
-# Most pairs that are tried as hypotheses of a vehicle's common error.
+# Cameras whose ground heights differ by less than this stand on one plane.
+_LEVEL_M = 0.5
+# Largest number of pairs that are tried as hypotheses of a vehicle's common error.
 _BELIEFS = 60
-# Hypotheses times pairs that are computed at once: a few megabytes.
+# Number of matrices, hypotheses times pairs, that are computed at once: a few megabytes.
 _MATRICES = 20_000
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """What one camera saw, a row a box: its table, where that alone puts everyone, as whom, and whether cut.
+    """What one camera saw, one row a box: table, places by this camera alone, targets, and whether boxes are cut.
 
-    score: (N,) in [0, 1]; 1 where the table's scores are on another scale.
+    score: (N,) in [0, 1]; 1 if the table's scores are on another scale.
     """
 
     table: DetectionTable
@@ -55,49 +59,58 @@ class CameraView:
 
 
 class GroundLocator:
-    """Locates people seen by one or several cameras on the ground.
+    """Locate people seen by one or several cameras on the ground.
 
-    >>> locator = GroundLocator(camera)
-    >>> places = locator.locate(people, frame=1)
-
-    origin_deg: longitude and latitude of the local metres; None where the cameras stand at local metres.
+    >>> camera = td.Camera("ugv1", (640, 480), (500.0, 500.0), (319.5, 239.5), height_m=1.2)
+    >>> people = td.People(np.array([[309.5, 240, 20, 60]]), np.ones(1), np.ones(1), np.array([False]))
+    >>> north_m = td.GroundLocator(camera).locate(people).positions.east_north_m[0, 1]
+    >>> round(float(north_m))
+    13
     """
 
     def __init__(
         self,
         cameras: Camera | Sequence[Camera],
-        settings: Settings | None = None,
         *,
+        settings: Settings | None = None,
         poses: Sequence[PoseTable | None] = (),
         rate_hz: float | None = None,
     ) -> None:
-        """poses: where each camera stood over time; None for one that stands still. rate_hz: for poses by time.
+        """poses: where each camera stood over time; None for a camera that stands still. rate_hz: for poses by time.
 
-        Raises InputError where there is no camera, the numbers of cameras and poses differ, or ground.mode = paper is
-        to fuse.
+        Raise InputError if there is no camera, if the numbers of cameras and poses differ, or for several cameras with
+        ground.mode = paper.
         """
         self.cameras = [cameras] if isinstance(cameras, Camera) else list(cameras)
         self.settings, self.rate_hz = check_settings(settings), rate_hz
         self.poses = list(poses) or [None] * len(self.cameras)
         if not self.cameras or not all(isinstance(camera, Camera) for camera in self.cameras):
-            raise InputError("GroundLocator wants one Camera or several, got another type or none")
+            raise InputError("GroundLocator expects one Camera or several, got another type or none")
         if len(self.poses) != len(self.cameras):
             raise InputError(f"{len(self.cameras)} cameras and {len(self.poses)} tables of poses; wanted one for each")
         if self.settings.ground.mode == "paper" and len(self.cameras) > 1:
             raise InputError(
-                f"ground.mode = paper knows no covariances to fuse {len(self.cameras)} cameras by; give one table, or "
-                "use default"
+                f"ground.mode = paper has no covariances, so it cannot fuse {len(self.cameras)} cameras; give one "
+                "table, or use default"
             )
         self.origin_deg: tuple[float, float] | None = None
-        # Numbers of people seen by several vehicles: by (vehicle, target), and the last one given.
+        heights = np.array([camera.elevation_m for camera in self.cameras])
+        self._above_sea_m, self._geoid_m = median_of(heights), math.nan
+        self.notes: list[str] = []
+        if np.isfinite(heights).any() and np.nanmax(np.abs(heights - self._above_sea_m)) > _LEVEL_M:
+            self.notes.append(
+                f"elevation_m of the cameras is {np.nanmin(heights):.1f} to {np.nanmax(heights):.1f} m: distances "
+                f"are not corrected for this, because the ground is assumed level, at {self._above_sea_m:.1f} m"
+            )
+        # Numbers of people, by (vehicle, target), and the last number that was given.
         self._number: dict[tuple[int, int], int] = {}
         self._last_number = 0
 
-    def locate(self, people: People | Sequence[People], frame: int = 1) -> GroundLocations:
-        """Where the people of one frame stand. people: of the one camera, or of each in their order."""
+    def locate(self, people: People | Sequence[People], *, frame: int = 1) -> GroundLocations:
+        """Locate the people of one frame. people: of the one camera, or of each camera in order."""
         seen = [people] if isinstance(people, People) else list(people)
         if not all(isinstance(one, People) for one in seen):
-            raise InputError("locate wants the People of each camera, got another type")
+            raise InputError("locate expects the People of each camera, got another type")
         tables = [
             DetectionTable("", np.full(len(one), frame), one.box_px, one.score, np.arange(len(one)), cut=one.cut)
             for one in seen
@@ -106,17 +119,17 @@ class GroundLocator:
         return self._locate(frame, views, [np.arange(len(view.table)) for view in views])
 
     def locate_tables(self, tables: Sequence[DetectionTable]) -> Iterator[GroundLocations]:
-        """Where people stand, frame by frame. Raises InputError as `place_tables`, at once."""
+        """Locate people frame by frame. Raise InputError at once, as `place_tables` does."""
         views = self.place_tables(tables)
         frames = _simultaneous_rows(views, self.settings.ground.within_frames)
         return (self._locate(frame, views, rows) for frame, rows in frames)
 
     def place_tables(self, tables: Sequence[DetectionTable]) -> list[CameraView]:
-        """Where each camera alone puts the people of its table.
+        """Locate the people of each table by its own camera alone.
 
-        Local metres are those of the cameras, or east and north of where the first camera stood first.
-        Raises InputError where the numbers of tables and cameras differ, cameras mix degrees and metres, poses do not
-        cover the frames, or an identity is twice in a frame.
+        Local metres are those of the cameras, or east and north of the first place of the first camera.
+        Raise InputError if the numbers of tables and cameras differ, if cameras mix degrees and metres, if poses do not
+        cover the frames, or if an identity occurs twice in a frame.
         """
         if len(tables) != len(self.cameras):
             raise InputError(
@@ -133,6 +146,8 @@ class GroundLocator:
         if self.origin_deg is None and stood[0][0].geographic:
             first = next((where.place[0] for _, where in stood if len(where.place)), stood[0][0].place)
             self.origin_deg = float(first[0]), float(first[1])
+        if math.isfinite(self._above_sea_m):
+            self._geoid_m = geoid_of(np.zeros((1, 2)), self.origin_deg, self.settings.aerial.geoid)
         return [self._view(table, *seen) for table, seen in zip(tables, stood, strict=True)]
 
     def _view(self, table: DetectionTable, camera: Camera, where: Poses) -> CameraView:
@@ -172,7 +187,17 @@ class GroundLocator:
         return GroundLocations(
             frame,
             Positions(
-                np.full(len(place), frame), target, place, covariance, score, self.origin_deg, degrees, label, number
+                np.full(len(place), frame),
+                target,
+                place,
+                covariance,
+                score,
+                self.origin_deg,
+                degrees,
+                label,
+                number,
+                np.full(len(place), self._above_sea_m),
+                np.full(len(place), self._above_sea_m + self._geoid_m),
             ),
             members,
             Sightings.concat(sightings),
@@ -184,9 +209,9 @@ class GroundLocator:
         )
 
     def _numbers(self, people: list[list[tuple[int, int]]]) -> np.ndarray:
-        """A number for each person, given as (vehicle, target) of its sightings; each number is given once.
+        """Return a unique number for each person, given as the (vehicle, target) pairs of its sightings.
 
-        A person takes the number that most of the vehicles' targets had when they were seen last.
+        A person takes the number that most of the vehicles' targets had when they were last seen.
         """
         wish = []
         for person, seen in enumerate(people):
@@ -205,10 +230,10 @@ class GroundLocator:
 
 
 def _simultaneous_rows(views: Sequence[CameraView], within_frames: int) -> Iterator[tuple[int, list[np.ndarray]]]:
-    """The first frame of each group of simultaneous frames, and each view's rows in it.
+    """Yield the first frame of each group of simultaneous frames, and each view's rows in it.
 
-    A group holds at most one frame of each camera, none later than within_frames after the first: cameras need not take
-    their pictures together.
+    A group holds at most one frame of each camera, and none later than within_frames after the first: cameras need not
+    take their pictures at the same time.
     """
     queues = [deque(np.unique(view.table.frame).tolist()) for view in views]
     while any(queues):
@@ -227,10 +252,11 @@ def _simultaneous_rows(views: Sequence[CameraView], within_frames: int) -> Itera
 def fuse(
     team: Sequence[Sightings], gate_sigmas: float = 3.0
 ) -> tuple[Int[np.ndarray, "P V"], Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 2"]]:
-    """Fuse what the vehicles of a team see at one time: `associate`, and the people's places with their covariances.
+    """Associate the sightings of a team's vehicles at one time, and estimate the places of the people they see.
 
-    team: the sightings of each vehicle, all located. gate_sigmas: sightings are of one person if their distance, by its
-    covariance, is as likely as this many sigmas.
+    team: the sightings of each vehicle, all located. gate_sigmas: two sightings belong to one person if their
+    Mahalanobis distance is at most this many standard deviations. Return the members, as `associate` does, the places
+    and their covariances.
     """
     members = associate(team, gate_sigmas)
     place, joint = estimate_places(team, members)
@@ -239,10 +265,11 @@ def fuse(
 
 
 def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.ndarray, "P V"]:
-    """The sightings of each person, -1 where a vehicle does not see it: every sighting is of exactly one person.
+    """Return the sightings of each person, -1 if a vehicle does not see it. Each sighting belongs to one person.
 
-    The vehicle that sees most begins; each other's are matched to what is known by then. Then each vehicle in turn is
-    matched again to the others, whose disagreement is known better by then, until nothing changes.
+    Start with the vehicle that sees most people, and match the sightings of each other vehicle to the people known so
+    far. Then match each vehicle in turn again to the others, whose disagreement is now known better, until nothing
+    changes.
     """
     order = sorted(range(len(team)), key=lambda v: -len(team[v]))
     members = np.zeros((0, len(team)), np.int64)
@@ -260,17 +287,17 @@ def associate(team: Sequence[Sightings], gate_sigmas: float = 3.0) -> Int[np.nda
 
 
 def gate_distance(sigmas: float) -> float:
-    """Squared Mahalanobis distance in the plane with the tail probability of this many sigmas on a line."""
+    """Return the squared Mahalanobis distance in the plane with the tail probability of this many sigmas on a line."""
     return -2 * math.log(max(math.erfc(sigmas / math.sqrt(2)), 1e-300))
 
 
 def estimate_places(
     team: Sequence[Sightings], members: Int[np.ndarray, "P V"]
 ) -> tuple[Float[np.ndarray, "P 2"], Float[np.ndarray, "P 2 P 2"]]:
-    """Places of people and their joint covariance: least squares over all sightings.
+    """Return the places of people and their joint covariance, by least squares over all sightings.
 
-    Unknown are each person's place and height, and each vehicle's six errors; what is known of the heights and errors
-    beforehand is that their sigma is 1.
+    The unknowns are each person's place and height, and each vehicle's six errors; heights and errors have a prior
+    sigma of 1.
     """
     people, vehicles = members.shape
     size = 3 * people + 6 * vehicles
@@ -286,7 +313,7 @@ def estimate_places(
         weighted = design.swapaxes(1, 2) @ np.linalg.inv(seen.own_m2[row])
         np.add.at(normal, (at[:, :, None], at[:, None, :]), weighted @ design)
         np.add.at(right, at, np.einsum("nij,nj->ni", weighted, seen.east_north_m[row]))
-    # Scaled to ones on the diagonal: metres and sigmas differ by orders of magnitude.
+    # Scale the diagonal to 1, because metres and sigmas differ by orders of magnitude.
     scale = 1 / np.sqrt(np.diag(normal))
     covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
     joint = covariance[: 2 * people, : 2 * people].reshape(people, 2, people, 2)
@@ -294,24 +321,26 @@ def estimate_places(
 
 
 def _matched(team: Sequence[Sightings], known: np.ndarray, vehicle: int, gate_sigmas: float) -> np.ndarray:
-    """The people known by other vehicles, with this vehicle's sightings among them; unmatched ones are new people."""
+    """Add a vehicle's sightings to the people known by other vehicles; unmatched sightings are new people."""
     seen = team[vehicle]
     members = known.copy()
     left = np.ones(len(seen), bool)
     if len(known) and len(seen):
-        for person, row in _pairs(*estimate_places(team, known), seen, gate_distance(gate_sigmas)):
+        for person, row in match_people(*estimate_places(team, known), seen, gate_distance(gate_sigmas)):
             members[person, vehicle], left[row] = row, False
     new = np.full((left.sum(), len(team)), -1, np.int64)
     new[:, vehicle] = np.flatnonzero(left)
     return np.concatenate([members, new])
 
 
-def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) -> np.ndarray:
-    """(K, 2) the people and the sightings that are the same, one to one.
+def match_people(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) -> np.ndarray:
+    """Return (K, 2) the pairs of people and sightings that are the same, one to one.
 
-    The sightings may all be off together, by more than people stand apart. So each likely pair in turn is believed, and
-    what it says of the errors in common is taken from the rest before these are matched (Hungarian). The belief under
-    which most agrees holds.
+    where (P, 2), joint (P, 2, P, 2): places of the people and their covariance. limit: the squared distance of a gate.
+
+    All sightings may share an error larger than the distance between people. Each likely pair is therefore tried as a
+    hypothesis: its implied common error is removed from the other pairs before these are matched (Hungarian). The
+    hypothesis with the best agreement wins.
     """
     apart = seen.east_north_m - where[:, None]
     spread = joint[np.arange(len(where)), :, np.arange(len(where))][:, None] + seen.covariance_m2
@@ -325,14 +354,15 @@ def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) 
     at_once = max(1, _MATRICES // max(distance.size, 1))
     for begin in range(0, len(persons), at_once):
         person, row = persons[begin : begin + at_once], rows[begin : begin + at_once]
-        # Covariance of what any other pair is apart with what this one is in its own sigmas: (beliefs, P, N, 2, 2).
+        # Covariance of every other pair's difference with this pair's difference in its own sigmas:
+        # (beliefs, P, N, 2, 2).
         whiten = np.linalg.inv(np.linalg.cholesky(spread[person, row])).swapaxes(1, 2)
         of_person, of_row = (
             held.transpose(2, 0, 1, 3) @ whiten[:, None] for held in (joint[:, :, person], common[:, :, row])
         )
         cross = of_person[:, :, None] + of_row[:, None]
         believed = np.einsum("kij,ki->jk", whiten, apart[person, row])[:, :, None, None]
-        # By components: NumPy is slow with many small matrices.
+        # Compute by components, because NumPy is slow with many small matrices.
         (ee, en), (ne, nn) = np.moveaxis(cross, (-2, -1), (0, 1))
         rest = _squared_distance(
             east - ee * believed[0] - en * believed[1],
@@ -347,7 +377,7 @@ def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) 
         score = np.where(rest < limit, limit - rest, 0.0)
         reach = np.minimum(score.max(axis=2).sum(axis=1), score.max(axis=1).sum(axis=1))
         for k in np.flatnonzero(reach > most).tolist():
-            if reach[k] > most:  # which may have grown
+            if reach[k] > most:  # `most` may have grown in this loop
                 found = geometry.best_pairs(score[k])
                 agreed = score[k][found[:, 0], found[:, 1]].sum()
                 if agreed > most:
@@ -358,5 +388,5 @@ def _pairs(where: np.ndarray, joint: np.ndarray, seen: Sightings, limit: float) 
 def _squared_distance(
     east: np.ndarray, north: np.ndarray, var_east: np.ndarray, covar: np.ndarray, var_north: np.ndarray
 ) -> np.ndarray:
-    """Squared distances by their covariances."""
+    """Return the squared distances, given the elements of their covariances."""
     return (var_north * east**2 - 2 * covar * east * north + var_east * north**2) / (var_east * var_north - covar**2)

@@ -1,7 +1,7 @@
-"""Landmarks in the picture: found by their colours, separated from targets, and tracked.
+"""Find landmarks in the picture by their colours, separate them from targets, and track them.
 
-Source: appendix A, IV-A. Beyond it: patches of a landmark's colour that are something else, blobs that hold a landmark
-and a person, and landmarks that the picture's border cuts.
+Source: appendix A, IV-A. Beyond the source: patches of a landmark's colour that are something else, blobs that hold a
+landmark and a person, and landmarks that the picture's border cuts.
 """
 
 from collections import deque
@@ -18,38 +18,38 @@ from torchvision_dddas.types import Detections
 
 # A blob this many times larger than usual for its colour holds something beside the landmark.
 _SHARED = 1.8
-# A vehicle's blob is no longer than it, but for its shadow; and its middle no further from the colour than this share.
+# A vehicle's blob is at most _LONGER vehicle lengths long, and its middle at most _WITHIN lengths from the colour.
 _LONGER, _WITHIN = 1.25, 0.6
-# Blobs whose boxes are no further than this from a patch's are beside it.
+# Blobs whose boxes are at most this far from a patch's box are beside the patch.
 _BESIDE_PX = 2.0
-# Frames whose blobs define the usual size, and the fewest that do.
+# Number of frames that define the usual blob size, and the fewest that suffice.
 _MEMORY, _ENOUGH = 25, 3
-# Score of a patch, in logarithms of its area: for motion at it; for its travel over the ground; for being the
-# landmark already. Greatest penalty for its distance from the expected place.
+# Scores of a patch, added to the logarithm of its area: for motion at the patch, for its travel over the ground, and
+# for being the landmark already. Then the greatest penalty for its distance from the expected place.
 _BLOB, _TRAVEL, _LOCK, _FAR = 2.0, 3.0, 1.0, 4.0
-# A patch of this many times the usual area is no better than one of half as many, and one that fills its box by less
-# than this is a shadow or a roof's edge rather than a vehicle's plate.
+# Area beyond this many times the usual area does not improve the score. A patch that fills a smaller share of its box
+# than _FILL is a shadow or the edge of a roof rather than a vehicle's plate.
 _LARGE, _FILL = 2.0, 0.5
-# Gain of a new frame in velocity, area and share of frames with motion.
+# Gain of a new frame in the averages of velocity, area and motion.
 _GAIN = 0.3
-# Most patches of a colour that are tracked.
+# Largest number of patches of one colour that are tracked.
 _MOST = 16
-# Margin by which the best patch must beat the next one to be taken for the landmark.
+# Margin by which the best patch must beat the next one to become the landmark.
 _MARGIN = 1.0
-# Patches smaller than the best by more than this logarithm are no rivals.
+# Patches whose log area is smaller than the best one's by more than this are not rivals.
 _ALIKE = 2.0
 
 
 def separate(
     colour_px: np.ndarray, blob_px: np.ndarray, parameters: LandmarkParameters, allowed: np.ndarray | bool = True
 ) -> np.ndarray:
-    """(n,) int64, which of the m blobs is each landmark's, -1 for none; no blob is of two.
+    """Return (n,) int64, the blob of each landmark, -1 for none; no two landmarks share a blob.
 
-    colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of what moves. allowed: (n, m) bool,
-    pairs that may be.
-    exact: as many matches as there can be within reach_px, then the least distance in all. The source asks for one blob
-    for each landmark, which is infeasible where one has none in reach; its text says "if any". greedy: its heuristic,
-    row by row, each landmark the nearest blob that is left.
+    colour_px: (n, 2), NaN for a colour that was not found. blob_px: (m, 2) centres of moving blobs. allowed: (n, m)
+    bool, permitted pairs.
+    exact: the largest number of matches within reach_px, then the least total distance. The source requires one blob
+    for each landmark, which is infeasible if a landmark has none in reach; its text says "if any". greedy: the source's
+    heuristic; each landmark in turn takes the nearest blob that is left.
     """
     distance = np.linalg.norm(colour_px[:, None] - blob_px[None], axis=2)
     within = (distance <= parameters.reach_px) & allowed  # False for NaN
@@ -63,7 +63,7 @@ def separate(
                 match[row] = np.where(near & free, distance[row], np.inf).argmin()
                 free[match[row]] = False
         return match
-    # One more pair outweighs any saving of distance.
+    # The cost of a missing pair exceeds any saving of distance.
     missing = 1.0 + parameters.reach_px * (min(distance.shape) + 1)
     rows, columns = cheapest(np.where(within, distance, missing))
     good = within[rows, columns]
@@ -75,10 +75,10 @@ def separate(
 class TrackedLandmarks:
     """The landmarks in one frame's picture, one row a landmark.
 
-    image_px: (K, 2) where each is, NaN where it was not found or the border cuts it. by: (K,) motion, colour, or "".
-    colour_px: (K, 2) centres of their colours. blob: (K,) int64, which detection is its own, -1 for none.
-    rows: (N,) bool, the detections that are landmarks or parts of them, and so no targets. shared: (N,) bool, those
-    that hold a landmark and something beside it: they stay among the targets.
+    image_px: (K, 2) pixels, NaN if not found or cut by the border. by: (K,) motion, colour, or "".
+    colour_px: (K, 2) centres of the colour patches. blob: (K,) int64, the landmark's own detection, -1 for none.
+    rows: (N,) bool, detections that are landmarks or parts of them, and so are not targets. shared: (N,) bool,
+    detections that hold a landmark and something beside it: they remain targets.
     """
 
     image_px: np.ndarray
@@ -91,10 +91,10 @@ class TrackedLandmarks:
 
 @dataclass
 class _Patch:
-    """A patch over time. Places are in the picture of the present frame; where it was not seen, as predicted.
+    """A patch over time. Places are in the current picture, and predicted if the patch was not seen in it.
 
-    origin_px: where the ground lies now on which it was seen first. moving: share of the late frames in which
-    something moved at it. seen, missed: frames in which it was, and since.
+    origin_px: current pixel of the ground where the patch was first seen. moving: share of recent frames with motion at
+    the patch. seen: number of frames with the patch. missed: number of frames since it was last seen.
     """
 
     centre_px: np.ndarray
@@ -108,10 +108,10 @@ class _Patch:
 
 
 class _ColourTracker:
-    """The patches of one colour, which of them is the landmark, and its blob.
+    """The patches of one colour, the patch that is the landmark (lock), and the landmark's blob.
 
-    sure: clearly more speaks for the lock than for the next best. blob_px: where the landmark's blob was in the last
-    frame, NaN without one. ratios: its blob's area over its colour's in late frames.
+    sure: whether the lock's score clearly exceeds the next best. blob_px: centre of the landmark's blob in the last
+    frame, NaN without one. ratios: area of the blob over the area of the colour in recent frames.
     """
 
     def __init__(self, parameters: LandmarkParameters) -> None:
@@ -125,11 +125,11 @@ class _ColourTracker:
 
     @property
     def shown(self) -> _Patch | None:
-        """The landmark's patch where this frame shows it for sure."""
+        """The landmark's patch if this frame shows it with certainty."""
         return self.lock if self.lock is not None and self.sure and not self.lock.missed else None
 
     def update(self, found: Patches, moving: np.ndarray, now_from_before: np.ndarray | None) -> None:
-        """Go on to the next picture and its patches; moving: (P,) bool, whether something moves at each."""
+        """Process the patches of the next picture. moving: (P,) bool, whether something moves at each."""
         if now_from_before is not None and self._patches:
             places = np.array([(one.centre_px, one.origin_px) for one in self._patches])
             places = transfer(now_from_before, places.reshape(-1, 2)).reshape(places.shape)
@@ -137,7 +137,7 @@ class _ColourTracker:
                 one.centre_px, one.origin_px = centre, origin
         for one in self._patches:
             one.centre_px = one.centre_px + one.velocity_px
-        # The most likely patches: those near the landmark first.
+        # Choose the most likely patches, those near the landmark first.
         area, near = found.area_px, np.zeros(len(found), bool)
         if self.lock is not None:
             area = np.minimum(area, _LARGE * self.lock.area_px)
@@ -165,7 +165,7 @@ class _ColourTracker:
             self.lock, self.sure = None, False
 
     def _continue(self, found: Patches, rows: np.ndarray, blind: bool) -> dict[int, int]:
-        """The row of the patch that continues each tracked one; blind: the background's motion is not known."""
+        """Return the row of the patch that continues each tracked patch. blind: the background's motion is unknown."""
         if not self._patches or not len(rows):
             return {}
         before = np.array([one.centre_px for one in self._patches])
@@ -179,9 +179,10 @@ class _ColourTracker:
         return {int(i): int(rows[j]) for i, j in zip(*cheapest(cost), strict=True) if cost[i, j] < 100}
 
     def decide(self, expected_px: np.ndarray, usual_px: float, anew: bool) -> None:
-        """Decide which patch is the landmark: as before, unless it is lost, in doubt, or to be decided again.
+        """Decide which patch is the landmark. Keep the previous one unless it is lost or uncertain, or `anew` is set.
 
-        expected_px: (2,) where it should be, NaN for unknown. usual_px: area of the landmarks' patches, inf: unknown.
+        expected_px: (2,) expected pixel, NaN if unknown. usual_px: usual area of the landmarks' patches, inf if
+        unknown.
         """
         if not self._patches or not (anew or self.lock is None or not self.sure):
             return
@@ -190,15 +191,15 @@ class _ColourTracker:
         held = np.array([_LOCK * (one is self.lock) for one in self._patches])
         best = int((sizes + signs + held).argmax())
         same, self.lock = self._patches[best] is self.lock, self._patches[best]
-        # Size alone does not tell a vehicle from a roof.
+        # Size alone does not distinguish a vehicle from a roof.
         rivals = sizes > sizes[best] - _ALIKE
         rivals[best] = False
         clear = not rivals.any() or signs[best] - signs[rivals].max() >= _MARGIN
         self.sure = bool(clear or (same and self.sure))
 
     def _score(self, one: _Patch, expected_px: np.ndarray, usual_px: float) -> float:
-        """Score of a patch without its size."""
-        fill = float(one.area_px / one.box_px[2:].prod())  # half for a square on its corner
+        """Return the score of a patch without its size."""
+        fill = float(one.area_px / one.box_px[2:].prod())  # 0.5 for a square on its corner
         travelled = min(np.linalg.norm(one.centre_px - one.origin_px) / np.sqrt(one.area_px), 1.0)
         score = 4 * np.log(min(fill / _FILL, 1.0)) + _BLOB * one.moving + _TRAVEL * travelled
         if np.isfinite(usual_px):
@@ -210,10 +211,11 @@ class _ColourTracker:
 
 
 class LandmarkTracker:
-    """Finds landmarks in successive pictures.
+    """Find landmarks in successive pictures.
 
-    Of each colour the patch counts that is large, is where the landmark was, and has something moving at it. Every
-    interval_frames landmarks are separated from targets again; between, a landmark's blob is the predicted one.
+    Of the patches of a landmark's colour, the tracker takes a large one that is near the former position and moves.
+    Every interval_frames, it decides which blobs are landmarks and which are targets. In between, it takes the blob at
+    the predicted position.
     """
 
     def __init__(self, count: int, parameters: LandmarkParameters) -> None:
@@ -231,12 +233,11 @@ class LandmarkTracker:
         expected_px: np.ndarray,
         length_px: np.ndarray,
     ) -> TrackedLandmarks:
-        """The landmarks of the next frame.
+        """Return the landmarks of the next frame.
 
-        masks: (K, H, W) uint8 of the landmarks' colours. foreground: (H, W), i + 1 where detection i is, as in Scene.
-        now_from_before: (3, 3) how the background moved since the frame before; None: it did not, or it is unknown.
-        expected_px: (K, 2) where each should be by what else is known, length_px (K,) how long it shows there; NaN:
-        unknown.
+        masks: (K, H, W) uint8 of the landmarks' colours. foreground: (H, W), i + 1 at the pixels of detection i, as in
+        Scene. now_from_before: (3, 3) motion of the background since the frame before; None: none, or unknown.
+        expected_px: (K, 2) expected pixels from other sources, length_px: (K,) expected lengths there; NaN: unknown.
         """
         size = masks.shape[2], masks.shape[1]
         anew = frame >= self._next
@@ -256,7 +257,7 @@ class LandmarkTracker:
         match = self._couple(centre, blobs, near, now_from_before, anew)
         has = match >= 0
         touching = _covering(own_px, blob_area, foreground)
-        # A blob that is not at the colour is a part of the vehicle; its centre is not the vehicle's.
+        # A blob that is not at the colour is only a part of the vehicle, so its centre is not the vehicle's centre.
         whole = touching.sum(axis=0) == 1
         touching[has, match[has]] = True
         shared = self._shared(match, touching, area, blob_area)
@@ -271,7 +272,8 @@ class LandmarkTracker:
                 image[k], by[k] = blobs[match[k]], "motion"
             elif shown[k] is not None and not cut[k]:
                 image[k], by[k] = centre[k], "colour"
-        # Too large for its colour need not be too large for a vehicle: of most, a part alone is seen to move at first.
+        # A blob too large for its colour may still fit the vehicle: at first only a part of most vehicles seems to
+        # move.
         at, long = np.where(np.isnan(centre), expected_px, centre), length_px[:, None]
         away = np.linalg.norm(at[:, None] - middle, axis=2)  # NaN where unknown
         own = ((away <= _WITHIN * long) & (boxes[:, 2:].max(axis=1, initial=0) <= _LONGER * long)).any(axis=0)
@@ -289,7 +291,7 @@ class LandmarkTracker:
         for mask, colour in zip(masks, self._colours, strict=True):
             found = find_patches(mask, self._parameters.least_area_px)
             colour.update(found, np.atleast_1d(inside(found.centre_px, boxes).any(axis=1)), now_from_before)
-        # Plates of one team are alike in size: those of others tell the usual size.
+        # The plates of one team have similar sizes, so the other landmarks give the usual size.
         usual = np.inf
         for _ in range(2):
             for colour, where in zip(self._colours, expected_px, strict=True):
@@ -300,10 +302,10 @@ class LandmarkTracker:
     def _couple(
         self, centre: np.ndarray, blobs: np.ndarray, near: np.ndarray, now_from_before: np.ndarray | None, anew: bool
     ) -> np.ndarray:
-        """Which blob is each landmark's: matched again, or the one at its prediction.
+        """Return the blob of each landmark: matched again, or the blob at its predicted place.
 
-        near: (K, N) bool, the blobs at or beside its colour: others are people who walk near a vehicle that is not
-        seen to move. Where the colour is hidden any blob serves.
+        near: (K, N) bool, blobs at or beside the landmark's colour. Other blobs are people who walk near a vehicle that
+        does not seem to move. If the colour is hidden, every blob is allowed.
         """
         if anew:
             match = separate(centre, blobs, self._parameters, near)
@@ -314,7 +316,7 @@ class LandmarkTracker:
         for k, colour in enumerate(self._colours):
             if not colour.coupled:
                 continue
-            # A lost blob, as of a vehicle that stood still, returns at the colour.
+            # A blob that was lost, for example while the vehicle stood still, reappears at the colour.
             predicted[k] = centre[k]
             if np.isfinite(colour.blob_px).all():
                 moved = colour.blob_px if now_from_before is None else transfer(now_from_before, colour.blob_px)[0]
@@ -323,14 +325,14 @@ class LandmarkTracker:
         return separate(predicted, blobs, self._parameters, near | np.isnan(centre[:, :1]))
 
     def _shared(self, match: np.ndarray, touching: np.ndarray, area: np.ndarray, blob_area: np.ndarray) -> np.ndarray:
-        """(N,) bool: the blobs that are much larger than the landmarks at them explain; takes note of what is usual.
+        """Return (N,) bool: blobs much larger than the landmarks at them explain. Also update the usual ratios.
 
-        touching: (K, N) bool. area: (K,) of the landmarks' colours, NaN where not seen.
+        touching: (K, N) bool. area: (K,) areas of the landmarks' colours, NaN if not seen.
         """
         ratio = np.full(len(match), np.nan)
         ratio[match >= 0] = blob_area[match[match >= 0]] / area[match >= 0]
         others = _median_of(ratio[np.isfinite(ratio) & (touching.sum(axis=1) == 1)], np.inf)
-        # Where the colour is hidden, the area that it had stands for it.
+        # If the colour is hidden, use its former area.
         areas = [np.inf if colour.lock is None else colour.lock.area_px for colour in self._colours]
         explained = np.array([_median_of(c.ratios, others) * own for c, own in zip(self._colours, areas, strict=True)])
         limit = np.where(touching, explained.reshape(-1, 1), 0).sum(axis=0)
@@ -342,7 +344,7 @@ class LandmarkTracker:
 
 
 def _covering(box_px: np.ndarray, area_px: np.ndarray, foreground: np.ndarray) -> np.ndarray:
-    """(K, N) bool: the blobs, of areas (N,), that cover a good part of boxes (K, 4), or are covered by them."""
+    """Return (K, N) bool: blobs with areas (N,) that cover a good part of boxes (K, 4), or are covered by them."""
     covers = np.zeros((len(box_px), len(area_px)), bool)
     for k in np.flatnonzero(np.isfinite(box_px).all(axis=1)) if len(area_px) else ():
         part = foreground[window_of(box_px[k], foreground.shape)]
@@ -352,5 +354,5 @@ def _covering(box_px: np.ndarray, area_px: np.ndarray, foreground: np.ndarray) -
 
 
 def _median_of(values: Sequence[float] | np.ndarray, otherwise: float) -> float:
-    """The median of values; `otherwise` where they are too few to say what is usual."""
+    """Return the median of values, or `otherwise` if there are too few of them."""
     return float(np.median(values)) if len(values) >= _ENOUGH else otherwise

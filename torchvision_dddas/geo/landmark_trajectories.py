@@ -1,6 +1,6 @@
-"""Where landmarks are in every frame, from reports that may be slow or drop out, and from the waypoints they plan.
+"""Places of landmarks in every frame, from reports that may be slow or drop out, and from planned waypoints.
 
-Source: appendix A, IV-A: "a GPS dropout costs nothing", as the vehicles share the waypoints that they mean to pass.
+Source: appendix A, IV-A: "a GPS dropout costs nothing", because the vehicles share the waypoints of their plan.
 """
 
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ import numpy as np
 from torchvision_dddas.config import LandmarkParameters
 from torchvision_dddas.types import Adjustment, LandmarkObservations, Landmarks
 
-# Reports further apart than this many times their usual distance have a dropout between them.
+# A dropout lies between reports that are further apart than this many times their usual distance.
 _SLACK = 1.5
-# A landmark's velocity is fitted to the reports of this time.
+# A landmark's velocity is fitted to the reports of this time span.
 _PACE_S = 5.0
 # Hysteresis: landmarks count as well detected again below this share of poor_speed_m_s.
 _CALM = 0.8
-# Other landmarks replace those in use once they are spread better by this factor.
+# Other landmarks replace those in use if their spread is better by this factor.
 _BETTER = 1.25
-# Of more landmarks than this, only this many that lie far apart are tried.
+# If there are more landmarks than this, only this many, far apart, are tried.
 _TRIED = 12
 
 _Place = tuple[np.ndarray, float]
-"""East and north (2,), and its standard deviation in metres."""
+"""East and north (2,), and their standard deviation in metres."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class _Track:
     values: np.ndarray
 
     def at(self, frame: float) -> _Place | None:
-        """Linear between reports; None before the first and after the last."""
+        """Interpolate linearly between reports; None before the first and after the last."""
         if not len(self.frame) or not self.frame[0] <= frame <= self.frame[-1]:
             return None
-        # The sigma is not less between two reports than at them: a receiver's error lasts for longer than that.
+        # The sigma is not smaller between two reports, because a receiver's error lasts longer than that interval.
         east, north, sigma_m = (np.interp(frame, self.frame, row) for row in self.values)
         return np.array([east, north]), float(sigma_m)
 
@@ -45,14 +45,14 @@ class _Track:
 class LandmarkTrajectories:
     """The places of landmarks over a clip; `at` gives those of one frame.
 
-    Between reports a landmark goes straight on. A gap between them that is unusually long is a dropout: there it
-    takes its planned waypoints, shifted by how far its reports lay from them; without a plan it goes straight from
-    report to report in a gap of up to gap_s, or on as it went for gap_s, its sigma growing by drift_m_s. After that it
-    is absent. A landmark's plan alone, without reports, suffices.
+    Between reports a landmark goes straight on. An unusually long gap is a dropout. In a dropout the landmark follows
+    its planned waypoints, shifted by the distance of its reports from them. Without a plan it goes straight from report
+    to report if the gap is at most gap_s; otherwise it continues for gap_s, with a sigma that grows by drift_m_s, and
+    is absent after that. A plan without any report suffices.
     """
 
     def __init__(self, landmarks: Landmarks, parameters: LandmarkParameters, rate_hz: float) -> None:
-        """landmarks: their places in local metres. Raises ValueError for degrees."""
+        """landmarks: places in local metres. Raise ValueError for degrees."""
         if landmarks.geographic:
             raise ValueError("these landmarks are in degrees; wanted local metres")
         self._count, self._parameters, self._rate_hz = len(landmarks.names), parameters, rate_hz
@@ -66,17 +66,19 @@ class LandmarkTrajectories:
 
         self._reports = [track(k, False) for k in range(self._count)]
         self._plans = [track(k, True) for k in range(self._count)]
-        # Longest usual gap; with two reports alone nothing is usual, and no gap up to gap_s is long.
+        # Longest usual gap. Two reports define no usual distance, so gaps up to gap_s are then usual.
         frames = [reports.frame for reports in self._reports]
         self._near = [_SLACK * float(np.median(np.diff(f))) if len(f) > 2 else self._longest for f in frames]
+        rows = [(landmarks.landmark == k) & np.isfinite(landmarks.elevation_m) for k in range(self._count)]
+        self._elevations = [(landmarks.frame[of], landmarks.elevation_m[of]) for of in rows]
         seen = np.isfinite(landmarks.image_px).all(axis=1)
         self._seen_frame, self._seen_landmark = landmarks.frame[seen], landmarks.landmark[seen]
         self._seen_px = landmarks.image_px[seen]
 
     def at(self, frame: int) -> LandmarkObservations:
-        """The landmarks of a frame whose places are known.
+        """Return the landmarks of a frame whose places are known.
 
-        Where the table says places in pictures, those that it has for this frame; else all, with image_px NaN.
+        If the table gives pixels, return the landmarks with a pixel in this frame; otherwise all, with image_px NaN.
         """
         if len(self._seen_frame):
             rows = slice(*np.searchsorted(self._seen_frame, [frame - 0.5, frame + 0.5]))
@@ -95,8 +97,13 @@ class LandmarkTrajectories:
             np.full(len(known), self._parameters.height_m),
         )
 
+    def elevation_m(self, frame: int) -> np.ndarray:
+        """Return the (K,) height above the sea of the ground at each landmark, NaN without a report."""
+        known = [np.interp(frame, *reports) if len(reports[0]) else np.nan for reports in self._elevations]
+        return np.array(known, float)
+
     def speed_m_s(self, frame: int) -> np.ndarray:
-        """(K,) how fast each landmark goes over the ground, over the second around a frame; NaN where unknown."""
+        """Return the (K,) speed of each landmark over the second around a frame; NaN if unknown."""
         half = self._rate_hz / 2
         speeds = np.full(self._count, np.nan)
         for k in range(self._count):
@@ -119,19 +126,19 @@ class LandmarkTrajectories:
             return chord[0], self._grown(chord[1], min(past, ahead))
         if past <= longest:
             return self._straight_on(reports, after - 1, frame)
-        # A table that begins a little after the clip.
+        # The table begins shortly after the clip.
         if after == 0 and ahead <= min(near, longest):
             return self._straight_on(reports, 0, frame)
         return None
 
     def _planned(self, k: int, frame: float, past: float, ahead: float) -> _Place | None:
-        """Along the plan, shifted by how far the reports before and after lay from it."""
+        """Return the place on the plan, shifted by the distance of the reports before and after from the plan."""
         plan, reports = self._plans[k], self._reports[k]
         if (there := plan.at(frame)) is None:
             return None
         place, loose = there
         offsets, weights, sigmas = [], [], []
-        # The nearer report counts for more, so that nothing jumps where a dropout ends.
+        # The nearer report gets more weight, so that the place does not jump at the end of a dropout.
         for distance, weight, at in ((past, ahead, frame - past), (ahead, past, frame + ahead)):
             if np.isfinite(distance) and (meant := plan.at(at)) and (report := reports.at(at)):
                 offsets.append(report[0] - meant[0])
@@ -140,12 +147,12 @@ class LandmarkTrajectories:
         if not offsets:
             return place, loose
         place = place + np.average(offsets, axis=0, weights=weights)
-        # How far it strays from its plan grows with time, up to how well it keeps to it at all.
+        # The deviation from the plan grows with time, up to the stated accuracy of the plan.
         strayed = min(self._parameters.drift_m_s * min(past, ahead) / self._rate_hz, loose)
         return place, float(np.hypot(np.average(sigmas, weights=weights), strayed))
 
     def _straight_on(self, reports: _Track, last: int, frame: float) -> _Place:
-        """From a report on with the velocity of those around it, before it or after the first."""
+        """Extrapolate from a report with the velocity of the reports up to it, or after it if it is the first."""
         usual = _SLACK * float(np.median(np.diff(reports.frame))) if len(reports.frame) > 1 else 0
         gone = frame - reports.frame[last]
         away = (reports.frame[last] - reports.frame) * (1 if gone >= 0 else -1)
@@ -162,7 +169,7 @@ class LandmarkTrajectories:
 
 @dataclass(frozen=True)
 class LandmarkUse:
-    """Which landmarks are in use, and whether more than `least` of them may be: their detection is poor."""
+    """The landmarks in use, and whether more than `least` may be used because their detection is poor."""
 
     landmark: tuple[int, ...] = ()
     poor: bool = False
@@ -171,12 +178,12 @@ class LandmarkUse:
 def select_landmarks(
     frame: int, now: LandmarkUse, marks: LandmarkObservations, speed_m_s: np.ndarray, parameters: LandmarkParameters
 ) -> tuple[np.ndarray, LandmarkUse, tuple[Adjustment, ...]]:
-    """The rows of `marks` to use, of those in view; what is in use from here on; and the record of a change of number.
+    """Return the rows of `marks` to use, the new state of use, and a record if the number of landmarks changes.
 
-    speed_m_s: (n,) over the ground, of the landmarks in marks' order; NaN where unknown.
-    rule = all: every landmark in view. Our study finds six never worse than four; the source's finding of the contrary
-    is one of its numerics. rule = source: more than `least` only where more are in view and their mean speed is above
-    poor_speed_m_s, so that they are detected poorly (appendix A, section V); else those `least` that are best spread.
+    speed_m_s: (n,) speed over the ground of each landmark; NaN if unknown.
+    rule = all: use every landmark in view. In our study six were never worse than four; the source's contrary finding
+    comes from its numerics. rule = source: use more than `least` only if more are in view and their mean speed exceeds
+    poor_speed_m_s, which means poor detection (appendix A, section V); otherwise the `least` with the best spread.
     """
     view = np.flatnonzero(np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1))
     if parameters.rule == "all":
@@ -191,7 +198,7 @@ def select_landmarks(
         poor, cause = True, f"above {limit:g}: they are detected poorly"
     rows = view
     if not poor and len(view) > least:
-        # Those used already, unless others are spread clearly better.
+        # Keep the landmarks in use, unless others are clearly better spread.
         places = marks.east_north_m[view]
         best = best_spread(places, least)
         held = np.flatnonzero(np.isin(marks.landmark[view], now.landmark))
@@ -205,14 +212,14 @@ def select_landmarks(
 
 
 def best_spread(places: np.ndarray, count: int) -> np.ndarray:
-    """(count,) rows of (n, 2) places, sorted, whose smallest triangle is the largest: no three are near one line."""
-    # Of many, those far apart are tried: each the one furthest from those before it.
+    """Return (count,) sorted rows of (n, 2) places whose smallest triangle is largest: no three are near one line."""
+    # Of many places, try those far apart: each is the furthest from those chosen before it.
     most = min(max(count, _TRIED), len(places))
     tried = [int(np.linalg.norm(places - places.mean(axis=0), axis=1).argmax())]
     nearest = np.full(len(places), np.inf)
     while len(tried) < most:
         nearest = np.minimum(nearest, np.linalg.norm(places - places[tried[-1]], axis=1))
-        nearest[tried] = -1.0  # where several are in one place, each is taken once
+        nearest[tried] = -1.0  # places that coincide are each taken once
         tried.append(int(nearest.argmax()))
     if len(tried) > _TRIED:
         return np.sort(tried[:count])
@@ -220,19 +227,19 @@ def best_spread(places: np.ndarray, count: int) -> np.ndarray:
     smallest = np.full(len(sets), np.inf)
     for triple in combinations(range(count), 3):
         smallest = np.minimum(smallest, _area(places[sets[:, triple]]))
-    # Where all lie on one line, those furthest apart.
+    # If all lie on one line, choose the places furthest apart.
     ties = np.flatnonzero(smallest >= smallest.max() * (1 - 1e-9))
     widths = np.ptp(places[sets[ties]], axis=1).sum(axis=1)
     return sets[ties[int(widths.argmax())]]
 
 
 def spread_m2(places: np.ndarray) -> float:
-    """The area of the smallest triangle among (n, 2) places; 0 for fewer than three."""
+    """Return the area of the smallest triangle among (n, 2) places; 0 for fewer than three."""
     triples = np.array(list(combinations(range(len(places)), 3)), int).reshape(-1, 3)
     return float(_area(places[triples]).min()) if len(triples) else 0.0
 
 
 def _area(corners: np.ndarray) -> np.ndarray:
-    """(T,) of triangles (T, 3, 2)."""
+    """Return the (T,) areas of triangles (T, 3, 2)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2

@@ -1,11 +1,12 @@
-"""Landmarks in the pictures of a clip: found by their colours or given by the table, and removed from the targets.
+"""Find landmarks in the pictures of a clip by their colours or by a table, and remove them from the targets.
 
-Then crowds: targets that are close together on the ground and move alike count as one target. Appendix A takes each
-crowd for one target of the aerial camera. How far its people may be apart is in metres here, not in pixels of a
+Then group crowds: targets that are close together on the ground and move alike become one target. Appendix A treats
+each crowd as one target of the aerial camera. The distance within a crowd is given in metres here, not in pixels of a
 closing kernel, so that it is the same at every altitude.
 """
 
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,25 +14,36 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.aerial_locator import AerialLocator, FrameFix
-from torchvision_dddas.geo.colours import ColourFinder, load_colours
+from torchvision_dddas.geo.colours import mask_colours
 from torchvision_dddas.geo.landmark_tracking import LandmarkTracker, TrackedLandmarks
 from torchvision_dddas.geo.plane_homography import LEAST
 from torchvision_dddas.geometry import connected_parts, distort_pixels, inside, middles_of, project, transfer
-from torchvision_dddas.types import Bool, Colours, Detections, Fix, Float, Int, LandmarkObservations, Landmarks, Scene
+from torchvision_dddas.types import (
+    Bool,
+    Colours,
+    Detections,
+    Fix,
+    Float,
+    Int,
+    LandmarkObservations,
+    Landmarks,
+    Scene,
+    most_common,
+)
 
-# A vehicle reaches this far from its colour, in its lengths: its corners, and its shadow.
+# A vehicle and its shadow reach this far from its colour, in vehicle lengths.
 _REACH = 0.75
-# What is left of a blob beside a vehicle is a target from this area on: a person with a shadow.
+# The rest of a blob beside a vehicle is a target if it has at least this area: a person with a shadow.
 _LEAST_M2 = 0.4
-# What is left of a vehicle's own blob must be this many times larger: as a rule it is the vehicle's shadow.
+# The rest of a vehicle's own blob must be this many times larger, because it is usually the vehicle's shadow.
 _VEHICLE_REST = 4
-# A blob's centre so many standard deviations from where the landmark is expected gives way to a colour half as far.
+# A blob's centre this many standard deviations from the expected place is replaced by a colour at half the distance.
 _ASTRAY_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
 class WatchedScene:
-    """A scene without the landmarks, its fix, and by what each landmark was found: motion, colour or table."""
+    """A scene without the landmarks, its fix, and how each landmark was found: motion, colour or table."""
 
     scene: Scene
     fixed: FrameFix
@@ -44,21 +56,21 @@ def without_pixels(landmarks: Landmarks) -> Landmarks:
 
 
 def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -> None:
-    """Raises InputError where the landmarks and colours cannot locate any picture.
+    """Raise InputError if the landmarks and colours cannot locate any picture.
 
-    helped: whether telemetry says where the camera is.
+    helped: whether telemetry gives the place of the camera.
     """
     if colours is None:
         if not np.isfinite(landmarks.image_px).all(axis=1).any():
             raise InputError(
-                f"landmarks {landmarks.path} say no places in pictures (u_px,v_px); give --colours FILE, the colours "
-                "that they wear, as `dddas colours` writes it"
+                f"landmarks {landmarks.path} give no pixels (u_px,v_px); give --colours FILE with the colours of the "
+                "landmarks, as `dddas colours` writes it"
             )
         return
     if strange := [name for name in colours.names if name not in landmarks.names]:
         raise InputError(
-            f"the colours name {', '.join(strange)}, the landmarks {landmarks.path} {', '.join(landmarks.names)}; "
-            "wanted the same names in both"
+            f"the colours name {', '.join(strange)}, but the landmarks {landmarks.path} are "
+            f"{', '.join(landmarks.names)}; use the same names in both"
         )
     if len(colours) < LEAST and not helped:
         raise InputError(
@@ -70,38 +82,37 @@ def check_colours(landmarks: Landmarks, colours: Colours | None, helped: bool) -
 class LandmarkWatch:
     """Locates the scenes of a clip in order, and removes landmarks from their targets."""
 
-    def __init__(self, locator: AerialLocator, colours: Colours | None, backend: str) -> None:
-        """colours: None where the table of landmarks gives their pixels. backend: finds colours; see `load_colours`."""
-        self.locator, self._colours, self._backend = locator, colours, backend
-        self._finder = load_colours(backend) if colours is not None else None
+    def __init__(self, locator: AerialLocator, colours: Colours | None) -> None:
+        """colours: None if the table of landmarks gives their pixels."""
+        self.locator, self._colours = locator, colours
         self._fix: Fix | None = None
         if colours is not None:
             names = locator.site.landmarks.names
-            # The colour of each landmark, -1 for none.
+            # Index of the colour of each landmark, -1 for none.
             self._colour_of = np.full(len(names), -1)
             self._colour_of[[names.index(name) for name in colours.names]] = np.arange(len(colours))
             self._tracker = LandmarkTracker(len(colours), locator.settings.landmarks)
 
     def restarted(self) -> "LandmarkWatch":
-        """The same watch as before its first scene."""
-        return LandmarkWatch(self.locator.restarted(), self._colours, self._backend)
+        """Return this watch in its state before the first scene."""
+        return LandmarkWatch(self.locator.restarted(), self._colours)
 
     def update(self, scene: Scene) -> WatchedScene:
-        """The next scene, without its landmarks, and its fix."""
+        """Locate the next scene, and return it without its landmarks."""
         start = time.perf_counter()
         marks = self.locator.landmarks_at(scene.frame.number)
-        if self._colours is not None and self._finder is not None:
-            marks, scene, by = self._find(scene, marks, self._colours, self._finder)
+        if self._colours is not None:
+            marks, scene, by = self._find(scene, marks, self._colours)
         else:
             by = np.full(len(marks), "table")
-            # The smallest box that holds a landmark is its own.
+            # The smallest box around a landmark belongs to it.
             box_px, shown = scene.detections.box_px, np.isfinite(marks.image_px).all(axis=1)
             area = np.where(inside(marks.image_px[shown], box_px), box_px[:, 2] * box_px[:, 3], np.inf)
             own = np.zeros(len(box_px), bool)
             own[[row.argmin() for row in area if np.isfinite(row).any()]] = True
             scene = without_detections(scene, own)
         spent = time.perf_counter() - start
-        fixed = self.locator.fix_frame(scene.frame.number, marks, scene.frame.time_s)
+        fixed = self.locator.fix_frame(scene.frame.number, marks, time_s=scene.frame.time_s)
         self._fix = fixed.fix
         found_by = dict(zip(marks.landmark.tolist(), by.tolist(), strict=True))
         return WatchedScene(
@@ -111,9 +122,9 @@ class LandmarkWatch:
         )
 
     def _find(
-        self, scene: Scene, marks: LandmarkObservations, colours: Colours, finder: ColourFinder
+        self, scene: Scene, marks: LandmarkObservations, colours: Colours
     ) -> tuple[LandmarkObservations, Scene, np.ndarray]:
-        """The landmarks with their pixels, the scene without them, and by what each was found."""
+        """Return the landmarks with their pixels, the scene without them, and how each was found."""
         image, step = scene.frame.image, scene.camera_motion
         if image.ndim == 2:
             raise InputError(
@@ -126,28 +137,28 @@ class LandmarkWatch:
         should_px, px_per_m = self._expected(marks, step)
         expected[colour] = should_px[rows]
         length[colour] = self.locator.settings.landmarks.length_m * px_per_m[rows]
-        masks = finder(image, colours.low, colours.high)
+        masks = mask_colours(image, colours.low, colours.high)
         seen = self._tracker.update(scene.frame.number, masks, scene.detections, scene.mask, step, expected, length)
         pixels, by = np.full((len(marks), 2), np.nan), np.full(len(marks), "", "<U6")
         pixels[rows], by[rows] = seen.image_px[colour], np.array(seen.by, "<U6")[colour]
-        # Often only a part of a slow vehicle is seen to move, and the centre of that part is not the vehicle's. The
-        # place of the colour is taken where it is clearly nearer to the expected place of the landmark.
+        # Often only a part of a slow vehicle moves visibly, and the centre of that part is not the vehicle's centre.
+        # The place of the colour is used if it is clearly nearer to the expected place of the landmark.
         worn = np.full((len(marks), 2), np.nan)
         worn[rows] = seen.colour_px[colour]
         off, colour_off = (np.linalg.norm(at - should_px, axis=1) for at in (pixels, worn))
         astray = (by == "motion") & (off > _ASTRAY_SIGMAS * marks.pixel_sigma) & (colour_off < 0.5 * off)
         pixels[astray], by[astray] = worn[astray], "colour"
-        # Blobs include shadows: their pixels are moved to the vehicle's feet. Colours stay at height_m.
+        # Blobs include shadows, so their pixels are moved to the vehicle's feet. Colours stay at height_m.
         height, moving, up_m = self.locator.settings.landmarks.height_m, by == "motion", marks.up_m.copy()
         if height and moving.any():
-            feet = None if self._fix is None else self.locator.feet_px(pixels[moving], self._fix, height)
+            feet = None if self._fix is None else self.locator.feet_px(self._fix, pixels[moving], height)
             up_m[moving] -= height / 2 if feet is None else height
             if feet is not None:
                 pixels[moving] = feet
         return replace(marks, up_m=up_m, image_px=pixels), self._cut(scene, seen, length), by
 
     def _cut(self, scene: Scene, seen: TrackedLandmarks, length_px: np.ndarray) -> Scene:
-        """The scene without the landmarks' own blobs, and without their part of shared ones."""
+        """Return the scene without the landmarks' own blobs, and without their part of shared blobs."""
         settings = self.locator.settings
         if scene.mask.shape != scene.frame.image.shape[:2] or not len(scene.detections):
             return without_detections(scene, seen.rows)
@@ -160,9 +171,9 @@ class LandmarkWatch:
         return replace(scene, detections=found, mask=mask)
 
     def _expected(self, marks: LandmarkObservations, step: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 2) where the landmarks should be, by how the frame before lay on the ground, and (n,) pixels a metre.
+        """Predict the pixels (n, 2) of the landmarks from the fix of the frame before, and (n,) pixels a metre.
 
-        NaN where unknown.
+        Both are NaN if unknown.
         """
         fix, camera = self._fix, self.locator.camera
         beside = np.concatenate([marks.east_north_m + metre for metre in ((0, 0), (1, 0), (0, 1))])
@@ -178,7 +189,7 @@ class LandmarkWatch:
 
 
 def without_detections(scene: Scene, rows: Bool[np.ndarray, " N"]) -> Scene:
-    """A scene without some of its detections."""
+    """Return a scene without the detections in `rows`."""
     if not rows.any():
         return scene
     value = np.zeros(len(rows) + 1, np.uint16)
@@ -194,11 +205,11 @@ def cut_out_landmarks(
     radius_px: Float[np.ndarray, " K"],
     least_px: float,
 ) -> tuple[Detections, np.ndarray]:
-    """The detections without the discs about vehicles' middles, and the (H, W) mask of them.
+    """Remove the discs around vehicles' middles from the detections, and return them with their (H, W) mask.
 
-    vehicles: which of them are landmarks: of these stays what is left outside the discs, if it is large enough; where a
-    middle or radius is unknown (NaN), nothing. Parts smaller than least_px go, of landmarks those four times as large.
-    A target that no disc touches stays as it is.
+    vehicles: which detections are landmarks. Of these, only parts outside the discs stay, if they are large enough;
+    nothing stays if a middle or radius is unknown (NaN). Parts smaller than least_px are dropped, those of landmarks if
+    smaller than four times least_px. A target that no disc touches is unchanged.
     """
     known = np.isfinite(middle_px).all(axis=1) & np.isfinite(radius_px)
     outside = mask.copy()
@@ -207,7 +218,7 @@ def cut_out_landmarks(
     rows, boxes, areas = [], [], []
     numbered = np.zeros_like(mask)
     for row, (x, y, width, height) in enumerate(found.box_px.astype(int).tolist()):
-        # Boxes of blobs lie within the picture. The whole blob of a vehicle without a known disc is removed.
+        # Boxes of blobs lie within the picture. A vehicle's whole blob is removed if its disc is unknown.
         left, top = max(x, 0), max(y, 0)
         window = np.s_[top : y + height, left : x + width]
         rest, whole = outside[window] == row + 1, mask[window] == row + 1
@@ -229,7 +240,7 @@ def cut_out_landmarks(
 
 
 def group_crowds(watched: WatchedScene, locator: AerialLocator, rate_hz: float) -> WatchedScene:
-    """The scene with each crowd as one target; unchanged where crowds are switched off or the fix is unknown.
+    """Return the scene with each crowd as one target; unchanged if crowds are off or the fix is unknown.
 
     rate_hz: frames a second; speed_px of the detections is in pixels a frame.
     """
@@ -242,8 +253,8 @@ def group_crowds(watched: WatchedScene, locator: AerialLocator, rate_hz: float) 
     place, onward = (locator.ground_places(fix, pixels) for pixels in (found.middle_px, found.middle_px + ahead))
     velocity, radius = (onward - place) * rate_hz, locator.ground_radii(fix, found.box_px)
     marks, length_m = locator.landmarks_at(scene.frame.number), locator.settings.landmarks.length_m
-    # What is no larger than a vehicle and lies where one reports to be is part of it or its shadow, whether or not its
-    # colour is seen.
+    # A detection no larger than a vehicle, at a place that a vehicle reports, is part of the vehicle or its shadow,
+    # whether or not its colour is seen.
     away = np.linalg.norm(place[:, None] - marks.east_north_m[None], axis=-1)
     beside = (away <= length_m + 2 * marks.sigma_m).any(axis=1) & (radius <= length_m / 2)
     scene = without_detections(replace(scene, detections=found), beside)
@@ -259,15 +270,15 @@ def group_targets(
     join_m: float,
     speed_m_s: float,
 ) -> Int[np.ndarray, " N"]:
-    """The crowd of each target, numbered from 0 in the order of the first targets.
+    """Return the crowd of each target, numbered from 0 in the order of the first targets.
 
     Two targets are in one crowd if the gap between their rims is at most join_m and their velocities differ by at most
-    speed_m_s; the relation is transitive. A target of unknown place is alone. An unknown velocity differs from none.
+    speed_m_s; the relation is transitive. A target of unknown place is alone. An unknown velocity matches every other.
     """
     count = len(place_m)
     apart = np.linalg.norm(place_m[:, None] - place_m[None], axis=-1) - radius_m[:, None] - radius_m[None]
     away = np.linalg.norm(velocity_m_s[:, None] - velocity_m_s[None], axis=-1)
-    # NaN compares as false: an unknown place is near none, an unknown velocity differs from none.
+    # Comparisons with NaN are false: an unknown place is near no other, and an unknown velocity differs from no other.
     near = (apart <= join_m) & ~(away > speed_m_s) | np.eye(count, dtype=bool)
     leader = np.arange(count)
     while True:
@@ -281,9 +292,10 @@ def group_targets(
 def merge_detections(
     found: Detections, mask: np.ndarray, crowd: Int[np.ndarray, " N"]
 ) -> tuple[Detections, np.ndarray]:
-    """The crowds as detections, and the (H, W) mask with their numbers. crowd: as by `group_targets`.
+    """Return the crowds as detections, and the (H, W) mask with their numbers. crowd: as from `group_targets`.
 
-    The velocity of a crowd is the mean of its parts', weighted by area; its middle is the mean of their foreground.
+    The velocity of a crowd is the mean of its targets' velocities, weighted by area; its middle is the mean of their
+    foreground, and its class is the most frequent one.
     """
     size = int(crowd.max(initial=-1)) + 1
     area = np.maximum(found.area_px, 1e-9)
@@ -305,4 +317,10 @@ def merge_detections(
     heading = np.where(speed > 0, np.arctan2(down, across), np.nan)
     box_px = np.c_[low, high - low].reshape(-1, 4)
     number = np.r_[0, crowd + 1].astype(mask.dtype)
-    return Detections(box_px, score, total(found.area_px), heading, speed, found.kind, middle), number[mask]
+    classes = [Counter[tuple[str, int]]() for _ in range(size)]
+    for k, label, class_id in zip(crowd.tolist(), found.label.tolist(), found.class_id.tolist(), strict=True):
+        classes[k][label, class_id] += 1
+    common = [most_common(one) for one in classes]
+    label, class_id = np.array([one for one, _ in common], object), np.array([one for _, one in common], np.int64)
+    merged = Detections(box_px, score, total(found.area_px), heading, speed, found.kind, middle, label, class_id)
+    return merged, number[mask]

@@ -1,8 +1,8 @@
-"""The plane homography from ground to picture by landmarks alone, its solvers, and pixels to places on the ground.
+"""Fit the plane homography from ground to picture by landmarks alone, and locate pixels on the ground.
 
-The homography (appendix A, IV-B, eq. 6 to 11) has eight unknowns; each landmark is weighted by how well it is known.
-`paper` solves as the source does, by normal equations of raw degrees. Eq. (11) prints 1 where the last element of the
-inverse belongs; here it has its place. With a known pose of the camera, pixels go to the ground by rays instead.
+The homography (appendix A, IV-B, eq. 6 to 11) has eight unknowns; each landmark is weighted by its accuracy.
+`paper` solves as the source does, by normal equations of raw degrees. Eq. (11) prints 1 in place of the last element of
+the inverse; here that element is used. If the camera's pose is known, pixels are mapped to the ground by rays instead.
 """
 
 from collections.abc import Callable
@@ -15,35 +15,35 @@ from torchvision_dddas.geometry import Surface, ground_with_slopes, inverse_2x2,
 from torchvision_dddas.runtime import SHIPPED, opened, wants_torch
 from torchvision_dddas.types import Camera, Fix, Float, LandmarkObservations
 
-# Landmarks that a plane homography takes.
+# Number of landmarks that a plane homography needs.
 LEAST = 4
-# A homography is refused whose depth at a landmark is no better known than this, as a share of it.
+# Refuse a homography if the relative standard deviation of its depth at a landmark exceeds this.
 _VAGUE = 0.3
 
 Solution = tuple[np.ndarray, np.ndarray]
-"""image_from_ground (B, 3, 3), h33 = 1, the identity where invalid, and whether each is valid (B,)."""
+"""image_from_ground (B, 3, 3), with h33 = 1 and the identity where invalid, and whether each is valid (B,)."""
 
 
 class PlaneSolver:
-    """Batched solver of plane homographies in float64: the shipped ONNX graphs, or torch; they agree to 1e-6 px."""
+    """Batched float64 solver of plane homographies: the shipped ONNX graphs or torch, which agree to 1e-6 px."""
 
     def __init__(self, fit: Callable[..., Solution], fit_raw: Callable[..., Solution]) -> None:
-        """The functions of `functional.plane_maps` on arrays."""
+        """fit, fit_raw: the functions of `functional.plane_maps`, on arrays."""
         self._fit, self._fit_raw = fit, fit_raw
 
     def solve(self, ground: np.ndarray, image: np.ndarray, weight: np.ndarray) -> Solution:
-        """Weighted least squares, Hartley-normalised, of ground and image (B, n, 2).
+        """Solve by weighted least squares with Hartley normalisation; ground and image are (B, n, 2).
 
-        weight: (B, n), 0 for a row that is padding, whatever it holds.
+        weight: (B, n), 0 for a padding row, whose values are ignored.
         """
-        # Zero times NaN is not zero.
+        # Padding may hold NaN, which a weight of zero does not remove: 0 x NaN is NaN.
         ground, image = (np.where(weight[..., None] > 0, points, 0.0) for points in (ground, image))
         return self._solve(self._fit, ground, image, weight)
 
     def solve_raw(self, ground: np.ndarray, image: np.ndarray) -> Solution:
-        """As the source solves it: normal equations of the given coordinates, such as degrees.
+        """Solve as the source does: by normal equations of the given coordinates, such as degrees.
 
-        On an ill-conditioned system the two engines err differently.
+        On an ill-conditioned system the errors of the two engines differ.
         """
         return self._solve(self._fit_raw, ground, image)
 
@@ -56,7 +56,7 @@ class PlaneSolver:
 
 
 def load_solver(backend: str) -> PlaneSolver:
-    """The solver of a back end: auto, onboard or torch. Raises InputError for another name or missing packages."""
+    """Return the solver of a back end: auto, onboard or torch. Raise InputError for other names or missing packages."""
     if not wants_torch(backend, auto_with_gpu=False):
         fit, fit_raw = open_graph("homography"), open_graph("homography_raw")
         return PlaneSolver(
@@ -75,7 +75,7 @@ def load_solver(backend: str) -> PlaneSolver:
 
 @cache
 def open_graph(name: str) -> Any:
-    """An ONNX Runtime session of a shipped graph. Opening one takes longer than thousands of solutions."""
+    """Open an ONNX Runtime session of a shipped graph, once: opening takes longer than thousands of solutions."""
     return opened(SHIPPED, f"{name}.onnx")
 
 
@@ -87,10 +87,10 @@ def fix_by_homography(
     degrees: tuple[np.ndarray, tuple[float, float]] | None = None,
     paper: bool = False,
 ) -> Fix:
-    """The homography of the landmarks; by = "" and a cause where there are too few or they stand on one line.
+    """Fit the homography of the landmarks; by = "" and a cause if they are too few or stand on one line.
 
-    marks: none may lack its pixel or its place. degrees, for `paper`: their longitudes and latitudes (n, 2), and the
-    origin of the local metres; without them `paper` solves the local metres.
+    marks: every landmark needs a pixel and a place. degrees, for `paper`: longitudes and latitudes (n, 2), and the
+    origin of the local metres; without degrees, `paper` solves the local metres.
     """
     n = len(marks)
     cause = describe_too_few(frame, n) if n < LEAST else describe_one_line(frame, marks, least_spread)
@@ -112,9 +112,9 @@ def fix_by_homography(
             degrees_from_metres[:2, :2] = (corner[1:] - corner[0]).T
             degrees_from_metres[:2, 2] = corner[0] - degrees_from_metres[:2, :2] @ middle
             ours = ours @ degrees_from_metres
-        # Its errors are unknown.
+        # The errors of this fix are unknown.
         return Fix(frame, "paper", image_from_ground=ours / ours[2, 2], landmark=marks.landmark, state=("used",) * n)
-    # Centred: with the origin far away, or on the line that the picture shows nowhere, h33 = 1 would not do.
+    # Centre the ground: h33 = 1 fails if the origin is far away or on the line that has no image.
     ground, image = marks.east_north_m - middle, marks.image_px
     variance = marks.pixel_sigma**2
     grown = np.linalg.norm(image - image.mean(axis=0)) / np.linalg.norm(ground)
@@ -128,7 +128,7 @@ def fix_by_homography(
         seen += by_ground @ by_ground.swapaxes(1, 2) * (marks.sigma_m**2)[:, None, None]
         applied = weight * depth**2
         if again:
-            # The solver's residuals are in pixels times this depth: now that it is known, each row is weighted rightly.
+            # The solver's residuals are in pixels times this depth. It is now known, so each row gets its right weight.
             weight = 2 / (depth**2 * np.trace(seen, axis1=1, axis2=2))
             weight = weight / weight.max()
     if (depth <= 0).any() and (depth >= 0).any():
@@ -140,8 +140,8 @@ def fix_by_homography(
     vague = np.sqrt(np.einsum("ni,ij,nj->n", ground, covariance[6:, 6:], ground)) / np.abs(depth)
     if vague.max() > _VAGUE:
         cause = (
-            f"the {n} landmarks of frame {frame} lie too near one line, three of them or all, for how well they are "
-            "known: their homography would be no more than a guess; add a landmark off the line, or telemetry"
+            f"the {n} landmarks of frame {frame} lie too near one line, three of them or all, for their accuracy: "
+            "the homography would be a guess; add a landmark off the line, or telemetry"
         )
         return no_fix(frame, marks, cause)
     far = _about(matrix[0], -middle)
@@ -157,33 +157,33 @@ def fix_by_homography(
 
 
 def no_fix(frame: int, marks: LandmarkObservations, cause: str) -> Fix:
-    """A fix that concludes nothing, with its cause in words."""
+    """Return a fix without a result, with its cause in words."""
     return Fix(frame, "", landmark=marks.landmark, state=("excluded",) * len(marks), cause=cause)
 
 
 def describe_too_few(frame: int, n: int, without: str = "") -> str:
-    """How many landmarks are missing in which frame, in words."""
+    """Return a message on how many landmarks are missing in which frame."""
     has = f"{n} landmark{'s' * (n != 1)}" if n else "no landmark"
     return f"frame {frame} has {has}{without}, {LEAST - n} missing of the {LEAST} that are needed"
 
 
 def describe_one_line(frame: int, marks: LandmarkObservations, least_spread: float) -> str:
-    """In words, why landmarks allow no fix: they lie on one line or in one spot. Empty where they are spread out."""
+    """Return why landmarks allow no fix: they lie on one line or in one spot. Empty if they are spread out."""
     if len(marks) and np.linalg.norm(marks.image_px - marks.image_px.mean(axis=0)) <= np.linalg.norm(marks.pixel_sigma):
         return f"the {len(marks)} landmarks of frame {frame} show in one spot of the picture"
     wide = relative_width(marks)
     if wide >= least_spread:
         return ""
     return (
-        f"the {len(marks)} landmarks of frame {frame} stand on one line: {wide:.3f} wide of 1 long, below "
+        f"the {len(marks)} landmarks of frame {frame} stand on one line: width over length is {wide:.3f}, below "
         f"aerial.least_spread = {least_spread:g}; a homography needs them spread, a pose needs telemetry"
     )
 
 
 def relative_width(marks: LandmarkObservations) -> float:
-    """Width of the landmarks as a share of their length, on the ground or in the picture, whichever is less.
+    """Return the width of the landmarks as a share of their length, on the ground or in the picture, the smaller one.
 
-    Receiver errors make a row on the ground wider than it is; in the picture it is a row whatever the errors.
+    Receiver errors make a row on the ground look wider than it is; in the picture they do not matter.
     """
     shares = []
     for points in (marks.east_north_m, marks.image_px):
@@ -200,10 +200,10 @@ def locate_pixels(
     up_m: float | Float[np.ndarray, "N"] = 0.0,
     surface: Surface | None = None,
 ) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2 2"]]:
-    """East and north of what pixels show, and the covariance relative to the landmarks' team; NaN where there is none.
+    """Return east and north of pixels, and the covariance relative to the landmarks' team; NaN without ground.
 
-    sigma_px: standard deviation of u and of v each. up_m: height of what is seen above the ground: the plane up = 0 or
-    the surface. A homography uses neither of them.
+    sigma_px: standard deviation of u and of v each. up_m: height of the points above the ground, which is the plane
+    up = 0 or the surface. A homography uses neither up_m nor the surface.
     """
     pixels = np.asarray(pixels, float).reshape(-1, 2)
     if fix.pose is not None and fix.covariance is not None:
@@ -236,7 +236,7 @@ def locate_pixels(
 
 
 def _slopes(ground: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth (n,) of eq. (6), and derivatives of the pixels by the ground (n, 2, 2) and by the matrix (n, 2, 8)."""
+    """Return the depth (n,) of eq. (6), and derivatives of the pixels by ground (n, 2, 2) and matrix (n, 2, 8)."""
     n = len(ground)
     rows = np.c_[ground, np.ones(n)]
     mapped = rows @ matrix.T
@@ -250,7 +250,7 @@ def _slopes(ground: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _about(matrix: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """A homography on ground coordinates that are counted from a middle."""
+    """Return a homography on ground coordinates that are counted from a middle."""
     shift = np.eye(3)
     shift[:2, 2] = middle
     return matrix @ shift

@@ -1,9 +1,9 @@
-"""Where the camera is: the likeliest pose, given telemetry and landmarks, all with their errors.
+"""Estimate the likeliest pose of the camera from telemetry and landmarks, all with their errors.
 
-Unknown are a small rotation about east, north and up (so that straight down is a view like any other), the place, the
-log of the focal length, and the places of the landmarks themselves: their receivers err too, and each landmark is
-weighted by how well it is known. The expectation is an information matrix, which may know nothing of some of them.
-Levenberg and Marquardt's steps find the least sum of squares; its inverse curvature is the covariance.
+The unknowns are a small rotation about east, north and up (so that straight down is a view like any other), the place,
+the log of the focal length, and the places of the landmarks: their receivers err too, and each landmark is weighted by
+its accuracy. The prior is an information matrix, in which some unknowns may have no information. Levenberg-Marquardt
+steps minimize the sum of squares; the inverse of its curvature is the covariance.
 """
 
 from dataclasses import dataclass, replace
@@ -24,20 +24,20 @@ from torchvision_dddas.geometry import (
 )
 from torchvision_dddas.types import Bool, Camera, CameraPose, Flight, Float, LandmarkObservations
 
-# Least standard deviation of a landmark's place: below, the curvature could not be inverted.
+# The smallest standard deviation of a landmark's place, m. With a smaller one the curvature matrix is singular.
 EXACT_M = 1e-3
-# The element of a pose that turns the heading, and the number of headings that are tried where none is known.
+# Index of the heading in a pose, and the number of headings that are tried if none is known.
 _HEADING, _HEADINGS = 2, 8
-# Most steps; the squared length of the last one, in standard deviations; a step that reduces the sum of squares by a
-# smaller share is the last, too.
+# Most steps; the squared length of the last step, in standard deviations; and the relative reduction of the sum of
+# squares below which a step is the last.
 _STEPS, _ENOUGH, _NO_BETTER = 30, 1e-5, 1e-5
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is expected of a pose before any landmark is seen.
+    """The expected pose before any landmark is seen.
 
-    information: (7, 7), in the order of Fix, inverse of its covariance; a row of zeros where nothing is known.
+    information: (7, 7), in the order of Fix, inverse of the pose's covariance; a row of zeros for an unknown parameter.
     """
 
     pose: CameraPose
@@ -45,16 +45,16 @@ class Prior:
 
     @property
     def known(self) -> Bool[np.ndarray, "7"]:
-        """Which of the seven have a prior."""
+        """(7,) which parameters have a prior."""
         return np.diag(self.information) > 0
 
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a pose and of n landmarks before they are seen in a picture.
+    """The expected pose and places of n landmarks before they are seen in a picture.
 
-    reference: what telemetry says. mean: (7 + 2n,) what to add to it and to the landmarks' reports.
-    information: (7 + 2n, 7 + 2n) of those sums. known: (7,) of which of the pose something is known.
+    reference: the pose by telemetry. mean: (7 + 2n,) expected corrections of the reference and of the landmarks'
+    reports. information: (7 + 2n, 7 + 2n) of the corrected values. known: (7,) which pose parameters have a prior.
     """
 
     reference: CameraPose
@@ -67,11 +67,11 @@ class Expected:
 class Linearization:
     """The sum of squares about a pose and places (n, 2) of landmarks, as a function of a step of these 7 + 2n.
 
-    missing: (2m,) px, where the picture has the m landmarks used, u and v in turn, less where they should be. slopes:
-    (2m, 7 + 2n) how the latter grow. correction: (7 + 2n,) what pose and places have beyond what telemetry and
-    landmarks report; by_turn: (3, 3) how its first three grow with a small rotation, the others with their own step.
-    cost: the sum of squares, in standard deviations; downhill (7 + 2n,): half its negative gradient; curvature: half
-    its second derivatives.
+    missing: (2m,) px, observed minus expected pixels of the m landmarks used, u and v in turn. slopes: (2m, 7 + 2n)
+    derivatives of the expected pixels. correction: (7 + 2n,) pose and places minus the values that telemetry and
+    landmarks report; by_turn: (3, 3) derivative of its first three by a small rotation, the others grow with their own
+    step. cost: the sum of squares, in standard deviations; downhill: (7 + 2n,) half its negative gradient; curvature:
+    half its second derivatives.
     """
 
     pose: CameraPose
@@ -86,11 +86,11 @@ class Linearization:
 
 
 @dataclass(frozen=True)
-class Solution(Linearization):
-    """The most likely pose and places, where the sum of squares is least.
+class PoseSolution(Linearization):
+    """The most likely pose and places, at the least sum of squares.
 
-    covariance: (7 + 2n, 7 + 2n) of pose and places; correction_covariance: the same of the correction. cost is
-    chi-squared with `freedom` degrees of freedom where all is as expected.
+    covariance: (7 + 2n, 7 + 2n) of pose and places; correction_covariance: the same for the correction. cost follows a
+    chi-squared distribution with `freedom` degrees of freedom if all errors are as expected.
     """
 
     covariance: np.ndarray
@@ -101,9 +101,9 @@ class Solution(Linearization):
 def pose_prior(
     flight: Flight | None, camera: Camera, parameters: AerialParameters, focal_known: bool = True
 ) -> Prior | None:
-    """The prior of the pose by telemetry; None without place, height and angles.
+    """Return the prior of the pose by telemetry; None without place, height and angles.
 
-    flight: its place in local metres. focal_known: the focal length is given, not guessed from a field of view.
+    flight: with its place in local metres. focal_known: the focal length is given, not guessed from a field of view.
     """
     if flight is None:
         return None
@@ -112,15 +112,16 @@ def pose_prior(
     if not (np.isfinite(place).any() or np.isfinite(angles).any()):
         return None
     sigma = np.full(7, np.inf)
-    # Without a pitch the tilt is no more than a guess.
+    # Without a pitch the tilt is only a guess.
     tilt = parameters.tilt_sigma_deg if np.isfinite(angles[1]) else parameters.tilt_guess_sigma_deg
     sigma[:2] = _known_or(flight.tilt_sigma_rad, np.radians(tilt))
     if np.isfinite(angles[0]):
         sigma[2] = _known_or(flight.heading_sigma_rad, np.radians(parameters.heading_sigma_deg))
-    sigma[3:5] = np.where(np.isfinite(place[:2]), parameters.position_sigma_m, np.inf)
+    position = _known_or(flight.position_sigma_m, parameters.position_sigma_m)
+    sigma[3:5] = np.where(np.isfinite(place[:2]), position, np.inf)
     if np.isfinite(place[2]):
         usual = float(np.hypot(parameters.altitude_sigma * flight.altitude_m, parameters.altitude_sigma_m))
-        sigma[5] = _known_or(flight.altitude_sigma_m, usual)
+        sigma[5] = np.hypot(_known_or(flight.altitude_sigma_m, usual), parameters.datum_sigma_m)
     bare = focal_prior(camera, parameters, focal_known)
     focal, information = bare.pose.focal, bare.information
     if np.isfinite(flight.hfov_rad) and 0 < flight.hfov_rad < np.pi:
@@ -137,14 +138,14 @@ def _known_or(value: float, otherwise: float) -> float:
 
 
 def focal_prior(camera: Camera, parameters: AerialParameters, focal_known: bool = True) -> Prior:
-    """The prior without telemetry: the focal length alone."""
+    """Return the prior without telemetry: only the focal length is known."""
     sigma = camera.focal_sigma if focal_known else parameters.focal_guess_sigma
     pose = CameraPose(np.zeros(3), axes_of(0.0, np.radians(parameters.pitch_deg), 0.0))
     return Prior(pose, np.diag([0.0] * 6 + [1 / max(sigma, 1e-6) ** 2]))
 
 
 def independent_expectation(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Expected:
-    """The expectation of a single picture: pose and landmarks are independent."""
+    """Return the expectation for a single picture: the errors of pose and landmarks are independent."""
     size = 7 + 2 * len(sigma_m)
     information = np.zeros((size, size))
     information[:7, :7] = prior.information
@@ -155,10 +156,10 @@ def independent_expectation(prior: Prior, sigma_m: Float[np.ndarray, "n"]) -> Ex
 
 def find_pose(
     marks: LandmarkObservations, camera: Camera, expected: Expected, used: Bool[np.ndarray, "n"] | None = None
-) -> Solution | None:
-    """The most likely of the poses found from all available starts; None without any.
+) -> PoseSolution | None:
+    """Return the most likely of the poses found from all available starts; None without any.
 
-    marks: none may lack its pixel or its place. used: the landmarks whose pixels count; all without it.
+    marks: every landmark needs a pixel and a place. used: the landmarks whose pixels count; default: all.
     """
     used = np.ones(len(marks), bool) if used is None else used
     known, reported = expected.known, move_pose(expected.reference, expected.mean[:7])
@@ -179,8 +180,8 @@ def find_pose(
 
 def _fit(
     marks: LandmarkObservations, camera: Camera, expected: Expected, used: np.ndarray, start: CameraPose
-) -> Solution | None:
-    """The likeliest pose and places from a start; None where the camera cannot show a landmark there."""
+) -> PoseSolution | None:
+    """Return the likeliest pose and places from a start; None if the camera cannot show a landmark there."""
     n = len(marks)
 
     def at(pose: CameraPose, places: np.ndarray) -> Linearization | None:
@@ -201,17 +202,17 @@ def _fit(
         gain = float(step @ state.downhill)
         tried = at(move_pose(state.pose, step[:7]), state.places + step[7:].reshape(n, 2))
         if tried is not None and n and not expected.known.all():
-            # The places alone a step nearer to the likeliest: where the telemetry does not hold the pose, pixels are so
-            # much finer than places that the sum of squares lies in a bent valley, and straight steps would be short.
+            # Also move the places alone a step towards the optimum. If telemetry does not fix the pose, pixels are so
+            # much more accurate than places that the sum of squares has a curved valley, and straight steps are short.
             try:
                 nearer_m = np.linalg.solve(tried.curvature[7:, 7:], tried.downhill[7:]).reshape(n, 2)
             except np.linalg.LinAlgError:
-                pass  # an absurd pose has landmarks so near its horizon that nothing else counts
+                pass  # an absurd pose has landmarks close to its horizon, and they dominate everything else
             else:
                 nearer = at(tried.pose, tried.places + nearer_m)
                 tried = nearer if nearer is not None and nearer.cost < tried.cost else tried
         if tried is not None and tried.cost <= state.cost + 1e-9:
-            # A bad fit need not be as precise.
+            # A bad fit needs less precision.
             gain = min(gain, (state.cost - tried.cost) / (_NO_BETTER * (1 + tried.cost)) * _ENOUGH)
             state, damping = tried, damping / 10
         else:
@@ -228,7 +229,7 @@ def _fit(
     corrected = covariance.copy()
     corrected[:3] = state.by_turn @ corrected[:3]
     corrected[:, :3] = corrected[:, :3] @ state.by_turn.T
-    return Solution(**vars(state), covariance=covariance, correction_covariance=corrected, freedom=freedom)
+    return PoseSolution(**vars(state), covariance=covariance, correction_covariance=corrected, freedom=freedom)
 
 
 def linearize_pose(
@@ -239,7 +240,7 @@ def linearize_pose(
     places: Float[np.ndarray, "n 2"],
     used: Bool[np.ndarray, "n"] | None = None,
 ) -> Linearization | None:
-    """The sum of squares about a pose and landmarks' places; None where the camera cannot show a landmark there."""
+    """Linearize about a pose and landmarks' places; None if the camera cannot show a landmark there."""
     used = np.ones(len(marks), bool) if used is None else used
     seen, slopes = project_landmarks(marks, camera, pose, places, used)
     if not np.isfinite(seen).all():
@@ -247,7 +248,7 @@ def linearize_pose(
     reference, information = expected.reference, expected.information
     turn = pose.axes @ reference.axes.T
     if not expected.known[_HEADING]:
-        # Where no heading is known the tilt is all that is expected, whichever way the camera looks.
+        # Without a known heading only the tilt is expected, in any direction of view.
         turn = turn @ about_up(turn).T
     turn_rad = turn_of(turn)
     by_turn = slope_of_turn(turn_rad)
@@ -270,7 +271,7 @@ def linearize_pose(
 def project_landmarks(
     marks: LandmarkObservations, camera: Camera, pose: CameraPose, places: np.ndarray, used: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (2m,) of the m landmarks used, u and v in turn, and their slopes by pose and all places (2m, 7 + 2n)."""
+    """Return pixels (2m,) of the m landmarks used, u and v in turn, and slopes (2m, 7 + 2n) by pose and places."""
     points = np.column_stack([places, marks.up_m])[used]
     seen, by_pose, by_point = project_with_slopes(points, pose, camera)
     slopes = np.zeros((2 * len(points), 7 + 2 * len(used)))
@@ -281,7 +282,7 @@ def project_landmarks(
 
 
 def move_pose(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
-    """A pose after a step, in the order of Fix."""
+    """Return a pose after a step, in the order of Fix."""
     return replace(
         pose,
         axes=turned(step[:3]) @ pose.axes,
@@ -296,7 +297,7 @@ def move_pose(pose: CameraPose, step: Float[np.ndarray, "7"]) -> CameraPose:
 def _turned_about_up(
     marks: LandmarkObservations, camera: Camera, known: np.ndarray, pose: CameraPose
 ) -> list[CameraPose]:
-    """With a known tilt the pixels lie on the ground but for turn, size and place, which the landmarks determine."""
+    """With a known tilt, pixels on the ground lack only turn, scale and place, which the landmarks determine."""
     if not known[:2].all() or len(marks) == 0:
         return []
     way = rays(marks.image_px, pose, camera)
@@ -324,10 +325,10 @@ def _turned_about_up(
 
 
 def _by_homography(marks: LandmarkObservations, camera: Camera) -> list[CameraPose]:
-    """Poses that see the ground as an unweighted homography does, and as its mirror, hard to tell apart from afar."""
+    """Return the poses that match an unweighted homography and its mirror, which are hard to distinguish from afar."""
     ground, flat = marks.east_north_m, normalize(marks.image_px, camera)
     middle = ground.mean(axis=0)
-    # From metres about the landmarks' middle to metres right and down a metre of depth, by the graph that ships.
+    # Map metres about the landmarks' middle to metres right and down per metre of depth, with the shipped graph.
     (matrix,), (is_valid,) = load_solver("onboard").solve((ground - middle)[None], flat[None], np.ones((1, len(flat))))
     if not is_valid or not np.isfinite(matrix).all():
         return []
@@ -335,14 +336,14 @@ def _by_homography(marks: LandmarkObservations, camera: Camera) -> list[CameraPo
     if not scale > 0:
         return []
     matrix = matrix / scale
-    # The ground's middle is before the camera.
+    # The middle of the ground must lie in front of the camera.
     matrix = matrix if matrix[2, 2] > 0 else -matrix
     sight = matrix[:, 2]
     two, _, other = np.linalg.svd(matrix[:, :2], full_matrices=False)
     east_north = two @ other
     normal = np.cross(east_north[:, 0], east_north[:, 1])
     cameras_from_world = [np.column_stack([east_north, normal])]
-    # The mirror: the ground's normal reflected at the line of sight to its middle.
+    # The mirror: reflect the ground's normal at the line of sight to the middle.
     mirrored = 2 * (sight @ normal) * sight / (sight @ sight) - normal
     axis = np.cross(normal, mirrored)
     sine = np.linalg.norm(axis)
@@ -350,5 +351,5 @@ def _by_homography(marks: LandmarkObservations, camera: Camera) -> list[CameraPo
         cameras_from_world.append(turned(axis / sine * np.arctan2(sine, normal @ mirrored)) @ cameras_from_world[0])
     above = np.array([*middle, float(marks.up_m.mean())])
     poses = [CameraPose(above - rotation.T @ sight, rotation.T) for rotation in cameras_from_world]
-    # A pose below the ground is wrong.
+    # Drop poses below the ground.
     return [pose for pose in poses if pose.place_m[2] > 0]

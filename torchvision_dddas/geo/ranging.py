@@ -1,17 +1,17 @@
-"""Where people stand, from one picture of a camera on the ground (appendix A, IV-C, eq. 13-15), with covariances.
+"""Locate people in one picture of a camera on the ground (appendix A, IV-C, eq. 13-15), with covariances.
 
-A person stands upright on the plane that the camera's height is measured from. A ray through a pixel, in a level frame
-at the camera that looks along its heading, falls by `slope` metres a metre ahead. With the slopes of the feet and of
-the head, the distance ahead is
-    body height / (feet - head)      whatever the camera's height, and
-    camera height / feet             whatever the person's.
-With a level camera the first is the source's D = f H / h. Inverse distances, 1 / ahead, are linear in the pixels: so
-there the two are weighted by the inverse of their covariance. They share the foot row, the pitch and the focal length,
-and those correlations count. Where the two disagree beyond chance, as for a child or a body half hidden, it is unknown
-which is right: then the covariance grows towards the other.
+A person stands upright on the plane from which the camera's height is measured. Consider a level frame at the camera
+that looks along its heading. The ray through a pixel falls by `slope` metres per metre ahead. With the slopes of the
+feet and of the head, the distance ahead is
+    body height / (feet - head)      for any camera height, and
+    camera height / feet             for any body height.
+With a level camera the first is the source's D = f H / h. Inverse distances, 1 / ahead, are linear in the pixels, so
+the two are averaged there, weighted by the inverse of their covariance. They share the foot row, the pitch and the
+focal length, so the covariance includes these correlations. If the two differ more than chance allows, for example for
+a child or a half hidden body, it is unknown which is right, so the covariance is extended towards the other.
 
-What the source does not do: D is the depth along the optical axis, and the way over the ground D / cos(alpha).
-`paper` takes D for it, as printed.
+Difference to the source: D is the depth along the optical axis, and the distance over the ground is D / cos(alpha).
+`paper` uses D as the distance, as printed.
 """
 
 import numpy as np
@@ -21,16 +21,16 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.geometry import normalize
 from torchvision_dddas.types import Bool, Camera, Float, Poses, Sightings
 
-# Least standard deviation of a box's edges, in pixels.
+# Smallest standard deviation of a box's edges, in pixels.
 _PIXEL_SIGMA = 0.5
 # Standard deviation of the middle of a box cut at its side, in box heights.
 _SIDE_SIGMA = 0.15
-# A box whose edge is this near the picture's border touches it.
+# A box touches the picture's border if its edge is at most this far from it.
 _BORDER_PX = 1.0
-# Largest relative standard deviation of a distance: beyond it the first order does not hold.
+# Largest relative standard deviation of a distance; above it the linearization is not valid.
 _COARSEST = 0.5
 
-# Columns of derivatives: one of each error, by its standard deviation.
+# Columns of derivatives: one for each error, multiplied by the error's standard deviation.
 _FEET, _TALL, _SIDE, _DISPUTE, _BODY, _EAST, _NORTH, _HEADING, _PITCH, _HEIGHT, _FOCAL = range(11)
 _OWN, _CAMERA = slice(_FEET, _BODY), slice(_EAST, _FOCAL + 1)
 
@@ -43,11 +43,11 @@ def range_people(
     east_north_m: Float[np.ndarray, "N 2"],
     parameters: GroundParameters,
 ) -> Sightings:
-    """Distance, bearing and place of people, a row a box.
+    """Return distance, bearing and place of people, one row a box.
 
-    cut: the picture's border cuts the body, so its height is unknown; the foot row still does where it is inside.
-    poses: where the camera looked, a row a box; its place is not read but given in local metres as east_north_m.
-    Raises InputError where parameters.use asks for the foot row and the camera's height is not known.
+    cut: the picture's border cuts the body, so its height is unknown; the foot row can still be used if it is visible.
+    poses: directions of the camera, one row a box; its place is given by east_north_m in local metres.
+    Raise InputError if parameters.use needs the foot row and the camera's height is unknown.
     """
     box = np.asarray(box_px, float).reshape(-1, 4)
     if parameters.mode == "paper":
@@ -63,7 +63,7 @@ def range_people(
     aside, by_aside = slopes[2], by_error[2]
     sine, cosine = np.sin(poses.heading_rad), np.cos(poses.heading_rad)
     along, across = np.stack([sine, cosine], axis=1), np.stack([cosine, -sine], axis=1)
-    way = along + aside[:, None] * across  # over the ground, a metre ahead
+    way = along + aside[:, None] * across  # over the ground, per metre ahead
     ahead = 1 / inverse
     offset = ahead[:, None] * way
     deviation = -(ahead**2)[:, None, None] * way[:, :, None] * by_distance[:, None, :]
@@ -84,14 +84,14 @@ def range_people(
 
 
 def touches_border(box_px: Float[np.ndarray, "N 4"], size_px: tuple[int, int]) -> Bool[np.ndarray, "N"]:
-    """Whether the picture's border may cut each body, for tables that do not say so."""
+    """Return whether the picture's border may cut each body, for tables that do not say so."""
     box = np.asarray(box_px, float).reshape(-1, 4)
     low, high = box[:, :2], box[:, :2] + box[:, 2:]
     return (low <= _BORDER_PX).any(axis=1) | (high >= np.array(size_px) - _BORDER_PX).any(axis=1)
 
 
 def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels to (right, down) per metre of depth, without distortion and roll; NaN where the lens has no such pixel."""
+    """Return pixels as (right, down) per metre of depth, without distortion and roll; NaN outside the lens model."""
     right, down = normalize(np.stack([u, v], axis=1), camera).T
     sine, cosine = np.sin(camera.roll_rad), np.cos(camera.roll_rad)
     return right * cosine - down * sine, right * sine + down * cosine
@@ -100,13 +100,13 @@ def level(u: np.ndarray, v: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 def _rays(
     box: np.ndarray, cut: np.ndarray, camera: Camera, poses: Poses, parameters: GroundParameters
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(3, N) slopes of feet and head, and metres to the right a metre ahead; (3, N, 11) their derivatives."""
+    """Return (3, N) slopes of feet and head, and metres right per metre ahead; and their (3, N, 11) derivatives."""
     u, tall = box[:, 0] + box[:, 2] / 2 - 0.5, box[:, 3]
     sine, cosine = np.sin(poses.pitch_rad), np.cos(poses.pitch_rad)
     x, y_feet = level(u, box[:, 1] + tall - 0.5, camera)
     _, y_head = level(u, box[:, 1] - 0.5, camera)
     y = np.stack([y_feet, y_head])
-    # How far the rays go ahead. One that goes straight up or down, or backward, has no slope of use.
+    # Distance ahead per ray length. A ray that goes straight up or down, or backward, has no usable slope.
     ahead = cosine - y * sine
     ahead = np.where(ahead > 1e-3, ahead, np.nan)
     slope = (sine + y * cosine) / ahead
@@ -135,7 +135,7 @@ def _inverse_distance(
     camera: Camera,
     parameters: GroundParameters,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """1 / ahead (N,), its (N, 11) derivatives, and the source of the distance (N,)."""
+    """Return 1 / ahead (N,), its (N, 11) derivatives, and the source of the distance (N,)."""
     body, above = parameters.body_height_m, camera.height_m
     (feet, head, _), (d_feet, d_head, _) = slopes, by_error
     by_height, by_feet = (feet - head) / body, feet / above
@@ -143,8 +143,8 @@ def _inverse_distance(
     can_feet = (by_feet > 0) & feet_shown & (parameters.use != "height")
     by = np.select([can_height & can_feet, can_height, can_feet], ["both", "height", "feet"], "bearing")
     d_height, d_feet = (d_feet - d_head) / body, d_feet / above
-    # Errors of the heights scale the inverse distance. They are taken at the weighted one: at its own, a distance that
-    # came out too large would seem the surer.
+    # Errors of the heights scale the inverse distance. They are evaluated at the weighted inverse distance: otherwise a
+    # distance that came out too large would seem more certain.
     inverse = np.where(can_feet, by_feet, by_height)
     for _ in range(3):
         d_height[:, _BODY] = -inverse * parameters.body_height_sigma_m / body
@@ -158,7 +158,7 @@ def _inverse_distance(
     derivative = np.where(share == 0, 0, share * d_height) + np.where(share == 1, 0, (1 - share) * d_feet)
     excess = np.abs(by_height - by_feet) - parameters.gate_sigmas * np.sqrt((gap**2).sum(axis=1))
     derivative[:, _DISPUTE] = np.where(by == "both", np.maximum(excess, 0) / 2, 0)
-    # NaN compares as false: such a distance is unknown.
+    # Comparisons with NaN are false, so such a distance is unknown.
     fine = (inverse > 0) & (np.sqrt((derivative**2).sum(axis=1)) < _COARSEST * inverse)
     return np.where(fine, inverse, np.nan), derivative, np.where(fine, by, "bearing")
 
@@ -166,7 +166,7 @@ def _inverse_distance(
 def _as_printed(
     box: np.ndarray, camera: Camera, poses: Poses, east_north_m: np.ndarray, parameters: GroundParameters
 ) -> Sightings:
-    """Eq. (13) to (15): the height alone, whatever the pitch, whether cut or not; nothing is known of the errors."""
+    """Apply eq. (13) to (15): use the box height alone, for any pitch and cut; the errors are unknown."""
     distance = camera.focal_px[1] * parameters.body_height_m / box[:, 3]
     right = (box[:, 0] + box[:, 2] / 2 - 0.5 - camera.centre_px[0]) / camera.focal_px[0]
     bearing = poses.heading_rad + np.arctan(right)

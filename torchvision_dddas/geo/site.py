@@ -1,4 +1,4 @@
-"""Landmarks, telemetry and camera before the first frame, in one system of local metres."""
+"""Bring landmarks, telemetry and camera into one system of local metres before the first frame."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,24 +10,33 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, is_set
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.geo.flight_gaps import fill_gaps, known_keys
+from torchvision_dddas.geo.heights import (
+    count_from_plane,
+    describe_takeoff,
+    geoid_of,
+    median_of,
+    plane_above_sea,
+    settle_landmarks,
+    settle_telemetry,
+)
 from torchvision_dddas.geometry import ground_height
 from torchvision_dddas.types import Camera, Elevation, Landmarks, Telemetry
 
 _Reports = TypeVar("_Reports", Landmarks, Telemetry)
 
-# A camera that looks higher above the horizon shows no landmarks as a rule: its angles have the other sign.
+# If the camera looks higher above the horizon than this, its angles probably have the wrong sign.
 _HIGHEST_DEG = 20.0
-# No vehicle sees landmarks from further away: then the files are of two flights.
+# If the vehicle is further from the landmarks than this, the files are from different flights.
 _FARTHEST_M = 100_000.0
-# Two focal lengths that differ by more than this share are not the same.
+# Focal lengths that differ by more than this share count as different.
 _OTHER = 0.02
 
-# A log whose altitude is lower begins on the ground.
+# A log whose first altitude is lower than this begins on the ground.
 _ON_GROUND_M = 3.0
-# Log and elevation agree on the ground within this; a geoid alone seldom puts them further apart than the second one.
+# The ground heights of log and elevation agree within _SAME_M. The geoid alone seldom separates them by _DATUMS_M.
 _SAME_M, _DATUMS_M = 10.0, 60.0
-# In these units an elevation has the ground so many times higher. Then it is so many times nearer in metres. The ratio
-# to a height near zero tells no unit.
+# _UNITS: factors by which an elevation in another unit is too high. Such a unit is reported if it reduces the
+# difference by the factor _NEARER. Heights below _LOW_M are not tested, because their ratio is not reliable.
 _LOW_M = 20.0
 _UNITS, _NEARER = {"feet": 1 / 0.3048, "decimetres": 10.0, "centimetres": 100.0, "millimetres": 1000.0}, 10.0
 
@@ -36,8 +45,9 @@ _UNITS, _NEARER = {"feet": 1 / 0.3048, "decimetres": 10.0, "centimetres": 100.0,
 class Site:
     """Landmarks and telemetry in the same local metres, east and north of origin_deg.
 
-    origin_deg: (longitude, latitude); None where all is in local metres from the start. sun_rad: azimuth and height of
-    the sun where that is known beside the telemetry's clock.
+    origin_deg: (longitude, latitude); None if all input is in local metres. sun_rad: azimuth and height of the sun, if
+    they are known from a source other than the telemetry's clock. geoid_m: height of the geoid above the ellipsoid.
+    plane_above_sea_m: height above the sea of up = 0. Both are NaN if unknown.
     """
 
     landmarks: Landmarks
@@ -45,25 +55,27 @@ class Site:
     origin_deg: tuple[float, float] | None
     elevation: Elevation | None = None
     sun_rad: tuple[float, float] | None = None
+    geoid_m: float = math.nan
+    plane_above_sea_m: float = math.nan
 
     @property
     def places(self) -> np.ndarray:
-        """(N, 2) where landmarks and vehicle were, local metres."""
+        """(N, 2) local metres of landmarks and vehicle."""
         return np.concatenate([_known(self.landmarks), _known(self.telemetry)])
 
 
 def _known(reports: Landmarks | Telemetry | None) -> np.ndarray:
-    """(N, 2) the places that are reported."""
+    """Return the (N, 2) places that are reported."""
     place = np.zeros((0, 2)) if reports is None else reports.place
     return place[np.isfinite(place).all(axis=1)]
 
 
 def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site:
-    """Everything in local metres: those of the landmarks, or east and north of their first place.
+    """Convert landmarks and telemetry to local metres: those of the landmarks, or east and north of their first place.
 
     Without landmarks the metres are those of the telemetry, or east and north of the vehicle's first place.
-    Raises InputError where neither gives a place, degrees and metres are mixed, longitude and latitude look swapped,
-    the vehicle's altitude is below the ground throughout, its camera looks into the sky, or it is far from landmarks.
+    Raise InputError if neither gives a place, degrees and metres are mixed, longitude and latitude look swapped, the
+    vehicle is below the ground throughout, its camera looks into the sky, or it is far from the landmarks.
     """
     if telemetry is not None:
         _check_telemetry(telemetry)
@@ -76,13 +88,13 @@ def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site
         landmarks = Landmarks((), rows, none, places, places, rows, rows.astype(bool), none, telemetry.geographic)
         first = flown[0]
     elif not len(_known(landmarks)):
-        raise InputError(f"landmarks {landmarks.path}: no row has a place; wanted longitude_deg,latitude_deg or metres")
+        raise InputError(f"landmarks {landmarks.path}: no row has a place; give longitude_deg,latitude_deg or metres")
     else:
         first = _known(landmarks)[0]
         if telemetry is not None and len(flown) and telemetry.geographic != landmarks.geographic:
             kinds = ("longitude and latitude", "local metres")
             one, other = kinds if landmarks.geographic else kinds[::-1]
-            raise InputError(f"the landmarks are in {one}, the telemetry in {other}; give both in one kind")
+            raise InputError(f"the landmarks are in {one}, the telemetry in {other}; give both in the same kind")
         if landmarks.geographic and len(flown):
             longitude, latitude = np.median(flown, axis=0).tolist()
             if looks_swapped(landmarks, (longitude, latitude)):
@@ -100,48 +112,83 @@ def build_site(landmarks: Landmarks | None, telemetry: Telemetry | None) -> Site
         away = np.linalg.norm(flown - np.nanmedian(landmarks.place, axis=0), axis=1).min()
         if away > _FARTHEST_M:
             raise InputError(
-                f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; "
-                f"wanted {_FARTHEST_M / 1000:g} km at most: give the telemetry of this flight, its places counted as "
-                "theirs"
+                f"the vehicle is {away / 1000:.0f} km or more from the landmarks of {landmarks.path} throughout; the "
+                f"limit is {_FARTHEST_M / 1000:g} km: give the telemetry of this flight, with places in the same "
+                "system"
             )
     return Site(landmarks, telemetry, origin)
 
 
 def describe_no_place(telemetry: Telemetry | None) -> str:
-    """Why nothing can be located without landmarks, in words."""
+    """Return why nothing can be located without landmarks."""
     if telemetry is None:
-        return "locating needs landmarks, or telemetry that says where the vehicle is; got neither"
+        return "locating needs landmarks, or telemetry with the vehicle's place; got neither"
     named = f"the telemetry {telemetry.origin}".rstrip()
-    return f"{named} holds no place of the vehicle, and there are no landmarks"
+    columns = "add the columns longitude_deg,latitude_deg or east_m,north_m to a CSV of it"
+    return f"{named} holds no place of the vehicle ({columns}), and there are no landmarks"
 
 
 def has_places(telemetry: Telemetry | None) -> bool:
-    """Whether the telemetry says where the vehicle was at any time."""
+    """Return whether the telemetry gives the vehicle's place at any time."""
     return len(_known(telemetry)) > 0
 
 
 def complete_site(site: Site, camera: Camera | None, settings: Settings) -> tuple[Site, list[str]]:
-    """A site whose telemetry has what the camera's file or the course flown say where the log does not; and notes.
+    """Fill gaps of the telemetry from the camera's file or from the course flown, and return the site and notes.
 
-    Raises InputError where by the camera's file it looks into the sky or flies below the ground.
+    Heights above the ellipsoid become heights above the sea, and the height of the site's plane is determined.
+    Raise InputError if with the camera's file the camera looks into the sky or the vehicle flies below the ground.
     """
-    if site.telemetry is None:
-        keys = [] if camera is None else known_keys(camera)
-        return site, [f"{', '.join(keys)} of the camera are not used: give --telemetry"] if keys else []
-    has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
-    telemetry, notes = fill_gaps(site.telemetry, camera, settings.aerial, has_ground, has_landmarks)
+    geoid_m = geoid_of(site.places, site.origin_deg, settings.aerial.geoid)
+    landmarks, notes = settle_landmarks(site.landmarks, geoid_m, settings.aerial.mode)
+    site = replace(site, landmarks=landmarks, geoid_m=geoid_m)
+    if settings.aerial.geoid and math.isnan(geoid_m):
+        notes.append("aerial.geoid is not used: in local metres the geoid's height is unknown")
+    if site.telemetry is not None:
+        site, more = _complete_telemetry(site, site.telemetry, camera, settings)
+        notes += more
+    elif camera is not None and (keys := known_keys(camera)):
+        notes.append(f"{', '.join(keys)} of the camera are not used: give --telemetry")
     if site.elevation is not None:
-        telemetry, more = _match_ground(telemetry, site.elevation, camera)
+        up_m = ground_height(site.elevation, landmarks.place) + site.elevation.base_m
+        apart_m = median_of(landmarks.elevation_m - up_m)
+        if abs(apart_m) > _SAME_M:
+            notes.append(
+                f"the landmarks' elevation_m is {apart_m:+.0f} m from the elevation's heights there, the geoid at "
+                f"{geoid_m:+.0f} m: does one of them count from the ellipsoid?"
+            )
+    plane_m = plane_above_sea(site.elevation, site.landmarks, site.telemetry, camera)
+    return replace(site, plane_above_sea_m=plane_m), notes
+
+
+def _complete_telemetry(
+    site: Site, telemetry: Telemetry, camera: Camera | None, settings: Settings
+) -> tuple[Site, list[str]]:
+    has_level = bool(np.isfinite(site.landmarks.elevation_m).any()) and settings.aerial.mode == "pose"
+    has_takeoff = camera is not None and camera.knows("takeoff_above_sea_m")
+    has_ground, has_landmarks = site.elevation is not None, len(site.landmarks) > 0
+    can_use = has_ground or has_level or has_takeoff
+    telemetry, notes = settle_telemetry(telemetry, site.geoid_m, can_use, bool(settings.aerial.geoid))
+    notes += describe_takeoff(telemetry, camera)
+    if has_level and not has_ground:
+        telemetry, more = count_from_plane(telemetry, plane_above_sea(None, site.landmarks, None, None), camera)
+        notes += more
+    telemetry, more = fill_gaps(telemetry, camera, settings.aerial, has_ground, has_landmarks)
+    notes += more
+    if site.elevation is not None:
+        telemetry, more = _match_ground(telemetry, site.elevation, camera, site.geoid_m)
         notes += more
     _check_altitude(telemetry, "the altitude by the camera's takeoff_above_sea_m", "correct that height")
     _check_pitch(telemetry, "camera file")
     return replace(site, telemetry=telemetry), notes
 
 
-def _match_ground(telemetry: Telemetry, elevation: Elevation, camera: Camera | None) -> tuple[Telemetry, list[str]]:
-    """Telemetry whose altitude counts from the ground below, and notes where log and elevation disagree on the ground.
+def _match_ground(
+    telemetry: Telemetry, elevation: Elevation, camera: Camera | None, geoid_m: float
+) -> tuple[Telemetry, list[str]]:
+    """Return telemetry whose altitude counts from the ground below, and notes if log and elevation disagree.
 
-    Raises InputError where the heights of the elevation are those of the log in another unit.
+    Raise InputError if the heights of the elevation are those of the log in another unit.
     """
     notes, altitude, up_m = list[str](), telemetry.altitude_m, ground_height(elevation, telemetry.place)
     takeoff_m = math.nan if camera is None else camera.takeoff_above_sea_m
@@ -170,23 +217,24 @@ def _match_ground(telemetry: Telemetry, elevation: Elevation, camera: Camera | N
         found += f", {raster / logged:.3g} times as much"
         raise InputError(f"{found}: is the {whose} in {unit}, {_UNITS[unit]:.3g} to the metre? Give both in metres")
     if apart > _SAME_M:
-        notes.append(f"{found}, {apart:.0f} m apart: does one of them count from the ellipsoid?")
+        geoid = f", where the geoid lies at {geoid_m:.0f} m" if math.isfinite(geoid_m) else ""
+        notes.append(f"{found}, {apart:.0f} m apart: does one of them count from the ellipsoid{geoid}?")
     return telemetry, notes
 
 
 def looks_swapped(landmarks: Landmarks, near_lonlat: tuple[float, float]) -> bool:
-    """Whether longitude and latitude are swapped, judged by a place in degrees that must be near, as the vehicle's."""
+    """Return whether longitude and latitude look swapped, judging by a near place in degrees, as the vehicle's."""
     known = _known(landmarks)
     if not landmarks.geographic or not len(known) or not np.isfinite(near_lonlat).all():
         return False
     near, middle = np.array(near_lonlat, float), np.median(known, axis=0)
     given, swapped = (float(geometry.great_circle_m(point[None], near)[0]) for point in (middle, middle[::-1]))
-    # Where longitude and latitude are nearly alike, swapping them moves a place by little.
+    # Swapping similar longitudes and latitudes moves a place only a little.
     return swapped < _FARTHEST_M and given > 10 * max(swapped, 300.0)
 
 
 def to_local(reports: _Reports, origin_deg: tuple[float, float]) -> _Reports:
-    """Reports in degrees as metres east and north of (longitude, latitude)."""
+    """Convert reports in degrees to metres east and north of (longitude, latitude)."""
     return replace(reports, place=geometry.east_north(reports.place, origin_deg), geographic=False)
 
 
@@ -199,7 +247,7 @@ def _check_altitude(telemetry: Telemetry, what: str, advice: str) -> None:
     altitude = telemetry.altitude_m[np.isfinite(telemetry.altitude_m)]
     if len(altitude) and (altitude <= 0).all():
         raise InputError(
-            f"{what} is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; wanted metres above "
+            f"{what} is {altitude.min():g} to {altitude.max():g} m, at or below ground throughout; give metres above "
             f"ground: {advice}"
         )
 
@@ -208,13 +256,13 @@ def _check_pitch(telemetry: Telemetry, whose: str) -> None:
     pitch = np.degrees(telemetry.pitch_rad[np.isfinite(telemetry.pitch_rad)])
     if len(pitch) and np.median(pitch) < -_HIGHEST_DEG:
         raise InputError(
-            f"by the {whose}'s pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; wanted degrees "
-            "below the horizon, 90 for straight down: turn the sign of pitch_deg"
+            f"by the {whose}'s pitch of {np.median(pitch):.0f} degrees the camera looks into the sky; give degrees "
+            "below the horizon, 90 for straight down: change the sign of pitch_deg"
         )
 
 
 def describe_unknown_heights(site: Site) -> list[str]:
-    """Notes on unknown heights of the vehicle, and of the ground below it or at landmarks."""
+    """Return notes on unknown heights of the vehicle, and of the ground below it or at landmarks."""
     telemetry, notes = site.telemetry, []
     if site.elevation is not None:
         for reports, what in (
@@ -227,8 +275,8 @@ def describe_unknown_heights(site: Site) -> list[str]:
     elif telemetry is not None:
         if not np.isfinite(telemetry.altitude_m).any() and np.isfinite(telemetry.above_sea_m).any():
             notes.append(
-                "the telemetry says heights above sea alone: --dem, or takeoff_above_sea_m or height_m in the "
-                "camera's file, gives those above ground"
+                "the telemetry gives only heights above the sea; for heights above ground give --dem, or "
+                "takeoff_above_sea_m or height_m in the camera's file"
             )
         low = telemetry.altitude_m <= 0
         if low.any():
@@ -246,12 +294,12 @@ def resolve_camera(
     settings: Settings,
     extent: tuple[float, float] | None = None,
 ) -> tuple[Camera, bool, list[str]]:
-    """The camera in the air, whether its focal length is given, and what the user should know of it.
+    """Return the aerial camera, whether its focal length is given, and notes for the user.
 
-    camera: as its file says, None without one. size: (width, height) of the pictures where the camera does not say.
-    extent: (width, height) that holds the boxes: it stands for the size where nothing depends on that, as when
-    landmarks alone map pictures to the ground.
-    Raises InputError where the size is not known, or the camera's is another than that of the pictures.
+    camera: from its file, None without one. size: (width, height) of the pictures, used if the camera has no size.
+    extent: (width, height) of all boxes, used as the size if nothing depends on the size, for example if landmarks
+    alone map pictures to the ground.
+    Raise InputError if the size is unknown, or if the camera's size is not that of the pictures.
     """
     parameters, notes = settings.aerial, list[str]()
     if camera is not None:
@@ -260,8 +308,8 @@ def resolve_camera(
                 f"camera {camera.name} has pictures of {camera.size_px[0]} x {camera.size_px[1]} px, the clip of "
                 f"{size[0]} x {size[1]}; give the camera's file for this size"
             )
-        if parameters.mode == "paper" and (camera.k1 or camera.k2):
-            notes.append(f"aerial.mode = paper takes the lens of camera {camera.name} for straight: no k1 and k2 count")
+        if parameters.mode == "paper" and any(camera.distortion):
+            notes.append(f"aerial.mode = paper ignores the lens distortion of camera {camera.name}")
         # A value set by hand overrides the file.
         if is_set(settings, "aerial.focal_sigma") or not math.isfinite(camera.focal_px[0]):
             camera = replace(camera, focal_sigma=parameters.focal_sigma)
@@ -270,7 +318,7 @@ def resolve_camera(
         size = (math.ceil(extent[0]), math.ceil(extent[1])) if extent is not None else (1, 1)
     if size is None:
         raise InputError(
-            "how large the pictures are is not known, nor then the focal length; give --camera FILE or --clip CLIP, or "
+            "the size of the pictures is unknown, and so is the focal length; give --camera FILE or --clip CLIP, or "
             "--set aerial.mode=homography, which needs neither"
         )
     logged = np.zeros(0) if telemetry is None else telemetry.focal_px(size)[np.isfinite(telemetry.hfov_rad)]
@@ -283,9 +331,9 @@ def resolve_camera(
                 f"nominal {logged.min():.0f} px"
             )
         elif any(abs(math.log(focal / camera.focal_px[0])) > _OTHER for focal in logged[:1]):
-            notes.append(f"the focal length of camera {camera.name} is not used: the telemetry's field of view is")
+            notes.append(f"the focal length of camera {camera.name} is not used: the telemetry's field of view is used")
         return camera, True, notes
-    # Unless somebody says so, a camera that stands upright does not see more than one that lies.
+    # Unless the user says otherwise, an upright picture has the same field of view along its longer side.
     guessed_px = (size[0] if is_set(settings, "aerial.hfov_deg") else max(size)) / 2
     focal = float(np.median(logged)) if len(logged) else guessed_px / math.tan(math.radians(parameters.hfov_deg) / 2)
     middle = ((size[0] - 1) / 2, (size[1] - 1) / 2)
@@ -294,8 +342,8 @@ def resolve_camera(
     if is_nominal:
         px = f"{logged.min():.0f} to {logged.max():.0f} px by its zoom" if _is_zoomed(logged) else f"{focal:.0f} px"
         notes.append(
-            f"the log's nominal focal length, {px}, is taken along the pictures' longer side. A video mode that "
-            "crops sees less; the camera's file (focal_px) overrides it"
+            f"the log's nominal focal length, {px}, is applied to the pictures' longer side. A cropping video mode "
+            "has a smaller field of view; the camera's file (focal_px) overrides it"
         )
     if len(logged) or parameters.mode != "pose":
         return made, bool(len(logged)), notes
@@ -308,10 +356,10 @@ def _is_zoomed(focal_px: np.ndarray) -> bool:
 
 
 def fit_lens(telemetry: Telemetry, camera: Camera) -> Telemetry:
-    """The telemetry with the field of view along u of the camera's pictures.
+    """Return the telemetry with the field of view along u of the camera's pictures.
 
-    A nominal focal length is along their longer side. Where the camera's file names the lens, the log's nominal one
-    tells no more than how far that is zoomed.
+    A nominal focal length applies to the longer side. If the camera's file gives the focal length, the log's nominal
+    one only gives the zoom.
     """
     if not telemetry.is_nominal or not np.isfinite(telemetry.hfov_rad).any():
         return telemetry

@@ -1,4 +1,4 @@
-"""Boxes and masks: overlap, containment, and the boxes that hold what is set in a mask."""
+"""Boxes and masks: overlap, containment, and the boxes that enclose the set pixels of a mask."""
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ _BLOCK_PX = 16
 
 
 def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
-    """(...) area in both of two boxes (..., 4), broadcast against each other; 0 where they lie apart."""
+    """Return the intersection area (...) of boxes (..., 4), which are broadcast; 0 for disjoint boxes."""
     low = np.maximum(box_px[..., :2], other_px[..., :2])
     high = np.minimum(box_px[..., :2] + box_px[..., 2:], other_px[..., :2] + other_px[..., 2:])
     across, down = np.moveaxis(high - low, -1, 0)
@@ -19,21 +19,22 @@ def shared_px(box_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
 
 
 def inside(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """(P, N) bool: which points lie in which boxes."""
+    """Return (P, N) bool: whether each point (P, 2) lies in each box (N, 4)."""
     offset = points[:, None] - boxes[None, :, :2] + 0.5
     return ((offset >= 0) & (offset <= boxes[None, :, 2:])).all(axis=2)
 
 
 def window_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The rows and columns of a box in a picture (H, W, ...), as far as it is inside."""
+    """Return the row and column slices of a box in a picture (H, W, ...), clipped to the picture."""
     left, top, right, bottom = (round(v) for v in (*box[:2], *(box[:2] + box[2:])))
     return slice(max(top, 0), min(bottom, shape[0])), slice(max(left, 0), min(right, shape[1]))
 
 
 def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | None = None) -> np.ndarray:
-    """(N, 2) u, v of the mean of each blob's pixels, i + 1 in the (H, W) foreground; NaN for one without any.
+    """Return (N, 2) u, v, the mean position of each blob's pixels; NaN for a blob without pixels.
 
-    core: (H, W) bool, the pixels that count, without what lies between the people of a crowd. None: all.
+    foreground: (H, W), value i + 1 at the pixels of blob i. core: (H, W) bool, use only these pixels, without the gaps
+    between the people of a crowd; None: use all pixels.
     """
     middles = np.full((len(boxes), 2), np.nan)
     for row, box in enumerate(boxes):
@@ -46,10 +47,10 @@ def middles_of(boxes: np.ndarray, foreground: np.ndarray, core: np.ndarray | Non
 
 
 def occupied(mask: np.ndarray, apart: int) -> list[Box]:
-    """Disjoint boxes, x, y, width, height, that hold all pixels set in a (H, W) uint8 mask.
+    """Return disjoint boxes (x, y, width, height) that contain all set pixels of a (H, W) uint8 mask.
 
-    Set pixels lie at least `apart` / 2 px inside their box, save at the picture's border, and more than `apart` px from
-    those in other boxes.
+    Set pixels lie at least `apart` / 2 px inside their box, except at the picture's border, and more than `apart` px
+    away from the set pixels of other boxes.
     """
     height, width = mask.shape
     block = _BLOCK_PX
@@ -59,7 +60,7 @@ def occupied(mask: np.ndarray, apart: int) -> list[Box]:
     blocks = cv2.dilate(blocks, np.ones((2 * reach + 1,) * 2, np.uint8))
     count, _, stats, _ = cv2.connectedComponentsWithStats(cv2.threshold(blocks, 0, 255, cv2.THRESH_BINARY)[1])
     waiting: list[Box] = [(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:count].tolist()]
-    # Boxes (left, top, right, bottom) that overlap are joined until none do.
+    # Join overlapping boxes (left, top, right, bottom) until all boxes are disjoint.
     apart_boxes: list[Box] = []
     while waiting:
         box = waiting.pop()
@@ -77,9 +78,9 @@ def occupied(mask: np.ndarray, apart: int) -> list[Box]:
 
 
 def connected_parts(mask: np.ndarray, box: Box, min_area_px: float) -> list[tuple[Box, np.ndarray]]:
-    """The connected parts (8 neighbours) of a (height, width) bool mask in a box, (box, mask) each.
+    """Return the connected parts (8 neighbours) of a (height, width) bool mask inside a box, as (box, mask) pairs.
 
-    box: x, y, width, height in the picture. Parts of less than min_area_px pixels are left out.
+    box: x, y, width, height in the picture. Parts with fewer than min_area_px pixels are left out.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), ltype=cv2.CV_32S)
     parts = []

@@ -1,4 +1,4 @@
-"""Places on the Earth: local metres east and north, longitude and latitude, and distances."""
+"""Convert between longitude and latitude and local metres east and north, and measure distances on the Earth."""
 
 from collections.abc import Callable
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from torchvision_dddas.types import Float
 
-# Length of a degree of latitude to the source, everywhere. On the ellipsoid it is 110 574 m to 111 694 m.
+# Length of a degree of latitude in the source. On the ellipsoid it varies from 110 574 m to 111 694 m.
 DEGREE_M = 111_320.0
-# So many points at once: the intermediate results stay in the cache, which halves the time of a million points.
+# Points converted at once. The intermediate results then stay in the cache, which halves the time of a million points.
 _PART = 1 << 14
 
 Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
@@ -16,8 +16,8 @@ Degrees = Float[np.ndarray, "*n 2"] | tuple[float, float]
 
 
 def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
-    """Metres east and north of an origin, both as (longitude, latitude)."""
-    import pymap3d  # here, as most runs have places in metres, or none
+    """Convert (longitude, latitude) in degrees to metres east and north of an origin."""
+    import pymap3d  # imported here because most runs do not need it
 
     def convert(longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return pymap3d.geodetic2enu(latitude, longitude, 0.0, origin_deg[1], origin_deg[0], 0.0)[:2]
@@ -26,7 +26,7 @@ def east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: tuple[float, fl
 
 
 def lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: tuple[float, float]) -> Float[np.ndarray, "N 2"]:
-    """(longitude, latitude) of local metres."""
+    """Convert metres east and north of an origin to (longitude, latitude) in degrees."""
     import pymap3d
 
     def convert(east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -47,35 +47,35 @@ def _by_parts(
 
 
 def plain_lonlat(east_north_m: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
-    """(longitude, latitude) as the source has them, eq. (14): K = 111 320 m a degree, K cos(latitude) of longitude.
+    """Convert metres to (longitude, latitude) on a sphere: K = 111 320 m a degree, K cos(latitude) for longitude.
 
-    0.3 m off in 150 m. Longitudes go on over 180 degrees at -180.
+    The error is 0.3 m in 150 m. Longitudes are wrapped to -180 to 180 degrees. Source: eq. (14).
     """
     origin = np.asarray(origin_deg, float)
     return wrap_longitude(origin + np.asarray(east_north_m, float) / _degree_m(origin))
 
 
 def plain_east_north(lonlat_deg: Float[np.ndarray, "N 2"], origin_deg: Degrees) -> np.ndarray:
-    """Metres east and north, the other way round."""
+    """Convert (longitude, latitude) to metres east and north: the inverse of `plain_lonlat`."""
     origin = np.asarray(origin_deg, float)
     return wrap_longitude(np.asarray(lonlat_deg, float) - origin) * _degree_m(origin)
 
 
 def _degree_m(origin_deg: np.ndarray) -> np.ndarray:
-    """(..., 2) metres a degree of longitude and of latitude."""
+    """Return (..., 2) metres in a degree of longitude and in a degree of latitude."""
     latitude = origin_deg[..., 1]
     return np.stack([DEGREE_M * np.cos(np.radians(latitude)), np.full_like(latitude, DEGREE_M)], axis=-1)
 
 
 def wrap_longitude(lonlat_deg: np.ndarray) -> np.ndarray:
-    """Longitude and latitude with the longitude in -180 to 180 degrees."""
+    """Wrap the longitude of (longitude, latitude) to -180 to 180 degrees."""
     longitude = lonlat_deg[..., 0]
     longitude = np.where(np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude)
     return np.stack([longitude, lonlat_deg[..., 1]], axis=-1)
 
 
 def great_circle_m(lonlat_deg: np.ndarray, from_deg: np.ndarray) -> np.ndarray:
-    """(N,) great-circle distances on a sphere, good to half a percent: enough to see a mistake."""
+    """Return (N,) great-circle distances in metres on a sphere. Their error of half a percent suffices for checks."""
     longitude, latitude = np.radians(lonlat_deg).T
     longitude_0, latitude_0 = np.radians(from_deg)
     across = np.cos(latitude) * np.cos(latitude_0) * np.sin((longitude - longitude_0) / 2) ** 2

@@ -1,4 +1,4 @@
-"""One-to-one pairs of rows and columns, by SciPy where it is needed."""
+"""Optimal one-to-one assignment of rows to columns. SciPy is loaded only if needed."""
 
 import numpy as np
 
@@ -7,10 +7,10 @@ from torchvision_dddas.types import Float, Int
 
 
 def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
-    """Rows, ascending, and the column of each: min(N, M) pairs of the least sum of finite costs."""
+    """Return the rows, ascending, and the columns of the min(N, M) pairs with the smallest sum of finite costs."""
     cost = np.asarray(cost, float)
-    # Where all rows have different best columns, no sum is less. SciPy's `optimize` takes 0.5 s and 45 MB to load, as
-    # much as the rest of a run onboard: it is loaded when two rows have the same best column.
+    # If the best columns of all rows differ, they are the optimal pairs. Otherwise SciPy is loaded: `scipy.optimize`
+    # takes 0.5 s and 45 MB to load, as much as the rest of an onboard run.
     tall = cost.shape[0] > cost.shape[1]
     best = (cost.T if tall else cost).argmin(axis=1) if cost.size else np.zeros(0, np.int64)
     if len(set(best.tolist())) == len(best):
@@ -24,20 +24,20 @@ def cheapest(cost: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "K"], Int[
 
 
 def best_pairs(score: Float[np.ndarray, "N M"], least: float = 0.0) -> Int[np.ndarray, "K 2"]:
-    """One-to-one pairs (row, column) with the largest sum of scores, sorted by row.
+    """Return one-to-one pairs (row, column) with the largest sum of scores, sorted by row.
 
-    An unpaired row or column scores 0, so only scores above 0, and above `least`, are used; -inf forbids a pair.
-    Raises InputError if the score is no matrix or holds NaN or +inf.
+    An unpaired row or column scores 0, so only scores above 0 and above `least` are used. -inf forbids a pair.
+    Raises InputError if the score is not a matrix, or contains NaN or +inf.
     """
     score = np.asarray(score, float)
     if score.ndim != 2:
-        raise InputError(f"best_pairs needs a matrix of scores (N, M); got shape {score.shape}. Give one row a target.")
-    if score.size and not score.max() < np.inf:  # a NaN is not either
+        raise InputError(f"best_pairs needs scores of shape (N, M), got {score.shape}. Give each target one row.")
+    if score.size and not score.max() < np.inf:  # this comparison is also false for NaN
         raise InputError("best_pairs needs scores below infinity; got NaN or +inf. Forbid a pair with -inf.")
-    # A forbidden pair counts as unpaired, so that a full matching always exists.
+    # A forbidden pair counts as unpaired, so that a complete assignment always exists.
     fits = score > max(least, 0.0)
     gain = np.where(fits, score, 0.0)
-    # Rows and columns that fit nothing are left out: this spares SciPy in most calls.
+    # Leave out rows and columns without a usable score. This avoids SciPy in most calls.
     rows, columns = np.flatnonzero(fits.any(axis=1)), np.flatnonzero(fits.any(axis=0))
     row, column = cheapest(-gain[np.ix_(rows, columns)])
     row, column = rows[row], columns[column]

@@ -1,4 +1,4 @@
-"""Formulas that NumPy and torch share take their functions from here."""
+"""Choose between NumPy and torch for formulas that work on both arrays and tensors."""
 
 import sys
 from typing import Any
@@ -7,5 +7,5 @@ import numpy as np
 
 
 def namespace(x: Any) -> Any:
-    """NumPy for an array, torch for a tensor; nothing is imported: who has a tensor has torch."""
+    """Return NumPy for an array and torch for a tensor. A tensor implies that torch is imported already."""
     return np if isinstance(x, np.ndarray) else sys.modules["torch"]

@@ -1,4 +1,4 @@
-"""Homographies on points: transfer, chaining of steps, and how far they move a picture."""
+"""Apply homographies to points, chain them, and measure how far they move a picture."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -7,7 +7,7 @@ import numpy as np
 
 
 def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
-    """(N, 2) points through a (3, 3) homography. A point on the horizon goes to infinity, not to an error."""
+    """Apply a (3, 3) homography to (N, 2) points. A point on the horizon gives infinity and no error."""
     points = np.asarray(points_px, np.float64).reshape(-1, 2)
     homogeneous = np.ones((len(points), 3))
     homogeneous[:, :2] = points
@@ -17,7 +17,7 @@ def transfer(to_from: np.ndarray, points_px: np.ndarray) -> np.ndarray:
 
 
 def chain(steps: Sequence[np.ndarray]) -> np.ndarray:
-    """The homography from the first frame to the last, from those of successive frames; scaled so that [2, 2] is 1."""
+    """Chain the homographies of successive frames: return that from the first to the last frame, with [2, 2] = 1."""
     total = np.eye(3)
     for later_from_earlier in steps:
         total = later_from_earlier @ total
@@ -26,7 +26,7 @@ def chain(steps: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def background_flow(later_from_earlier: np.ndarray, size: tuple[int, int], samples: int = 9) -> float:
-    """Median displacement in pixels of a grid of points over a (width, height) image."""
+    """Return the median displacement in pixels of a grid of points over a (width, height) image."""
     grid = _grid(size, samples)
     return float(np.median(np.linalg.norm(transfer(later_from_earlier, grid) - grid, axis=1)))
 
@@ -38,6 +38,6 @@ def _grid(size: tuple[int, int], samples: int) -> np.ndarray:
 
 
 def corner_error(a: np.ndarray, b: np.ndarray, size: tuple[int, int]) -> float:
-    """How far two homographies differ, at most, at the corners of a (width, height) image, in pixels."""
+    """Return the largest difference of two homographies at the corners of a (width, height) image, in pixels."""
     corners = _grid(size, 2)
     return float(np.linalg.norm(transfer(a, corners) - transfer(b, corners), axis=1).max())

@@ -1,4 +1,4 @@
-"""Where a camera stood in each frame, between the samples of a table."""
+"""Interpolate the poses of a camera between the rows of a table."""
 
 from dataclasses import replace
 
@@ -12,10 +12,11 @@ from torchvision_dddas.types import Camera, Poses, PoseTable
 def poses_at(
     camera: Camera, table: PoseTable | None, frame: np.ndarray, rate_hz: float | None = None
 ) -> tuple[Camera, Poses]:
-    """The camera, with the kind of place that its poses have, and where it stood in each frame.
+    """Return the camera, marked as geographic if its poses are, and its poses in each frame.
 
-    Between samples place and pitch go straight on, heading and longitude by the shorter way round.
-    Raises InputError where the poses do not cover the frames, or are timed and there is no rate.
+    Position and pitch are interpolated linearly between rows, heading and longitude along the shorter arc. table: None
+    gives the camera's own pose in every frame. frame: (N,) numbers from 1.
+    Raises InputError if the poses do not cover the frames, or are by time and there is no rate.
     """
     n = len(frame)
     place = np.tile(camera.place, (n, 1)).astype(float)
@@ -23,7 +24,7 @@ def poses_at(
     if table is None:
         return camera, Poses(place, heading, pitch)
     if table.timed and rate_hz is None:
-        raise InputError(f"poses {table.path} are by time_s; say with --rate how many frames a second there are")
+        raise InputError(f"poses {table.path} are by time_s; give the number of frames a second with --rate")
     at, values = table.at, table.values
     when = (np.asarray(frame) - 1) / rate_hz if table.timed and rate_hz else np.asarray(frame, float)
     outside = (when < at[0] - 1e-6) | (when > at[-1] + 1e-6)
@@ -32,10 +33,10 @@ def poses_at(
         first = int(outside.argmax())
         raise InputError(
             f"poses {table.path} cover {unit} {at[0]:g} to {at[-1]:g}; {int(outside.sum())} of {n} rows of "
-            f"the table lie outside, the first at frame {frame[first]}. Give poses for all of them"
+            f"the table lie outside, the first at frame {frame[first]}. Give poses for all frames"
         )
     if "longitude_deg" in values:
-        # A longitude goes on over 180 degrees, not back through 0.
+        # Unwrap the longitude, so that interpolation across 180 degrees does not pass through 0.
         longitude = np.interp(when, at, np.unwrap(values["longitude_deg"], period=360))
         place = wrap_longitude(np.stack([longitude, np.interp(when, at, values["latitude_deg"])], axis=1))
         camera = replace(camera, geographic=True)

@@ -1,4 +1,4 @@
-"""Rotation vectors and matrices, and their derivatives, for the optimisers of poses."""
+"""Rotation vectors, rotation matrices and their derivatives, for the optimisation of poses."""
 
 from math import atan2, cos, sin, sqrt
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def cross(vector: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) matrices that multiply like the cross product with (..., 3) vectors."""
+    """Return the (..., 3, 3) matrices of the cross products with (..., 3) vectors."""
     matrices = np.zeros((*np.shape(vector), 3))
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0] = x, y, z
@@ -15,7 +15,7 @@ def cross(vector: np.ndarray) -> np.ndarray:
 
 
 def _polynomial(vector: np.ndarray, first: float, second: float) -> np.ndarray:
-    """I + first K + second K², with K the matrix of the cross product with a vector."""
+    """Return I + first K + second K², where K is the matrix of the cross product with a vector."""
     x, y, z = vector.tolist()
     fx, fy, fz, sx, sy, sz = first * x, first * y, first * z, second * x, second * y, second * z
     return np.array(
@@ -28,7 +28,7 @@ def _polynomial(vector: np.ndarray, first: float, second: float) -> np.ndarray:
 
 
 def turned(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation about a vector by its length in radians (Rodrigues)."""
+    """Return the (3, 3) rotation about a vector by its length in radians (Rodrigues)."""
     angle = sqrt(vector @ vector)
     if angle < 1e-6:
         return _polynomial(vector, 1.0, 0.5)
@@ -36,7 +36,7 @@ def turned(vector: np.ndarray) -> np.ndarray:
 
 
 def turn_of(rotation: np.ndarray) -> np.ndarray:
-    """(3,) the vector about which a rotation turns, by its length in radians: the inverse of `turned`."""
+    """Return the (3,) rotation vector of a rotation matrix: the inverse of `turned`."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     x, y, z = h - f, c - g, d - b
     sine, cosine = sqrt(x * x + y * y + z * z) / 2, (a + e + i - 1) / 2
@@ -45,22 +45,22 @@ def turn_of(rotation: np.ndarray) -> np.ndarray:
         return np.array([x, y, z]) * (angle / (2 * sine))
     if cosine > 0:
         return np.array([x, y, z]) / 2
-    # Half a turn: the axis is what the symmetric part leaves in place, its sign is free.
+    # For half a turn, the axis is any nonzero column of (R + I) / 2, and its sign is arbitrary.
     symmetric = (rotation + np.eye(3)) / 2
     axis = symmetric[:, int(np.argmax(np.diag(symmetric)))]
     return angle * axis / np.linalg.norm(axis)
 
 
 def slope_of_turn(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) how `turn_of(turned(small) @ turned(vector))` grows with the small rotation."""
+    """Return the (3, 3) derivative of `turn_of(turned(small) @ turned(vector))` by the small rotation."""
     angle = sqrt(vector @ vector)
     if angle < 1e-3:
         return _polynomial(vector, -0.5, 1 / 12)
-    # Bounded below half a turn, where the vector changes its sign.
+    # Keep the sine away from 0, because the vector changes its sign at half a turn.
     return _polynomial(vector, -0.5, 1 / angle**2 - (1 + cos(angle)) / (2 * angle * max(sin(angle), 1e-6)))
 
 
 def about_up(rotation: np.ndarray) -> np.ndarray:
-    """(3, 3) the rotation about up that leaves, undone first, only a tilt: rotation = tilt @ about_up."""
+    """Return the (3, 3) rotation about the up axis in the decomposition rotation = tilt @ about_up."""
     angle = atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])
     return turned(np.array([0.0, 0.0, angle]))

@@ -1,9 +1,10 @@
-"""Files in and out: video, telemetry, tables, maps, overlays, streams, reports.
+"""Read and write files: video, telemetry, tables, maps, overlays, streams, reports.
 
 Other rooms use:
 `sources` (`open_source` for clips; live streams), `images.decode_image`;
 `telemetry.read_telemetry`, `elevation.read_elevation` and `read_ortho`;
-`detection_tables`, `ground_tables`, `camera_files`, `colour_files` (`read_...` and `check_...`), `tables` (schemas);
+`detection_tables`, `foreign_boxes`, `ground_tables`, `camera_files`, `colour_files`, `zone_files`;
+`tables`, `track_files.write_tracks`, `drawing.draw`;
 `output` (recorders and records of runs), `streams.open_streams`, `report`, `overlay`, `overlay_video`, `maps`;
-`atomic_files` (writing whole files, or none).
+`atomic_files` (writing a file completely or not at all).
 """

@@ -1,7 +1,7 @@
-"""Files that appear whole or not at all, and folders that one run at a time writes into.
+"""Write files completely or not at all, and let only one run at a time write into a folder.
 
-A file is written under a hidden name beside its place, then renamed. Whoever writes it holds a lock of the system on
-it, which ends with the process however that ends: a hidden file without a lock is what a killed process left.
+A file is written under a hidden name beside its final place, then renamed. The writing process holds a system lock on
+it, which ends with the process in every case: a hidden file without a lock was left by a killed process.
 """
 
 import errno
@@ -19,7 +19,7 @@ from typing import Protocol, TextIO, TypeVar
 
 from torchvision_dddas.errors import InputError
 
-with suppress(ImportError):  # without such locks nothing is refused, and nothing counts as left behind
+with suppress(ImportError):  # without system locks, nothing is refused and no file counts as left behind
     import fcntl
 
 LOCK = ".dddas.lock"
@@ -38,21 +38,21 @@ class Part(Protocol[_Taken]):
     """A part of a run's output: tables, masks, an overlay, maps, the log."""
 
     def write(self, item: _Taken, /) -> None:
-        """Add an item. Raises OSError if it cannot be kept."""
+        """Add an item. Raise OSError if it cannot be stored."""
 
     def close(self, complete: bool) -> None:
-        """Make the files valid and put them in their places. complete: False if the user cut the run short."""
+        """Make the files valid and move them to their places. complete: False if the user ended the run early."""
         return
 
     def discard(self) -> None:
-        """Leave nothing behind that looks whole and is not. Never raises."""
+        """Remove files that look complete but are not. Never raise."""
         return
 
 
 class PartFile:
-    """A file under way. path: its hidden name, random and made for this process alone, with the ending of its place.
+    """A file being written. path: its hidden name, random and unique to this process, with the final file's suffix.
 
-    Raises OSError if it cannot be made.
+    Raise OSError if it cannot be created.
     """
 
     def __init__(self, place: Path) -> None:
@@ -61,26 +61,26 @@ class PartFile:
             name = f".{place.stem}.{secrets.token_hex(8)}.part{place.suffix}"
             self.path = place.with_name(name)
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-            # Another process may take it for one left behind, until it is locked.
+            # Until it is locked, another process may mistake the file for one left by a killed process.
             has_lock = _lock(self._file)
             if has_lock is None or (has_lock and _is_at(self._file, self.path)):
                 return
             os.close(self._file)
 
     def write(self, content: bytes) -> None:
-        """Add bytes. Raises OSError."""
+        """Add bytes. Raise OSError."""
         rest = memoryview(content)
         with self.naming():
             while rest:
                 rest = rest[os.write(self._file, rest) :]
 
     def open_text(self) -> TextIO:
-        """A text file that writes here; closed before `keep`."""
+        """Return a text file that writes here; close it before `keep`."""
         return open(self._file, "w", encoding="utf-8", newline="", closefd=False)
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Name the file in an OSError of the block that names none, as those of open files."""
+        """Set this file's name in an OSError of the block that names no file."""
         try:
             yield
         except OSError as error:
@@ -88,12 +88,12 @@ class PartFile:
             raise
 
     def keep(self) -> None:
-        """Put the file in its place. Raises OSError."""
+        """Move the file to its place. Raise OSError."""
         self.path.replace(self.place)
         self._close()
 
     def discard(self) -> None:
-        """Remove the file, unless it was kept. Never raises."""
+        """Remove the file, unless it was kept. Never raise."""
         if self._file >= 0:
             remove(self.path)
             self._close()
@@ -104,7 +104,7 @@ class PartFile:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file at once. Raises OSError, and then leaves neither a new file nor a temporary one."""
+    """Write a file in one step. Raise OSError, and then leave neither a new file nor a temporary file."""
     part = PartFile(path)
     try:
         part.write(content)
@@ -115,7 +115,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def save_file(path: Path, content: bytes) -> None:
-    """Write a file at once, and the folders above it. Raises InputError where the disk refuses."""
+    """Write a file in one step, and create the folders above it. Raise InputError if the disk refuses."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, content)
@@ -124,13 +124,13 @@ def save_file(path: Path, content: bytes) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file if it is there and can be removed: used while another error is on its way to the user."""
+    """Remove a file if it exists and can be removed. Used while another error is being reported to the user."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
 
 def remove_left_behind(folder: Path) -> None:
-    """Remove the hidden files in a folder that killed processes left. Never raises."""
+    """Remove the hidden files that killed processes left in a folder. Never raise."""
     with suppress(OSError):
         for path in folder.glob(_PATTERN):
             if _PART.fullmatch(path.name) is not None:
@@ -140,10 +140,10 @@ def remove_left_behind(folder: Path) -> None:
 
 
 class ClaimedFolder:
-    """A folder that this process alone writes into, until `release` or the end of the process.
+    """A folder that only this process writes into, until `release` or the end of the process.
 
-    Files that killed runs left under way are removed. made: the folders that were made, innermost first.
-    Raises InputError: another run writes into it, or it cannot be written.
+    Unfinished files of killed runs are removed. made: the folders that were created, innermost first.
+    Raise InputError if another run writes into the folder, or if it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -175,19 +175,19 @@ class ClaimedFolder:
                 raise InputError(
                     f"another run is writing into {self.folder}: wait for its end, or choose another folder with --out"
                 )
-            if has_lock is None or _is_at(file, path):  # else the run before removed it meanwhile
+            if has_lock is None or _is_at(file, path):  # otherwise the previous run removed the file meanwhile
                 return file
             os.close(file)
 
     def release(self) -> None:
-        """Let others write there. Never raises."""
+        """Let other runs write into the folder. Never raise."""
         if self._lock >= 0:
             remove(self.folder / LOCK)
             file, self._lock = self._lock, -1
             os.close(file)
 
     def remove_made(self) -> None:
-        """Release it, and remove the folders that were made, as far as nothing is in them."""
+        """Release the folder, and remove the folders that were created if they are empty."""
         self.release()
         for folder in self.made:
             try:
@@ -201,7 +201,7 @@ class ClaimedFolder:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[ClaimedFolder]:
-    """The block alone writes into a folder, which is not left behind if nothing was written. Raises InputError."""
+    """Claim a folder for the block, and remove it afterwards if it is empty. Raise InputError."""
     claim = ClaimedFolder(folder)
     try:
         yield claim
@@ -210,7 +210,7 @@ def claimed(folder: Path) -> Iterator[ClaimedFolder]:
 
 
 def _lock(file: int) -> bool | None:
-    """Lock an open file; False if another process has it locked, None where the system has no such locks."""
+    """Lock an open file. Return False if another process has locked it, None if the system has no such locks."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except NameError:
@@ -221,7 +221,7 @@ def _lock(file: int) -> bool | None:
 
 
 def _is_at(file: int, path: Path) -> bool:
-    """Whether an open file is still the one of that name."""
+    """Return whether an open file is still the file at a path."""
     try:
         return os.path.samestat(os.fstat(file), path.stat())
     except OSError:
@@ -229,10 +229,10 @@ def _is_at(file: int, path: Path) -> bool:
 
 
 def utf8_name(path: str | Path) -> str:
-    """A name for FFmpeg, which takes `word:` at the beginning for a protocol, and UTF-8 alone.
+    """Return a name for FFmpeg, which takes `word:` at the beginning for a protocol and needs UTF-8.
 
-    Another name may crash it: such a file's is a link to its folder, which lasts as long as the process.
-    Raises InputError if the link cannot be made.
+    Other names may crash FFmpeg; for such a file the name is that of a link, which lasts as long as the process.
+    Raise InputError if the link cannot be made.
     """
     name = os.path.abspath(path) if ":" in str(path) else str(path)  # noqa: PTH100 (a link is not followed)
     if name.isascii():
@@ -258,7 +258,7 @@ def _is_utf8(name: bytes) -> bool:
 
 @cache
 def _link(target: bytes) -> str:
-    """A plain name that leads to a file or folder, with its ending."""
+    """Return a plain name with the same suffix that links to a file or folder."""
     ending = re.sub(r"[^\w.]", "", Path(os.fsdecode(target)).suffix, flags=re.ASCII)
     link = Path(_links().name) / f"{secrets.token_hex(8)}{ending}"
     link.symlink_to(os.fsdecode(target))
@@ -280,28 +280,28 @@ def _opened(path: Path, flags: int) -> Iterator[int]:
 
 
 def refuse_own_input(given: Iterable[Path], written: Iterable[Path], option: str) -> None:
-    """Raises InputError where a file that is read is one of those to be written; option: what names another place."""
-    places = {os.path.realpath(path) for path in written}  # unlike Path.resolve it takes links that go in circles
+    """Raise InputError if a file that is read would also be written. option: the option that chooses another place."""
+    places = {os.path.realpath(path) for path in written}  # unlike Path.resolve, it accepts circular links
     for path in given:
         if os.path.realpath(path) in places:
             raise InputError(f"{path} is a file that this run writes; choose another {option}")
 
 
 def refuse_folder(path: Path) -> None:
-    """Raises InputError where a folder is in the place of a file to be written, or no file can have that name."""
+    """Raise InputError if a folder is in the place of a file to be written, or if the file name is impossible."""
     try:
         folder = path.is_dir()
     except OSError as error:
         raise cannot_write(path, error) from None
     if folder:
-        raise InputError(f"--out {path} is a folder; wanted the name of a file")
+        raise InputError(f"--out {path} is a folder; give the name of a file")
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:
-    """The InputError to raise for a failed write of a file."""
+    """Return the InputError for a failed write of a file."""
     part = _PART.fullmatch(path.name)
     place = path if part is None else path.with_name(f"{part[1]}{part[2] or ''}")
     return InputError(
-        f"cannot write {place}: {error.strerror or error}. What was not whole, such as tables under way, "
-        "is removed; free some space or choose another --out"
+        f"cannot write {place}: {error.strerror or error}. Unfinished files, such as tables being written, "
+        "are removed; free some space or choose another --out"
     )

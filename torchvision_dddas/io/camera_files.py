@@ -1,4 +1,4 @@
-"""Cameras on the ground: their TOML files, CSVs of where a moving one stood, and CSVs of measured heights.
+"""Cameras on the ground: TOML files of cameras, CSVs of the poses of moving cameras, and CSVs of measured heights.
 
 focal_px = 1195            # or hfov_deg; `dddas calibrate` finds it
 width_px = 768
@@ -26,32 +26,41 @@ LIMITS: dict[str, tuple[float, float]] = {
     "focal_px": (1, 1e6), "focal_v_px": (1, 1e6), "hfov_deg": (0.1, 170), "width_px": (1, 1e5), "height_px": (1, 1e5),
     "height_m": (0.01, 1000), "pitch_deg": (-89, 89), "roll_deg": (-180, 180), "heading_deg": (-360, 360),
     "east_m": (-1e7, 1e7), "north_m": (-1e7, 1e7), "longitude_deg": (-180, 180), "latitude_deg": (-90, 90),
-    "k1": (-10, 10), "k2": (-100, 100), "focal_sigma": (0, 1), "height_sigma_m": (0, 100), "pitch_sigma_deg": (0, 45),
+    "k1": (-10, 10), "k2": (-100, 100), "p1": (-1, 1), "p2": (-1, 1), "k3": (-1000, 1000),
+    "focal_sigma": (0, 1), "height_sigma_m": (0, 100), "pitch_sigma_deg": (0, 45),
     "heading_sigma_deg": (0, 180), "position_sigma_m": (0, 1000), "takeoff_above_sea_m": (-500, 9000),
+    "elevation_m": (-500, 9000),
 }  # fmt: skip
-"""Range of every key that is a number. `centre_px` is a pair; `name` is text.
+"""Range of every numeric key. `centre_px` is a pair; `name` is text.
 
-focal_v_px: along the columns, where pixels are not square. centre_px: u, v of the optical axis. pitch_deg: positive
-down. roll_deg: turned clockwise. takeoff_above_sea_m: the height where an aerial vehicle took off. k1, k2: radial
-distortion as OpenCV has it. The sigmas are standard deviations, of the focal length as a share: 1 %, 0.05 m, 0.5°, 2°
-(a compass) and 1.43 m (a GPS of 3.5 m in 95 %) where not given, from the air those of the group `aerial`.
+focal_v_px: focal length along the columns, if pixels are not square. centre_px: u, v of the optical axis. pitch_deg:
+positive down. roll_deg: clockwise. takeoff_above_sea_m: height of the take-off point of an aerial vehicle.
+elevation_m: height above the sea of the ground below a ground camera. k1, k2, k3: radial distortion, p1, p2: tangential
+distortion, as in OpenCV. The sigmas are standard deviations, of the focal length as a share. Defaults: 1 %, 0.05 m,
+0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %); for aerial cameras those of the group `aerial`.
 """
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3")
+"""The keys of the distortion, in OpenCV's order."""
 
 KEYS = (*LIMITS, "centre_px", "name")
 _SIZE = ("width_px", "height_px")
 # Keys that are fields of Camera; degrees become radians.
 _FIELDS = (
-    *("height_m", "pitch_deg", "roll_deg", "heading_deg", "k1", "k2", "takeoff_above_sea_m"),
+    *("height_m", "pitch_deg", "roll_deg", "heading_deg", *DISTORTION, "takeoff_above_sea_m", "elevation_m"),
     *(key for key in LIMITS if "sigma" in key),
 )
 
 
-def read_camera_keys(path: str | Path, is_aerial: bool = False) -> dict[str, Any]:
-    """The keys of a camera's file, complete or not, each checked. is_aerial: it may look straight down.
+def read_camera_keys(
+    path: str | Path, is_aerial: bool = False, content: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Read and check the keys of a camera's file, which may be incomplete. is_aerial: it may look straight down.
 
-    Raises InputError with the file and the key: unreadable, no TOML, a key that no camera has, a value out of range.
+    content: the keys, if they are a table in another file; path then only names that file in messages.
+    Raise InputError with the file and the key: unreadable, not TOML, an unknown key, a value out of range.
     """
-    content = read_toml(path, "camera")
+    content = read_toml(path, "camera") if content is None else content
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)
@@ -76,9 +85,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def describe_missing(camera: str | Path, poses: PoseTable | None = None) -> str:
-    """The keys that a camera's file and its poses lack, and what is assumed instead, in words; "" where none lacks."""
-    given = {*read_camera_keys(camera), *(poses.values if poses is not None else ())}
+def describe_missing(camera: str | Path, poses: PoseTable | None = None, content: dict[str, Any] | None = None) -> str:
+    """Return which keys a camera's file and its poses lack, and what is assumed instead; "" if nothing is missing."""
+    given = {*read_camera_keys(camera, content=content), *(poses.values if poses is not None else ())}
     assumed = {
         "no height_m: distances by the foot row are unknown": {"height_m"},
         "no pitch_deg: level is assumed": {"pitch_deg"},
@@ -90,20 +99,33 @@ def describe_missing(camera: str | Path, poses: PoseTable | None = None) -> str:
 
 
 def read_aerial_camera(path: str | Path, size_px: tuple[int, int] | None) -> Camera:
-    """Read a camera in the air. The file may lack the size, if size_px is given, and the focal length, NaN then.
+    """Read an aerial camera. The file may lack the size, if size_px is given, and the focal length, which is then NaN.
 
-    Raises InputError as `read_camera`.
+    Raise InputError as `read_camera` does.
     """
     return _build_camera(path, size_px, is_aerial=True)
 
 
-def read_camera(path: str | Path) -> Camera:
-    """Read a camera. Raises InputError with the file and the key: unreadable, unknown, missing, out of range."""
-    return _build_camera(path)
+def read_camera(path: str | Path, *, content: dict[str, Any] | None = None) -> Camera:
+    r"""Read a camera. content: as in `read_camera_keys`.
+
+    Raise InputError with the file and the key: unreadable, unknown, missing, out of range.
+
+    >>> lines = ["focal_px = 500", "width_px = 640", "height_px = 480", "height_m = 1.2", "east_m = 0", "north_m = 0"]
+    >>> written = pathlib.Path("camera.toml").write_text("\n".join([*lines, "heading_deg = 90", "pitch_deg = 0"]))
+    >>> td.read_camera("camera.toml").focal_px
+    (500.0, 500.0)
+    """
+    return _build_camera(path, content=content)
 
 
-def _build_camera(path: str | Path, size_px: tuple[int, int] | None = None, is_aerial: bool = False) -> Camera:
-    content = read_camera_keys(path, is_aerial)
+def _build_camera(
+    path: str | Path,
+    size_px: tuple[int, int] | None = None,
+    is_aerial: bool = False,
+    content: dict[str, Any] | None = None,
+) -> Camera:
+    content = dict(read_camera_keys(path, is_aerial, content))
     if size_px is not None and not set(_SIZE) & content.keys():
         content |= dict(zip(_SIZE, size_px, strict=True))
     numbers = {key: float(content[key]) for key in LIMITS if key in content}
@@ -142,10 +164,10 @@ def _build_camera(path: str | Path, size_px: tuple[int, int] | None = None, is_a
 def _place(numbers: dict[str, float], path: str | Path) -> tuple[tuple[float, float], bool]:
     given = [[key for key in kind if key in numbers] for kind in PLACES]
     if all(given):
-        raise InputError(f"camera {path} has {given[0][0]} and {given[1][0]}; give its place in degrees or in metres")
+        raise InputError(f"camera {path} has {given[0][0]} and {given[1][0]}; give the place in degrees or in metres")
     for kind, keys in zip(PLACES, given, strict=True):
         if len(keys) == 1:
-            raise InputError(f"camera {path} has {keys[0]} alone; wanted {' and '.join(kind)}")
+            raise InputError(f"camera {path} has {keys[0]} alone; give {' and '.join(kind)}")
     first, second = PLACES[0] if given[0] else PLACES[1]
     return (numbers.get(first, 0.0), numbers.get(second, 0.0)), bool(given[0])
 
@@ -158,10 +180,14 @@ POSES = Schema("poses", *(Column(name, "g", *LIMITS.get(name, (-1e12, 1e12))) fo
 
 
 def read_poses(path: str | Path) -> PoseTable:
-    """Read the poses of a camera: `frame` or `time_s`, and any other column of POSES; further ones are ignored.
+    r"""Read the poses of a camera: `frame` or `time_s`, and any other column of POSES; further ones are ignored.
 
-    Raises InputError with file and line: as read_table, no such column, half a place, no rows, a frame or time that
+    Raise InputError with file and line: as read_table, no such column, half a place, no rows, a frame or time that
     does not come after the one before.
+
+    >>> written = pathlib.Path("poses.csv").write_text("frame,heading_deg\n1,0\n2,5\n")
+    >>> td.read_poses("poses.csv").values["heading_deg"]
+    array([0., 5.])
     """
     text = read_csv(path, "poses")
     columns = f"poses {path}: its columns are {', '.join(text.header) or 'none'}"
@@ -192,7 +218,7 @@ MEASUREMENTS = Schema(
 
 
 def has_measurements(path: str | Path) -> bool:
-    """Whether the first line of a file names the columns of MEASUREMENTS. A file that cannot be read does not."""
+    """Return whether the first line of a file names the columns of MEASUREMENTS; False for an unreadable file."""
     try:
         with Path(path).open(encoding="utf-8-sig") as file:
             return set(MEASUREMENTS.names) <= {name.strip() for name in file.readline().split(",")}
@@ -201,7 +227,7 @@ def has_measurements(path: str | Path) -> bool:
 
 
 def read_measurements(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """A person's distances (N,) in metres and heights (N,) in pixels. Raises InputError as read_table; no rows."""
+    """Read a person's distances (N,), m, and heights (N,), px. Raise InputError as read_table, or without rows."""
     table = read_table(path, MEASUREMENTS, MEASUREMENTS.names, is_ragged=True)
     table.require_rows()
     return table["distance_m"], table["height_px"]

@@ -1,4 +1,4 @@
-"""Open videos, streams and cameras: through PyAV where it is installed, else, and for cameras, through OpenCV."""
+"""Open videos, streams and cameras: through PyAV if it is installed; otherwise, and for cameras, through OpenCV."""
 
 import os
 import time
@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-# FFmpeg reads this when OpenCV first opens a video; without it a damaged file fills the terminal with decoder messages.
+# FFmpeg reads this variable when OpenCV first opens a video. Without it a damaged file floods the terminal.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
@@ -19,17 +19,17 @@ from torchvision_dddas.io.atomic_files import utf8_name
 from torchvision_dddas.io.images import quiet_opencv
 from torchvision_dddas.memory import VIDEO, check_memory
 
-# FFmpeg draws any text file as an old terminal would, which is never wanted.
+# FFmpeg renders any text file as an old terminal would. Such input is refused.
 _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
 # A stream is the cover of a file if it is marked as an attached picture, a thumbnail or a still image, or if it holds a
 # single picture in one of the codecs of pictures.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
-# FFmpeg's options of a stream, `name;value|name;value`, as OpenCV reads them from this variable; by default as OpenCV.
+# FFmpeg's options for streams, `name;value|name;value`, from the variable that OpenCV reads, with OpenCV's default.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
-# Pictures after which a stream without key frames has replaced what was damaged.
+# Number of pictures after which a stream without key frames has replaced damaged content.
 _HEALED = 250
-# Pictures by whose time stamps a rate is measured, and how few do not suffice.
+# Number of pictures from whose time stamps a rate is measured, and the smallest sufficient number.
 _MEASURED, _LEAST_MEASURED = 64, 8
 
 
@@ -44,11 +44,11 @@ class Capture(Protocol):
 
 
 def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | None = None) -> Capture:
-    """A file, a camera's index or a stream's address.
+    """Open a file, a camera by its index, or a stream by its address.
 
-    limits_s: after which opening a stream, and later reading from it, fails. Without PyAV an address is refused: OpenCV
-    (4.14) squeezes pictures of another size to the size of the first one and says nothing (OpenCV issue 27116).
-    Raises InputError: cannot be opened, is no video.
+    limits_s: timeouts for opening a stream and for reading from it. Without PyAV an address is refused, because OpenCV
+    (4.14) silently resizes pictures of another size to the size of the first one (OpenCV issue 27116).
+    Raise InputError if the target cannot be opened or is not a video.
     """
     if isinstance(target, str):
         try:
@@ -60,11 +60,11 @@ def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | N
 
 
 def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
-    """As open_capture, for a camera's index, and for a file without PyAV."""
+    """Open a camera's index, or a file without PyAV, as open_capture does."""
     with quiet_opencv():
         if isinstance(target, int):
             capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
-        else:  # other back ends than FFmpeg take a numbered image or a text file for a video
+        else:  # back ends other than FFmpeg take a numbered image or a text file for a video
             capture = cv2.VideoCapture(utf8_name(target), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(_refusal(target, name))
@@ -79,21 +79,21 @@ def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
 
 
 def is_cut_to_8_bits(capture: Capture) -> bool:
-    """Whether pictures are grey and lose their lower bits, as OpenCV (4.14) gives them."""
+    """Return whether OpenCV (4.14) delivers grey pictures without their lower bits."""
     if isinstance(capture, AvCapture):
         return False
     tag = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).to_bytes(4, "little", signed=True)
-    return b"Y1\x00" in (tag[:3], tag[:0:-1])  # FFmpeg's tag of deep greys, with the lowest byte first or last
+    return b"Y1\x00" in (tag[:3], tag[:0:-1])  # FFmpeg's tag of deep grey, in either byte order
 
 
 class AvCapture:
-    """A file or stream through PyAV; arguments and errors of `open_capture`. Pixels are those that OpenCV gives.
+    """A file or stream through PyAV; arguments and errors as in `open_capture`. Pixels equal those of OpenCV.
 
-    A picture has the size that it was sent with. Of several streams of pictures the first that is no cover is read.
-    concealed: whether the decoder concealed errors in the picture grabbed last, or got damaged data for it.
-    damaged: the same, or it may build on such a picture: until the next key frame, or for _HEALED pictures.
-    stored: how many pictures the data read so far hold, whether or not they can be decoded.
-    Raises ImportError where PyAV is not installed.
+    Pictures keep the size in which they were sent. If there are several video streams, the first that is not a cover is
+    read. concealed: whether the last grabbed picture has errors that the decoder concealed, or damaged data.
+    damaged: whether the picture may depend on such a picture: until the next key frame, or for _HEALED pictures.
+    stored: number of pictures in the data read so far, whether or not they can be decoded.
+    Raise ImportError if PyAV is not installed.
     """
 
     def __init__(self, target: str, name: str, limits_s: tuple[float, float] | None = None) -> None:
@@ -116,28 +116,28 @@ class AvCapture:
         _check_size(target, name, films[0].width, films[0].height)
         self._video, self._reformatter = films[0], cast(Any, VideoReformatter())
         self._tick_s = float(self._video.time_base or 0)
-        # H.264 conceals errors, and says so, only if its slices are not decoded in parallel. Frames in parallel come
-        # late, which only matters for what is live.
+        # The H.264 decoder reports concealed errors only if slices are not decoded in parallel. Decoding frames in
+        # parallel adds a delay, which matters only for live input.
         if limits_s is None:
             self._video.thread_type, self._video.codec_context.thread_count = "FRAME", cv2.getNumberOfCPUs()
         elif self._video.codec_context.name == "h264":
             self._video.codec_context.thread_count = 1
-        # Until a larger block was freed, glibc maps the memory of each picture anew, which takes 2 ms at 1080p.
+        # Until a larger block has been freed, glibc maps each picture's memory anew, which takes 2 ms at 1080p.
         np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
         form = self._video.format if limits_s is None else None
         self._is_deep = form is not None and form.name.startswith("gray") and form.bits_per_pixel > 8
         self._packets: Iterator[Any] = self._container.demux(self._video)
-        self._waiting: list[Any] = []  # frames of the packet read last
+        self._waiting: list[Any] = []  # frames of the last packet
         self._spoiled: set[int | None] = set()  # time stamps of damaged packets
         self._frame: Any = None
         self.concealed = self.damaged = False
         self.stored, self._since = 0, _HEALED  # pictures since errors were concealed
 
     def grab(self) -> bool:
-        """Wait for the next picture; False: none came, or it cannot be decoded."""
+        """Wait for the next picture. Return False if none came or it cannot be decoded."""
         self._frame, until_s = None, time.monotonic() + self._limit_s
         while not self._waiting:
-            if time.monotonic() > until_s:  # packets come, and no picture of them
+            if time.monotonic() > until_s:  # packets arrive, but no picture
                 return False
             try:
                 packet = next(self._packets)
@@ -151,7 +151,7 @@ class AvCapture:
                 self._spoiled.add(packet.pts)
             try:
                 self._waiting = packet.decode()
-            except self._failures:  # a damaged packet: of a file one picture is lost, a stream goes on
+            except self._failures:  # a damaged packet: a file loses one picture, a stream continues
                 self._since = 0
                 if self._limit_s == float("inf"):
                     return False
@@ -163,9 +163,9 @@ class AvCapture:
         return True
 
     def retrieve(self) -> tuple[bool, np.ndarray | None]:
-        """The picture grabbed last, upright, BGR; False and None where it cannot be decoded.
+        """Return the last grabbed picture, upright, BGR; False and None if it cannot be decoded.
 
-        uint8 (H, W, 3), or uint16 (H, W) of a file with grey pictures of more than 8 bits.
+        The picture is uint8 (H, W, 3), or uint16 (H, W) for a file with grey pictures of more than 8 bits.
         """
         if self._frame is None:
             return False, None
@@ -175,18 +175,18 @@ class AvCapture:
                 return True, np.ascontiguousarray(np.rot90(deep, round(self._frame.rotation / 90) % 4))
             frame = self._reformatter.reformat(self._frame, format="bgr24", interpolation="BICUBIC")
             plane, turns = frame.planes[0], round(self._frame.rotation / 90) % 4
-            # Not frame.to_ndarray, which copies: the array keeps the plane.
+            # frame.to_ndarray would copy; this array refers to the plane.
             rows = np.frombuffer(plane, np.uint8).reshape(frame.height, plane.line_size)
             image = rows[:, : 3 * frame.width].reshape(frame.height, frame.width, 3)
             return True, np.ascontiguousarray(np.rot90(image, turns))
         return False, None
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        """Grab and retrieve."""
+        """Read the next picture, as OpenCV's `read` does: whether there is one, and the picture."""
         return self.retrieve() if self.grab() else (False, None)
 
     def get(self, propId: int, /) -> float:
-        """As OpenCV: the time stamp of the picture grabbed last (NaN: none), the announced rate or frame count."""
+        """Return, as OpenCV does, the last time stamp (NaN: none), the announced rate, or the frame count."""
         video, frame = self._video, self._frame
         rate_hz = float(video.guessed_rate or video.average_rate or 0)
         if propId == cv2.CAP_PROP_FPS:
@@ -197,10 +197,10 @@ class AvCapture:
         return float("nan") if stamp is None else 1000 * self._tick_s * stamp
 
     def sample(self, count: int) -> list[np.ndarray]:
-        """Up to `count` - 1 pictures spread over the rest of a file, which can then not be read in order."""
+        """Return up to `count` - 1 pictures spread over the rest of a file, which can then not be read in order."""
         found = []
         for share in np.linspace(0, 1, count)[1:].tolist():
-            with suppress(*self._failures):  # to the picture before that can be decoded alone
+            with suppress(*self._failures):  # seek to the key frame before
                 self._container.seek(int(share * (self._container.duration or 0)))
             self._packets, self._waiting = self._container.demux(self._video), []
             decoded, image = self.read()
@@ -208,14 +208,14 @@ class AvCapture:
         return found
 
     def stamps_s(self, most: int | None = None) -> list[float]:
-        """Time stamps of the next pictures, at most so many, as stored, NaN for none. The pictures are not read."""
+        """Return stored time stamps of at most `most` next pictures, NaN for none, without decoding them."""
         packets, stamps = islice(self._packets, most), list[int | None]()
         with suppress(*self._failures):
             stamps.extend(packet.dts if packet.pts is None else packet.pts for packet in packets if packet.size)
         return [float("nan") if stamp is None else self._tick_s * stamp for stamp in stamps]
 
     def measure_hz(self) -> float | None:
-        """The usual rate of the next pictures by their time stamps, None where unknown. They are not read."""
+        """Measure the usual rate of the next pictures from time stamps, None if unknown. Pictures are not decoded."""
         stamps_s = np.array(self.stamps_s(_MEASURED))
         steps_s = np.diff(np.unique(stamps_s[np.isfinite(stamps_s)]))
         if len(steps_s) < _LEAST_MEASURED:
@@ -225,17 +225,17 @@ class AvCapture:
         return 1 / step_s if 0.001 <= step_s <= 100 else None
 
     def release(self) -> None:
-        """Let go of the file or the connection."""
+        """Close the file or the connection."""
         self._container.close()
 
 
 def is_live(target: str | int) -> bool:
-    """Whether a target is a camera's index or an address."""
+    """Return whether a target is a camera's index or an address."""
     return isinstance(target, int) or "://" in target
 
 
 def announced_hz(capture: Capture) -> float | None:
-    """The rate that a video or stream announces; None where nothing credible is."""
+    """Return the rate that a video or stream announces; None if it is not credible."""
     rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
     return rate_hz if 0 < rate_hz <= 1000 else None
 
@@ -255,7 +255,7 @@ def _is_cover(video: Any) -> bool:
 def _refusal(target: str | int, name: str) -> str:
     live = is_live(target)
     what = f"camera {target}" if isinstance(target, int) else f"{name} as a {'stream' if live else 'video'}"
-    return f"cannot open {what}; " + ("is it there?" if live else "it is damaged or no video file")
+    return f"cannot open {what}; " + ("is it there?" if live else "it is damaged or not a video file")
 
 
 def _read_options() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Detections from a table: MOTChallenge text of any tool, a CSV with named columns, or a folder of YOLO's labels."""
+"""Detections from a table: MOTChallenge text, a CSV with named columns, YOLO's labels, or a foreign format."""
 
 import os
 import re
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.foreign_boxes import name_columns, read_foreign
 from torchvision_dddas.io.images import natural_order
 from torchvision_dddas.io.tables import (
     BOX,
@@ -79,22 +80,33 @@ SCHEMA = Schema(
 
 
 def read_detections(
-    path: str | Path, order: str | None = None, size: tuple[float, float] | None = None, pictures: Sequence[str] = ()
+    path: str | Path, *, order: str | None = None, size: tuple[float, float] | None = None, pictures: Sequence[str] = ()
 ) -> DetectionTable:
-    """Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
+    r"""Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
 
-    Or a folder of YOLO's labels, `class cx cy w h [score]`, a file a picture. pictures: their names without endings, in
-    order; else the number at the end of a file's name is its frame. order: of a box's columns, one of ORDERS; None: as
-    names and numbers tell. size: (width, height) of the pictures; boxes within [0, 1] are shares of it. Frames may
-    count from 0.
+    Or a folder of YOLO's labels, `class cx cy w h [score]`, a file a picture; classes.txt may name the classes. Or
+    COCO, CVAT, VisDrone and the others of `foreign_boxes`, or Parquet.
+    pictures: their names without endings, in order; else the number at the end of a file's name is its frame. order: of
+    a box's columns, one of ORDERS; None: as names and numbers tell. size: (width, height) of the pictures; boxes within
+    [0, 1] are shares of it. Frames may count from 0.
     An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET, CLASS, `class_id`
     may be there; any other and all that follows the score are ignored. Rows may come in any order.
     A table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
     Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
     range, a few scores outside [0, 1] (see FEW_SHARE), shares where the size is not known, boxes of unknown order.
+
+    >>> written = pathlib.Path("boxes.txt").write_text("1,-1,40,60,20,20,0.9,-1,-1,-1\n")
+    >>> td.read_detections("boxes.txt").at(1).xyxy
+    array([[40., 60., 60., 80.]])
     """
     is_folder = os.path.isdir(path)  # noqa: PTH112 (pathlib raises for a name that no file can have)
-    text, is_named = _read_labels(Path(path), pictures) if is_folder else _read_cells(path, "detections")
+    foreign = read_foreign(Path(path), pictures)
+    if foreign is not None:
+        is_folder, is_named, (text, said) = False, True, foreign
+    else:
+        text, is_named = _read_labels(Path(path), pictures) if is_folder else _read_cells(path, "detections")
+        named = None if is_named or is_folder else name_columns(Path(path), text)
+        (text, said), is_named = named or (text, []), is_named or named is not None
     if is_named:
         header, found = _rename(text)
         text, order = text._replace(header=header), order or found
@@ -107,6 +119,7 @@ def read_detections(
     table = read_table(path, SCHEMA, REQUIRED, text=text)
     check_crowding(table["frame"], f"detections {path}")
     box_px, order, notes = _in_pixels(table, order, size, is_folder, path)
+    notes += said
     for k, column in enumerate(BOX):
         is_wrong = box_px[:, k] < column.low
         table.refuse(is_wrong, f"{column.name} is '{box_px[is_wrong, k][:1].sum():g}'; wanted {column.wanted}")
@@ -116,7 +129,8 @@ def read_detections(
     if has_none.any() and not has_none.all():
         notes.append(f"{has_none.sum()} of {len(table)} rows have no score: they count as certain")
     score = np.where(has_none, 1.0, table["score"])
-    # Without names, 87.5 may be on any scale: detectors of MOTChallenge give such scores.
+    # A table without column names may have scores on any scale, such as 87.5: detectors of MOTChallenge give them. Only
+    # whole numbers are then read as percent.
     is_score = is_named or (score == np.round(score)).all()
     if is_score and score.min(initial=0) >= 0 and 20 <= score.max(initial=0) <= 100:
         score = score / 100
@@ -138,7 +152,8 @@ def read_detections(
     label = next((table.columns[name] for name in CLASS if name in table), None)
     if class_id is not None:
         class_id = np.where(np.isfinite(class_id), class_id, -1).astype(np.int64)
-        label = [str(k) if k >= 0 else "" for k in class_id.tolist()] if label is None else label
+        known = _class_names(Path(path)) if is_folder else {}
+        label = [known.get(k, str(k)) if k >= 0 else "" for k in class_id.tolist()] if label is None else label
     frame = table["frame"].astype(np.int64)
     if (frame == 0).any():
         frame += 1
@@ -254,13 +269,21 @@ def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
     return CsvText([*MOT_NAMES], lines, rows), False
 
 
+def _class_names(folder: Path) -> dict[int, str]:
+    """The names of classes by number, of a file classes.txt in a folder of labels or above it, a line each."""
+    for file in (folder / "classes.txt", folder.parent / "classes.txt"):
+        if file.is_file():
+            return dict(enumerate(file.read_text("utf-8", "replace").splitlines()))
+    return {}
+
+
 def read_for_clip(
     path: Path, order: str | None, source: Source | None, size: tuple[float | None, float | None] = (None, None)
 ) -> DetectionTable:
     """`read_detections` for a clip, whose size counts before the one that is given. Raises InputError as it does."""
     size = size if source is None else source.size
     known = (size[0], size[1]) if size[0] and size[1] else None
-    return read_detections(path, order, known, [file.stem for file in getattr(source, "files", ())])
+    return read_detections(path, order=order, size=known, pictures=[file.stem for file in getattr(source, "files", ())])
 
 
 def read_header(path: str | Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Places on the ground from CSV: reports of landmarks, which are ground vehicles of known place, and located targets.
+"""CSV tables of places on the ground: reports of landmarks, which are vehicles of known place, and located targets.
 
 frame,landmark,longitude_deg,latitude_deg       # or time_s; or east_m,north_m; optional u_px,v_px, sigma_m, planned
 1,rover,-110.95000,32.23000
@@ -28,6 +28,8 @@ from torchvision_dddas.io.tables import (
 from torchvision_dddas.types import Landmarks, Positions
 
 IMAGE = ("u_px", "v_px")
+HEIGHT_M = -600.0, 9000.0
+"""Lowest and highest ground, above the sea or above the ellipsoid."""
 LANDMARKS = Schema(
     "landmarks",
     Column("frame", "d", 1, FRAME.high, True, wanted="a whole number from 1; between two pictures, give time_s"),
@@ -38,19 +40,24 @@ LANDMARKS = Schema(
     *(Column(name, ".3f", -1e6, 1e6, may_be_empty=True) for name in IMAGE),
     Column("sigma_m", ".6g", 0, 1e5, may_be_empty=True),
     Column("planned", "d", 0, 1, True, may_be_empty=True, wanted="0 or 1"),
+    *(Column(name, ".3f", *HEIGHT_M, may_be_empty=True) for name in ("elevation_m", "above_ellipsoid_m")),
 )
 FARTHEST_M = 100_000.0
-"""Landmarks of one table are no further apart: what lies beyond is a typing mistake."""
+"""Largest distance between landmarks of one table; larger ones are typing mistakes."""
 
 
-def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_s: float = 0.0) -> Landmarks:
-    """Read `frame` or `time_s`, `landmark` (a name or a number), a place; `u_px,v_px`, `sigma_m`, `planned` if there.
+def read_landmarks(path: str | Path, *, rate_hz: float | None = None, clock_offset_s: float = 0.0) -> Landmarks:
+    r"""Read `frame` or `time_s`, `landmark` (a name or a number), a place, and the other columns of LANDMARKS if given.
 
-    Rows may come in any order; further columns are ignored. An empty place is a dropout, an empty u_px and v_px means
-    not seen; `nan` counts as empty. Times become frames, 1 + (time_s + clock_offset_s) rate_hz, whole ones where the
-    row has a place in the picture; a table by frames ignores rate and offset.
-    Raises InputError with file and line: as read_table, times without a rate, longitude and latitude swapped, degrees
+    Rows may come in any order; further columns are ignored. An empty place is a dropout, and empty u_px and v_px mean
+    not seen; `nan` counts as empty. Times become frames, 1 + (time_s + clock_offset_s) rate_hz, rounded if the row has
+    pixels; a table by frames ignores rate and offset.
+    Raise InputError with file and line: as read_table, times without a rate, longitude and latitude swapped, degrees
     and metres mixed, half a place, a landmark twice in a frame, places further apart than FARTHEST_M.
+
+    >>> written = pathlib.Path("marks.csv").write_text("frame,landmark,east_m,north_m\n1,a,3.0,4.0\n1,b,7.0,4.0\n")
+    >>> td.read_landmarks("marks.csv").names
+    ('a', 'b')
     """
     text = read_csv(path, "landmarks")
     _check_header(text.header, path, rate_hz)
@@ -62,23 +69,22 @@ def read_landmarks(path: str | Path, rate_hz: float | None = None, clock_offset_
     place, is_geographic = _places(table)
     image = _pair(table, IMAGE)
     planned, is_seen = table["planned"] == 1, np.isfinite(image[:, 0])
-    table.refuse(planned & np.isnan(place[:, 0]), "planned is 1 but there is no place; wanted the waypoint's")
+    table.refuse(planned & np.isnan(place[:, 0]), "planned is 1 but there is no place; give the waypoint's place")
     table.refuse(
         planned & is_seen, "planned is 1 and there is a u_px; a waypoint is not seen, leave u_px and v_px empty"
     )
     frame = table["frame"]
     if "frame" not in table:
         frame = 1 + (table["time_s"] + clock_offset_s) * (rate_hz or 1.0)
-        # A picture's time is written with three digits or so: what is seen is seen in a whole frame.
+        # A picture's time is written with about three digits, so a pixel belongs to a whole frame.
         frame = np.round(np.where(is_seen, np.round(frame), frame), 6)
     check_crowding(frame, f"landmarks {path}", "landmarks")
     index: dict[str, int] = {}
     landmark = np.array([index.setdefault(name, len(index)) for name in table.columns["landmark"]], np.int64)
-    table.refuse(landmark == index.get("", -1), "landmark is empty; wanted its name or number")
+    table.refuse(landmark == index.get("", -1), "landmark is empty; give its name or number")
     columns = (frame, landmark, image, place, table["sigma_m"], planned, table.line)
-    found = Landmarks(tuple(index), *columns, geographic=is_geographic, path=str(path))[
-        np.argsort(frame, kind="stable")
-    ]
+    heights = {name: table[name] for name in ("elevation_m", "above_ellipsoid_m")}
+    found = Landmarks(tuple(index), *columns, is_geographic, str(path), **heights)[np.argsort(frame, kind="stable")]
     _check_once_a_frame(found)
     _check_far(found)
     return found
@@ -101,7 +107,7 @@ def _check_header(header: list[str], path: str | Path, rate_hz: float | None) ->
 
 
 def _check_degrees(table: CsvTable) -> None:
-    """Check latitudes first: they reveal swapped columns more often than longitudes."""
+    """Check the ranges of degrees, latitudes first: they reveal swapped columns more often than longitudes."""
     for name, most in (("latitude_deg", 90), ("longitude_deg", 180)):
         is_wrong = np.abs(table[name]) > most
         if is_wrong.any():
@@ -116,12 +122,12 @@ def _check_degrees(table: CsvTable) -> None:
 
 
 def _places(table: CsvTable) -> tuple[np.ndarray, bool]:
-    """(N, 2) places, and whether they are longitudes and latitudes."""
+    """Return the (N, 2) places, and whether they are longitudes and latitudes."""
     degrees, metres = (_pair(table, kind) for kind in PLACES)
     in_degrees, in_metres = np.isfinite(degrees[:, 0]), np.isfinite(metres[:, 0])
     table.refuse(
         in_degrees & in_metres,
-        "a place in degrees and in metres; give one kind in all rows and leave the columns of the other out",
+        "the row has a place in degrees and in metres; give one kind in all rows and leave the other columns out",
     )
     if in_degrees.any() and in_metres.any():
         first, second = (table.line[known.argmax()] for known in (in_degrees, in_metres))
@@ -131,7 +137,7 @@ def _places(table: CsvTable) -> tuple[np.ndarray, bool]:
 
 
 def _pair(table: CsvTable, names: tuple[str, str]) -> np.ndarray:
-    """(N, 2), NaN where a row has neither."""
+    """Return two columns as (N, 2), NaN for a row with neither."""
     pair = table.stack(*names)
     is_half = np.isnan(pair).sum(axis=1) == 1
     if is_half.any():
@@ -145,12 +151,12 @@ def _check_once_a_frame(found: Landmarks) -> None:
     keys = np.stack([found.frame, found.landmark, found.planned])[:, order]
     is_same = (keys[:, 1:] == keys[:, :-1]).all(axis=0)
     if is_same.any():
-        # The first in the file, whatever the order of frames.
+        # Report the first duplicate of the file, for any order of frames.
         k = int(np.where(is_same, found.line[order][1:], np.iinfo(np.int64).max).argmin())
         row, again = order[k : k + 2]
         raise InputError(
             f"landmarks {found.path}, line {found.line[again]}: {found.names[found.landmark[row]]} is in frame "
-            f"{found.frame[row]:g} already, by line {found.line[row]}; wanted each landmark once in a frame"
+            f"{found.frame[row]:g} already, by line {found.line[row]}; give each landmark once in a frame"
         )
 
 
@@ -167,7 +173,7 @@ def _check_far(found: Landmarks) -> None:
     k = int(np.where(is_known, away, 0.0).argmax())
     if away[k] > FARTHEST_M:
         first, second = found.place[k]
-        fix = "a receiver without a fix says so: leave the place empty" if first == second == 0 else "check the digits"
+        fix = "a receiver without a fix reports 0, 0: leave it empty" if first == second == 0 else "check the digits"
         raise InputError(
             f"landmarks {found.path}, line {found.line[k]}: {first:g}, {second:g} lies {away[k] / 1000:.0f} km from "
             f"most others; wanted at most {FARTHEST_M / 1000:g} km: {fix}"
@@ -183,16 +189,20 @@ POSITION_COLUMNS = ("frame", "target", "east_m", "north_m")
 
 
 def read_positions(path: str | Path) -> Positions:
-    """Read POSITION_COLUMNS, and the covariance, longitude_deg, latitude_deg and score where they are there.
+    r"""Read POSITION_COLUMNS, and the covariance, longitude_deg, latitude_deg and score if given.
 
     Rows may come in any order. An empty cell of a covariance or score is unknown. A table without rows is valid.
-    Raises InputError with file and line: as read_table, variances that cannot be, a longitude and latitude that only
-    some rows have.
+    Raise InputError with file and line: as read_table, impossible variances, a longitude and latitude in only some
+    rows.
+
+    >>> written = pathlib.Path("places.csv").write_text("frame,target,east_m,north_m\n1,7,3.0,4.0\n")
+    >>> td.read_positions("places.csv").east_north_m
+    array([[3., 4.]])
     """
     table = read_table(path, POSITIONS, POSITION_COLUMNS)
     check_crowding(table["frame"], f"positions {path}", "places")
     east, both, north = (table[column.name] for column in COVARIANCE)
-    # Unknown variances pass each comparison; a share above 1 allows for rounding.
+    # Comparisons with unknown variances pass; a correlation slightly above 1 allows for rounding.
     is_wrong = (east < 0) | (north < 0) | (both**2 > east * north * 1.01 + 1e-8)
     if is_wrong.any():
         row = int(is_wrong.argmax())
@@ -206,7 +216,7 @@ def read_positions(path: str | Path) -> Positions:
     if is_known.any():
         table.refuse(
             ~is_known,
-            "no longitude_deg or latitude_deg, which other rows have; wanted both in all rows or in none",
+            "no longitude_deg or latitude_deg, which other rows have; give both in all rows or in none",
         )
     return Positions(
         table["frame"].astype(np.int64),

@@ -1,4 +1,4 @@
-"""Pictures in files: reading and decoding them, finding them in folders, and one PNG a frame for masks."""
+"""Picture files: read and decode them, find them in folders, and write one PNG a frame for masks."""
 
 import math
 import re
@@ -13,24 +13,27 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import Part, write_whole
-from torchvision_dddas.memory import PICTURE, check_memory
+from torchvision_dddas.memory import MASK, PICTURE, check_memory
 from torchvision_dddas.types import Scene
 
 IMAGE_SUFFIXES = frozenset(
     {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".pnm", ".webp", ".jp2", ".gif"}
 )
 NUMBERED = re.compile(r"\d{6,}\.(png|jpg)")
-"""Names of the pictures of a run, one a frame."""
+"""Names of the pictures that a run writes, one a frame."""
 
-# 8, 16 bits and EXIF rotation are kept, alpha is dropped.
+OPENCV_LOGGING = getattr(cv2.utils, "logging", cv2)
+"""The module with the log level of OpenCV's own messages, which version 4.13 moved."""
+
+# Keep 8 or 16 bits and the EXIF rotation, and drop alpha.
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def read_image(file: Path, cost: int = PICTURE, size: int | None = None) -> np.ndarray | None:
-    """The picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None when it is not a whole picture.
+    """Return the picture as stored, (H, W) or (H, W, 3) BGR, turned upright; None if it is incomplete.
 
-    cost: bytes of memory a pixel. size: bytes of the input that it belongs to; None: of its own file.
+    cost: bytes of memory a pixel. size: bytes of the input that contains it; None: bytes of its own file.
     """
     try:
         return decode_image(file.read_bytes(), _FLAGS, file, cost, size)
@@ -38,8 +41,22 @@ def read_image(file: Path, cost: int = PICTURE, size: int | None = None) -> np.n
         raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
 
+def read_mask(path: Path) -> np.ndarray:
+    """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
+    try:
+        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK)
+    except OSError:
+        image = None
+    if image is None:
+        raise InputError(f"{path} is no picture that can be read")
+    if image.ndim == 2:
+        return image.astype(np.int32)
+    blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
+    return blue + 256 * green + 65536 * red
+
+
 def read_colour_image(file: Path) -> np.ndarray:
-    """A picture as (H, W, 3) uint8 BGR. Raises InputError if it cannot be read, is broken, grey or not of 8 bits."""
+    """Read a picture as (H, W, 3) uint8 BGR. Raise InputError if it is unreadable, broken, grey, or not 8 bits deep."""
     image = read_image(file)
     if image is None:
         raise InputError(f"{file} is not a whole picture; give a PNG, JPEG or TIFF")
@@ -49,31 +66,31 @@ def read_colour_image(file: Path) -> np.ndarray:
 
 
 def read_ignored(file: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) uint8, 255 where a picture is not black: what detection leaves out. size: (width, height) of the frames.
+    """Return (H, W) uint8, 255 for ignored pixels, where a mask is not black. size: (width, height) of the frames.
 
-    Black is up to a sixteenth of white, so that a JPEG, in which edges ring, leaves out what was drawn.
-    Raises InputError if it cannot be read, has another size, or leaves nothing.
+    Values up to a sixteenth of white count as black, because the edges of a JPEG ring.
+    Raise InputError if the picture cannot be read, has another size than the frames, or ignores every pixel.
     """
     image = read_image(file)
     if image is None:
-        raise InputError(f"{file} is not a whole picture; give a PNG of the frames' size, white where nothing counts")
+        raise InputError(f"{file} is not a whole picture; give a PNG of the frames' size, white for ignored pixels")
     white = np.iinfo(image.dtype).max if image.dtype.kind == "u" else 1.0
     shown = (image if image.ndim == 2 else image[:, :, :3].max(axis=2)) > white / 16
     if shown.shape[::-1] != size:
         got, wanted = (f"{width}x{height}" for width, height in (shown.shape[::-1], size))
         raise InputError(f"{file} has {got} pixels and the frames {wanted}; give a mask of the frames' size")
     if shown.all():
-        raise InputError(f"{file} is black nowhere, so nothing of the frames is left; black is what is looked at")
+        raise InputError(f"{file} has no black pixel, so nothing of the frames is left; black is what is searched")
     return np.where(shown, 255, 0).astype(np.uint8)
 
 
 def decode_image(
     data: bytes, flags: int, name: object = "a picture", cost: int = PICTURE, input_size: int | None = None
 ) -> np.ndarray | None:
-    """The picture in the bytes of a file, (H, W) or (H, W, C); None where it is not whole. flags: cv2.IMREAD_...
+    """Decode the bytes of a picture file, (H, W) or (H, W, C); None if it is incomplete. flags: cv2.IMREAD_...
 
-    name: of the file, for the message. cost, input_size: cost and size of `read_image`. A picture whose size its header
-    does not say is not decoded. Raises InputError, before anything is decoded, for more pixels than the input may have.
+    name: of the file, for messages. cost, input_size: cost and size of `read_image`. A picture without a size in its
+    header is not decoded. Raise InputError, before decoding, if the picture has more pixels than the input may have.
     """
     size = size_in_header(data)
     if size is None or not _is_whole(data):
@@ -82,13 +99,13 @@ def decode_image(
     with quiet_opencv():
         try:
             image: np.ndarray | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-        except (cv2.error, MemoryError):  # damaged, or of a size that no memory holds
+        except (cv2.error, MemoryError):  # damaged, or too large for the memory
             return None
     return image
 
 
 def size_in_header(data: bytes) -> tuple[int, int] | None:
-    """(width, height), px, as a picture's file says them before any turn; None where it does not, or is no picture."""
+    """Return (width, height), px, from the header of a picture file, before any rotation; None if it gives none."""
     try:
         return next((find(data) for magic, find in _SIZES if data.startswith(magic)), None)
     except (struct.error, IndexError):  # too short
@@ -96,7 +113,7 @@ def size_in_header(data: bytes) -> tuple[int, int] | None:
 
 
 def _at(form: str, place: int) -> Callable[[bytes], tuple[int, int]]:
-    """The reader of a size that is stored at a place, as `struct` names its form."""
+    """Return a reader of a size that is stored at a fixed place. form: its format for `struct`."""
     return lambda data: struct.unpack_from(form, data, place)
 
 
@@ -122,7 +139,7 @@ def _size_in_webp(data: bytes) -> tuple[int, int] | None:
 
 
 def _size_in_tiff(data: bytes) -> tuple[int, int] | None:
-    """Of its first page, or of that page's tiles if they are larger: the decoder makes room for a whole tile."""
+    """Return the size of the first page, or of its tiles if they are larger: the decoder allocates a whole tile."""
     order = "<" if data[:1] == b"I" else ">"
     is_big = data[2:4] in (b"\x2b\0", b"\0\x2b")
     (place,) = struct.unpack_from(order + ("Q" if is_big else "I"), data, 8 if is_big else 4)
@@ -139,7 +156,7 @@ def _size_in_tiff(data: bytes) -> tuple[int, int] | None:
 
 
 def _size_in_jpeg2000(data: bytes) -> tuple[int, int] | None:
-    """Of the codestream, or of the header around it if that says more."""
+    """Return the size of the codestream, or of the header around it if that is larger."""
     place = data.find(b"\xff\x4f\xff\x51")
     right, bottom, left, top = struct.unpack_from(">4I", data, place + 8) if place >= 0 else (0, 0, 0, 0)
     box = data.find(b"ihdr", 0, 4096)
@@ -175,17 +192,17 @@ _SIZES: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
     (b"\xff\x4f\xff\x51", _size_in_jpeg2000),
     (b"\0\0\0\x0cjP  ", _size_in_jpeg2000),
 )
-"""How each kind of picture begins, and what finds its size."""
+"""The first bytes of each kind of picture, and the function that finds its size."""
 
 
 def _is_whole(data: bytes) -> bool:
-    """Whether a PNG or a JPEG goes on to its end; other kinds are left to the decoder."""
+    """Return whether a PNG or a JPEG is complete; other kinds are left to the decoder."""
     if data[:2] == b"\xff\xd8":
-        # Cut short it decodes to a picture with a grey bottom: its end marker is missing after the start of the scan.
+        # A truncated JPEG decodes to a picture with a grey bottom. It has no end marker after the start of the scan.
         return data.rfind(b"\xff\xd9") >= data.rfind(b"\xff\xda")
     if data[:8] != _PNG:
         return True
-    # OpenCV 4.14 asks for as much memory as a chunk says it is long, and may then never return.
+    # OpenCV 4.14 allocates as much memory as a chunk claims to need, and may then never return.
     place = len(_PNG)
     while place + 12 <= len(data):
         length = int.from_bytes(data[place : place + 4])
@@ -197,23 +214,23 @@ def _is_whole(data: bytes) -> bool:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Keep OpenCV's own complaints off the terminal: the user gets our one line instead."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
+    """Suppress OpenCV's own messages: the user gets one line from this package instead."""
+    level = OPENCV_LOGGING.getLogLevel()
+    OPENCV_LOGGING.setLogLevel(0)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        OPENCV_LOGGING.setLogLevel(level)
 
 
 def natural_order(name: str) -> list[str | int]:
-    """Sorting key under which numbers count as numbers: frame2 comes before frame10."""
-    # Texts and numbers by turns; digits of other scripts are text.
+    """Return a sorting key that compares numbers by value: frame2 comes before frame10."""
+    # Texts and numbers alternate; digits of other scripts count as text.
     return [int(part) if k % 2 else part.casefold() for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def images_of_folder(folder: Path) -> list[Path]:
-    """The folder's images in natural order. Raises InputError when there are none, with a guess at what was meant."""
+    """Return the folder's images in natural order. Raise InputError without any, with a guess at the intended input."""
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
@@ -227,7 +244,7 @@ def images_of_folder(folder: Path) -> list[Path]:
 
 
 def images_of_glob(pattern: str) -> list[Path]:
-    """The images that match, in natural order. Raises InputError when none does."""
+    """Return the matching images in natural order. Raise InputError if none matches."""
     matches = [Path(match) for match in glob(pattern, recursive=True)]  # noqa: PTH207 (a pattern may be absolute)
     if files := _images(matches):
         return files
@@ -239,38 +256,38 @@ def _images(paths: Sequence[Path]) -> list[Path]:
     return sorted(files, key=lambda file: natural_order(str(file)))
 
 
-# Of a picture's values, the shares below: its whole range without a few hot or dead pixels, and its core.
+# Quantiles of a picture's values: the whole range without a few hot or dead pixels, and the core of the range.
 _SHARES = (0.001, 0.05, 0.95, 0.999)
-# The 8-bit pictures of thermal cameras have 2.2 to 2.3 times as many levels as their core (three clips of HIT-UAV).
+# The 8-bit pictures of thermal cameras have 2.2 to 2.3 times as many levels as the core (three clips of HIT-UAV).
 _WIDTH = 2.5
-# Of the room beside the core, the share that the range keeps at either end.
+# The share of the room beside the core that is kept free at either end of the range.
 _GUARD = 0.25
-# A value that is as frequent is one that the sensor gives, and no fault of a pixel.
+# A value with at least this share of the pixels comes from the sensor, not from a faulty pixel.
 _FREQUENT = 2e-4
-# Values so many times their core's width away from all others are bars, padding or the sun, and no part of the scene;
-# of one value alone, as bars are, half the width will do.
+# Values this many core widths away from all others are bars, padding or the sun, and not part of the scene. For a
+# single constant value, such as that of bars, half the width suffices.
 _APART, _APART_CONSTANT = 4.0, 0.5
-# Levels that one step may become: more would only show the noise.
+# Largest number of levels for one step of the values: more would only show the noise.
 _MOST_GAIN = 4
 _SENSOR_BITS = (8, 10, 12, 14, 16)
 
 
 Scale = tuple[int, int] | None
-"""The values of 16-bit pictures that become black and white; None: the clip gives them."""
+"""The 16-bit values that become black and white; None: they are taken from the clip."""
 
 
 class Levels:
-    """How the 16-bit pictures of a clip become 8-bit ones: by one gain, so that they do not flicker.
+    """Convert the 16-bit pictures of a clip to 8 bits with one constant gain, so that they do not flicker.
 
-    black, white: the values that become 0 and 255. Samples of the clip give the range. Where their values are no more
-    than 256 steps, one step becomes one level, and nothing is lost; of a few counts up to four. Otherwise the range is
-    2.5 times as wide as the middle 90 % of the values, within that of the sensor. Bars, padding and the sun, far from
-    all other values, do not count. Where a picture's values drift towards an end of the range, the range follows by as
-    few whole levels as will do.
+    black, white: the values that become 0 and 255. Samples of the clip determine the range. If their values span at
+    most 256 steps, each step becomes one level, and nothing is lost; very few steps become up to four levels each.
+    Otherwise the range is 2.5 times as wide as the middle 90 % of the values, at most that of the sensor. Bars, padding
+    and the sun, far from all other values, do not count. If a picture's values drift towards an end of the range, the
+    range follows by the smallest sufficient number of whole levels.
     """
 
     def __init__(self, samples: Sequence[np.ndarray], given: Scale = None) -> None:
-        """given: black and white, which stay then."""
+        """given: values of black and white, which then stay fixed."""
         self.is_given, self._core, self._most = given is not None, 0.0, 0.0
         self._black, self.width = (0.0, 0.0) if given is None else (float(given[0]), float(given[1] - given[0]))
         if given is None:
@@ -278,7 +295,7 @@ class Levels:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what was followed: the clip begins anew."""
+        """Reset the range for a new pass over the clip."""
         self.black = self._black
 
     @property
@@ -287,9 +304,9 @@ class Levels:
         return self.black + self.width
 
     def to_bytes(self, image: np.ndarray) -> tuple[np.ndarray, bool]:
-        """The next picture of the clip as uint8, and whether over 5 % of its values lie beyond an end of the range."""
+        """Return the next picture as uint8, and whether over 5 % of its values lie beyond an end of the range."""
         _, low, high, _ = _find_shares(image)
-        if not self.is_given and high - low > self._core / 4:  # a blank picture moves nothing
+        if not self.is_given and high - low > self._core / 4:  # a blank picture does not move the range
             guard, unit = _GUARD * max(self.width - (high - low), 0.0), self.width / 255
             way = float(np.clip(self.black, *sorted((high + guard - self.width, low - guard)))) - self.black
             moved = self.black + math.copysign(math.ceil(abs(way) / unit - 1e-9), way) * unit
@@ -310,11 +327,11 @@ class Levels:
         brightest = max(int(image.max()) for image in samples)
         top = next(2**bits - 1 for bits in _SENSOR_BITS if brightest < 2**bits)
         self.width = float(min(255 * step if is_whole else max(_WIDTH * self._core, 255), top))
-        if is_whole and step == 1 and top > 255:  # a sensor of few counts: they fill half of the levels
+        if is_whole and step == 1 and top > 255:  # a sensor with few counts: spread them over half of the levels
             self.width /= min(max(128 // whole, 1), _MOST_GAIN)
         self._most = top - self.width
         low, high = (shares[:, 0].min(), shares[:, 3].max()) if is_whole else (shares[:, 1].min(), shares[:, 2].max())
-        if high - low > self.width:  # the values drift: begin where the clip does
+        if high - low > self.width:  # the values drift: begin with the first picture's range
             low, high = shares[0, 1:3]
         black = min(max((low + high - self.width) / 2, 0.0), self._most)
         self._black = black - (black - frequent[0]) % step if is_whole and len(frequent) > 1 and black else black
@@ -325,14 +342,14 @@ class Levels:
 
 
 def _thin_out(image: np.ndarray) -> np.ndarray:
-    """Some values of a picture, sorted, without those that are no part of the scene."""
+    """Return a sample of a picture's values, sorted, without values that are not part of the scene."""
     values = np.sort(image[:: 1 + image.shape[0] // 64, :: 1 + image.shape[1] // 64], axis=None)
     while True:
         step = np.diff(values)
         if not step.any():
             return values
         at = int(step.argmax()) + 1
-        # A side of one value is none of the scene, however large it is.
+        # A side with a single constant value is not part of the scene, however large it is.
         rest, scene = sorted((values[:at], values[at:]), key=lambda part: (bool(np.ptp(part)), len(part)))
         low, high = scene[[round(share * (len(scene) - 1)) for share in _SHARES[1:3]]].astype(int)
         limit = (_APART if np.ptp(rest) else _APART_CONSTANT) * (high - low)
@@ -347,20 +364,20 @@ def _find_shares(image: np.ndarray) -> np.ndarray:
 
 
 class Masks(Part[Scene]):
-    """masks/000001.png and so on, each whole once it is there. 8 bits, or 16 for frames with over 255 targets."""
+    """Write masks/000001.png and so on, each as a whole. 8 bits, or 16 for frames with over 255 targets."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "masks"
 
     def write(self, scene: Scene) -> None:
-        """Write the mask of a frame. Raises OSError if the disk refuses."""
+        """Write the mask of a frame. Raise OSError if the disk refuses."""
         self.add(scene.frame.number, scene.mask)
 
     def add(self, number: int, mask: np.ndarray) -> None:
-        """The same for the mask (H, W) of any frame."""
+        """Write the mask (H, W) of any frame, as `write` does."""
         self._folder.mkdir(exist_ok=True)
         kind = np.uint8 if mask.size == 0 or mask.max() <= 255 else np.uint16
-        # Level 1: masks are nearly empty, and higher levels cost time for a few bytes.
+        # Compression level 1: masks are nearly empty, and higher levels take more time for a few bytes.
         ok, png = cv2.imencode(".png", mask.astype(kind, copy=False), [cv2.IMWRITE_PNG_COMPRESSION, 1])
         if not ok:
             raise OSError(f"mask of frame {number} could not be encoded")

@@ -1,4 +1,4 @@
-"""Signals that end a run: Ctrl-C, SIGTERM and SIGHUP. They wait while a frame is written, and outputs stay whole."""
+"""Signals that end a run: Ctrl-C, SIGTERM and SIGHUP. They wait while a frame is written, to keep outputs whole."""
 
 import os
 import signal
@@ -15,28 +15,28 @@ from torchvision_dddas.errors import InputError
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 KEPT = "results up to here are kept"
-"""The note of an exception that cut short a run whose outputs are whole."""
+"""The note on an exception that ended a run early, if its outputs are whole."""
 
 TOGETHER_S = 2.0
-"""Signals that follow the first within this time are one request: a second Ctrl-C, or SIGTERM and SIGHUP at once."""
+"""Signals within this time of the first count as one request: a second Ctrl-C, or SIGTERM and SIGHUP together."""
 
-_DEAF_S = 1.0  # after which the main thread counts as stuck in a library, where no signal reaches it
+_DEAF_S = 1.0  # after this time without reaction the main thread counts as stuck in a library
 _POLL_S = 0.01
 
 
 def _heeded() -> list[int]:
-    """The signals that the process does not ignore, as under nohup."""
+    """Return the signals that the process does not ignore; under nohup it ignores some."""
     return [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
 
 
 def ignore_signals() -> None:
-    """Ignore signals from now on: for the end of the process, where Python would let them kill it."""
+    """Ignore signals from now on. Used at the end of the process, when Python would let them kill it."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asks the run to end. number: of the signal. Its notes say what is kept; without any, nothing is."""
+    """A signal requests the end of the run. number: of the signal. Its notes say what is kept; without any, nothing."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -44,10 +44,10 @@ class Stopped(KeyboardInterrupt):
 
 
 def is_stop(error: BaseException | None) -> bool:
-    """Whether a signal raised an exception, also where a library turned it into another.
+    """Return whether a signal caused an exception, even if a library replaced the exception by another.
 
-    Libraries raise ImportError or SystemError in its place, and not all say of which exception. An InputError tells of
-    something else, also if it came while a signal was dealt with.
+    Libraries raise ImportError or SystemError instead, and some omit the original exception. An InputError has another
+    cause, even if it was raised while a signal was handled.
     """
     if isinstance(error, (ImportError, SystemError)) and _heard:
         return True
@@ -61,8 +61,8 @@ def is_stop(error: BaseException | None) -> bool:
 class StopSignals:
     """A context in which SIGNALS are requests to stop.
 
-    signal: the first that came, None before; noticed: the first that the main thread was told of.
-    The signals wake a thread of this class: the main thread may be deep in a library, hold any lock, or hang.
+    signal: the first signal, None before; noticed: the first signal that the main thread received.
+    Signals wake a thread of this class, because the main thread may be busy in a library, hold a lock, or hang.
     Signals that the process ignores, as under nohup, stay ignored.
     """
 
@@ -73,7 +73,7 @@ class StopSignals:
         notice: Callable[[int, FrameType | None], object] = lambda number, frame: None,
         together_s: float = TOGETHER_S,
     ) -> None:
-        """ask: called in another thread with the first signal; notice: in the main thread with each, when it can.
+        """ask: called in another thread at the first signal. notice: called in the main thread at each, when possible.
 
         at_once: called with the exit code at a further signal later than together_s.
         """
@@ -118,17 +118,17 @@ class StopSignals:
 
 
 Rescue = Callable[[], bool]
-"""Makes the outputs of an open run whole, from another thread; returns whether there are any."""
+"""Makes the outputs of an open run whole, from another thread. Returns whether there are any."""
 
 _rescues: list[Rescue] = []
-# The signals that the main thread knows of; it acts on them when it may. Not an Event, which takes a lock: a handler
-# that a second signal interrupts would wait for itself.
+# Signals that the main thread has received; it acts on them when allowed. An Event would take a lock, and a handler
+# interrupted by a second signal would wait for itself.
 _heard: list[int] = []
 
 
 @contextmanager
 def rescued_by(rescue: Rescue) -> Iterator[None]:
-    """While the block runs, a signal that the main thread cannot notice calls a function before the process ends."""
+    """While the block runs, call `rescue` before the process ends if the main thread cannot receive a signal."""
     _rescues.append(rescue)
     try:
         yield
@@ -137,12 +137,12 @@ def rescued_by(rescue: Rescue) -> Iterator[None]:
 
 
 def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
-    """Signals that raise Stopped in the main thread, once.
+    """Return signals that raise Stopped in the main thread, once.
 
-    Where that thread is stuck in a library, open outputs are made whole beside it, and then `end` is called in another
-    thread with the signal, and whether anything was kept; it ends the process.
+    If that thread is stuck in a library, another thread makes open outputs whole and then calls `end` with the signal
+    and whether anything was kept; `end` ends the process.
     """
-    taken, is_rescued = threading.Lock(), threading.Event()  # taken: by the thread that ends the run
+    taken, is_rescued = threading.Lock(), threading.Event()  # taken: held by the thread that ends the run
     _heard.clear()
 
     def notice(number: int, frame: FrameType | None) -> None:
@@ -168,7 +168,7 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold signals back until the block is done, so that an item is written to every file or to none."""
+    """Delay signals until the block ends, so that an item is written to every file or to none."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -187,6 +187,6 @@ def uninterrupted() -> Iterator[None]:
     if not held:
         return
     if callable(handler := before[held[0]]):
-        handler(held[0], None)  # not by a signal of our own, which would count as the user's second
+        handler(held[0], None)  # a new signal would count as the user's second one
     else:
         signal.raise_signal(held[0])

@@ -1,4 +1,4 @@
-"""Several clips of one flight as one clip, with the logs that belong to them."""
+"""Join several clips of one flight, with their logs, into one clip."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -12,18 +12,18 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import frame_times
 from torchvision_dddas.types import COLUMNS_OF_TELEMETRY, Frame, Problem, Source, Telemetry, is_sampled
 
-# A clip that begins within this time of the end of the one before goes on from it: clocks of logs are that rough.
+# A clip that begins within this time of the end of the one before is continuous with it: log clocks are inaccurate.
 _SEAM_S = 2.0
 
 
 class JoinedSource:
-    """A Source of clips of one flight, in order. Frame numbers go on from clip to clip, and so do times.
+    """A Source of clips of one flight, in order. Frame numbers and times continue from clip to clip.
 
-    Where the logs of all clips tell the time of day, in whatever zone, a pause between two clips is kept.
+    If the logs of all clips give the time of day, in any zone, pauses between clips are kept.
     """
 
     def __init__(self, parts: Sequence[Source], logs: Sequence[Path] = ()) -> None:
-        """logs: one for all clips, or one for each. Raises InputError for clips of different sizes or rates."""
+        """logs: one for all clips, or one for each. Raise InputError for clips of different sizes or rates."""
         self._parts, self._logs, first = parts, logs, parts[0]
         if len(logs) not in (0, 1, len(parts)):
             raise InputError(
@@ -50,7 +50,7 @@ class JoinedSource:
         return self.every(1)
 
     def every(self, interval: int) -> Iterator[Frame]:
-        """Frames 1, 1 + interval, ..."""
+        """Yield frames 1, 1 + interval, ..."""
         self.problems, self.notes, self.concealed, before = [], [], 0, 0
         for part, start_s in zip(self._parts, self.starts_s.tolist(), strict=True):
             for frame in part:
@@ -63,7 +63,7 @@ class JoinedSource:
             self.last = before = before + part.last
 
     def read_logs(self, read: Callable[[Path, str], Telemetry]) -> Telemetry:
-        """The logs as one. read: reads that of a clip. Raises InputError where their clocks contradict the order."""
+        """Join the logs. read: reads the log of a clip. Raise InputError if their clocks contradict the order."""
         logs = [read(path, part.name) for path, part in zip(self._logs, self._parts, strict=False)]
         clocks_s = np.array([[log.start_utc_s, log.start_local_s] for log in logs])
         is_known = np.isfinite(clocks_s).all(axis=0)
@@ -84,7 +84,7 @@ class JoinedSource:
 
 
 def _joined(logs: Sequence[Telemetry], starts_s: np.ndarray) -> Telemetry:
-    """Logs as one, each cut to its clip. Nothing is known in a pause between two."""
+    """Join logs, each cut to its clip. Values are unknown in a pause between two clips."""
     if len({log.geographic for log in logs}) > 1:
         raise InputError("some logs have longitudes and latitudes, others local metres; give all in one kind")
     pieces = list[dict[str, Any]]()

@@ -1,74 +1,74 @@
-"""Live streams, picture by picture: the camera or the sender may fall silent at any time."""
+"""Live streams, picture by picture. The camera or the sender may stop sending at any time."""
 
 from typing import Protocol
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.captures import Capture, announced_hz, open_capture
+from torchvision_dddas.io.images import OPENCV_LOGGING
 
-# Pictures in a row that may fail to be decoded at the start: a stream is joined in the middle.
+# Number of pictures in a row that may fail to be decoded at the start, because a stream is joined in the middle.
 _MOST_UNDECODED = 100
 
 
-class Stream(Protocol):
-    """What a live run needs of an open camera or stream; the calls may take as long as they like."""
+class LiveStream(Protocol):
+    """The interface of an open camera or stream for a live run; its calls may block for any time."""
 
-    rate_hz: float | None  # as announced; None where nothing credible is
+    rate_hz: float | None  # as announced; None if not credible
 
     def grab(self) -> bool:
-        """Wait for the next picture; False: none came."""
+        """Wait for the next picture. Return False if none came."""
         ...
 
     def retrieve(self) -> np.ndarray | None:
-        """The picture grabbed last, uint8 (H, W) or (H, W, 3) BGR; None where it cannot be decoded."""
+        """Return the last grabbed picture, uint8 (H, W) or (H, W, 3) BGR; None if it cannot be decoded."""
         ...
 
     def release(self) -> None:
-        """Let go of the camera or the connection."""
+        """Close the camera or the connection."""
         ...
 
 
-def open_stream(target: str | int, name: str, limits_s: tuple[float, float]) -> Stream:
-    """An address through PyAV, a camera of this machine through OpenCV; arguments and errors of `open_capture`."""
+def open_stream(target: str | int, name: str, limits_s: tuple[float, float]) -> LiveStream:
+    """Open an address through PyAV, or a local camera through OpenCV; arguments and errors as in `open_capture`."""
     return OpenedStream(open_capture(target, name, limits_s))
 
 
 class OpenedStream:
-    """The Stream of a capture."""
+    """A Stream that reads from a capture."""
 
     def __init__(self, capture: Capture) -> None:
         self._capture, self.rate_hz = capture, announced_hz(capture)
-        # The reader reports failures from now on; OpenCV would write a line for each.
-        cv2.utils.logging.setLogLevel(0)
+        # From now on the reader reports failures, and OpenCV's own messages are switched off.
+        OPENCV_LOGGING.setLogLevel(0)
 
     @property
     def concealed(self) -> bool:
-        """Whether the decoder concealed errors in the picture grabbed last; False where it does not say."""
+        """Whether the decoder concealed errors in the last grabbed picture; False if it does not report them."""
         return getattr(self._capture, "concealed", False)
 
     @property
     def damaged(self) -> bool:
-        """As `concealed`, also where the picture may build on such a one."""
+        """Whether the last grabbed picture has concealed errors or may depend on such a picture."""
         return getattr(self._capture, "damaged", False)
 
     def grab(self) -> bool:
-        """Wait for the next picture; False: none came."""
+        """Wait for the next picture. Return False if none came."""
         return self._capture.grab()
 
     def retrieve(self) -> np.ndarray | None:
-        """The picture grabbed last; None where it cannot be decoded."""
+        """Return the last grabbed picture; None if it cannot be decoded."""
         decoded, image = self._capture.retrieve()
         return image if decoded else None
 
     def release(self) -> None:
-        """Let go of the camera or the connection."""
+        """Close the camera or the connection."""
         self._capture.release()
 
 
-def first_picture(stream: Stream, name: str) -> np.ndarray:
-    """The first picture that can be decoded. Raises InputError where there is none."""
+def first_picture(stream: LiveStream, name: str) -> np.ndarray:
+    """Return the first picture that can be decoded. Raise InputError if there is none."""
     for _ in range(_MOST_UNDECODED):
         if not stream.grab():
             raise InputError(f"no picture comes from {name}; is it sending, in a codec that FFmpeg knows?")

@@ -1,12 +1,21 @@
 """What overlays show: targets with tint and heading, tracks with trails, people, landmarks and orders."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.types import AerialLocations, Command, FrameResult, PeopleFrame, Scene, TrackedFrame
+from torchvision_dddas.types import (
+    AerialLocations,
+    Command,
+    Detections,
+    FrameResult,
+    PeopleFrame,
+    Scene,
+    TrackedFrame,
+    Zone,
+)
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""
@@ -20,6 +29,7 @@ CUT: Colour = (60, 160, 255)
 UNLIKELY: Colour = (150, 150, 150)
 SEARCHED: Colour = (200, 170, 90)
 ORDER: Colour = (255, 255, 255)
+AREA: Colour = (220, 120, 190)
 LANDMARK: dict[str, Colour] = {"used": (90, 230, 90), "reassigned": (60, 220, 255), "excluded": WARNING}
 """The colour of a landmark by its state in the fix."""
 LETTERS = {"human": "H", "not_human": "N"}
@@ -27,7 +37,7 @@ LETTERS = {"human": "H", "not_human": "N"}
 LIKELY = 0.5
 """The least probability of a person that is drawn as one."""
 _GOLDEN_DEG = 137.508  # neighbours in number are far apart in hue, for any count of them
-_TRAIL_LENGTH = 12
+TRAIL_LENGTH = 12
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -45,7 +55,7 @@ def colour_picture(image: np.ndarray) -> np.ndarray:
 
 
 def line_width(picture: np.ndarray) -> int:
-    """Pixels that suit a picture's size."""
+    """The width of drawn lines in pixels, for a picture of this height."""
     return max(1, round(picture.shape[0] / 480))
 
 
@@ -92,23 +102,28 @@ def _arrow(picture: np.ndarray, start: np.ndarray, tip: np.ndarray, colour: Colo
 def draw_scene(scene: Scene) -> np.ndarray:
     """The frame with its targets, (H, W, 3) uint8 BGR; the caption says when not to trust it."""
     picture = colour_picture(scene.frame.image)
-    thick = line_width(picture)
     foreground = scene.mask > 0
     if foreground.any():
         picture[foreground] = (0.7 * picture[foreground] + 0.3 * np.array(TARGET)).astype(np.uint8)
         outlines = cv2.findContours(foreground.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
         cv2.drawContours(picture, outlines, -1, TARGET, 1)
     found = scene.detections
+    draw_detections(picture, found)
+    text = f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(found)}"
+    doubt = "" if scene.reliable else f"registration unreliable: {scene.cause}"
+    _caption(picture, (text, TEXT), (doubt, WARNING))
+    return picture
+
+
+def draw_detections(picture: np.ndarray, found: Detections) -> None:
+    """Draw boxes with the direction and speed of their motion."""
+    thick = line_width(picture)
     for box, heading, speed in zip(found.box_px, found.heading_rad, found.speed_px, strict=True):
         rectangle(picture, box, TARGET, thick)
         if not math.isnan(heading):
             length = 14 * thick + 4 * min(float(np.nan_to_num(speed)), 12.0)
             middle = box[:2] + box[2:] / 2
             _arrow(picture, middle, middle + length * np.array([np.cos(heading), np.sin(heading)]), TEXT, thick, 0.35)
-    text = f"frame {scene.frame.number}  interval {scene.interval_frames}  targets {len(found)}"
-    doubt = "" if scene.reliable else f"registration unreliable: {scene.cause}"
-    _caption(picture, (text, TEXT), (doubt, WARNING))
-    return picture
 
 
 def draw_people(found: PeopleFrame) -> np.ndarray:
@@ -165,6 +180,14 @@ class Trails:
         for identity in [i for i, trail in self.places.items() if number - trail[-1][0] > self.memory]:
             del self.places[identity]
 
+    def speed(self, identity: int) -> float:
+        """Pixels a frame over the ground since the place before; NaN for an identity with one place."""
+        trail = self.places[identity]
+        if len(trail) < 2:
+            return math.nan
+        (before, u0, v0), (now, u1, v1) = trail[-2:]
+        return math.hypot(u1 - u0, v1 - v0) / (now - before)
+
 
 class RunPictures:
     """Draws frames of a run with tracks, landmarks, what ground vehicles say, and what they were asked to do.
@@ -172,10 +195,14 @@ class RunPictures:
     Frames are shown in order; each is drawn once however many callers want it, and not at all if none does.
     """
 
-    def __init__(self, size: tuple[int, int], names: Sequence[str] = ()) -> None:
-        """size: (width, height) of the pictures, for frames that could not be read. names: of the landmarks."""
+    def __init__(self, size: tuple[int, int], names: Sequence[str] = (), zones: Sequence[Zone] = ()) -> None:
+        """size: (width, height) of the pictures, for frames that could not be read. names: of the landmarks.
+
+        zones: those in pixels are drawn.
+        """
         self._size, self._names = size, tuple(names)
-        self._trails = Trails(_TRAIL_LENGTH)
+        self._zones = [zone for zone in zones if zone.unit == "px"]
+        self._trails = Trails(TRAIL_LENGTH)
         self._shown: FrameResult | None = None
         self._picture: np.ndarray | None = None
 
@@ -196,25 +223,16 @@ class RunPictures:
         return self._picture
 
     def _draw(self, result: FrameResult) -> np.ndarray:
-        tracked, located, confirmed = result.tracked, result.locations, result.confirmed
+        tracked, located = result.tracked, result.locations
         width, height = self._size
         black = np.zeros((height, width, 3), np.uint8)
         picture = black if tracked.frame is None else colour_picture(tracked.frame.image)
         thick = line_width(picture)
-        tracks, given = tracked.tracks, tracked.detections
-        letters = {}
-        if confirmed is not None and located is not None:
-            targets = located.positions.target[confirmed.row].tolist()
-            letters = {t: f" {LETTERS.get(kind, '?')}" for t, kind in zip(targets, confirmed.kind, strict=True)}
-        for row in tracked.untracked:
-            rectangle(picture, given.box_px[row], UNTRACKED, 1)
-        for identity, box, row in zip(tracks.identity.tolist(), tracks.box_px, tracks.row, strict=True):
-            colour = identity_colour(identity)
-            way = drawable(np.array([place[1:] for place in self._trails.places[identity]]))
-            cv2.polylines(picture, [way], False, colour, thick, cv2.LINE_AA)
-            rectangle(picture, box, colour, thick + 1 if row >= 0 else 1)
-            label(picture, box, f"{identity}{letters.get(identity, '')}", colour)
-        text = f"frame {tracked.number}  identities {len(tracks)}  detections {len(given)}"
+        for zone in self._zones:
+            cv2.polylines(picture, list(map(drawable, zone.rings)), not zone.is_line, AREA, thick, cv2.LINE_AA)
+            label(picture, np.array([*zone.rings[0][0], 0.0, 0.0]), zone.name, AREA)
+        draw_tracks(picture, tracked, self._trails, target_words(result))
+        text = f"frame {tracked.number}  identities {len(tracked.tracks)}  detections {len(tracked.detections)}"
         place = ("", TEXT) if located is None else _summarize_location(located)
         command = "" if result.command is None else _summarize_command(result.command)
         _caption(picture, (text, TEXT), (tracked.cause, WARNING), place, (command, TEXT))
@@ -255,6 +273,33 @@ class RunPictures:
             if length > 4 * line_width(picture):
                 tip = marks.image_px[row] + way * min(1.0, picture.shape[0] / 10 / length)
                 _arrow(picture, marks.image_px[row], tip, ORDER, line_width(picture) + 1, 0.3)
+
+
+def draw_tracks(picture: np.ndarray, tracked: TrackedFrame, trails: Trails, words: Mapping[int, str]) -> None:
+    """Draw trails, boxes and identities, and after an identity its words."""
+    thick, tracks = line_width(picture), tracked.tracks
+    for row in tracked.untracked:
+        rectangle(picture, tracked.detections.box_px[row], UNTRACKED, 1)
+    for identity, box, row in zip(tracks.identity.tolist(), tracks.box_px, tracks.row, strict=True):
+        colour = identity_colour(identity)
+        way = drawable(np.array([place[1:] for place in trails.places[identity]]))
+        cv2.polylines(picture, [way], False, colour, thick, cv2.LINE_AA)
+        rectangle(picture, box, colour, thick + 1 if row >= 0 else 1)
+        label(picture, box, f"{identity}{words.get(identity, '')}", colour)
+
+
+def target_words(result: FrameResult) -> dict[int, str]:
+    """What ground vehicles say of targets, in one letter, and the fused number of those that several platforms see."""
+    located, confirmed, fused = result.locations, result.confirmed, result.fused
+    words: dict[int, str] = {}
+    if confirmed is not None and located is not None:
+        targets = located.positions.target[confirmed.row].tolist()
+        words = {t: f" {LETTERS.get(kind, '?')}" for t, kind in zip(targets, confirmed.kind, strict=True)}
+    if fused is not None:
+        rows = zip(fused.target.tolist(), fused.seen_by, strict=True)
+        numbers = {seen.get(fused.by): f" fused {number}" for number, seen in rows if len(seen) > 1}
+        words = {k: words.get(k, "") + numbers.get(k, "") for k in words.keys() | numbers.keys()}
+    return words
 
 
 def _summarize_location(located: AerialLocations) -> tuple[str, Colour]:

@@ -1,4 +1,4 @@
-"""Where frames come from: video files, folders and globs of images, cameras, network streams."""
+"""Sources of frames: video files, folders and globs of images, cameras, network streams."""
 
 import math
 import time
@@ -42,11 +42,11 @@ def open_source(
 ) -> Source:
     """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`.
 
-    rate_hz: frames a second; None takes the video's own, and 10 for images.
-    full_scale: of 16-bit pictures the value that becomes white (255), or those that become black and white. None: they
-    are taken from the clip, as `images.Levels` says; the source's `levels` tells them.
-    single: a file that is one image is a clip of one frame; else it is refused, since nothing can move in it.
-    Raises InputError with one line when it cannot be read.
+    rate_hz: frames a second; None: the video's own rate, or 10 for images.
+    full_scale: the value of 16-bit pictures that becomes white (255), or the values that become black and white. None:
+    `images.Levels` takes them from the clip; the source's `levels` holds them.
+    single: accept a file that is one image as a clip of one frame. By default it is refused, as nothing can move in it.
+    Raise InputError with one line if the clip cannot be read.
     """
     text = str(spec)
     if rate_hz is not None and not 0 < rate_hz <= 1000:
@@ -55,7 +55,7 @@ def open_source(
     if scale is not None and not (len(scale) == 2 and 0 <= scale[0] < scale[1] <= 65535):
         raise InputError(f"the full scale must be black below white, both between 0 and 65535, got {full_scale}")
     if not text:
-        raise InputError(f"the input's name is empty; wanted {_WANTED}")
+        raise InputError(f"the input's name is empty; give {_WANTED}")
     if (target := stream_target(text)) is not None:
         return VideoSource(target, without_secrets(text), rate_hz, scale)
     path = Path(text)
@@ -63,7 +63,7 @@ def open_source(
         path.stat()
     except FileNotFoundError:
         pass
-    except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered, a name with a NUL
+    except (OSError, ValueError) as error:  # a long name, a forbidden folder, a name with a NUL
         raise InputError(f"{text[:200]} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
         return VideoSource(text, text, rate_hz, scale)
@@ -78,21 +78,21 @@ def open_source(
     elif any(sign in text for sign in "*?["):
         files = images_of_glob(text)
     else:
-        raise InputError(f"{path} does not exist; wanted {_WANTED}")
+        raise InputError(f"{path} does not exist; give {_WANTED}")
     return ImageSource(files, text, rate_hz, scale)
 
 
-# Pictures in a row of another size, after which a tolerant reader goes on with that size.
+# After this many consecutive pictures of another size, a tolerant reader adopts that size.
 _LASTING = 10
 
 
 class _Clip(ABC):
-    """What recordings share.
+    """The common part of recordings.
 
-    tolerant: a frame of another size or depth is left out, and a size that lasts is the clip's from then on; else such
-    a frame raises InputError.
+    tolerant: leave out frames of another size or depth, and adopt a size that persists. If it is not set, such a frame
+    raises InputError.
 
-    levels: how 16-bit pictures become 8-bit ones; None for other pictures.
+    levels: conversion of 16-bit pictures to 8 bits; None for other pictures.
     """
 
     levels: Levels | None = None
@@ -106,20 +106,20 @@ class _Clip(ABC):
         self.problems: list[Problem] = []
         self.notes: list[str] = []
         self.concealed = 0  # frames read so far in which the decoder concealed errors
-        self._odd = 0  # pictures of another size in a row
+        self._odd = 0  # consecutive pictures of another size
 
     def __iter__(self) -> Iterator[Frame]:
         return self.every(1)
 
     @abstractmethod
     def every(self, interval: int) -> Iterator[Frame]:
-        """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
+        """Yield frames 1, 1 + interval, ...; do not decode the others into pictures."""
 
     def _note(self, number: int, what: str) -> None:
         self.problems.append(Problem(number, what))
 
     def _fits(self, image: np.ndarray, number: int, this: str, first: str) -> bool:
-        """Whether a picture has the clip's size. this, first: names of the picture and the first one, for messages."""
+        """Return whether a picture has the clip's size. this, first: names of it and of the first, for messages."""
         (width, height), size = self.size, (image.shape[1], image.shape[0])
         self._odd = 0 if size == self.size else self._odd + 1
         if self.tolerant and self._odd >= _LASTING:
@@ -135,7 +135,7 @@ class _Clip(ABC):
             self.levels.begin()
 
     def _to_bytes(self, image: np.ndarray, number: int) -> np.ndarray:
-        """The picture in 8 bits; note once where much of it is beyond the range."""
+        """Return the picture in 8 bits; note once if much of it is beyond the range."""
         if self.levels is None:
             return image
         image, is_beyond = self.levels.to_bytes(image)
@@ -159,11 +159,11 @@ _SAMPLES = 9
 class ImageSource(_Clip):
     """The files of a folder or glob in natural order (frame2 before frame10), one a frame.
 
-    rate_hz: images carry no frame rate, so the caller gives one; 10 is assumed otherwise (`assumes_rate`).
-    scale: of 16-bit images the values that become black and white; by default nine images spread over the clip give
-    them. A picture of which much lies beyond saturates, which is recorded once.
-    The first image decides whether the clip is grey or colour; the others follow it.
-    Raises InputError: the first image cannot be read, an image of another size or depth (when it is reached).
+    rate_hz: images carry no frame rate, so the caller gives one; otherwise 10 is assumed (`assumes_rate`).
+    scale: the values of 16-bit images that become black and white; by default nine images spread over the clip
+    determine them. The first picture with many values beyond the range is recorded as a problem. The first image
+    decides whether the clip is grey or colour; the others are converted. Raise InputError if the first image cannot be
+    read, or, when it is reached, for an image of another size or depth.
     """
 
     def __init__(self, files: Sequence[Path], name: str, rate_hz: float | None = None, scale: Scale = None) -> None:
@@ -172,7 +172,7 @@ class ImageSource(_Clip):
             raise InputError(f"{name} holds no images")
         self.files, self.count, self.rate_hz = list(files), len(files), rate_hz or 10.0
         self.assumes_rate = rate_hz is None
-        # All pictures together are the input: a few hundred photos are no small one.
+        # The input is all pictures together: a few hundred photos are not a small input.
         sizes = accumulate(file.stat().st_size for file in files if file.is_file())
         size = next((size for size in sizes if size >= SMALL_FILE), None)
         self._read = partial(read_image, cost=cost_of_pictures(len(files)), size=size)
@@ -189,7 +189,7 @@ class ImageSource(_Clip):
             self.levels = Levels([i for i in images if i is not None and i.dtype == np.uint16], scale)
 
     def every(self, interval: int) -> Iterator[Frame]:
-        """Frames 1, 1 + interval, ...: the other files are not opened."""
+        """Yield frames 1, 1 + interval, ...; do not open the other files."""
         self._begin()
         for number, file in enumerate(self.files, start=1):
             self.last = number
@@ -214,52 +214,52 @@ class ImageSource(_Clip):
 # --------------------------------------------------------------------------------------------------------------------
 # Videos.
 
-# These containers count their frames; others guess from the duration, often one off.
+# These containers store their number of frames; for others it is estimated from the duration, often off by one.
 _EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}
-# Reads that may fail in a row before the clip counts as ended, however many frames it announced.
+# Consecutive reads that may fail before the clip counts as ended, however many frames it announced.
 _MOST_LOST, _MOST_LOST_LIVE = 1000, 10
 STALL_S = 30.0
-"""An address that sends nothing for so long counts as lost."""
-# A read that fails after this share of the time was ended by it.
+"""An address that sends nothing for this time counts as lost."""
+# A failed read that took at least this share of the time limit was ended by the limit.
 _STALLED = 0.9
 # How far a time stamp may lie from its place on a constant frame rate, in frames.
 _REGULAR = 0.25
-# An announced rate that differs by more from the rate of the time stamps is wrong.
+# An announced rate is wrong if it differs from the rate of the time stamps by more than this share.
 _OFF = 0.2
-# Time stamps that run back by more begin anew, as where files were joined.
+# Time stamps that run back by more than this start a new series, as in joined files.
 _ANEW_S = 1.0
 
 
 class _Stamps:
     """Numbers and times of the frames of a file.
 
-    A clip of constant rate is numbered by its time stamps, which stay true when a damaged stretch comes out short or
-    out of order; other clips are numbered by counting. regular: the rate has been constant so far.
+    A clip of constant rate is numbered by its time stamps, which remain correct if a damaged stretch loses frames or
+    returns them out of order; other clips are numbered by counting. regular: the rate has been constant so far.
     """
 
     def __init__(self, own_hz: float, given_hz: float | None) -> None:
         self.number, self.time_s, self.regular = 0, 0.0, True
         self._own_hz, self._given_hz, self._damaged, self._is_stamped = own_hz, given_hz, False, False
-        self._start_s, self._before_s = math.nan, 0.0  # the stamp of the first frame, the latest time
-        self._steps_ms = Counter[int]()  # between successive frames
+        self._start_s, self._before_s = math.nan, 0.0  # stamp of the first frame; latest time
+        self._steps_ms = Counter[int]()  # steps between successive frames
 
     def add(self, stamp_s: float, lost: int, damaged: bool) -> int:
-        """Number the next frame; returns how many are missing before it, or -1 if it came out of order.
+        """Number the next frame. Return how many frames are missing before it, or -1 if it came out of order.
 
-        stamp_s: NaN where it has none, which counts as one step after the frame before. lost: reads that failed before
-        it. damaged: whether its data are.
+        stamp_s: time stamp; NaN if it has none, which counts as one step after the frame before. lost: failed reads
+        before it. damaged: whether its data are damaged.
         """
         self._damaged |= damaged or lost > 0
-        # Of a varying rate the shortest step, so that the next stamp is not passed.
+        # For a varying rate use the shortest step, so that the next stamp is not passed.
         steps_ms = () if self.regular else (step for step in self._steps_ms if step > 0)
         step_s = min(steps_ms, default=1000 / self._own_hz) / 1000
         expected_s = self._before_s + (lost + 1) * step_s if self.number else 0.0
         is_stamped = not math.isnan(stamp_s)
-        if is_stamped and not stamp_s - self._start_s >= self._before_s - _ANEW_S:  # the first one, or anew
+        if is_stamped and not stamp_s - self._start_s >= self._before_s - _ANEW_S:  # the first stamp, or a new series
             self._start_s = stamp_s - expected_s
         stamp_s = stamp_s - self._start_s if is_stamped else expected_s
         place = round(stamp_s * self._own_hz)
-        # Stamps off the constant rate, or out of step although every read succeeded, mean a varying rate.
+        # Stamps off the constant rate, or out of step although every read succeeded, indicate a varying rate.
         on_rate = abs(stamp_s * self._own_hz - place) < _REGULAR and place - self.number < _MOST_LOST
         self.regular = self.regular and on_rate and (self._damaged or place == self.number)
         missing = place - self.number if self.regular else lost
@@ -276,7 +276,7 @@ class _Stamps:
         return missing
 
     def describe(self) -> str:
-        """How a varying frame rate varies, in words; "" for a constant rate, and where the times are not the file's."""
+        """Return a text on how the frame rate varies; "" for a constant rate, or if times are not from the file."""
         steps = [] if self._given_hz else sorted(self._steps_ms.elements())
         usual = steps[len(steps) // 2] if steps else 0
         odd = sum(abs(step - usual) > max(_REGULAR * usual, 2) for step in steps)
@@ -289,12 +289,12 @@ class _Stamps:
 
 
 class VideoSource(_Clip):
-    """A video file, a camera's index or a stream's address. Frames are BGR, also those of grey videos.
+    """A video file, a camera's index or a stream's address. Frames are BGR, also for grey videos.
 
     A file's rotation is applied, so size is that of the upright picture. rate_hz: the file's own, unless the caller
-    gives one. Frames that cannot be decoded leave a gap in the numbers. Time is the file's, a live stream's is the
-    clock's.
-    Raises InputError: cannot be opened, is no video, the first frame cannot be decoded, the size changes.
+    gives one. Frames that cannot be decoded leave a gap in the numbers. Times come from the file, or from the clock
+    for a live stream.
+    Raise InputError: cannot be opened, not a video, first frame cannot be decoded, size changes.
     """
 
     def __init__(self, target: str | int, name: str, rate_hz: float | None = None, scale: Scale = None) -> None:
@@ -317,7 +317,7 @@ class VideoSource(_Clip):
             raise InputError(f"the first frame of {name} cannot be decoded; the file is damaged or its codec unknown")
         self.size = (first.shape[1], first.shape[0])
         if true_hz and (own_hz is None or abs(true_hz / own_hz - 1) > _OFF):
-            own_hz, count = true_hz, 0  # the count may be by the announced rate
+            own_hz, count = true_hz, 0  # the count may be based on the announced rate
         self._own_hz, self._given_hz = own_hz or 10.0, rate_hz
         self.rate_hz, self.assumes_rate = rate_hz or self._own_hz, not (rate_hz or own_hz)
         self.count = int(count) if not self._live and 0 < count < 1e8 else None
@@ -325,7 +325,7 @@ class VideoSource(_Clip):
         self._announced = int(count) if self._live and is_counted and 0 < count < 1e8 else 0
 
     def every(self, interval: int) -> Iterator[Frame]:
-        """Frames 1, 1 + interval, ...: the others are not turned into pictures."""
+        """Yield frames 1, 1 + interval, ...; do not decode the others into pictures."""
         self._begin()
         self.notes.clear()
         capture = self._open()
@@ -340,7 +340,7 @@ class VideoSource(_Clip):
 
     def _read_file(self, capture: Capture, interval: int) -> Iterator[Frame]:
         stamps, lost, self.concealed, first = _Stamps(self._own_hz, self._given_hz), 0, 0, 0
-        # As many reads in a row may fail as frames are still announced, and a few where none are.
+        # Consecutive reads may fail as often as frames are still announced, and a few times if none are.
         while lost < min(max((self.count or 0) - stamps.number, 0) + 4, _MOST_LOST):
             if not capture.grab():
                 lost += 1
@@ -366,19 +366,19 @@ class VideoSource(_Clip):
                 image = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
                 yield Frame(number, stamps.time_s, image, damaged=getattr(capture, "damaged", False))
         number = self.last
-        if 0 < first < number:  # the last frame alone is that of a clip which is cut short
+        if 0 < first < number:  # a truncated clip conceals errors in its last frame only
             self._note(first, f"the decoder concealed errors in {_span(first, number)}")
         if words := stamps.describe():
             self.notes.append(words)
         if not isinstance(capture, AvCapture) and not self.exact:
             self.notes.append(
-                "without PyAV a change of the pictures' size is not seen: pip install 'torchvision-dddas[video]'"
+                "without PyAV a change of the pictures' size is not noticed: pip install 'torchvision-dddas[video]'"
             )
         if self.exact and self.count and self.count > number:
-            # Of the frames announced, those whose data are in the file belong to the clip.
+            # Announced frames belong to the clip if their data are in the file.
             self.last = max(number, min(self.count, getattr(capture, "stored", 0)))
             self._note_lost(number + 1, self.last)
-        # A count guessed from the duration means something only where the rate is constant.
+        # A count estimated from the duration is meaningful only for a constant rate.
         allowed = 0 if self.exact else max(2, number // 50) if stamps.regular else number
         if self.count and self.count - self.last > allowed:
             what = f"the clip ends after frame {self.last} but announces {self.count}: it is cut short or damaged"
@@ -391,7 +391,7 @@ class VideoSource(_Clip):
             is_wanted = is_sampled(number, interval)
             asked_s = time.monotonic()
             decoded, image = capture.read() if is_wanted else (capture.grab(), np.zeros((0, 0), np.uint8))
-            # After it a decoder still gives the pictures that it holds.
+            # After a long silence the decoder still returns the pictures that it holds.
             silent_s = max(silent_s, time.monotonic() - asked_s)
             if not decoded:
                 lost += 1
@@ -415,7 +415,7 @@ class VideoSource(_Clip):
     def _open(self) -> Capture:
         capture = open_capture(self._target, self.name, (STALL_S, STALL_S) if self._live else None)
         if is_cut_to_8_bits(capture):
-            self._note(1, "of deeper greys the upper 8 bits are read: pip install 'torchvision-dddas[video]'")
+            self._note(1, "only the upper 8 bits of deep grey are read: pip install 'torchvision-dddas[video]'")
         return capture
 
 
@@ -424,7 +424,7 @@ def _span(first: int, last: int) -> str:
 
 
 def frame_times(source: Source) -> dict[int, float]:
-    """The time of each frame of a video file, s, by the data that it stores; empty where nothing says it."""
+    """Return the time of each frame of a video file, s, from its stored data; empty if they do not give it."""
     if not isinstance(source, VideoSource) or source._live:
         return {}
     capture, stamps, times_s = source._open(), _Stamps(source._own_hz, source._given_hz), dict[int, float]()
@@ -432,7 +432,7 @@ def frame_times(source: Source) -> dict[int, float]:
         stored = capture.stamps_s() if isinstance(capture, AvCapture) else []
     finally:
         capture.release()
-    # In the order in which they are shown; those without a stamp after what was stored before.
+    # Sort by display order; packets without a stamp follow those stored before them.
     places_s = np.where(np.isnan(stored), np.fmax.accumulate(stored), stored)
     for stamp_s in np.array(stored)[np.argsort(places_s, kind="stable")].tolist():
         stamps.add(stamp_s, 0, False)
@@ -441,7 +441,7 @@ def frame_times(source: Source) -> dict[int, float]:
 
 
 def names_file(spec: str) -> bool:
-    """Whether something in the file system has this name, although it begins like `camera:` or `sim:`."""
+    """Return whether a file has this name, although it begins like `camera:` or `sim:`."""
     try:
         return Path(spec).exists()
     except (OSError, ValueError):
@@ -449,10 +449,10 @@ def names_file(spec: str) -> bool:
 
 
 def stream_target(spec: str) -> str | int | None:
-    """What is to be opened for `camera:0` or an address; None for anything else. Raises InputError."""
+    """Return the target to open for `camera:0` or an address; None for anything else. Raise InputError."""
     if spec.startswith("camera:") and not names_file(spec):
         index = spec.removeprefix("camera:")
         if not index.isdecimal() or len(index) > 4:
-            raise InputError(f"'{spec}' names no camera; wanted camera:0, camera:1, ...")
+            raise InputError(f"'{spec}' names no camera; give camera:0, camera:1, ...")
         return int(index)
     return spec if "://" in spec else None

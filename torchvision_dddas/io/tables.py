@@ -1,4 +1,4 @@
-"""Tables as text files, CSV and MOTChallenge: a schema names the columns once, for the reader and for the writer."""
+"""Text tables, CSV and MOTChallenge. A schema defines the columns once, for the reader and for the writer."""
 
 import codecs
 import csv
@@ -16,21 +16,22 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import PartFile
+from torchvision_dddas.io.column_files import read_columns
 from torchvision_dddas.types import Scene
 
 Item = TypeVar("Item")
 
 LAST_FRAME = 10_000_000
-"""A higher frame number is taken for a mistake, such as a time stamp."""
+"""A higher frame number is rejected as a mistake, such as a time stamp."""
 
 FARTHEST = 1e9
-"""No place in pixels or metres, no variance and no score is larger."""
+"""Largest place in pixels or metres, variance or score."""
 
 
 MOST_BOXES = 1000
-"""A frame has no more: tracking and scoring compare each box with each of the frame after, or of the truth.
+"""Largest number of boxes in a frame: tracking and scoring compare each with each of the next frame or of the truth.
 
-A frame of 1000 takes 0.6 GB and 1 s to score.
+A frame of 1000 boxes takes 0.6 GB and 1 s to score.
 """
 
 
@@ -38,8 +39,8 @@ A frame of 1000 takes 0.6 GB and 1 s to score.
 class Column:
     """A column of a table.
 
-    name: with its unit, as `x_px`. format: of its numbers, as `format(value, ".2f")` takes it; "" for text.
-    low, high: the range that a reader accepts, ends included. is_whole: whether its numbers are whole.
+    name: with its unit, as `x_px`. format: of its numbers, as for `format(value, ".2f")`; "" for text.
+    low, high: the range that a reader accepts, ends included. is_whole: whether numbers must be whole.
     may_be_empty: whether a reader accepts empty cells, which become NaN. wanted: the range in words, for messages.
     """
 
@@ -53,7 +54,7 @@ class Column:
 
     @property
     def range_text(self) -> str:
-        """What a cell may hold, in words."""
+        """The allowed content of a cell, in words."""
         if self.wanted:
             return self.wanted
         kind, form = ("whole number", ".0f") if self.is_whole else ("number", "g")
@@ -75,10 +76,10 @@ class Schema:
         self.header = ",".join(self.names) + "\n" if has_header else ""
 
     def format_rows(self, values: Mapping[str, Any]) -> str:
-        """Lines of text with the cells of some rows, in the order of the columns; "" for no rows.
+        """Return lines of text with the cells of some rows, in the order of the columns; "" for no rows.
 
-        values: column name -> one value a row; a single number, word or None stands in every row. Unknown
-        numbers (NaN, infinite, None) become empty cells, and words are quoted where CSV needs it. Raises KeyError for
+        values: column name -> one value a row; a single number, word or None applies to every row. Unknown
+        numbers (NaN, infinite, None) become empty cells, and words are quoted if CSV requires it. Raise KeyError for
         a missing column.
         """
         given = [values[name] for name in self.names]
@@ -103,14 +104,14 @@ def _format_cells(values: Any, form: str, count: int) -> list[str]:
 
 
 Rows = Mapping[str, Any]
-"""Column name -> one value a row, or a single one for all rows; as Schema.format_rows takes it."""
+"""Column name -> one value a row, or one value for all rows, as for Schema.format_rows."""
 
 
 class TableFiles(Generic[Item]):
     """Tables that grow together, item by item, and appear whole at the end.
 
-    is_optional: whether there is no file unless an item has rows; rows are None for items that have none.
-    tables: path -> the table's schema, and the function that makes its rows of an item:
+    is_optional: write no file unless an item has rows; rows are None for items without any.
+    tables: path -> the table's schema, and the function that makes its rows from an item:
 
         TableFiles({folder / "sizes.csv": (SIZES, lambda frame: {"frame": frame.number, "width_px": frame.widths})})
     """
@@ -122,24 +123,24 @@ class TableFiles(Generic[Item]):
         self._files = TextFiles({path: schema.header for path, (schema, _) in tables.items()})
 
     def write(self, item: Item) -> None:
-        """Add the rows of an item to each table. Raises OSError if the disk refuses."""
+        """Add the rows of an item to each table. Raise OSError if the disk refuses."""
         given = [(schema, rows(item)) for schema, rows in self._tables]
         if texts := [schema.format_rows(rows) for schema, rows in given if rows is not None]:
             self._is_left_out = False
             self._files.write(*texts)
 
     def close(self, complete: bool = True) -> None:
-        """Put the tables in their places, also those without rows. Raises OSError if they cannot be written."""
+        """Move the tables to their places, including those without rows. Raise OSError if they cannot be written."""
         if not self._is_left_out:
             self._files.close()
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove unfinished tables."""
         self._files.discard()
 
 
 class TextFiles:
-    """Text files that grow together and appear whole at the end. content: path -> the line that it begins with."""
+    """Text files that grow together and appear whole at the end. content: path -> first line of the file."""
 
     def __init__(self, content: Mapping[Path, str]) -> None:
         self._content = dict(content)
@@ -147,13 +148,13 @@ class TextFiles:
         self._files: list[TextIO] = []
 
     def write(self, *texts: str) -> None:
-        """Add to each file, in the order of the paths."""
+        """Add text to each file, in the order of the paths."""
         for file, part, text in zip(self._open(), self._parts, texts, strict=True):
             with part.naming():
                 file.write(text)
 
     def close(self) -> None:
-        """Put the files in their places, also those to which nothing was added. Raises OSError if they cannot be."""
+        """Move the files to their places, including unchanged ones. Raise OSError if they cannot be written."""
         for file, part in zip(self._open(), self._parts, strict=True):
             with part.naming():
                 file.close()
@@ -161,7 +162,7 @@ class TextFiles:
             part.keep()
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove unfinished files."""
         for file in self._files:
             with suppress(OSError):  # a full disk refuses the last lines again
                 file.close()
@@ -182,20 +183,25 @@ class TextFiles:
 
 
 class CsvText(NamedTuple):
-    """The cells of a CSV without the blanks around them; blank lines are left out.
+    """The cells of a CSV without surrounding blanks; blank lines are left out.
 
-    header: the cells of the first line, none in an empty file. line: of each further row, from 1. rows: their cells.
+    header: the cells of the first line, none in an empty file. line: number of each further row, from 1. rows: cells.
     """
 
     header: list[str]
     line: list[int]
     rows: list[list[str]]
 
+    @property
+    def unit(self) -> str:
+        """What messages call a row."""
+        return "line"
 
-# The beginning of a file tells how it is written.
+
+# The beginning of a file determines its format.
 _HEAD_BYTES, _HEAD_LINES = 65_536, 50
 _QUOTED, _SEP_LINE = re.compile(r'"[^"]*"'), re.compile(r'"?sep=([,;|\t])"?')
-# Digits after a mark only: two runs of digits side by side would try each way to part a long one, its length squared.
+# Require digits only after a mark: two adjacent runs of digits would take time quadratic in the length of a number.
 _NUMBER = re.compile(r"[-+]?\d*(?:[.,]\d*)?(?:[eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(?:,\d{3})+(?:\.\d+)?")
 _POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(?:\.\d{3})+(?:,\d+)?")  # 1.540,25
@@ -210,13 +216,18 @@ codecs.register_error("windows", _from_windows)
 
 
 def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvText:
-    """Read the cells of a CSV. what: what the file holds, for messages. has_header: whether line 1 names the columns.
+    """Read the cells of a CSV. what: the content, for messages. has_header: whether line 1 names the columns.
 
-    Cells are parted by commas, semicolons, tabs or bars, and numbers may have decimal commas; the first lines tell.
-    A line `sep=;` is left out. Text is UTF-8, UTF-16 with its mark, or Windows-1252.
-    Raises InputError: unreadable, no CSV text.
+    Cells are separated by commas, semicolons, tabs or bars, and numbers may have decimal commas; the first lines
+    decide. A line `sep=;` is left out. Text is UTF-8, UTF-16 with its mark, or Windows-1252. Parquet counts as CSV;
+    its `line` is the row. Raise InputError if the file is unreadable or not CSV text.
     """
     name = f"{what} {path}".strip()
+    if Path(path).suffix.lower() == ".parquet":
+        columns = read_columns(Path(path), name)
+        table = [[_cell(value) for value in row] for row in zip(*columns.values(), strict=True)]
+        number = [*range(len(table) + 1)]
+        return CsvText([*columns], number[1:], table) if has_header else CsvText([], number, [[*columns], *table])
     lines, rows = list[int](), list[list[str]]()
     try:
         with Path(path).open("rb") as raw:
@@ -233,7 +244,7 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
     except OSError as error:
         raise InputError(f"{name} cannot be read: {error.strerror}") from None
     except (UnicodeError, csv.Error) as error:
-        raise InputError(f"{name} is no CSV text: {error}") from None
+        raise InputError(f"{name} is not CSV text: {error}") from None
     if comma is not None:
         form = _NUMBER if comma else _THOUSANDS
         if comma == ".,":
@@ -247,17 +258,21 @@ def read_csv(path: str | Path, what: str = "", has_header: bool = True) -> CsvTe
     return CsvText(rows[0], lines[1:], rows[1:]) if has_header and rows else CsvText([], lines, rows)
 
 
-def _find_format(head: str) -> tuple[str, str | None]:
-    """The sign between cells, and what stands for a comma in a number: "." for a decimal one, "" between thousands.
+def _cell(value: Any) -> str:
+    return "" if value is None or value != value else str(value)
 
-    ".," where it is decimal and points part thousands.
+
+def _find_format(head: str) -> tuple[str, str | None]:
+    """Return the separator of cells, and the replacement for a comma in numbers: "." if decimal, "" for thousands.
+
+    The replacement is ".," if the comma is decimal and points separate thousands. None: leave commas.
     """
     lines = [line for line in head.splitlines() if line.strip()][:_HEAD_LINES]
     told = _SEP_LINE.fullmatch(lines[0]) if lines else None
     bare = [_QUOTED.sub("", line) for line in lines]
 
     def rank(sign: str) -> tuple[int, float]:
-        """How many lines have equally many cells, and the share of numbers in these."""
+        """Return the number of lines with equally many cells, and the share of numbers among the cells."""
         counts = Counter(count for line in bare if (count := line.count(sign)))
         cells = [cell.strip() for line in bare for cell in line.split(sign)]
         return max(counts.values(), default=0), sum(map(bool, map(_NUMBER.fullmatch, cells))) / max(len(cells), 1)
@@ -275,20 +290,21 @@ def _find_format(head: str) -> tuple[str, str | None]:
     pointed = [cell for cell in cells if "." in cell and _POINTED.fullmatch(cell)]
     points = sum("." in cell for cell in numbers if "," not in cell)
     is_thousands = all(map(_THOUSANDS.fullmatch, commas))
-    # Where commas are decimal for sure, all points may part thousands.
+    # If commas are certainly decimal, points may all separate thousands.
     if not is_thousands and pointed and points <= len(pointed) <= len(commas):
         return separator, ".,"
     if 10 * points > len(commas):
         return separator, "" if commas and is_thousands else None
-    # Where each comma may part thousands, only the semicolon tells: it is there because commas are decimal.
+    # If every comma may separate thousands, only a semicolon decides: it is used because commas are decimal.
     return separator, "." if separator == ";" or not is_thousands else None
 
 
 class CsvTable:
-    """A table that was read. columns: name -> (N,) float64, or a list of text. line: (N,) int64, in the file from 1."""
+    """A table that was read. columns: name -> (N,) float64, or a list of text. line: (N,) int64, from 1."""
 
     def __init__(self, path: str | Path, what: str, text: CsvText) -> None:
         self.what, self.header, self._path, self._rows = what, tuple(text.header), path, text.rows
+        self._unit = text.unit
         self.line = np.array(text.line, np.int64)
         self.columns: dict[str, Any] = {}
 
@@ -299,30 +315,30 @@ class CsvTable:
         return name in self.columns
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """A column; NaN in every row where the table does not have it."""
+        """Return a column; NaN in every row if the table lacks it."""
         values: np.ndarray = self.columns.get(name, np.full(len(self), np.nan))
         return values
 
     def stack(self, *names: str) -> np.ndarray:
-        """Several columns side by side, (N, K)."""
+        """Return several columns side by side, (N, K)."""
         return np.stack([self[name] for name in names], axis=1)
 
     def cell(self, name: str, row: int) -> str:
-        """The text of a number."""
+        """Return the text of a cell."""
         return self._rows[row][self.header.index(name)]
 
     def error(self, message: str, row: int | None = None) -> InputError:
-        """The error to raise, with the file and the line of a row."""
-        place = "" if row is None else f", line {self.line[row]}"
+        """Return an InputError with the file and the line of a row."""
+        place = "" if row is None else f", {self._unit} {self.line[row]}"
         return InputError(f"{self.what} {self._path}{place}: {message}")
 
     def refuse(self, is_wrong: np.ndarray, message: str) -> None:
-        """Raises InputError at the first of the rows that are wrong, (N,) bool."""
+        """Raise InputError at the first wrong row. is_wrong: (N,) bool."""
         if is_wrong.any():
             raise self.error(message, int(is_wrong.argmax()))
 
     def require_rows(self) -> None:
-        """Raises InputError for a table without rows."""
+        """Raise InputError for a table without rows."""
         if not len(self):
             raise InputError(f"{self.what} {self._path} has a header but no rows")
 
@@ -332,9 +348,9 @@ def read_table(
 ) -> CsvTable:
     """Read the columns of a schema that a CSV has; further columns are ignored.
 
-    required: names without which the table is refused. is_ragged: whether lines may have more or fewer cells than the
-    first, as long as the schema's columns are there. text: the file's cells where they are known.
-    Raises InputError with file and line: unreadable, a column missing or named twice, too many or too few cells, not a
+    required: names that the table must have. is_ragged: whether lines may have more or fewer cells than the first, as
+    long as the schema's columns are present. text: the file's cells, if already read.
+    Raise InputError with file and line: unreadable, a column missing or named twice, too many or too few cells, not a
     number, out of range.
     """
     text = text or read_csv(path, schema.what)
@@ -346,7 +362,7 @@ def read_table(
             f"{schema.what} {path} lacks {', '.join(missing)}; its columns are {columns}, wanted {','.join(required)}"
         )
     if twice := [name for name in schema.names if header.count(name) > 1]:
-        raise table.error(f"column {twice[0]} is named twice; wanted each name once")
+        raise table.error(f"column {twice[0]} is named twice; give each name once")
     counts = np.array([len(cells) for cells in rows], int)
     if not is_ragged and (is_odd := counts != len(header)).any():
         count = int(counts[is_odd][0])
@@ -361,7 +377,7 @@ def read_table(
 
 
 def _numbers(table: CsvTable, column: Column, cells: list[str]) -> np.ndarray:
-    """(N,) float64, NaN for an empty cell. Raises InputError for a cell that is no number or out of range."""
+    """Return (N,) float64, NaN for an empty cell. Raise InputError for a cell that is not a number in the range."""
     values = parse_numbers(cells)
     is_wrong = np.isinf(values) | (values < column.low) | (values > column.high)
     if not column.may_be_empty:
@@ -375,7 +391,7 @@ def _numbers(table: CsvTable, column: Column, cells: list[str]) -> np.ndarray:
 
 
 def parse_numbers(cells: Sequence[str]) -> np.ndarray:
-    """(N,) float64: NaN for an empty cell, infinity for what is no number, `nan` included."""
+    """Return (N,) float64: NaN for an empty cell, infinity for text that is not a number, `nan` included."""
     try:
         values = np.array([float(cell) if cell else math.nan for cell in cells], float)
         if "_" not in "".join(cells) and np.isnan(values).sum() == cells.count(""):
@@ -386,7 +402,7 @@ def parse_numbers(cells: Sequence[str]) -> np.ndarray:
 
 
 def check_crowding(frame: np.ndarray, name: str, rows: str = "boxes") -> None:
-    """Raises InputError where one of the frames (N,) has more than MOST_BOXES rows. name: of the table."""
+    """Raise InputError if one of the frames (N,) has more than MOST_BOXES rows. name: of the table."""
     numbers, counts = np.unique(frame, return_counts=True)
     if len(counts) and counts.max() > MOST_BOXES:
         crowded = numbers[counts.argmax()]
@@ -417,7 +433,7 @@ PRECISE_SCORE = replace(SCORE, format=".6g")
 KIND = Column("kind")
 MOTION = (Column("heading_deg", ".1f"), Column("speed_px_per_frame", ".3f"))
 EAST_NORTH = tuple(Column(name, ".4f", -FARTHEST, FARTHEST) for name in ("east_m", "north_m"))
-# A centimetre squared is 0.0001 m2: fixed digits would lose what is known well.
+# A square centimetre is 0.0001 m2: a fixed number of digits would truncate small variances.
 COVARIANCE = tuple(
     Column(name, ".6g", -FARTHEST, FARTHEST, may_be_empty=True)
     for name in ("var_east_m2", "cov_east_north_m2", "var_north_m2")
@@ -427,37 +443,37 @@ DEGREES = tuple(
 )
 TARGET = Column("target", "d", 1, 2**53, is_whole=True)
 PLACES = (("longitude_deg", "latitude_deg"), ("east_m", "north_m"))
-"""The two kinds of place that a table may have."""
+"""The two kinds of places in tables."""
 
 MOT = Schema("boxes", FRAME, IDENTITY, *BOX, SCORE, *(Column(n, "d") for n in ("x", "y", "z")), has_header=False)
 """MOTChallenge text: `frame,identity,x,y,width,height,score,-1,-1,-1`, frames from 1, pixels from 0.
 
-An identity of -1 is none.
+An identity of -1 means no identity.
 """
 
 MOT_TRACKS = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, *MOT.columns[-3:], has_header=False)
-"""The same with scores as they were given."""
+"""The same columns with unrounded scores."""
 
 DETECTIONS = Schema("detections", FRAME, TARGET, *BOX, SCORE, KIND, Column("area_px", ".0f"), *MOTION)
-"""detections.csv of `dddas detect`. heading_deg: clockwise from the picture's upward direction, over the ground.
+"""detections.csv of `dddas detect`. heading_deg: clockwise from the picture's upward direction.
 
-speed_px_per_frame: relative to the background.
+heading_deg and speed_px_per_frame are relative to the background.
 """
 
 
 def mot_rows(frame: int, box_px: np.ndarray, score: np.ndarray, identity: np.ndarray | int = -1) -> dict[str, Any]:
-    """What MOT and MOT_TRACKS write of the boxes (N, 4) of a frame."""
+    """Return the columns of MOT and MOT_TRACKS for the boxes (N, 4) of a frame."""
     box = dict(zip(("x_px", "y_px", "width_px", "height_px"), np.reshape(box_px, (-1, 4)).T, strict=True))
     return {"frame": frame, "identity": identity, **box, "score": score, "x": -1, "y": -1, "z": -1}
 
 
 def compass_deg(heading_rad: float) -> float:
-    """Degrees clockwise from image up, in tenths below 360, of a heading in image axes (0 right, pi/2 down)."""
+    """Convert a heading in image axes (0 right, pi/2 down) to degrees clockwise from image up, in tenths below 360."""
     return round(math.degrees(heading_rad) + 90, 1) % 360
 
 
 def detection_tables(folder: Path) -> TableFiles[Scene]:
-    """detections.txt and detections.csv of a clip's frames."""
+    """Return the tables detections.txt and detections.csv of a clip's frames."""
 
     def mot(scene: Scene) -> Rows:
         return mot_rows(scene.frame.number, scene.detections.box_px, scene.detections.score)

@@ -1,4 +1,4 @@
-"""Live runs: capture in a thread of its own, load shedding, health, and serving its state."""
+"""Live runs: capture in a thread of its own, load shedding, health, and a server for the health."""
 
 from torchvision_dddas.live.capture import LiveSource
 from torchvision_dddas.live.health import Health

@@ -1,4 +1,4 @@
-"""Live capture: a camera, a stream or a recording is read in a thread of its own, at its own pace."""
+"""Live capture: a thread reads a camera, a stream or a recording at its own pace."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -9,7 +9,7 @@ import numpy as np
 from torchvision_dddas import open_video
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import without_secrets
-from torchvision_dddas.io.live_streams import Stream, open_stream
+from torchvision_dddas.io.live_streams import LiveStream, open_stream
 from torchvision_dddas.io.sources import ImageSource, VideoSource, stream_target
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
@@ -18,20 +18,20 @@ from torchvision_dddas.live.refusal import open_or_refuse
 from torchvision_dddas.types import Frame, Problem, Source
 
 _JOIN_S = 1.0
-_LATE_S = 1.0  # a recording that is later than this goes on from now, not in a burst
+_LATE_S = 1.0  # a recording that is later than this skips the delay instead of catching up in a burst
 
 
 class LiveSource:
-    """A Source of frames in real time; a run that is slow gets the newest ones.
+    """A Source of frames in real time; a slow run gets the newest frames.
 
-    It begins when it is first iterated. A recording (file, folder, sim:) plays at live.pace times its own speed and
-    ends; with pace 0 it waits for the run. A camera or stream is opened again whenever it is lost, and ends by `stop`.
-    Frame numbers follow the clock at rate_hz; a frame's `skipped` counts those before it that were dropped, left out or
-    lost. time_s is a recording's own; that of a camera counts from its first picture. What goes wrong while it runs is
-    an event of `health` (kind `stream`) and a problem; only a driver that hangs again and again raises DeadCamera.
+    It begins at the first iteration. A recording (file, folder, sim:) plays at live.pace times its own speed and
+    ends; with pace 0 it waits for the run. A camera or stream is reopened whenever it is lost, and ends by `stop`.
+    Frame numbers follow the clock at rate_hz; `skipped` of a frame counts the frames before it that were dropped, left
+    out or lost. time_s is a recording's own; for a camera it counts from the first picture. Failures during the run
+    become an event of `health` (kind `stream`) and a problem; only a driver that hangs repeatedly raises DeadCamera.
 
-    name: as given, without passwords. recorded: the number of frames of a recording, None where it is not certain.
-    busy_s: how long the run worked on the frame before. Raises InputError if it cannot be opened or sends no picture.
+    name: as given, without passwords. recorded: the number of frames of a recording, None if uncertain. busy_s: time
+    spent by the run on the previous frame. Raise InputError if the source cannot be opened or sends no picture.
     """
 
     count: int | None = None
@@ -46,13 +46,13 @@ class LiveSource:
         *,
         rate_hz: float | None = None,
         full_scale: int | tuple[int, int] | None = None,
-        opener: Callable[[], Stream] | None = None,
+        opener: Callable[[], LiveStream] | None = None,
         clock: Clock | None = None,
         waiting: Callable[[], object] | None = None,
     ) -> None:
-        """spec, rate_hz, full_scale: as `open_video` takes them. opener: opens the stream instead of OpenCV.
+        """spec, rate_hz, full_scale: as for `open_video`. opener: opens the stream instead of OpenCV.
 
-        waiting: called every second while a camera that is not there yet is waited for; None: it is not waited for.
+        waiting: called every second while waiting for an absent camera; None: do not wait for it.
         """
         text = str(spec)
         self.name, self.last, self.busy_s = without_secrets(text), 0, 0.0
@@ -61,9 +61,10 @@ class LiveSource:
         self._log = CaptureLog(self.health, self._clock)
         shared = (self._queue, self._log, self.health, self._clock)
         target = stream_target(text)
+        self.is_stream = opener is not None or target is not None
         self._feed: Player | Receiver
         self.recorded: int | None = None
-        if opener is None and target is None:
+        if not self.is_stream:
             recording = open_video(text, rate_hz=rate_hz, full_scale=full_scale)
             self._feed = Player(recording, self.parameters.pace, *shared)
             self.rate_hz = recording.rate_hz
@@ -76,8 +77,8 @@ class LiveSource:
         self._feed = Receiver(self.name, opening, rate_hz, self.parameters, *shared, waiting)
         self.rate_hz = self._feed.rate_hz
 
-    def _open(self, target: str | int, limits_s: tuple[float, float]) -> Stream:
-        # A lost stream is not asked why: it was there, and may count its clients.
+    def _open(self, target: str | int, limits_s: tuple[float, float]) -> LiveStream:
+        # Do not ask a lost stream for a reason: it was there, and may limit its clients.
         return (open_stream if self._queue.begun else open_or_refuse)(target, self.name, limits_s)
 
     @property
@@ -87,7 +88,7 @@ class LiveSource:
 
     @property
     def seeking(self) -> bool:
-        """Whether the camera is lost and is being opened again by a driver that answers."""
+        """Whether the camera is lost and is being reopened by a driver that responds."""
         return self._feed.seeking
 
     @property
@@ -97,16 +98,16 @@ class LiveSource:
 
     @property
     def start_utc_s(self) -> float:
-        """Seconds since 1970 at time_s = 0, NaN before the first frame; follows the machine's clock when it is set."""
+        """Seconds since 1970 at time_s = 0, NaN before the first frame; adjusted when the machine's clock is set."""
         return self._log.start_utc_s
 
     @property
     def problems(self) -> list[Problem]:
-        """The latest 64."""
+        """The latest 64 problems."""
         return self._log.problems
 
     def look_at(self, every: int) -> None:
-        """From now on yield one of so many frames; the others are left out on purpose."""
+        """From now on yield one of `every` frames; the others are left out on purpose."""
         with self._queue.changed:
             self._queue.every = max(int(every), 1)
 
@@ -116,7 +117,7 @@ class LiveSource:
         return iter(self)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield frames, the newest if the run is late; a further iteration goes on where the one before ended."""
+        """Yield frames, the newest if the run is late; a further iteration continues where the last one ended."""
         if not self._queue.begun:
             self._queue.note(begun=True)
             self._feed.begin()
@@ -137,7 +138,7 @@ class LiveSource:
         self._queue.note(closed=True)
 
     def close(self) -> None:
-        """Stop and release the camera; a thread that hangs in its driver is left behind."""
+        """Stop and release the camera; a thread that hangs in its driver is abandoned."""
         self.stop()
         for thread in self._feed.threads:
             if thread.is_alive():
@@ -145,7 +146,7 @@ class LiveSource:
 
 
 class Player:
-    """Plays a recording at `pace` times its speed; with 0 as fast as frames are taken."""
+    """Play a recording at `pace` times its speed; with 0 as fast as frames are taken."""
 
     def __init__(
         self, recording: Source, pace: float, queue: FrameQueue, log: CaptureLog, health: Health, clock: Clock
@@ -168,7 +169,7 @@ class Player:
         self.threads[0].start()
 
     def check(self) -> float | None:
-        """As in Receiver: a player never hangs."""
+        """Do nothing, because a player never hangs. Same interface as Receiver."""
         return None
 
     def _play(self) -> None:
@@ -193,7 +194,7 @@ class Player:
                 self._log.captured(taken_s)
                 if queue.wanted(frame.number):
                     queue.put(replace(frame, skipped=0, taken_s=taken_s))
-        except Exception as error:  # ends the recording: results of the frames so far still come
+        except Exception as error:  # ends the recording; results of earlier frames still come
             self._log.report(f"the recording cannot be read further: {error}")
         finally:
             self._report()

@@ -1,4 +1,4 @@
-"""What the capture thread and the run share: a short queue of frames, the log of the capture, and the clock."""
+"""State shared by the capture thread and the run: a short queue of frames, the log of the capture, and the clock."""
 
 import threading
 import time
@@ -10,11 +10,11 @@ import numpy as np
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.types import Frame, Problem
 
-# An event that may happen often is reported once in this time; the counts have all.
+# An event that may happen often is reported once in this time; the counts include every occurrence.
 _QUIET_S = 10.0
-# A larger jump of the time of day against the monotonic clock means that the clock was set.
+# A larger jump of the time of day against the monotonic clock shows that the clock was set.
 _CLOCK_SET_S = 0.5
-# The rate is measured over this time, which begins so long after a stream was joined.
+# The rate is measured over _COUNTED_S, starting _GATHERED_S after a stream was joined.
 _COUNTED_S, _GATHERED_S = 2.0, 2.0
 _PROBLEMS = 64
 
@@ -31,15 +31,16 @@ class Clock:
         return time.time()
 
     def wait(self, changed: threading.Condition, seconds: float | None = None) -> None:
-        """Wait for the condition, which the caller holds, at most so many seconds."""
+        """Wait for the condition, which the caller holds, for at most `seconds`."""
         changed.wait(seconds)
 
 
 class FrameQueue:
-    """A queue with one thread on each side; a full one drops its oldest frame.
+    """A queue with one thread on each side. A full queue drops its oldest frame.
 
-    changed: the condition that guards it and all that the two threads share. begun: frames are being taken. ended: the
-    source gives no more. closed: the run takes no more, and no thread waits. every: one of so many frames is wanted.
+    changed: condition that guards the queue and all state shared by the threads. begun: the run takes frames. ended:
+    the source gives no more frames. closed: the run takes no more frames, and no thread waits. every: the run wants one
+    of `every` frames.
     """
 
     def __init__(self, room: int, health: Health, clock: Clock) -> None:
@@ -48,7 +49,7 @@ class FrameQueue:
         self.every = 1
         self._room, self._health, self._clock = room, health, clock
         self._waiting: deque[Frame] = deque()
-        self._newest = 0  # number of the frame added last
+        self._newest = 0  # number of the newest frame
 
     def wanted(self, number: int) -> bool:
         """Whether the run wants a frame."""
@@ -96,7 +97,7 @@ class FrameQueue:
                 self._clock.wait(self.changed, left)
 
     def note(self, begun: bool = False, ended: bool = False, closed: bool = False) -> None:
-        """Note whether frames are being taken, and wake whoever waits."""
+        """Set flags, and wake all waiting threads."""
         with self.changed:
             self.begun, self.ended, self.closed = self.begun or begun, self.ended or ended, self.closed or closed
             self.changed.notify_all()
@@ -107,9 +108,9 @@ class FrameQueue:
 
 
 class CaptureLog:
-    """What the capture thread records. number: of the newest frame. start_utc_s, problems: as in LiveSource.
+    """Records of the capture thread. number: of the newest frame. start_utc_s, problems: as in LiveSource.
 
-    sent_hz: the rate measured last; None before the first measurement.
+    sent_hz: the latest measured rate; None before the first measurement.
     """
 
     def __init__(self, health: Health, clock: Clock) -> None:
@@ -123,7 +124,7 @@ class CaptureLog:
         self._count, self._joined_s, self._since_s = 0, float("nan"), float("nan")
 
     def report(self, what: str, number: int | None = None, topic: str = "") -> None:
-        """Record an event and a problem. topic: of events that may happen often; one of a topic every 10 s is kept."""
+        """Record an event and a problem. topic: of frequent events; one event of a topic is kept every 10 s."""
         now_s, number = self._clock.now(), self.number if number is None else number
         if topic and now_s - self._reported_s.get(topic, -np.inf) < _QUIET_S:
             return
@@ -134,12 +135,12 @@ class CaptureLog:
         del self.problems[:-_PROBLEMS]
 
     def damaged(self, what: str, number: int | None = None, topic: str = "damage") -> None:
-        """Report damage to the pictures, a trouble for the next 10 s."""
+        """Report damage to the pictures, as a trouble for the next 10 s."""
         self.report(what, number, topic)
         self._health.trouble("damage", what, _QUIET_S)
 
     def captured(self, taken_s: float, note: Callable[[float], object] = lambda sent_hz: None) -> None:
-        """Count a picture that came at taken_s. note: called with each new measurement of the rate, Hz."""
+        """Count a picture taken at taken_s. note: called with each new measurement of the rate, Hz."""
         self._health.count("captured")
         ahead_s = self._clock.utc() - self._clock.now()
         if np.isnan(self.start_utc_s):
@@ -153,7 +154,7 @@ class CaptureLog:
             self.report(what, topic=f"clock {which}")
         if np.isnan(self._joined_s):
             self._joined_s = taken_s
-        # What the driver has gathered while it opened the stream comes at once, and says nothing of the rate.
+        # Pictures that the driver gathered while it opened the stream arrive at once, so they are not counted.
         if taken_s - self._joined_s < _GATHERED_S:
             return
         if np.isnan(self._since_s):
@@ -167,5 +168,5 @@ class CaptureLog:
             self._count, self._since_s = 0, taken_s
 
     def restart(self) -> None:
-        """Measure the rate again, of a stream that is joined with the next picture."""
+        """Measure the rate again, because a stream is joined with the next picture."""
         self._joined_s = self._since_s = float("nan")

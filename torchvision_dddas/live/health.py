@@ -1,4 +1,4 @@
-"""The health of a live run: counts, gauges, durations, events; and the thread that writes it to the disk."""
+"""The health of a live run: counts, gauges, durations, events; and the thread that writes it to disk."""
 
 import math
 import os
@@ -7,7 +7,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,18 +19,18 @@ from torchvision_dddas.io.output import EVENTS, RUN_JSON, AdjustmentList, Event,
 from torchvision_dddas.io.streams import Stream
 from torchvision_dddas.types import Adjustment
 
-_DURATIONS = 4096  # kept of each kind: percentiles are of the latest
+_DURATIONS = 4096  # durations of each kind that are kept for the percentiles
 _EVENTS = 64
-_ADJUSTMENTS = 100  # of a parameter that are listed: run.json is written every few seconds
-_LATE = 25  # results are late if most of so many were
+_ADJUSTMENTS = 100  # listed changes of a parameter: run.json is written every few seconds
+_LATE = 25  # results are late if most of this many were late
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Health at one moment. since_s: since the start. idle_s: since the last result, or the start.
+    """Health at one moment. since_s: seconds since the start. idle_s: seconds since the last result, or the start.
 
-    troubles: what is not well now, in words.
-    counts: since the start. gauges: now. seconds: 50, 95 and 99 % quantiles of the latest durations, by name.
+    troubles: current problems, in words. platforms: the state of further platforms.
+    counts: since the start. gauges: current values. seconds: 50, 95 and 99 % quantiles of recent durations, by name.
     """
 
     since_s: float
@@ -40,10 +40,11 @@ class Snapshot:
     seconds: Mapping[str, tuple[float, float, float]]
     events: tuple[Event, ...] = ()
     troubles: tuple[str, ...] = ()
+    platforms: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 class Health:
-    """Written by the capture and the run; read by the page, the watchdog and run.json."""
+    """The health of a run, written by the capture and the run; read by the page, the watchdog and run.json."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -52,8 +53,9 @@ class Health:
         self._gauges: dict[str, float] = {}
         self._seconds: dict[str, deque[float]] = {}
         self._events: deque[Event] = deque(maxlen=_EVENTS)
-        self._troubles: dict[str, tuple[str, float]] = {}  # words, and until when they hold
+        self._troubles: dict[str, tuple[str, float]] = {}  # text, and the time until which it holds
         self._asked: list[Callable[[], str]] = []
+        self.platforms: Callable[[], Mapping[str, Mapping[str, Any]]] = dict
         self._late: deque[bool] = deque(maxlen=_LATE)
         self._adjustments, self._unwritten = AdjustmentList(_ADJUSTMENTS), list[Event]()
 
@@ -68,7 +70,7 @@ class Health:
             self._gauges[name] = value
 
     def begin(self) -> None:
-        """Count the time without a result from now on: a camera that was waited for is there."""
+        """Restart the idle time, because the awaited camera is there."""
         self._result = time.monotonic()
 
     def took(self, name: str, seconds: float) -> None:
@@ -83,14 +85,19 @@ class Health:
             self._result = time.monotonic()
 
     def timed(self, is_late: bool) -> None:
-        """Count a result that came late; results are a trouble while most of the latest are."""
+        """Count whether a result came late; lateness is a trouble while most recent results are late."""
         self.count("late", int(is_late))
         self._late.append(is_late)
         late = sum(self._late)
         self.trouble("late", f"{late} of the latest {len(self._late)} results are late" if late > _LATE // 2 else "")
 
+    @property
+    def is_late(self) -> bool:
+        """Whether most of the latest results are late."""
+        return "late" in self._troubles
+
     def trouble(self, name: str, words: str = "", for_s: float = math.inf) -> None:
-        """Say that something is not well for so long, or until it is called with no words."""
+        """Report a trouble for `for_s` seconds, or until this is called without words."""
         with self._lock:
             if words:
                 self._troubles[name] = words, time.monotonic() + for_s
@@ -98,11 +105,11 @@ class Health:
                 self._troubles.pop(name, None)
 
     def ask(self, trouble: Callable[[], str]) -> None:
-        """Ask a function for further trouble whenever the health is read; it returns "" while all is well."""
+        """Register a function that is asked for a trouble at every reading; it returns "" if all is well."""
         self._asked.append(trouble)
 
     def adjusted(self, adjustments: Sequence[Adjustment], told: Collection[str] = ()) -> None:
-        """Add changes of parameters, for run.json and events.log alone. told: parameters whose changes are events."""
+        """Add changes of parameters, for run.json and events.log only. told: parameters already reported as events."""
         with self._lock:
             for a in self._adjustments.add(adjustments):
                 if a.parameter not in told:
@@ -110,13 +117,13 @@ class Health:
                     self._unwritten.append(Event(time.time(), a.frame, "adjusted", words))
 
     def take_adjusted(self) -> list[Event]:
-        """The changes of parameters since the last call, as events."""
+        """Return the changes of parameters since the last call, as events."""
         with self._lock:
             taken, self._unwritten = self._unwritten, []
         return taken
 
     def adjustments(self) -> dict[str, Any]:
-        """What run.json says of changed parameters: the first of each, and how many there were."""
+        """Return changed parameters for run.json: the first changes of each, and the number of changes."""
         with self._lock:
             return {"adjustments": list(self._adjustments.rows), "adjustments_made": dict(self._adjustments.made)}
 
@@ -126,7 +133,7 @@ class Health:
         return time.monotonic() - self._result
 
     def event(self, kind: str, text: str, frame: int = 0) -> Event:
-        """Add an event of one word's kind, and return it. frame: 0 if it belongs to none."""
+        """Add an event, and return it. kind: one word. frame: 0 if it belongs to no frame."""
         event = Event(time.time(), frame, kind, readable(without_secrets(text)))
         with self._lock:
             self._counts[f"events_{kind}"] += 1
@@ -134,24 +141,24 @@ class Health:
         return event
 
     def events_since(self, known: int) -> tuple[int, tuple[Event, ...]]:
-        """The number of events so far, and those of the kept ones that came after the first `known`."""
+        """Return the number of events so far, and the kept events that came after the first `known`."""
         with self._lock:
             total = sum(count for name, count in self._counts.items() if name.startswith("events_"))
             new = min(total - known, len(self._events))
             return total, tuple(self._events)[len(self._events) - new :]
 
     def snapshot(self) -> Snapshot:
-        """The health now."""
+        """Return the current health."""
         with self._lock:
             now = time.monotonic()
             since_s, idle_s = now - self._start, now - self._result
             counts, gauges, events = dict(self._counts), dict(self._gauges), tuple(self._events)
             troubles = [words for words, until_s in self._troubles.values() if now < until_s]
             taken = {name: list(values) for name, values in self._seconds.items()}
-        # Sorting thousands of times takes a millisecond, which a frame must not wait for.
+        # Sorting thousands of durations takes a millisecond, so it is done without the lock, which a frame may need.
         seconds = {name: tuple(np.percentile(values, (50, 95, 99)).tolist()) for name, values in taken.items()}
         troubles += filter(None, [trouble() for trouble in self._asked])
-        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, tuple(troubles))
+        return Snapshot(since_s, idle_s, counts, gauges, seconds, events, tuple(troubles), self.platforms())
 
 
 _EVENTS_S = 0.2
@@ -159,9 +166,9 @@ _MOST_WAITING = 1000  # events kept while the disk refuses them
 
 
 class StatusWriter:
-    """A context whose thread writes events and state; both are written once more when it is left.
+    """A context whose thread writes events and state; both are written once more at its end.
 
-    The run never waits for it. A disk that refuses to write is an event and a trouble, and does not end the run.
+    The run never waits for it. If the disk refuses to write, this is an event and a trouble, but the run continues.
     """
 
     def __init__(
@@ -184,7 +191,7 @@ class StatusWriter:
         self._thread = threading.Thread(target=self._run, name="status", daemon=True)
 
     def begin(self) -> None:
-        """Begin both files. Raises InputError if the disk refuses one; then the other says so."""
+        """Begin both files. Raise InputError if the disk refuses one; the other file then records this."""
         self._is_written(EVENTS, lambda: self._log.append([]))
         self._write_state()
         if self.refused:
@@ -195,7 +202,7 @@ class StatusWriter:
 
     @property
     def refused(self) -> str:
-        """Why the files are not as they should be; empty if the disk took all."""
+        """Reason why files are incomplete; empty if the disk accepted all."""
         return "; ".join(f"{name} cannot be written: {why}" for name, why in self._failing.items())
 
     def __enter__(self) -> Self:
@@ -209,7 +216,7 @@ class StatusWriter:
         self._thread.join()
         self.events()
         self.status()
-        self.events()  # the status may have failed
+        self.events()  # writing the status may have failed
 
     def events(self) -> None:
         """Write and show the new events."""
@@ -234,7 +241,7 @@ class StatusWriter:
         if now_s - self._measured_s > 0.1:
             self._health.gauge("rate_hz", (results - self._results) / (now_s - self._measured_s))
         self._measured_s, self._results = now_s, results
-        with suppress(OSError, ValueError):  # only Linux has it
+        with suppress(OSError, ValueError):  # /proc exists only on Linux
             pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
             self._health.gauge("resident_bytes", pages * os.sysconf("SC_PAGE_SIZE"))
 
@@ -243,7 +250,7 @@ class StatusWriter:
         self._is_written(RUN_JSON, lambda: self._log.write_state(self.state, facts))
 
     def _is_written(self, name: str, write: Callable[[], object]) -> bool:
-        """Write a file. A new refusal is an event; an event for each would fail to be written and make another."""
+        """Write a file. Only a new refusal becomes an event; otherwise each failed event would cause another one."""
         before = set(self._failing.values())
         try:
             write()
@@ -265,7 +272,7 @@ class StatusWriter:
 
 
 def snapshot_facts(now: Snapshot) -> dict[str, Any]:
-    """What run.json and /health.json say of the health."""
+    """Return the health in the form of run.json and /health.json."""
     return {
         "since_s": round(now.since_s, 3),
         "idle_s": round(now.idle_s, 3),
@@ -275,4 +282,5 @@ def snapshot_facts(now: Snapshot) -> dict[str, Any]:
             name: dict(zip(("p50", "p95", "p99"), values, strict=True)) for name, values in now.seconds.items()
         },
         "events": [asdict(event) for event in now.events],
+        **({"platforms": now.platforms} if now.platforms else {}),
     }

@@ -1,4 +1,4 @@
-"""Reads a camera or stream that may fall silent, hang or change its size, and opens it again when it is lost."""
+"""Read a camera or stream that may stop sending, hang or change its size, and reopen it when it is lost."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -8,45 +8,45 @@ import numpy as np
 
 from torchvision_dddas.config import LiveParameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.live_streams import Stream, first_picture
+from torchvision_dddas.io.live_streams import LiveStream, first_picture
 from torchvision_dddas.live.frame_queue import CaptureLog, Clock, FrameQueue
 from torchvision_dddas.live.health import Health
 from torchvision_dddas.live.refusal import Refused
 from torchvision_dddas.types import Frame
 
 OPENING = 2.0
-"""Opening a stream may take so many times stall_s."""
-_GRACE = 1.25  # times stall_s after which a call that the driver should have ended is given up
-_MOST_FAILED = 10  # reads in a row, after which a stream is lost
-_AHEAD_S = 0.5  # frames of a stream that is further ahead of the clock are dropped
-_OFF = 0.2  # a larger relative error of the announced rate is reported
-_MOST_HUNG = 3  # threads that hang in a driver, which cannot be ended
-_MEASURED = 12  # pictures by which a rate that is not announced is measured
-_FALLBACK_HZ = 10.0  # where they come all at once
+"""Time limit for opening a stream, in multiples of stall_s."""
+_GRACE = 1.25  # a call that lasts this many times its limit is abandoned
+_MOST_FAILED = 10  # consecutive failed reads after which a stream is lost
+_AHEAD_S = 0.5  # frames further ahead of the clock than this are dropped
+_OFF = 0.2  # relative error of the announced rate that is reported
+_MOST_HUNG = 3  # threads that may hang in a driver, which cannot be ended
+_MEASURED = 12  # pictures from which an unannounced rate is measured
+_FALLBACK_HZ = 10.0  # rate if these pictures come all at once
 
 
-_WAITING_S = 1.0  # between two calls of `waiting`
+_WAITING_S = 1.0  # interval between calls of `waiting`
 
 
 class DeadCamera(Exception):
-    """The camera stays lost, or its driver hung again and again. The message is for the user."""
+    """The camera stays lost, or its driver hung repeatedly. The message is for the user."""
 
 
 class _GivenUp(Exception):
-    """Another thread replaced this one while it hung."""
+    """Another thread replaced this thread while it hung."""
 
 
 class Receiver:
-    """Reads a stream in a thread of its own from the start on, and fills the queue once frames are taken.
+    """Read a stream in a thread of its own from the start, and fill the queue once frames are taken.
 
     rate_hz: as given, else as announced, else measured. size: of the first picture; it follows a stream that changes.
-    waiting: as in LiveSource. Raises InputError if no first picture comes.
+    waiting: as in LiveSource. Raise InputError if no first picture comes.
     """
 
     def __init__(
         self,
         name: str,
-        opener: Callable[[], Stream],
+        opener: Callable[[], LiveStream],
         rate_hz: float | None,
         parameters: LiveParameters,
         queue: FrameQueue,
@@ -62,13 +62,13 @@ class Receiver:
         self._failure: InputError | None = None
         self._ready = False
         self._turn = 0  # number of the current thread
-        self._call: tuple[float, float] | None = None  # since when it is in the driver, and for how long it may be
+        self._call: tuple[float, float] | None = None  # start of the current driver call, and its time limit
         self._pause_s = parameters.retry_s
         self._lost_s: float | None = None
-        self._why = ""  # why the camera was lost, or could not be opened again
+        self._why = ""  # why the camera was lost, or could not be reopened
         self._tries = 0
         self._start_s = float("nan")
-        self._odd_s: float | None = None  # since when pictures differ from `size`; None: they do not
+        self._odd_s: float | None = None  # time since which pictures differ from `size`; None: they do not
         self._off = False  # whether a wrong announced rate was reported
         self.threads: list[threading.Thread] = []
         self._at_work: threading.Thread | None = None  # the current thread; None if all hang
@@ -81,22 +81,22 @@ class Receiver:
 
     @property
     def apart_s(self) -> float:
-        """Seconds between pictures as measured."""
+        """Measured seconds between pictures."""
         return 1 / (self._log.sent_hz or self.rate_hz)
 
     @property
     def seeking(self) -> bool:
-        """Whether the stream is lost, is being opened again by a driver that answers, and may be for ever."""
+        """Whether the stream is lost, may be sought without limit, and is being reopened by a driver that responds."""
         is_endless = self._parameters.lost_s == 0
         return is_endless and self._lost_s is not None and sum(thread.is_alive() for thread in self.threads) <= 1
 
     def begin(self) -> None:
-        """Nothing to do: it reads already, so that the first frame taken is a fresh one."""
+        """Do nothing: reading began already, so that the first frame taken is a fresh one."""
 
     def check(self) -> float:
-        """Replace a thread that hangs; called by the run while it waits. Returns the time of the next check.
+        """Replace a hung thread; called by the run while it waits. Return the time of the next check.
 
-        Raises DeadCamera if too many hang, or if no picture has come for live.lost_s since the stream was lost.
+        Raise DeadCamera if too many threads hang, or if no picture has come for live.lost_s since the stream was lost.
         """
         with self._queue.changed:
             until_s = self._lost_until_s()
@@ -105,13 +105,13 @@ class Receiver:
             return min(self._check_driver(), until_s)
 
     def _lost_until_s(self) -> float:
-        """When a stream that was there has been lost for too long."""
+        """Return the time at which a stream that was there counts as lost for good."""
         if self._lost_s is None or not self._ready or not self._parameters.lost_s:
             return float("inf")
         return self._lost_s + self._parameters.lost_s
 
     def _check_driver(self) -> float:
-        """As check, for the driver alone; the caller holds the queue."""
+        """Check the driver alone, as check does; the caller holds the queue."""
         now_s = self._clock.now()
         if self._call is not None:
             since_s, allowed_s = self._call
@@ -120,7 +120,7 @@ class Receiver:
             self._turn += 1
             self._call = self._at_work = None
             self._lost(f"its driver has not answered for {now_s - since_s:.1f} s")
-            self._pause_s = self._parameters.retry_s  # the hung call was pause enough
+            self._pause_s = self._parameters.retry_s  # the hung call was a sufficient pause
         elif self._at_work is not None and self._at_work.is_alive():
             return now_s + self._parameters.stall_s
         self.threads = [thread for thread in self.threads if thread.is_alive()]
@@ -173,7 +173,7 @@ class Receiver:
     def _connected(self, turn: int) -> None:
         """Open the stream, read it until it is lost, and release it."""
         self._tries += 1
-        stream: Stream | None = None
+        stream: LiveStream | None = None
         why, since_s = "", self._clock.now()
         try:
             with self._driver(turn, OPENING):
@@ -205,18 +205,18 @@ class Receiver:
                 with self._driver(turn):
                     stream.release()
         if self._clock.now() - since_s > max(self._parameters.stall_s, self._pause_s):
-            self._pause_s = self._parameters.retry_s  # the connection held
+            self._pause_s = self._parameters.retry_s  # the connection lasted for a while
         if not self._queue.closed:
             self._lost(why)
 
-    def _measured(self, stream: Stream) -> float:
+    def _measured(self, stream: LiveStream) -> float:
         times_s = [self._clock.now() for _ in range(_MEASURED) if stream.grab()]
         apart_s = float(np.median(np.diff(times_s))) if len(times_s) > 2 else 0.0
         return 1 / apart_s if 0.001 < apart_s < 10 else _FALLBACK_HZ
 
     @contextmanager
     def _driver(self, turn: int, times: float = 1.0) -> Iterator[None]:
-        """Watch a call that may never return."""
+        """Set a time limit for a call that may never return."""
         with self._queue.changed:
             if turn == self._turn:
                 self._call = (self._clock.now(), _GRACE * times * self._parameters.stall_s)
@@ -230,7 +230,7 @@ class Receiver:
         if not mine:
             raise _GivenUp
 
-    def _read(self, stream: Stream, turn: int) -> str:
+    def _read(self, stream: LiveStream, turn: int) -> str:
         """Read until the stream is lost; return the reason."""
         failed, came_s = 0, self._clock.now()
         good_s = came_s
@@ -239,11 +239,11 @@ class Receiver:
                 began_s = self._clock.now()
                 came = stream.grab()
                 blocked_s = self._clock.now() - began_s
-            if blocked_s >= self._parameters.stall_s:  # what comes now was left in a buffer when the driver gave up
+            if blocked_s >= self._parameters.stall_s:  # a picture that comes now was buffered before the driver gave up
                 return f"no picture has come for {self._clock.now() - came_s:.1f} s"
             if not came:
                 failed += 1
-                # A driver may time out again and again: once is enough.
+                # A driver may time out repeatedly; one timeout is sufficient.
                 if failed >= _MOST_FAILED or self._clock.now() - came_s >= self._parameters.stall_s:
                     return "it sends no more pictures"
                 continue
@@ -255,8 +255,8 @@ class Receiver:
                 return f"none of its pictures could be decoded for {taken_s - good_s:.1f} s"
         return ""
 
-    def _picture(self, stream: Stream, taken_s: float) -> bool:
-        """Number the grabbed picture and put it into the queue if it is wanted. Returns whether it could be decoded."""
+    def _picture(self, stream: LiveStream, taken_s: float) -> bool:
+        """Number the grabbed picture, and queue it if it is wanted. Return whether it could be decoded."""
         if not self._queue.begun:
             return True
         log, rate_hz = self._log, self.rate_hz
@@ -269,7 +269,7 @@ class Receiver:
         if log.number - place > max(_AHEAD_S * rate_hz, 2):
             self._health.count("dropped")
             return True
-        # Numbers never go back, also where pictures come in bursts.
+        # Numbers never decrease, even if pictures come in bursts.
         log.number = max(log.number + 1, 1 + round(place))
         if not self._queue.wanted(log.number):
             return True
@@ -280,13 +280,13 @@ class Receiver:
             return False
         if self._fits(image, taken_s):
             self._found()
-            # The number follows the clock; the moment at which a picture comes is less even.
+            # The time follows from the number, because the arrival times of pictures are less regular.
             damaged = getattr(stream, "damaged", False)
             self._queue.put(Frame(log.number, (log.number - 1) / rate_hz, image, 0, taken_s, damaged))
         return True
 
     def _found(self) -> None:
-        """Note that pictures come."""
+        """Record that pictures come."""
         self._health.gauge("connected", 1)
         if self._lost_s is None:
             return
@@ -298,7 +298,7 @@ class Receiver:
         self._log.report(f"{self.name} is {'back' if self._queue.begun else 'there'} after {gone_s:.1f} s, at {tries}")
 
     def _fits(self, image: np.ndarray, taken_s: float) -> bool:
-        """Whether the picture has the stream's size, which changes where another one lasts."""
+        """Return whether the picture has the stream's size; adopt another size if it persists."""
         width, height = self.size
         if image.shape[:2] == (height, width):
             self._odd_s = None
@@ -308,9 +308,9 @@ class Receiver:
         if self._odd_s is None:
             self._odd_s = taken_s
             self._log.report(f"{what}: they are left out", topic="size")
-        if taken_s - self._odd_s < self._parameters.stall_s:  # single ones are left out
+        if taken_s - self._odd_s < self._parameters.stall_s:  # leave out single pictures
             return False
-        # The size may have changed again since: the newest one counts.
+        # The size may have changed again meanwhile; use the newest.
         self._log.report(f"{what} for {taken_s - self._odd_s:.1f} s: begun anew with them")
         self.size, self._odd_s = (image.shape[1], image.shape[0]), None
         return True

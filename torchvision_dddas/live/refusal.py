@@ -1,4 +1,4 @@
-"""Tells a camera that refuses an address (401, 404) from one that is not there, which FFmpeg does not."""
+"""Distinguish a camera that refuses an address (401, 404) from one that is absent, which FFmpeg does not."""
 
 import base64
 import hashlib
@@ -8,7 +8,7 @@ import ssl
 from urllib.parse import unquote, urlsplit
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.live_streams import Stream, open_stream
+from torchvision_dddas.io.live_streams import LiveStream, open_stream
 
 _PORTS = {"rtsp": 554, "http": 80, "https": 443}
 _MOST_BYTES = 65536
@@ -20,11 +20,11 @@ _MEANING = {
 
 
 class Refused(InputError):
-    """The camera is there and refuses the address; waiting does not help."""
+    """The camera is present and refuses the address; waiting does not help."""
 
 
-def open_or_refuse(target: str | int, name: str, limits_s: tuple[float, float]) -> Stream:
-    """An opened stream. Raises Refused if the server answers 401, 403 or 404, else InputError."""
+def open_or_refuse(target: str | int, name: str, limits_s: tuple[float, float]) -> LiveStream:
+    """Open a stream. Raise Refused if the server answers 401, 403 or 404, else InputError."""
     try:
         return open_stream(target, name, limits_s)
     except InputError:
@@ -35,7 +35,7 @@ def open_or_refuse(target: str | int, name: str, limits_s: tuple[float, float]) 
 
 
 def answered_status(address: str, limit_s: float) -> int | None:
-    """The status that an RTSP or HTTP server answers; None without an answer, or for another protocol."""
+    """Return the status that an RTSP or HTTP server answers; None without an answer, or for another protocol."""
     try:
         parts = urlsplit(address)
         port = parts.port or _PORTS.get(parts.scheme)
@@ -71,14 +71,14 @@ def _ask(where: tuple[str, int], is_encrypted: bool, request: str, limit_s: floa
 
 
 def _unverified() -> ssl.SSLContext:
-    """As FFmpeg, which accepts a camera's own certificate."""
+    """Return a context that, like FFmpeg, accepts a camera's own certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     return context
 
 
 def _authorization(headers: str, user: str, password: str, method: str, uri: str) -> str:
-    """The answer to a challenge, Digest where it is offered, else Basic. Source: RFC 2617, without qop (RFC 2069)."""
+    """Answer a challenge, by Digest if it is offered, else Basic. Source: RFC 2617, without qop (RFC 2069)."""
     digest = re.search(r"(?im)^WWW-Authenticate: *Digest +(.*)$", headers)
     if digest is None:
         return "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()

@@ -1,4 +1,4 @@
-"""The loop of a live run: frames in, results out, cheaper settings under load, and a restart after an error."""
+"""The loop of a live run: take frames, send results, use cheaper settings under load, and restart after an error."""
 
 import time
 import traceback
@@ -22,19 +22,20 @@ from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.types import Adjustment, Frame, FrameResult, Telemetry, TrackedFrame
 
 _MOST_FAILURES = 25
-"""Restarts in a row without a result, after which the run gives up."""
+"""Consecutive restarts without a result after which the run gives up."""
 
 
 class RepeatedFailure(Exception):
-    """The work failed too often in a row, or the camera is dead. The message is for the user."""
+    """The work failed too often in succession, or the camera is dead. The message is for the user."""
 
 
 class Feed:
-    """The source as the pipeline sees it: one stream of frames, also after the pipeline was restarted.
+    """The source that the pipeline reads. The stream of frames continues when the pipeline is restarted.
 
-    A step lasts from taking a frame to asking for the next one. newest: the frame taken last. log: the telemetry.
-    telemetry: a function, as the pipeline expects of a source; None if there is none. clock_offset_s: set it beside a
-    camera, as for `align_log`, so that a log with a clock is aligned by it. aligned: called with the aligned log.
+    A step lasts from the moment a frame is taken until the next one is requested. newest: the frame taken last. log:
+    the telemetry. telemetry: a function that returns it, as the pipeline expects of a source; None if there is none.
+    clock_offset_s: the offset of the camera's clock, with which `align_log` aligns a log that has a clock. aligned: is
+    called with the aligned log.
     """
 
     count = None
@@ -43,7 +44,7 @@ class Feed:
     def __init__(
         self, source: LiveSource, health: Health, watchdog: Watchdog, telemetry: Telemetry | None = None
     ) -> None:
-        """telemetry: given if its gaps are to be reported."""
+        """telemetry: the log whose gaps are reported; None reports none."""
         self.name, self.rate_hz, self.size = source.name, source.rate_hz, source.size
         self.problems: list[object] = []
         self.newest: Frame | None = None
@@ -55,11 +56,11 @@ class Feed:
         self._frames = iter(source)
         self._has_altitude = telemetry is not None and bool(np.isfinite(telemetry.altitude_m).any())
         self._first = True
-        self._held: Frame | None = None  # the first of another size, for the pipeline that begins anew
+        self._held: Frame | None = None  # first frame of another size, kept for the restarted pipeline
 
     @property
     def last(self) -> int:
-        """As in Source."""
+        """Number of the newest frame, as in Source."""
         return self._source.last
 
     def restart(self) -> None:
@@ -76,7 +77,7 @@ class Feed:
                 self.ended = True
                 return
             if (size := (frame.image.shape[1], frame.image.shape[0])) != self.size:
-                # The pipeline settles what it has, and begins anew with this one.
+                # The pipeline finishes its frames, and restarts with this one.
                 self._held, self.size = frame, size
                 words = f"pictures are {size[0]}x{size[1]} from now on: begun anew"
                 self._health.event("run", words, frame.number)
@@ -108,16 +109,16 @@ class Feed:
             self._health.trouble("telemetry", words if silent else "")
 
     def stop(self) -> None:
-        """Take no further frame; results of those taken still come."""
+        """Take no further frame; results of frames already taken still come."""
         self.ended = True
 
 
 Result = tuple[FrameResult, TrackedFrame | None]
-"""A frame and the people in it; None if people are not searched for."""
+"""A frame and the people in it; None if people are not detected."""
 
 
 class _Renumbering:
-    """Makes identities of targets and of people go on after a restart where they ended before it."""
+    """Continues the numbers of targets and people after a restart, so that none is used twice."""
 
     def __init__(self) -> None:
         self._before, self._highest = [0, 0], [0, 0]
@@ -141,10 +142,10 @@ class _Renumbering:
 
 
 def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Health) -> Iterator[Result]:
-    """Yield the results of `begin(feed)`; after an error it is called again and goes on with the frames that follow.
+    """Yield the results of `begin(feed)`; after an error call it again, and continue with the next frames.
 
-    Each error is an event, but the 25th without a result between them raises RepeatedFailure, as a dead camera does. An
-    InputError after the feed ended ends the run. A feed whose pictures change size ends `begin(feed)` too.
+    Each error is an event, but the 25th without a result in between raises RepeatedFailure, and so does a dead camera.
+    An InputError after the end of the feed ends the run. `begin(feed)` also ends when the size of the pictures changes.
     """
     renumbered, failures = _Renumbering(), 0
     while True:
@@ -155,7 +156,7 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
         except DeadCamera as error:
             raise RepeatedFailure(str(error)) from error
         except Exception as error:
-            if feed.ended and isinstance(error, InputError):  # as of a clip that was stopped after its second frame
+            if feed.ended and isinstance(error, InputError):  # for example a clip stopped after its second frame
                 health.event("run", str(error))
                 return
             failures += 1
@@ -174,7 +175,7 @@ def results(begin: Callable[[Feed], Iterable[Result]], feed: Feed, health: Healt
 
 
 def send_result(result: Result, streams: Iterable[Stream], health: Health) -> None:
-    """Write a result to all streams. A stream that raises leaves it out; that is an event."""
+    """Write a result to all streams. If a stream raises, that stream omits the result, and an event records it."""
     for stream in streams:
         try:
             stream.write(*result)
@@ -187,7 +188,7 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
     """Record the latency of a result that was sent, and what it holds, in the health."""
     located, people = result
     now_s, frame = time.monotonic(), located.tracked.frame
-    if frame is not None and isfinite(frame.taken_s):  # rows of pictures that never came are not late
+    if frame is not None and isfinite(frame.taken_s):  # results for missing pictures are not late
         health.took("age", now_s - frame.taken_s)
         if feed.newest is not None and isfinite(feed.newest.taken_s):
             latency_s = now_s - feed.newest.taken_s
@@ -205,21 +206,21 @@ def record_result(result: Result, feed: Feed, health: Health, deadline_ms: float
 
 
 def _where(error: BaseException) -> str:
-    """The innermost line of this package in the traceback."""
+    """Return the innermost line of this package in the traceback."""
     frames = traceback.extract_tb(error.__traceback__)
     ours = [f for f in frames if "torchvision_dddas" in f.filename] or frames
     return f"{ours[-1].filename.rpartition('torchvision_dddas/')[2]}:{ours[-1].lineno}" if ours else "nowhere"
 
 
-# The cost of a frame is the mean of the latest, without the longest of them: that one may wait for something else.
+# The cost of a frame is the mean of recent costs without the largest one, which may include waiting for something else.
 _MOST_FRAMES = 10
 _FEWEST_FRAMES = 5
 
 
 class LoadShedding:
-    """Applies the rule `control.shed`. Call it before each frame; it returns the settings that keep up with the source.
+    """Applies the rule `control.shed`. Call it before each frame; it returns settings that keep up with the source.
 
-    settings: those in force. people: whether people are searched for, so that their search can be narrowed.
+    settings: the current settings. people: whether people are detected, so that their search can be narrowed.
     """
 
     def __init__(
@@ -238,7 +239,7 @@ class LoadShedding:
         self._show(control.rungs(settings, people)[0])
 
     def __call__(self, frame: Frame) -> tuple[Settings, tuple[Adjustment, ...]]:
-        """The settings from this frame on, and the record of what changed."""
+        """Return the settings from this frame on, and the record of changes."""
         if not self._has_begun:  # no frame was processed before the first
             self._has_begun = True
             return self.settings, ()
@@ -254,7 +255,7 @@ class LoadShedding:
             in_settings = {name: value for name, value in values.items() if name != control.SAMPLING}
             self.settings = with_parameters(self._base, in_settings)
             self._source.look_at(int(values[control.SAMPLING]))
-            self._costs.clear()  # measured with the settings before
+            self._costs.clear()  # these were measured with the old settings
             self._show(values)
             words = ", ".join(f"{a.parameter} {a.old:g} -> {a.new:g}" for a in moved)
             self._health.event("load", f"{words}: {moved[0].cause}", frame.number)

@@ -1,4 +1,4 @@
-"""The state of a live run over HTTP: a page for people, text for Prometheus, JSON for programs."""
+"""Serve the state of a live run over HTTP: a page for people, text for Prometheus, JSON for programs."""
 
 import json
 import math
@@ -21,10 +21,10 @@ from torchvision_dddas.live.watchdog import Watchdog
 LOOPBACK = "127.0.0.1"
 
 Page = Callable[[], tuple[int, str, str]]
-"""Returns (status, type, text); called in a thread of the server."""
+"""Returns (status, type, text); called in a server thread."""
 
 _CLIENT_TIMEOUT_S = 5.0
-_MOST_CLIENTS = 8  # at a time; one more hangs up on the oldest, so that slow ones cannot take the page away
+_MOST_CLIENTS = 8  # simultaneous clients; a further one disconnects the oldest, so that slow clients cannot block it
 _SHOWN_EVENTS = 20
 
 
@@ -32,7 +32,7 @@ class HealthServer:
     """Serves pages while the context is open. address: (host, port) in use. pages: by path; may be filled later."""
 
     def __init__(self, address: tuple[str, int], pages: dict[str, Page]) -> None:
-        """Raises InputError if the port is in use, or the host is not one of this machine."""
+        """Raise InputError if the port is in use, or if the host is not an address of this machine."""
         try:
             self._server = _Server(address, pages)
         except OSError as error:
@@ -56,10 +56,10 @@ class HealthServer:
 
 
 def parse_address(spec: str) -> tuple[str, int]:
-    """(host, port) of PORT or HOST:PORT; a port alone is on this machine only. Raises InputError for anything else."""
+    """Parse PORT or HOST:PORT as (host, port); a port alone is local to this machine. Raise InputError otherwise."""
     host, _, port = spec.rpartition(":")
     if not port.isdecimal() or len(port) > 5 or int(port) > 65535:
-        raise InputError(f"--serve {spec} is no address; wanted PORT or HOST:PORT, such as 8080 or 0.0.0.0:8080")
+        raise InputError(f"--serve {spec} is no address; give PORT or HOST:PORT, such as 8080 or 0.0.0.0:8080")
     return host.strip("[]") or LOOPBACK, int(port)
 
 
@@ -72,7 +72,7 @@ def health_pages(
     version: str,
     patience_s: float,
 ) -> dict[str, Page]:
-    """The pages of a run. state_now: its state. patience_s: a longer time without a result is reported as trouble."""
+    """Return the pages of a run. state_now: returns its state. patience_s: longest time without result that is fine."""
 
     def state() -> tuple[Snapshot, str]:
         now = health.snapshot()
@@ -123,7 +123,7 @@ class _Server(ThreadingHTTPServer):
                 self._clients.remove(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore clients that hung up."""
+        """Ignore clients that disconnected."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -139,7 +139,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", f"{kind}; charset=utf-8")
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Cache-Control", "no-store")
-        # Nothing from elsewhere and no script: a stream's name stays text.
+        # Allow no external content and no script, so that a stream's name cannot become code.
         self.send_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
         self.end_headers()
         if self.command != "HEAD":
@@ -148,10 +148,10 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
-        """Requests are not logged."""
+        """Do not log requests."""
 
 
-# What is known of the health: by name, the title of its tile on the page, "" for none, and the help for Prometheus.
+# Quantities of the health by name: title of the tile on the page, "" for none, and the help text for Prometheus.
 _COUNTS = {
     "captured": ("pictures captured", "Pictures that the source gave."),
     "dropped": ("dropped", "Pictures that came too late to be processed."),
@@ -186,7 +186,7 @@ _HELP = {name: words for table in (_COUNTS, _GAUGES, _SECONDS) for name, (_, wor
 
 
 def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int = 2) -> str:
-    """The page for people: no scripts, nothing fetched from elsewhere, reloaded every refresh_s."""
+    """Return the page for people, without scripts or external content, reloaded every refresh_s."""
 
     def count(name: str) -> str:
         return f"{now.counts.get(name, 0):,}".replace(",", " ")
@@ -205,6 +205,7 @@ def html_page(now: Snapshot, name: str, state: str, trouble: str, refresh_s: int
             median, _, most = now.seconds[key]
             figures += [(f"{title}, median", f"{1000 * median:.0f} ms"), (f"{title}, 99 %", f"{1000 * most:.0f} ms")]
     figures += [(title, count(key)) for key, (title, _) in _COUNTS.items() if title and key in now.counts]
+    figures += [(platform, facts["state"]) for platform, facts in now.platforms.items()]
     return render_page(
         "live.html",
         title=f"{state} · {name}",
@@ -229,11 +230,11 @@ def _clock(utc_s: float) -> str:
 
 
 def metrics(now: Snapshot, trouble: str, version: str, lost: Mapping[str, int]) -> str:
-    """Prometheus' text exposition format, version 0.0.4. lost: messages lost for good, by stream."""
+    """Return Prometheus' text exposition format, version 0.0.4. lost: permanently lost messages, by stream."""
     lines: list[str] = []
 
     def add(name: str, kind: str, words: str, values: Mapping[str, float]) -> None:
-        """values: by labels in braces, or by an empty text."""
+        """Add a metric. values: by labels in braces, or by "" without labels."""
         lines.extend([f"# HELP dddas_{name} {words}", f"# TYPE dddas_{name} {kind}"])
         lines.extend(f"dddas_{name}{labels} {_value(value)}" for labels, value in values.items())
 

@@ -1,4 +1,4 @@
-"""One session of `dddas run --live`: the whole path on pictures as they come, for as long as they come."""
+"""One session of `dddas run --live`: process live pictures for as long as they come."""
 
 import signal
 import sys
@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from math import inf, isnan, nan
@@ -15,11 +16,13 @@ from typing import Any
 from torchvision_dddas.config import LiveParameters, Settings, is_set, with_parameters
 from torchvision_dddas.detection import check_length, load_engine
 from torchvision_dddas.errors import InputError, printable, without_secrets
+from torchvision_dddas.geo import Zones
 from torchvision_dddas.io.interrupts import Stopped, StopSignals
 from torchvision_dddas.io.output import (
     RESULTS,
     Event,
     SessionLog,
+    ZoneCounts,
     describe_nothing_located,
     make_session_folder,
     without_numbers,
@@ -40,6 +43,7 @@ from torchvision_dddas.live.runner import (
     send_result,
 )
 from torchvision_dddas.live.server import HealthServer, Page, health_pages, parse_address
+from torchvision_dddas.live.team import LiveTeam
 from torchvision_dddas.live.watchdog import HUNG, UNWRITTEN, Supervisor, Watchdog
 from torchvision_dddas.people import PersonTracker, load_scorer
 from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, locator_facts
@@ -69,39 +73,41 @@ def run_live(
     rate_hz: float | None = None,
     quiet: bool = False,
     wait: bool = False,
+    zones: Zones | None = None,
+    ground: Sequence[Path] = (),
+    aerial: Sequence[Path] = (),
 ) -> int:
-    """Run until the pictures end or a signal ends it; returns the exit code. Writes a new folder under out.
+    """Run until the pictures end or a signal ends the run, and return the exit code. Write a new folder under out.
 
-    SIGTERM is how a supervisor ends a session, and gives 0; other signals give 128 and their number. wait: for a camera
-    that is not there at the start. Raises InputError for anything else that is wrong then; what goes wrong later is an
-    event.
+    SIGTERM, by which a supervisor ends a session, gives 0; other signals give 128 plus their number. wait: wait for an
+    absent camera at the start. Raise InputError for any other fault at the start; a later fault becomes an event.
     """
     address = None if serve is None else parse_address(serve)
     if wait and stream_target(clip) is None:
-        raise InputError(f"--wait is for a camera or a stream, and {clip} is none; leave it out")
-    if backend == "auto":  # the torch engine settles frames in batches, which would delay what is live
+        raise InputError(f"--wait is for a camera or a stream, but {clip} is neither; leave --wait out")
+    if backend == "auto":  # the torch engine finishes frames in batches, which would delay live results
         backend = "onboard"
-    # O of the interval rule is measured, unless it is set; without a pace frames wait, and all runs give the same.
+    # Measure O of the interval rule unless it is set; without a pace frames wait, so that every run gives the same.
     if settings.live.pace and not is_set(settings, "interval.cost"):
         settings = with_parameters(settings, {"interval.cost": 0.0})
     health, supervisor, live = Health(), Supervisor(), settings.live
-    for name in _COUNTED:  # a count that is there from the start can be distinguished from a missing one
+    for name in _COUNTED:  # a count that exists from the start can be distinguished from a missing one
         health.count(name, 0)
     with ExitStack() as stack:
-        # What may be wrong at the start is found before the session has a folder.
+        # Find possible faults before the session has a folder.
         watchdog = Watchdog(health, live.watchdog_s, supervisor)
         name, pages = without_secrets(clip), dict[str, Page]()
         server = None if address is None else stack.enter_context(HealthServer(address, pages))
         health.trouble("waiting", _WAITING)
         pages |= health_pages(health, watchdog, (), lambda: _WAITING, name, VERSION, inf)
-        if wait:  # the service is up, and has no camera yet
+        if wait:  # the service is up, but has no camera yet
             supervisor.say("READY=1", f"STATUS={_WAITING}")
             if server is not None and not quiet:
                 _print_page(server)
         told: list[Event] = []
 
         def waiting() -> None:
-            """Notify the supervisor, and tell once why there is no camera yet."""
+            """Notify the supervisor, and report once why there is no camera yet."""
             watchdog.check()
             if not told and (events := health.snapshot().events):
                 told.append(events[0])
@@ -114,7 +120,7 @@ def run_live(
             _print(str(error))
             return HUNG
         except Stopped as stopped:
-            if stopped.number == signal.SIGTERM:  # how a supervisor ends a run, also one that has no camera yet
+            if stopped.number == signal.SIGTERM:  # a supervisor ends a run that has no camera yet
                 return 0
             raise
         stack.callback(source.close)
@@ -127,14 +133,17 @@ def run_live(
         ready.notes.extend([str(source.levels)] if source.levels else [])
         flight, is_recording, offset_s = ready.telemetry, stream_target(clip) is None, settings.aerial.clock_offset_s
         site = None if ready.watch is None else ready.watch.locator.site
+        if zones is not None:
+            zones.check(site is not None, None if site is None else site.origin_deg)
         if flight is not None:
             ready.notes.append(describe_log(flight, is_recording, time.time(), offset_s))
         if site is not None and not is_recording:
             ready.notes.extend(describe_landmarks(site.landmarks))
-        # Of a recording, times of day are those of its own log, if that has a clock.
+        team = LiveTeam((ground, aerial), settings, backend, ready.watch, source, health) if ground or aerial else None
+        # For a recording, times of day come from its own log, if the log has a clock.
         recorded_utc_s = flight.start_utc_s if is_recording and flight is not None else nan
         begin = build_path(ready, source, people, interval, backend, health, prepare)
-        # What streams need to know; the time follows the source's clock.
+        # Data that streams need; the time follows the source's clock.
         about = About(time.time())
         if site is not None:
             about = About(time.time(), site.origin_deg is not None, site.landmarks.names)
@@ -153,6 +162,7 @@ def run_live(
         }
         if given is not None and ready.watch is not None:
             facts |= {**given.facts, **locator_facts(ready.watch.locator)}
+        facts |= {key: paths for key, paths in (("ground", ground), ("aerial", aerial)) if paths}
         facts["settings"] = ready.settings.model_dump()
         log = SessionLog(folder, facts)
         stack.callback(log.close)
@@ -167,13 +177,16 @@ def run_live(
         feed.clock_offset_s = nan if is_recording else offset_s
 
         def stop(number: int) -> None:
-            """Take no further picture; the run ends once those that were taken are settled."""
+            """Take no further picture; the run ends when all taken pictures are finished."""
             feed.stop()
             source.stop()
 
         signals = stack.enter_context(StopSignals(stop))
         stack.enter_context(status)
         stack.enter_context(watchdog)
+        if team is not None:
+            team.begin(folder)
+            stack.callback(team.finish)
         supervisor.say("READY=1", "STATUS=running")
         if not quiet:
             _print("{}, {}x{} at {:g} Hz; into {}".format(source.name, *source.size, source.rate_hz, folder))
@@ -182,8 +195,19 @@ def run_live(
             if server is not None and not wait:
                 _print_page(server)
         failure, tally = "", _Located()
+        counts = ZoneCounts(zones.zones if zones else ())
+        if zones:
+            facts["zones"] = deepcopy(counts.rows)
         try:
-            for result in results(begin, feed, health):
+            for located, seen in results(begin, feed, health):
+                located = located if team is None else team.add(located)
+                if events := (*located.events, *(zones.update(located) if zones else ())):
+                    located = replace(located, events=events)
+                    counts.add(events)
+                    facts |= deepcopy({"zones": counts.rows, "crowd_events": counts.crowds})  # another thread writes it
+                    for event in events:
+                        health.event("zone" if event.zone else "crowd", event.describe(), event.frame)
+                result = located, seen
                 if cause := tally.add(result[0]):
                     health.event("locate", f"not located: {cause}", result[0].number)
                 about.start_utc_s = source.start_utc_s if isnan(recorded_utc_s) else recorded_utc_s
@@ -193,6 +217,8 @@ def run_live(
         except RepeatedFailure as error:
             failure, status.state = str(error), "failed"
             health.event("run", failure)
+        facts["notes"] += zones.notes if zones else []
+        facts["notes"] += team.finish() if team is not None else []
         if ready.watch is not None and not tally.located:
             facts["notes"].append(tally.describe())
             health.event("locate", tally.describe())
@@ -211,14 +237,14 @@ def run_live(
 
 
 class _Located:
-    """Counts the targets that were located, and why others were not."""
+    """Count the located targets, and the reasons why others were not located."""
 
     def __init__(self) -> None:
         self.located = self._unplaced = 0
         self._causes, self._told = Counter[str](), set[str]()
 
     def add(self, result: FrameResult) -> str:
-        """Count a frame. Returns why it was not located where that is new, apart from its numbers; else ""."""
+        """Count a frame. Return why it was not located if that reason, apart from its numbers, is new; else ""."""
         if (found := result.locations) is None:
             return ""
         self.located += len(found.positions)
@@ -233,7 +259,7 @@ class _Located:
         return cause
 
     def describe(self) -> str:
-        """Why nothing was located, in words."""
+        """Return why nothing was located."""
         return describe_nothing_located(self._causes, self._unplaced)
 
 
@@ -246,14 +272,14 @@ def build_path(
     health: Health,
     prepare: Callable[[], Assembly],
 ) -> Callable[[Feed], Iterator[Result]]:
-    """The path from frames to results, which restarts each time that it is called, and sheds load.
+    """Return the path from frames to results, which restarts at each call, and sheds load.
 
     prepare: makes `ready` again for pictures of another size.
-    Raises InputError at once for pictures that are too small for people.
+    Raise InputError at once for pictures that are too small for people.
     """
     settings, scorer = ready.settings, None
     if people:
-        # To search the whole picture takes as long as many pictures take to arrive.
+        # Searching the whole picture takes as long as many pictures take to arrive.
         share = min(settings.people.look_share, 0.1)
         settings = with_parameters(settings, {"people.search": "regions", "people.look_share": share})
         scorer = load_scorer(settings.people, backend)
@@ -270,9 +296,9 @@ def build_path(
     build_person_tracker(watch_size)
 
     def begin(feed: Feed) -> Iterator[Result]:
-        # After an error nothing that remembers a frame is used again.
+        # After an error, no object that remembers a frame is used again.
         nonlocal watch, watch_size
-        if watch is not None and feed.size != watch_size:  # the camera model is for a size
+        if watch is not None and feed.size != watch_size:  # the camera model depends on the size
             watch, watch_size = prepare().watch, feed.size
         engine = next(engines, None) or load_engine(backend, shedding.settings)
         person_tracker = build_person_tracker(feed.size)
@@ -290,7 +316,7 @@ def build_path(
             feed.aligned(feed.log)
         pipeline = Pipeline.from_assembly(
             Assembly(shedding.settings, engine, None, running),
-            interval,
+            interval=interval,
             seen=None if person_tracker is None else person_tracker.update,
             retune=retune,
             pictures=False,
@@ -304,7 +330,7 @@ def build_path(
 def _open(
     opened: ExitStack, texts: Sequence[str], about: About, health: Health, live: LiveParameters, option: str
 ) -> list[Stream]:
-    """Streams that are closed when `opened` is. Raises InputError."""
+    """Open streams that are closed when `opened` is. Raise InputError."""
     streams = open_streams(texts, about, health.event, live.retry_s, live.retry_most_s, option)
     for stream in streams:
         opened.callback(stream.close)
@@ -330,7 +356,7 @@ def _print_event(event: Event) -> None:
 
 
 def _print_snapshot(now: Snapshot) -> None:
-    """The state in one line, in place of the one before; nothing where stderr is no terminal."""
+    """Replace the previous line by the state in one line; do nothing if stderr is not a terminal."""
     if not sys.stderr.isatty():
         return
     latency = f", latency {1000 * now.seconds['latency'][0]:.0f} ms" if "latency" in now.seconds else ""

@@ -1,4 +1,4 @@
-"""What watches a live run: a watchdog that ends one that hangs, and the supervisor that is told how it is."""
+"""Supervision of a live run: a watchdog that ends a hung run, and notifications to a supervisor such as systemd."""
 
 import os
 import socket
@@ -13,15 +13,15 @@ from typing import Self
 from torchvision_dddas.live.health import Health
 
 HUNG = 70
-"""Exit code of a run that hung or failed again and again: EX_SOFTWARE of sysexits.h."""
+"""Exit code of a run that hung or failed repeatedly: EX_SOFTWARE of sysexits.h."""
 UNWRITTEN = 74
-"""Exit code of a run that went well, and whose files the disk refused: EX_IOERR."""
+"""Exit code of a run that succeeded but could not write all files to the disk: EX_IOERR."""
 
 _CHECK_S = 1.0
 
 
 class Supervisor:
-    """Notifies systemd, as of a service with Type=notify; does nothing without NOTIFY_SOCKET.
+    """Notify systemd about a service with Type=notify; do nothing without NOTIFY_SOCKET.
 
     every_s: half the interval in which systemd expects WATCHDOG=1; 0: never.
     Source: sd_notify(3), sd_watchdog_enabled(3).
@@ -35,7 +35,7 @@ class Supervisor:
         self.every_s = int(wanted) / 2e6 if wanted.isdigit() and mine and self._address else 0.0
 
     def say(self, *words: str) -> None:
-        """Send words such as READY=1. Never raises."""
+        """Send words such as READY=1. Never raise."""
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as way:
@@ -44,10 +44,10 @@ class Supervisor:
 
 
 class Watchdog:
-    """Reports a step that takes longer than hung_s as an event, and ends the process after twice that.
+    """Report a step that takes longer than hung_s as an event, and end the process after twice that time.
 
-    While its context is open, a thread checks the step and notifies the supervisor as long as none hangs and results
-    come. idle_s: seconds since the last result while one is due.
+    While its context is open, a thread checks the step, and notifies the supervisor as long as no step hangs and
+    results come. idle_s: seconds since the last result while one is due.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Watchdog:
 
     @property
     def hung(self) -> str:
-        """Which step hangs, in words; empty if none does."""
+        """Description of the step that hangs; empty if none does."""
         step = self._step
         if step is None or not self._hung_s or self._clock() - step[1] <= self._hung_s:
             return ""

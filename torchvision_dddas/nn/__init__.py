@@ -12,12 +12,13 @@ from torchvision_dddas.nn.motion_segmenter import (
 )
 from torchvision_dddas.nn.people import HOGDescriptor, PersonScorer
 from torchvision_dddas.nn.plane_homography import PlaneHomography
-from torchvision_dddas.nn.registration import GRAPH_EFFORT, Motion, Registration
+from torchvision_dddas.nn.registration import GRAPH_EFFORT, FrameRegistration, Motion
 
 __all__ = [
     "GRAPH_EFFORT",
     "Core",
     "Differences",
+    "FrameRegistration",
     "HOGDescriptor",
     "HistogramAffinity",
     "Motion",
@@ -25,7 +26,6 @@ __all__ = [
     "PersonScorer",
     "PlaneHomography",
     "Regions",
-    "Registration",
     "Values",
     "check_softness",
     "differences_of",

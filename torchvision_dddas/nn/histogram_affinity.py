@@ -12,9 +12,15 @@ _PIXELS, _AFFINITIES = 1 << 20, 1 << 21
 
 
 class HistogramAffinity(nn.Module):
-    """Histograms of the boxes of a clip, and the generalised Jaccard affinities of all its windows in batches."""
+    """Histograms of the boxes of a clip, and the generalised Jaccard affinities of all its windows in batches.
 
-    def __init__(self, normalize: bool = True, softness: float = 0.0) -> None:
+    >>> clip, boxes = torch.rand(3, 3, 32, 32), torch.tensor([[[4.0, 4, 12, 12], [16, 16, 8, 8]]]).expand(3, 2, 4)
+    >>> there, windows = torch.ones(3, 2, dtype=torch.bool), torch.tensor([[0, 1], [1, 2]])
+    >>> nn.HistogramAffinity()(clip, boxes, there, windows).shape
+    torch.Size([2, 2, 2])
+    """
+
+    def __init__(self, *, normalize: bool = True, softness: float = 0.0) -> None:
         """normalize: each colour's histogram adds up to 1. softness: see `functional.rgb_histogram`."""
         super().__init__()
         self.normalize, self.softness = normalize, softness
@@ -45,7 +51,10 @@ class HistogramAffinity(nn.Module):
         for first in range(0, frames, frames_at_once):
             some = slice(first, first + frames_at_once)
             columns = zip(box_px[some].split(boxes_at_once, 1), valid[some].split(boxes_at_once, 1), strict=True)
-            found = [F.rgb_histogram(clip[some], *of, self.softness, self.normalize, largest) for of in columns]
+            found = [
+                F.rgb_histogram(clip[some], *of, softness=self.softness, normalize=self.normalize, largest=largest)
+                for of in columns
+            ]
             made.append([torch.cat(parts, 1) for parts in zip(*found, strict=True)])
         histogram, inside = zip(*made, strict=True)
         return torch.cat(histogram), torch.cat(inside)

@@ -28,7 +28,7 @@ from torchvision_dddas.chain import (
 )
 from torchvision_dddas.config import Settings, check_settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.nn.registration import LEVEL, Registration
+from torchvision_dddas.nn.registration import LEVEL, FrameRegistration
 
 Values = Mapping[str, float | Tensor]
 TensorChain = DetectionChain[Tensor, Tensor, tuple[Tensor, Tensor]]
@@ -67,6 +67,14 @@ class Differences:
 
     least: the difference of each near pair, as `difference.kind` has it, grey levels. both: where both neighbours are
     seen. texture: of the reference, 4 x grey levels a pixel; grey: its grey levels.
+
+    >>> least = torch.zeros(1, 2, 64, 64, dtype=torch.uint8)
+    >>> least[..., 20:40, 20:40] = 90
+    >>> nothing = torch.zeros(1, 1, 64, 64)
+    >>> found = nn.Differences(least, torch.ones(1, 2, 64, 64, dtype=torch.bool), nothing, nothing.byte())
+    >>> core = nn.MotionSegmenter().segment(found)
+    >>> core.mask[0, 0, [10, 30], 30].tolist()
+    [0.0, 1.0]
     """
 
     least: UInt8[Tensor, "B P H W"]
@@ -80,6 +88,11 @@ class Core(NamedTuple):
 
     mask: 0 to 1. margin: above 0 where the mask is above one half; with softness by how much evidence is above the
     threshold, cleaned. evidence: the largest over the near pairs. Both in noise units, or grey levels.
+
+    >>> maps = torch.zeros(1, 1, 64, 64)
+    >>> core = nn.Core(mask=maps, margin=maps - 3.5, evidence=maps)
+    >>> bool((core.mask == (core.margin > 0)).all())
+    True
     """
 
     mask: Float[Tensor, "B 1 H W"]
@@ -92,6 +105,14 @@ class Regions:
     """Label maps of the connected regions of a hard core: 0 is background, others 1 to `count`.
 
     near: the regions, and the pixels around them that may join them. filled: their hulls, or themselves.
+
+    >>> labels = torch.zeros(1, 1, 64, 64, dtype=torch.int64)
+    >>> labels[..., 20:40, 20:40] = 1
+    >>> mask = (labels > 0).float()
+    >>> core = nn.Core(mask, margin=mask - 0.5, evidence=20 * mask)
+    >>> outlined = nn.MotionSegmenter().outlined(core, nn.Regions(near=labels, filled=labels, count=1))
+    >>> outlined[0, 0, [10, 30], 30].tolist()
+    [0.0, 1.0]
     """
 
     near: Int64[Tensor, "B 1 H W"]
@@ -102,7 +123,7 @@ class Regions:
 class MotionSegmenter(nn.Module):
     """Masks of what moves in clips of a moving camera, up to the cleaned mask.
 
-    `detection.detect_masks` adds the detector's later steps: weak blobs, hulls, persistence, outlines.
+    `detection.detect_masks` adds the detector's later steps: hulls, tracklets, outlines, small targets.
 
     Parameters that are named in `tuned` are nn.Parameters, float64 as the settings' numbers; others are those of the
     settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
@@ -111,11 +132,17 @@ class MotionSegmenter(nn.Module):
     Nothing is asked of the host on a GPU, with two exceptions: a size in pixels that is a tensor (blur_px, erode_px,
     dilate_px, close_px) decides which kernels are built, and is read; and corners of the whole frame
     (`registration.corners`) are chosen in rounds whose end the host asks for.
+
+    >>> model = nn.MotionSegmenter(td.load_settings("fast"))
+    >>> found = model(torch.rand(1, 3, 1, 64, 64))
+    >>> found.mask.shape, found.later_from_earlier.shape
+    (torch.Size([1, 3, 1, 64, 64]), torch.Size([1, 2, 3, 3]))
     """
 
     def __init__(
         self,
         settings: Settings | None = None,
+        *,
         softness: float = 0.0,
         tuned: Sequence[str] = TUNED,
         whole: bool = True,
@@ -129,7 +156,7 @@ class MotionSegmenter(nn.Module):
             raise InputError(f"softness must be 0 or more, got {softness}")
         _check_names(tuned)
         self.settings, self.softness, self.whole = check_settings(settings), softness, whole
-        self.registration = Registration(self.settings.registration)
+        self.registration = FrameRegistration(self.settings.registration)
         self.tuned = {name: name.replace(".", "_") for name in tuned}
         chain = DetectionChain(self.settings, F.TensorOperations())
         for name, attribute in self.tuned.items():
@@ -152,6 +179,7 @@ class MotionSegmenter(nn.Module):
         self,
         clip: Float[Tensor, "B T C H W"],
         later_from_earlier: Float[Tensor, "B T-1 3 3"] | None = None,
+        *,
         values: Values | None = None,
     ) -> Segmentation:
         """Segment every frame of clips of RGB or grey pictures in [0, 1].
@@ -185,20 +213,20 @@ class MotionSegmenter(nn.Module):
                 continue
             with torch.no_grad():
                 differences = self._differences(levels, later_from_earlier, places, pairs)
-            core = self.segment(differences, values)
+            core = self.segment(differences, values=values)
             for maps, found in ((mask, core.mask), (evidence, core.evidence), (margin, core.margin)):
                 for place, of_frame in zip(places, found.unflatten(0, (batch, -1)).unbind(1), strict=True):
                     maps[place] = of_frame
         masks, evidences, margins = (torch.stack(frames_of, 1) for frames_of in (mask, evidence, margin))
         return Segmentation(masks, evidences, later_from_earlier, inliers, margins)
 
-    def segment(self, differences: Differences, values: Values | None = None, softness: float | None = None) -> Core:
+    def segment(self, differences: Differences, *, values: Values | None = None, softness: float | None = None) -> Core:
         """The core of windows of known differences. softness: in place of the module's own.
 
         Raises InputError for soft masks of a smoothed silhouette.
         """
         softness, texture = self.softness if softness is None else softness, differences.texture
-        chain = self.chain(values, softness, texture.dtype)
+        chain = self.chain(values, softness=softness, dtype=texture.dtype)
         least, both = differences.least, differences.both
         pairs = [(least[:, k : k + 1], both[:, k : k + 1]) for k in range(least.shape[1])]  # a graph has no split
         largest = chain.find_evidence(pairs, Reference(differences.grey, texture))
@@ -208,10 +236,10 @@ class MotionSegmenter(nn.Module):
             mask = (margin > 0).to(evidence.dtype)
             return Core(mask, mask, evidence)
         margin = margin / unit
-        return Core(F.step(margin, softness * self.settings.difference.threshold), margin, evidence)
+        return Core(F.step(margin, softness=softness * self.settings.difference.threshold), margin, evidence)
 
     def chain(
-        self, values: Values | None = None, softness: float = 0.0, dtype: torch.dtype = torch.float32
+        self, values: Values | None = None, *, softness: float = 0.0, dtype: torch.dtype = torch.float32
     ) -> TensorChain:
         """The detection chain on tensors, with the module's parameters. values: in place of them.
 
@@ -221,10 +249,12 @@ class MotionSegmenter(nn.Module):
         if is_soft:
             check_softness(self.settings)
         own = {name: getattr(self, attribute) for name, attribute in self.tuned.items()}
-        return DetectionChain(self.settings, F.TensorOperations(softness, self.whole, dtype), {**own, **(values or {})})
+        return DetectionChain(
+            self.settings, F.TensorOperations(softness, whole=self.whole, dtype=dtype), {**own, **(values or {})}
+        )
 
     def outlined(
-        self, core: Core, found: Regions, values: Values | None = None, softness: float | None = None
+        self, core: Core, found: Regions, *, values: Values | None = None, softness: float | None = None
     ) -> Float[Tensor, "B 1 H W"]:
         """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
         value = self.chain(values).value
@@ -235,7 +265,7 @@ class MotionSegmenter(nn.Module):
             found.count,
             value("gates.min_area_px"),
             value("difference.peak"),
-            self.softness if softness is None else softness,
+            softness=self.softness if softness is None else softness,
         )
         drawn = core.mask * F.gates_of_pixels(gate, found.near)
         # In the hull of a region, a hole or a speck is foreground as far as that region is, whatever its evidence.
@@ -299,7 +329,15 @@ def _check_clip(clip: Tensor, later_from_earlier: Tensor | None) -> None:
 
 
 def differences_of(chain: TensorChain, window: Window[Tensor]) -> Differences:
-    """The part of a batch of windows that depends on no tunable parameter."""
+    """The part of a batch of windows that depends on no tunable parameter.
+
+    >>> from torchvision_dddas.chain import DetectionChain, Window
+    >>> levels = (255 * torch.rand(3, 1, 64, 64)).round()
+    >>> still = torch.eye(3).expand(1, 2, 3, 3)
+    >>> window = Window(levels[1:2], (levels[:1], levels[2:]), still, offsets=(-1, 1), near=((0, 1),))
+    >>> nn.differences_of(DetectionChain(td.Settings(), F.TensorOperations()), window).least.shape
+    torch.Size([1, 1, 64, 64])
+    """
     neighbours = chain.neighbours(window)
     least, both = (torch.cat([of(pair) for pair in window.near], 1) for of in (neighbours.compared, neighbours.both))
     reference = neighbours.reference()
@@ -307,7 +345,13 @@ def differences_of(chain: TensorChain, window: Window[Tensor]) -> Differences:
 
 
 def check_softness(settings: Settings) -> None:
-    """Raises InputError for a smoothed silhouette, whose outline at one half is no threshold of evidence."""
+    """Raises InputError for a smoothed silhouette, whose outline at one half is no threshold of evidence.
+
+    >>> nn.check_softness(td.load_settings("source"))
+    Traceback (most recent call last):
+        ...
+    torchvision_dddas.errors.InputError: difference.blur_of = silhouette has no s...
+    """
     if settings.difference.blur_of == "silhouette":
         raise InputError(
             "difference.blur_of = silhouette has no soft masks and cannot be tuned by gradient; "

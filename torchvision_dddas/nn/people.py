@@ -12,7 +12,11 @@ from torchvision_dddas.errors import InputError
 
 
 class HOGDescriptor(nn.Module):
-    """Normalised histograms of all blocks of RGB or grey pictures in [0, 1], as cv2.HOGDescriptor computes them."""
+    """Normalised histograms of all blocks of RGB or grey pictures in [0, 1], as cv2.HOGDescriptor computes them.
+
+    >>> nn.HOGDescriptor()(torch.rand(1, 3, 128, 64)).shape
+    torch.Size([1, 36, 15, 7])
+    """
 
     def __init__(self, layout: F.Layout | None = None) -> None:
         """layout: of cells, blocks and window; OpenCV's default."""
@@ -29,10 +33,14 @@ class HOGDescriptor(nn.Module):
 
 
 class PersonScorer(nn.Module):
-    """Scores of all windows of a picture under a linear SVM of HOG; weights and bias are nn.Parameters."""
+    """Scores of all windows of a picture under a linear SVM of HOG; weights and bias are nn.Parameters.
+
+    >>> nn.PersonScorer(torch.zeros(3780), 1.5)(torch.rand(1, 3, 136, 72)).tolist()
+    [[[1.5, 1.5], [1.5, 1.5]]]
+    """
 
     def __init__(
-        self, weights: Float[Tensor, " D"], bias: float, layout: F.Layout | None = None, window_stride_px: int = 8
+        self, weights: Float[Tensor, " D"], bias: float, *, layout: F.Layout | None = None, window_stride_px: int = 8
     ) -> None:
         """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window.
 

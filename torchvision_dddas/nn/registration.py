@@ -47,10 +47,15 @@ GRAPH_EFFORT = Effort(96, 1, 6, 6, (1.0,), (1.0, 0.5), branches=False)
 
 
 class Motion(NamedTuple):
-    """What `Registration` finds.
+    """What `FrameRegistration` finds.
 
     later_from_earlier: float64. start_px, end_px: keypoints, and where they were found if tracked. inliers: the tracked
     ones that agree with the matrix; where nothing agrees it is the identity, with none.
+
+    >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 96, 96), 7)
+    >>> motion = nn.FrameRegistration()(picture, picture)
+    >>> motion.later_from_earlier.dtype, bool(motion.inliers.any())
+    (torch.float64, True)
     """
 
     later_from_earlier: Float[Tensor, "B 3 3"]
@@ -60,10 +65,16 @@ class Motion(NamedTuple):
     inliers: Bool[Tensor, "B N"]
 
 
-class Registration(nn.Module):
-    """Corners, pyramidal Lucas-Kanade, RANSAC and refits; nothing here is learned."""
+class FrameRegistration(nn.Module):
+    """Corners, pyramidal Lucas-Kanade, RANSAC and refits; nothing here is learned.
 
-    def __init__(self, parameters: RegistrationParameters | None = None, effort: Effort | None = None) -> None:
+    >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 96, 96), 7)
+    >>> motion = nn.FrameRegistration()(picture, picture.roll(3, -1))
+    >>> motion.later_from_earlier[0, 0, 2].round(decimals=1)
+    tensor(3., dtype=torch.float64)
+    """
+
+    def __init__(self, parameters: RegistrationParameters | None = None, *, effort: Effort | None = None) -> None:
         super().__init__()
         self.settings, self.effort = parameters or RegistrationParameters(), effort or Effort()
         self.model = F.MODELS[self.settings.model]
@@ -76,7 +87,7 @@ class Registration(nn.Module):
         return self.match(points, valid, self.pyramid(matched[0]), self.pyramid(matched[1]))
 
     def keypoints(
-        self, levels: Float[Tensor, "B 1 H W"], halved: bool | None = None
+        self, levels: Float[Tensor, "B 1 H W"], *, halved: bool | None = None
     ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
         """The best corner of every cell or of the whole frame, and where there is one. levels: grey, 0 .. 255.
 
@@ -92,10 +103,17 @@ class Registration(nn.Module):
         least = 1e-7 * LEVEL**2
         if parameters.corners == "frame":
             found = F.frame_features(
-                levels, parameters.keypoints, parameters.quality, apart_px, parameters.block_px, least
+                levels,
+                parameters.keypoints,
+                quality=parameters.quality,
+                min_distance_px=apart_px,
+                block=parameters.block_px,
+                least=least,
             )
             return step * found[0], found[1]
-        points, _, valid = F.grid_features(levels, cell, parameters.quality, parameters.block_px, least=least)
+        points, _, valid = F.grid_features(
+            levels, cell, quality=parameters.quality, block=parameters.block_px, least=least
+        )
         return step * points, valid
 
     def pyramid(self, levels: Float[Tensor, "B 1 H W"]) -> list[Tensor]:
@@ -111,6 +129,7 @@ class Registration(nn.Module):
         valid: Bool[Tensor, "B N"],
         earlier: list[Tensor],
         later: list[Tensor],
+        *,
         samples: Int64[Tensor, "B S size"] | None = None,
         ransac_px: float | Tensor | None = None,
     ) -> Motion:
@@ -121,7 +140,7 @@ class Registration(nn.Module):
         """
         effort, parameters = self.effort, self.settings
         ransac_px = parameters.ransac_px if ransac_px is None else ransac_px
-        frames = _Frames(points, valid, earlier, later, samples)
+        frames = _FramePairs(points, valid, earlier, later, samples)
         if not points.shape[1]:
             return Motion(_identities(points), points, points, valid, valid)
         if effort.branches and points.shape[1] < 2 * effort.scouts:
@@ -152,7 +171,7 @@ class Registration(nn.Module):
                 made |= {place: Motion(*row) for place, *row in zip(chosen.tolist(), *part, strict=True)}
         return Motion(*(torch.stack(column) for column in zip(*(made[place] for place in sorted(made)), strict=True)))
 
-    def _search_everywhere(self, frames: "_Frames", _: Tensor, ransac_px: float | Tensor) -> Motion:
+    def _search_everywhere(self, frames: "_FramePairs", _: Tensor, ransac_px: float | Tensor) -> Motion:
         """Lucas-Kanade through the whole pyramid, then RANSAC."""
         search = self._search(self.settings.iterations, _SCOUT_REACH_PX) | {"rounds": 3}
         end, tracked = self._track(frames, None, search)
@@ -160,7 +179,7 @@ class Registration(nn.Module):
         matrix = self._ransac(frames.points, end, tracked, frames.samples, ransac_px, refits, count)
         return self._judged(matrix, frames.points, end, tracked, ransac_px)
 
-    def _search_near(self, frames: "_Frames", motion: Tensor, ransac_px: float | Tensor) -> Motion:
+    def _search_near(self, frames: "_FramePairs", motion: Tensor, ransac_px: float | Tensor) -> Motion:
         """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
         effort, points = self.effort, frames.points
         finest = frames._replace(earlier=frames.earlier[:1], later=frames.later[:1])
@@ -175,7 +194,7 @@ class Registration(nn.Module):
             matrix = self._ransac(points, end, tracked, frames.samples, ransac_px, effort.refits, count)
         return self._judged(matrix, points, end, tracked, ransac_px)
 
-    def _track(self, frames: "_Frames", guess: Tensor | None, search: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    def _track(self, frames: "_FramePairs", guess: Tensor | None, search: dict[str, Any]) -> tuple[Tensor, Tensor]:
         """Where the points go, and which were found there and, if that is asked for, on the way back."""
         given, limit_px = (frames.points, frames.earlier, frames.later, guess), self.settings.forward_backward_px
         if limit_px > 0 and self.effort.branches:
@@ -213,7 +232,9 @@ class Registration(nn.Module):
             samples = _drawn(hypotheses, count, model.size).to(start.device).expand(batch, -1, -1)
         gates_px = [share * ransac_px for share in shares]
         samples = samples[..., : model.size]
-        return F.ransac(start.double(), end.double(), tracked, samples, model, ransac_px, gates_px)[0]
+        return F.ransac(
+            start.double(), end.double(), tracked, samples, model=model, tolerance_px=ransac_px, refits=gates_px
+        )[0]
 
     def _judged(self, matrix: Tensor, start: Tensor, end: Tensor, tracked: Tensor, ransac_px: float | Tensor) -> Motion:
         miss = F.oneway_transfer_error(start.double(), end.double(), matrix, squared=False)
@@ -221,7 +242,7 @@ class Registration(nn.Module):
         return Motion(matrix, start, end, tracked, inliers & (inliers.sum(1, keepdim=True) >= self.model.size))
 
 
-class _Frames(NamedTuple):
+class _FramePairs(NamedTuple):
     """points: keypoints, valid: which are there. earlier, later: pyramids."""
 
     points: Tensor
@@ -230,10 +251,10 @@ class _Frames(NamedTuple):
     later: list[Tensor]
     samples: Tensor | None
 
-    def select(self, chosen: Tensor) -> "_Frames":
+    def select(self, chosen: Tensor) -> "_FramePairs":
         earlier, later = ([level[chosen] for level in pyramid] for pyramid in (self.earlier, self.later))
         samples = None if self.samples is None else self.samples[chosen]
-        return _Frames(self.points[chosen], self.valid[chosen], earlier, later, samples)
+        return _FramePairs(self.points[chosen], self.valid[chosen], earlier, later, samples)
 
 
 def _drawn(hypotheses: int, count: int, size: int) -> Int64[Tensor, "1 S size"]:
@@ -241,7 +262,7 @@ def _drawn(hypotheses: int, count: int, size: int) -> Int64[Tensor, "1 S size"]:
     if F.is_traced():  # a graph holds no generator: the numbers are its constants
         numbers = np.random.default_rng(0).permuted(np.tile(np.arange(count), (hypotheses, 1)), axis=1)
         return torch.tensor(numbers[None, :, :size].tolist())
-    return F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, size)
+    return F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, size=size)
 
 
 def _identities(like: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""People in pictures from the ground, by HOG and a linear SVM; `PersonDetector` is the public class."""
+"""Detect people in pictures from the ground by HOG and a linear SVM. The public class is `PersonDetector`."""
 
 from torchvision_dddas.people.detector import (
     PersonDetector,

@@ -1,4 +1,4 @@
-"""Linear SVMs from files: the shipped coefficients, or a user's own as text, NumPy's or OpenCV's."""
+"""Read linear SVMs: the shipped coefficients, or a user's file in text, NumPy or OpenCV format."""
 
 import math
 import re
@@ -17,7 +17,7 @@ from torchvision_dddas.types import LinearSvm
 SHIPPED = {"opencv": Path(__file__).parents[1] / "models" / "opencv_people.txt"}
 
 Layout = Mapping[str, object]
-"""Descriptor that a classifier was trained on: all or some keys of `PeopleParameters.descriptor`."""
+"""Layout of the descriptor that a classifier was trained on: some or all keys of `PeopleParameters.descriptor`."""
 
 _PARAMETERS = {
     "window": "people.window_width_px and people.window_height_px",
@@ -39,30 +39,32 @@ _HOG_KEYS = {
     "clip": "L2HysThreshold",
     "gamma": "gammaCorrection",
 }
-"""Of a HOGDescriptor that OpenCV saved."""
-_MOST_NUMBERS = 1_000_000  # of an array; descriptors have thousands
-_LONGEST_HEADER = 10_000  # of an array, bytes; NumPy reads no longer ones, after it has made room
-_MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # begins a part of what OpenCV saves: a key, a list, an item, a tag
-_MOST_MARKS = 10_000  # OpenCV crashes on parts that lie deeper in each other than twice that
-_DIGITS = 1e-6  # files store a clip of 0.2 with different rounding
+"""The keys of a HOGDescriptor that OpenCV saved."""
+_MOST_NUMBERS = 1_000_000  # largest accepted array; descriptors have thousands of numbers
+_LONGEST_HEADER = 10_000  # longest accepted array header, bytes; NumPy refuses longer ones after allocating memory
+_MARK = re.compile(r"[\[{:]|<[^/!?]|-(?![\d.])")  # the start of a key, list, item or tag in a file that OpenCV saved
+_MOST_MARKS = 10_000  # OpenCV crashes on parts that are nested more than twice as deep
+_DIGITS = 1e-6  # tolerance of a comparison: files store a clip of 0.2 with different rounding
 
 
 def read_classifier(name: str | Path, features: int, wanted: Layout | None = None) -> LinearSvm:
-    """The classifier of a shipped name, or of a file; features: the length of the descriptor it must fit.
+    """Read a classifier from a file, or a shipped classifier by its name.
 
-    Files: text (numbers apart by blanks, commas or lines; `#` begins a comment), .npy, .npz (weights, bias, and any of
-    the keys of `PeopleParameters.descriptor`), and what OpenCV saves as .yml, .yaml, .xml or .json: a HOGDescriptor
-    with its SVMDetector, or a linear SVM of cv2.ml. They hold the weights, or these and a bias last. wanted: the
-    descriptor in use, which must be the one that the file tells of, if it does.
-    Raises InputError: no such file, not readable, another length (with both), another descriptor, not finite numbers.
+    Files hold the weights, optionally followed by a bias. Formats: text (numbers separated by blanks, commas or lines;
+    `#` begins a comment); .npy; .npz (weights, bias, and any of the keys of `PeopleParameters.descriptor`); and .yml,
+    .yaml, .xml or .json saved by OpenCV (a HOGDescriptor with its SVMDetector, or a linear SVM of cv2.ml). features:
+    length of the descriptor, which is the required number of weights. wanted: the descriptor in use; if the file states
+    a descriptor, both must agree.
+    Raises InputError if the file is missing or unreadable, or has another length, another descriptor or numbers that
+    are not finite.
     """
     path = SHIPPED.get(str(name), Path(name))
     try:
         there = path.exists()
-    except OSError as error:  # a name too long, a folder that may not be entered
+    except OSError as error:  # the name is too long, or the folder may not be entered
         raise InputError(f"classifier {str(name)[:200]} cannot be read: {error.strerror or error}") from None
     if not there:
-        raise InputError(f"no classifier is named '{name}', nor is it a file; give {', '.join(SHIPPED)}, or a file")
+        raise InputError(f"no classifier or file is named '{name}'; give {', '.join(SHIPPED)}, or a file")
     reader = _READERS.get(path.suffix.lower(), _read_text)
     try:
         numbers, stated = reader(path, features)
@@ -71,14 +73,14 @@ def read_classifier(name: str | Path, features: int, wanted: Layout | None = Non
     for name, parameter in _PARAMETERS.items():
         if wanted is not None and name in stated and name in wanted and not _is_same(stated[name], wanted[name]):
             raise InputError(
-                f"classifier {path} was trained with a {name} of {_format(stated[name], wanted[name])}, the "
+                f"classifier {path} was trained with a {name} of {_format(stated[name], wanted[name])}, but the "
                 f"settings say {_format(wanted[name], wanted[name])}; change {parameter}"
             )
     return _svm(numbers, features, path)
 
 
 def load_classifier(parameters: PeopleParameters) -> LinearSvm:
-    """The classifier that the settings name. Raises InputError as `read_classifier`, and for one that does not fit."""
+    """Read the classifier that the settings name. Raises InputError as `read_classifier` does."""
     return read_classifier(parameters.classifier, parameters.features, parameters.descriptor)
 
 
@@ -89,11 +91,12 @@ def _svm(numbers: np.ndarray, features: int, path: Path) -> LinearSvm:
     with np.errstate(over="ignore"):
         numbers = numbers.ravel().astype(np.float32)
     if len(numbers) == 0:
-        raise InputError(f"classifier {path} is empty; wanted {features} weights, or these and a bias")
+        raise InputError(f"classifier {path} is empty; wanted {features} weights, or {features} weights and a bias")
     if len(numbers) not in (features, features + 1):
         raise InputError(
-            f"classifier {path} has {len(numbers)} numbers; a descriptor of these settings has {features}, so that "
-            f"{features} weights, or these and a bias, are wanted; set people.window_width_px and its like as trained"
+            f"classifier {path} has {len(numbers)} numbers; a descriptor of these settings has {features}, so "
+            f"{features} weights, or these and a bias, were expected; set people.window_width_px, people.cell_px and "
+            "the other descriptor parameters to the training layout"
         )
     if not np.isfinite(numbers).all():
         first = int(np.argmin(np.isfinite(numbers)))
@@ -121,7 +124,7 @@ def _read_text(path: Path, features: int) -> tuple[np.ndarray, Layout]:
     for place, line in enumerate(lines, 1):
         for cell in line.partition("#")[0].replace(",", " ").replace(";", " ").split():
             try:
-                numbers.append(float(cell.replace("_", "?")))  # 1_0 is a number to Python alone
+                numbers.append(float(cell.replace("_", "?")))  # only Python reads 1_0 as a number, so refuse it
             except ValueError:
                 raise InputError(f"classifier {path}, line {place}: '{cell[:40]}' is not a number") from None
             if not math.isfinite(numbers[-1]):
@@ -145,10 +148,10 @@ def _read_numpy(path: Path, features: int) -> tuple[np.ndarray, Layout]:
         raise
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(f"classifier {path} is not an array of numbers in NumPy's format: {error}") from None
-    except Exception as error:  # a broken archive: zipfile and zlib have errors of their own
+    except Exception as error:  # zipfile and zlib raise their own classes for a broken archive
         raise InputError(f"classifier {path} is a broken file: {error}") from None
     if "weights" not in content:
-        raise InputError(f"classifier {path} holds {', '.join(held[:9]) or 'no array'}; wanted weights, and a bias")
+        raise InputError(f"classifier {path} holds {', '.join(held[:9]) or 'no array'}; wanted weights (and bias)")
     parts = [np.ravel(content[name]) for name in ("weights", "bias") if name in content]
     if len(parts) == 2 and parts[1].size != 1:
         raise InputError(f"classifier {path} has a bias of {parts[1].size} numbers; wanted one")
@@ -159,7 +162,7 @@ def _read_numpy(path: Path, features: int) -> tuple[np.ndarray, Layout]:
 
 
 def _read_array(file: IO[bytes], path: Path) -> np.ndarray:
-    """An array, if its header announces at most _MOST_NUMBERS. NumPy would make room for all, and for the header."""
+    """Read an array if its header announces at most _MOST_NUMBERS: NumPy would allocate memory for any header."""
     file.seek(0)
     start = file.read(12)
     length = int.from_bytes(start[8 : 10 if start[6:7] == b"\1" else 12], "little")
@@ -182,22 +185,22 @@ def _read_opencv(path: Path, features: int) -> tuple[np.ndarray, Layout]:
         text = path.read_text(encoding="utf-8")
         if (count := sum(1 for _ in _MARK.finditer(text))) > _MOST_MARKS:
             raise InputError(
-                f"classifier {path} has {count:,} keys, lists and items; wanted at most {_MOST_MARKS:,}, as of a "
-                "HOGDescriptor with its SVMDetector, or of a linear SVM of cv2.ml"
+                f"classifier {path} has {count:,} keys, lists and items; wanted at most {_MOST_MARKS:,}, as in a "
+                "HOGDescriptor with its SVMDetector, or a linear SVM of cv2.ml"
             )
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         top = storage.getFirstTopLevelNode()
-        # An SVM's node is the top one; a HOGDescriptor saved by hand may lie anywhere at the top.
+        # The top-level node may be an SVM or a HOGDescriptor, whatever its name.
         inside = set(top.keys()) if not top.empty() and top.isMap() else set()
     except (UnicodeDecodeError, cv2.error, SystemError):
         raise InputError(f"classifier {path} is not a file that OpenCV saved (YAML, XML or JSON)") from None
     try:
         if "SVMDetector" in inside:
             values = {name: _numbers(top.getNode(key), 2).tolist() for name, key in _HOG_KEYS.items() if key in inside}
-            # Cells, blocks and strides are squares in a layout.
+            # A layout has one number for square cells, blocks and strides.
             stated = {name: v if name == "window" or len(set(v)) > 1 else v[0] for name, v in values.items()}
             detector = top.getNode("SVMDetector")
-            if detector.size() > features + 1:  # whose length alone is told
+            if detector.size() > features + 1:  # the caller reports its length; the numbers are not needed
                 return np.full(detector.size(), np.nan), stated
             return _numbers(detector, features + 1), stated
         if "support_vectors" in inside:
@@ -212,14 +215,15 @@ def _read_opencv(path: Path, features: int) -> tuple[np.ndarray, Layout]:
 
 
 def _read_support_vectors(node: "cv2.FileNode", path: Path, features: int) -> np.ndarray:
-    """Weights and bias of a saved cv2.ml.SVM.
+    """Return the weights and the bias of a saved cv2.ml.SVM.
 
-    Its decision is alpha . K - rho. A classifier takes a positive one for its first label, the lower number; people are
-    the second, so the score is rho minus the rest. A regression gives the label itself, people having the higher one.
+    The SVM computes alpha . K - rho. In a classification a positive value means the first label, which is the lower
+    number. People have the second label, so the score is the negative of that value. In a regression the value is the
+    label itself, and people have the higher label.
     """
     kind, kernel = node.getNode("svmType").string(), node.getNode("kernel").getNode("type").string()
     if kernel != "LINEAR":
-        raise InputError(f"classifier {path} has the kernel {kernel or 'of no name'}; wanted a linear SVM")
+        raise InputError(f"classifier {path} has the kernel {kernel or '(none)'}; wanted a linear SVM")
     vectors, functions = node.getNode("support_vectors"), node.getNode("decision_functions")
     sign = {"C_SVC": -1.0, "NU_SVC": -1.0, "EPS_SVR": 1.0, "NU_SVR": 1.0}.get(kind)
     if sign is None:
@@ -238,12 +242,12 @@ def _read_support_vectors(node: "cv2.FileNode", path: Path, features: int) -> np
     place = np.arange(len(rows)) if index.empty() else _numbers(index, len(rows))
     if not ((place >= 0) & (place < len(rows))).all():
         raise InputError(f"classifier {path} names support vectors that it does not hold; save it again")
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused with its place
+    with np.errstate(over="ignore", invalid="ignore"):  # `_svm` refuses numbers that are not finite
         return sign * np.append(alpha @ rows[place.astype(int)], -function.getNode("rho").real())
 
 
 def _numbers(node: "cv2.FileNode", most: int) -> np.ndarray:
-    """A number, or a sequence of them. Raises ValueError for more than `most`: OpenCV finds each from the first on."""
+    """Return the numbers of a node. Raise ValueError for more than `most`, since OpenCV takes quadratic time."""
     if not node.isSeq():
         return np.array([node.real()])
     if node.size() > most:

@@ -1,4 +1,4 @@
-"""People in pictures, clips and live scenes by HOG and a linear SVM: parts of the pyramid, scores, windows, people."""
+"""Detect people by HOG and a linear SVM in pictures, in clips, and in the scenes of a live run."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,16 +32,22 @@ from torchvision_dddas.types import (
 
 KIND = "person"
 UNREAD = "the frame could not be read"
-"""Cause of a frame without picture."""
+"""The cause that a frame without a picture has."""
 
 
 class PersonDetector:
-    """Detects people in single pictures."""
+    """Detects people in single pictures.
 
-    def __init__(self, settings: Settings | None = None, backend: str = "auto") -> None:
-        """backend: onboard (OpenCV and ONNX Runtime), torch, or auto for the former.
+    >>> people = td.PersonDetector()(np.full((240, 320, 3), 128, np.uint8))
+    >>> len(people), people.box_px.shape
+    (0, (0, 4))
+    """
 
-        Raises InputError for an unknown backend, and a classifier or graphs that cannot be read or do not fit.
+    def __init__(self, settings: Settings | None = None, *, backend: str = "auto") -> None:
+        """Load the classifier.
+
+        backend: onboard (OpenCV and ONNX Runtime), torch, or auto. auto is torch with a CUDA device, else onboard.
+        Raises InputError for an unknown backend, and for a classifier or graphs that cannot be read or do not fit.
         """
         self.parameters = check_settings(settings).people
         self.scorer = load_scorer(self.parameters, backend)
@@ -51,9 +57,10 @@ class PersonDetector:
     @overload
     def __call__(self, images: Sequence[np.ndarray]) -> list[People]: ...
     def __call__(self, images: np.ndarray | Sequence[np.ndarray]) -> People | list[People]:
-        """The people of a picture, (H, W, 3) BGR or (H, W) grey uint8, or of each of several; best first.
+        """Detect the people of one picture, or of each picture of a sequence; the best score comes first.
 
-        Raises InputError for another shape or type, and a picture that is smaller than the window.
+        images: (H, W, 3) BGR or (H, W) grey uint8. Raises InputError for another shape or type, and for a picture that
+        is smaller than the window.
         """
         several: Any = images
         if not isinstance(several, Iterable) or isinstance(several, str) or getattr(several, "ndim", 4) < 4:
@@ -62,24 +69,25 @@ class PersonDetector:
 
 
 class WindowScorer(Protocol):
-    """A backend's scorer of windows, for one classifier and one layout of its descriptor."""
+    """A backend's scorer of windows for one classifier and one descriptor layout."""
 
     name: str
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
-        """For every image its parts' score maps: (ny, nx) float32, [j, i] the window at (x + i stride, y + j stride).
+        """Return for each image a list of score maps, one for each of its parts.
 
-        images: uint8 (H, W) or (H, W, 3) BGR; resized as by OpenCV's INTER_LINEAR_EXACT, reflected (101) at the border.
-        A part does not see its own edge: its scores are those of the same windows in a search everywhere.
-        A part that is smaller than the window has an empty map.
+        A map is (ny, nx) float32; entry [j, i] is the score of the window at (x + i stride, y + j stride). images:
+        uint8 (H, W) or (H, W, 3) BGR. They are resized like OpenCV's INTER_LINEAR_EXACT, and reflected (101) at the
+        border. The edge of a part has no effect: scores equal those of a search of the whole picture. The map of a
+        part that is smaller than the window is empty.
         """
         ...
 
 
 def load_scorer(parameters: PeopleParameters, backend: str = "auto", svm: LinearSvm | None = None) -> WindowScorer:
-    """The scorer of windows of a backend, for a classifier; None: the one that the settings name.
+    """Return the window scorer of a backend.
 
-    Raises InputError as `wants_torch` and `load_classifier`.
+    svm: the classifier; None: the one that the settings name. Raises InputError as `wants_torch` and `load_classifier`.
     """
     svm = load_classifier(parameters) if svm is None else svm
     if not wants_torch(backend):
@@ -97,8 +105,8 @@ def detect_people(
     parameters: PeopleParameters,
     regions: Sequence[Regions] | None = None,
 ) -> list[People]:
-    """The people of pictures, searched everywhere or in regions of each. Raises InputError as `detect_in_clip`."""
-    images = [as_picture(image, f"picture {i}") for i, image in enumerate(images, start=1)]
+    """Detect the people of pictures, everywhere or in regions of each. Raises InputError as `detect_in_clip` does."""
+    images = [as_picture(image, name=f"picture {i}") for i, image in enumerate(images, start=1)]
     parts = []
     for i, image in enumerate(images):
         size = image.shape[1], image.shape[0]
@@ -127,12 +135,12 @@ def detect_in_clip(
     moving: DetectionTable | None = None,
     batch: int | None = None,
 ) -> Iterator[PeopleFrame]:
-    """The people of every frame number of the clip, in order. Frames that could not be read are black, with a cause.
+    """Yield the people of every frame number of a clip, in order. Unreadable frames are black and have a cause.
 
-    moving: boxes around which to search, by frame; see `search_regions.Search`. batch: frames given to the backend at
-    once, which does not change the result. None: 8 for torch, else 1; with `people.search = regions` each frame waits
-    for what was found in the one before.
-    Raises InputError: a picture that is not 8 bits grey or BGR, or smaller than the window.
+    moving: boxes around which to search, by frame; see `search_regions.Search`. batch: frames that the backend scores
+    at once; it does not change the result. None means 8 for torch, else 1. With `people.search = regions` the batch is
+    always 1, because the search of a frame needs the people of the frame before.
+    Raises InputError for a picture that is not 8-bit grey or BGR, or is smaller than the window.
     """
     parameters = settings.people
     search = Search(parameters, None if moving is None else lambda number: moving.at(number).box_px)
@@ -165,7 +173,7 @@ def detect_in_clip(
     start = time.perf_counter()
     for frame in source:
         read = time.perf_counter()
-        image = as_picture(frame.image, f"frame {frame.number}")
+        image = as_picture(frame.image, name=f"frame {frame.number}")
         if frame.number > number:
             yield from search_waiting()
             yield from unread(range(number, frame.number), image.shape)
@@ -181,29 +189,29 @@ def detect_in_clip(
     yield from unread(range(number, getattr(source, "last", 0) + 1), shape)
 
 
-class FrameTracker(Protocol):
-    """What gives frames their tracks, such as `tracking.FrameTracker`."""
+class AddsTracks(Protocol):
+    """A tracker that adds tracks to frames, such as `tracking.FrameTracker`."""
 
     def update(self, given: TrackedFrame) -> Iterable[TrackedFrame]:
-        """Add a frame; returns the frames that are settled by it."""
+        """Add a frame, and return the frames whose tracks no later frame can change."""
         ...
 
     def flush(self) -> Iterable[TrackedFrame]:
-        """The frames that were still waiting."""
+        """Return the remaining frames at the end."""
         ...
 
 
 class PersonTracker:
-    """Detects people around what moves in the scenes of a run, and tracks them by the run's own registrations.
+    """Detects people around the moving targets of a run's scenes, and tracks them with the run's registrations.
 
-    Give it the scenes in order. A scene whose picture could not be read has no people. Identities are from 1, apart
-    from those of what moves.
+    Pass the scenes in order to `update`. A scene whose picture could not be read has no people. Identities of people
+    start at 1 and are independent of those of moving targets.
     """
 
     def __init__(
-        self, scorer: WindowScorer, settings: Settings, interval: int, size: tuple[int, int], tracker: FrameTracker
+        self, scorer: WindowScorer, settings: Settings, interval: int, size: tuple[int, int], tracker: AddsTracks
     ) -> None:
-        """size: (width, height) of the pictures. Raises InputError where they are smaller than the window."""
+        """Start without people. size: (width, height) of the pictures. Raises InputError below the window's size."""
         self._scorer, self._interval, self._size, self._tracker = scorer, interval, size, tracker
         self._box_px = np.zeros((0, 4))
         self._search = Search(settings.people, lambda number: self._box_px)
@@ -212,7 +220,7 @@ class PersonTracker:
         pyramid.everywhere(size, settings.people)
 
     def retune(self, settings: Settings) -> None:
-        """Search as these settings say from now on."""
+        """Use these settings for the search from the next scene on."""
         self._search.retune(settings.people)
 
     def update(self, scene: Scene) -> None:
@@ -229,7 +237,7 @@ class PersonTracker:
             start = time.perf_counter()
             self._box_px = scene.detections.box_px
             plan = self._search.plan(number, self._size)
-            image = as_picture(image, f"frame {number}")
+            image = as_picture(image, name=f"frame {number}")
             (people,) = _score_people([image], [plan.parts], self._scorer, self._search.parameters)
             self._search.update(number, people, plan)
             unknown = np.full(len(people), np.nan)
@@ -240,9 +248,9 @@ class PersonTracker:
         self._settled |= {settled.number: settled for settled in self._tracker.update(given)}
 
     def people_of(self, number: int, ended: bool) -> TrackedFrame | None:
-        """The people of a frame, once; None while they are not settled. Those of earlier frames are forgotten.
+        """Return the people of a frame, or None while later scenes may change them.
 
-        ended: whether no scene follows.
+        This returns each frame once, and drops all earlier frames. ended: whether no scene follows.
         """
         if ended and number not in self._settled:
             self._settled |= {settled.number: settled for settled in self._tracker.flush()}

@@ -1,7 +1,7 @@
-"""Scores of windows by OpenCV and ONNX Runtime, for a small CPU without torch.
+"""Score windows by OpenCV and ONNX Runtime, for a small CPU without torch.
 
-The graphs are made from `functional.hog` by `dddas export`. A part goes through them in tiles that stay in the cache;
-parts are shared among threads, each of which runs the graphs on one thread.
+`dddas export` makes the graphs from `functional.hog`. The graphs process a part in tiles that fit into the cache. The
+levels are distributed to a pool of threads; each thread runs the graphs single-threaded.
 """
 
 import math
@@ -25,20 +25,20 @@ from torchvision_dddas.runtime import opened as open_graph
 from torchvision_dddas.types import LinearSvm, Part
 
 GRAPHS = "people_histograms.onnx", "people_scores.onnx"
-# What the graphs have baked in; their manifest names it.
+# Parameters that are constants in the graphs. The manifest states their values.
 BAKED = ("cell_px", "block_px", "block_stride_px", "bins", "signed", "gamma")
 
-# Side of a tile: its 16 maps take 1.8 MB, about what stays in a core's cache; smaller ones overlap their neighbours
-# for a larger share (104 px: 1.2 times the time), and larger ones gain nothing.
+# Side of a tile: its 16 maps take 1.8 MB, about the size of a core's cache. Smaller tiles overlap their neighbours by a
+# larger share (104 px: 1.2 times the time), and larger tiles gain nothing.
 _TILE_PX = 168
 # Pixels of a band: with three channels its buffers take 1 MB, which should stay in a core's cache.
 _BAND_PX = 20_000
-# Pixels whose gradient is taken at once, and blocks that are scored at once: what bounds the memory.
+# Pixels whose gradient is computed at once, and blocks that are scored at once. These numbers limit the memory.
 _GRADIENT_PX = 160_000
 _BLOCKS = 2_500
-# Pixels of a level whose histograms are held at once, 2.3 bytes a pixel; strips overlap by a window's height.
+# Pixels of a level whose histograms are in memory at once, 2.3 bytes a pixel. Strips overlap by a window's height.
 _STRIP_PX = 16_000_000
-# Pictures with more values are resized as they are, which takes longer and less memory.
+# Pictures with more values than this are not copied to four channels before resizing: slower, but with less memory.
 _FEW_VALUES = 25_000_000
 
 
@@ -48,7 +48,7 @@ class OnnxScorer:
     name = "onboard"
 
     def __init__(self, parameters: PeopleParameters, svm: LinearSvm) -> None:
-        """Raises InputError where the SVM has another length than the descriptor, or the graphs another layout."""
+        """Load the scorer. Raises InputError if the SVM's length or the graphs' layout do not fit the parameters."""
         self.parameters, self.svm, self.graphs = parameters, svm, find_graphs(parameters)
         self.svm_feed = {
             "weights": arrange_weights(svm, parameters),
@@ -59,24 +59,24 @@ class OnnxScorer:
 
     @cached_property
     def sessions(self) -> tuple[Any, Any]:
-        """The graphs of histograms and of scores, loaded when first needed: that takes longer than a frame."""
-        # A memory pattern is a plan for every size of a level, which is no quicker and takes 9 MB.
+        """The graphs of histograms and of scores. They are loaded on first use, which takes longer than a frame."""
+        # ONNX Runtime's memory patterns, one for each size of a level, save no time here and take 9 MB.
         histograms, scores = (open_graph(self.graphs, name, enable_mem_pattern=False) for name in GRAPHS)
         return histograms, scores
 
     @cached_property
     def pool(self) -> ThreadPoolExecutor:
-        """As many threads as OpenCV uses; each holds some 15 MB at 640x480."""
+        """A pool of as many threads as OpenCV uses. Each thread takes about 15 MB at 640x480."""
         return ThreadPoolExecutor(max(1, cv2.getNumThreads()))
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
-        """The score map of each part of each picture."""
+        """Return the score map of each part of each picture, see `WindowScorer.scores`."""
         _ = self.sessions
         jobs: dict[tuple[int, tuple[int, int]], list[int]] = defaultdict(list)
         for picture, wanted in enumerate(parts):
             for index, part in enumerate(wanted):
                 jobs[picture, part.level].append(index)
-        # With an unused fourth channel: OpenCV resizes four channels quicker than three.
+        # Add an unused fourth channel, because OpenCV resizes four channels faster than three.
         sources = [
             cv2.cvtColor(image, cv2.COLOR_BGR2BGRA) if image.ndim == 3 and image.size <= _FEW_VALUES else image
             for image in images
@@ -91,14 +91,14 @@ class OnnxScorer:
             for index in jobs[job]:
                 maps[picture][index] = self._score_part(level, parts[picture][index])
 
-        # The largest first, so that the threads end together.
+        # Start the largest jobs first, so that all threads finish at about the same time.
         order = sorted(jobs, key=lambda job: -sum(parts[job[0]][i].width * parts[job[0]][i].height for i in jobs[job]))
         for _ in self.pool.map(score, order):
             pass
         return maps
 
     def _score_part(self, level: np.ndarray, part: Part) -> np.ndarray:
-        """A part's scores, every window stride. level: uint8 (H, W), or (H, W, 3) or (H, W, 4) in the order BGRA."""
+        """Return the scores of a part at every window stride. level: uint8 (H, W), (H, W, 3) BGR or (H, W, 4) BGRA."""
         stride, block_stride = self.parameters.window_stride_px, self.parameters.block_stride_px
         width, height = count_windows(part, self.parameters)
         scores = np.empty((height, width), np.float32)
@@ -110,7 +110,7 @@ class OnnxScorer:
                 high = (bottom - top - 1) * stride + self.parameters.window_height_px
                 scores[top:bottom] = self._score_part(level, replace(part, y=part.y + top * stride, height=high))
             return scores
-        # Windows whose offset is the same modulo the block stride share their blocks: these are scored together.
+        # Windows whose offsets are equal modulo the block stride share their blocks, and are scored together.
         common = math.gcd(stride, block_stride)
         phases, every = block_stride // common, stride // common
         for row in range(min(phases, height)):
@@ -123,19 +123,20 @@ class OnnxScorer:
         return scores
 
     def _score_blocks(self, histograms: np.ndarray) -> np.ndarray:
-        """Scores of the windows at every block stride."""
+        """Return the scores of the windows at every block stride."""
         _, ny, nx = histograms.shape
         down, across, _ = self.svm_feed["weights"].shape
         found = np.empty((ny - down + 1, nx - across + 1), np.float32)
-        # Each block takes as many numbers as a window has blocks: some rows at a time bound the memory.
+        # The graph stores, for each block, as many numbers as a window has blocks. Score some rows at a time to save
+        # memory.
         for top, bottom in split_evenly(len(found), max(down, _BLOCKS // nx)):
             rows = np.ascontiguousarray(histograms[:, top : bottom + down - 1])
             (found[top:bottom],) = self.sessions[1].run(None, {"histograms": rows, **self.svm_feed})
         return found
 
     def _compute_histograms(self, level: np.ndarray, part: Part) -> np.ndarray:
-        """(F, ny, nx), tile by tile."""
-        if not hasattr(self.local, "gradient"):  # one a thread
+        """Compute the block histograms (F, ny, nx) of a part, tile by tile."""
+        if not hasattr(self.local, "gradient"):  # each thread has its own object
             self.local.gradient = Gradient(self.parameters.gamma, self.parameters.signed)
         gradient: Gradient = self.local.gradient
         block, stride = self.parameters.block_px, self.parameters.block_stride_px
@@ -145,7 +146,7 @@ class OnnxScorer:
         size = self.parameters.bins * (block // self.parameters.cell_px) ** 2
         found = gradient.scratch("histograms", (size, down, across))
         for first, last in split_evenly(down, max(side, _GRADIENT_PX // (part.width + 2) // stride)):
-            # The channels of these rows alone: those of the whole would take 6 MB at 1280x720.
+            # Copy the channels of these rows only: those of the whole picture would take 6 MB at 1280x720.
             rows_px = (last - 1 - first) * stride + block
             planes = gradient.scratch("planes", (channels, rows_px + 2, part.width + 2), np.uint8)
             fill_planes(planes, level, replace(part, y=part.y + first * stride, height=rows_px))
@@ -163,12 +164,12 @@ class OnnxScorer:
 
 
 def find_graphs(parameters: PeopleParameters) -> Path:
-    """The folder of the graphs. Raises InputError where they are not those of the manifest, or of another layout."""
+    """Return the folder of the graphs. Raise InputError if they differ from the manifest or have another layout."""
     folder = SHIPPED if parameters.graphs == "shipped" else Path(parameters.graphs)
     wanted = {name: int(getattr(parameters, name)) for name in BAKED}
     settings = " ".join(f"--set people.{name}={value}" for name, value in wanted.items())
-    make = f"make such graphs with `dddas export --graph people --out FOLDER {settings}`, and give "
-    make += "people.graphs=FOLDER; or take --backend torch"
+    make = f"make matching graphs with `dddas export --graph people --out FOLDER {settings}`, and set "
+    make += "people.graphs=FOLDER; or use --backend torch"
     try:
         held = manifest(folder)["graphs"]
     except InputError as error:
@@ -185,9 +186,9 @@ def find_graphs(parameters: PeopleParameters) -> Path:
 
 
 def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
-    """Channels (C, H + 2, W + 2) of a part with one pixel more on each side.
+    """Write the channels of a part, with a border of one pixel, into planes (C, H + 2, W + 2).
 
-    That is its neighbour in the level, which is reflected beyond its own edge.
+    The border pixels come from the level, which is reflected at its own edge.
     """
     width, height = part.level
     left, top = max(0, 1 - part.x), max(0, 1 - part.y)
@@ -196,7 +197,7 @@ def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
     _, rows, columns = planes.shape
     x, y = part.x - 1 + left, part.y - 1 + top
     if max(left, right) >= columns - left - right or max(top, bottom) >= rows - top - bottom:
-        # More border than there is of the part to reflect.
+        # The border is wider than the visible part, so reflect the whole level instead.
         level = cv2.copyMakeBorder(level, top, bottom, left, right, cv2.BORDER_REFLECT_101)
         left = top = right = bottom = 0
     inside = level[y : y + rows - top - bottom, x : x + columns - left - right]
@@ -206,33 +207,36 @@ def fill_planes(planes: np.ndarray, level: np.ndarray, part: Part) -> None:
 
 
 def arrange_weights(svm: LinearSvm, parameters: PeopleParameters) -> np.ndarray:
-    """(down, across, F) weights as `functional.arrange_weights` has them.
+    """Return the weights as (down, across, F), in the order of `functional.arrange_weights`.
 
-    Raises InputError where the SVM is of another length than the descriptor.
+    Raises InputError if the length of the SVM differs from that of the descriptor.
     """
     (across, down), cells = parameters.blocks, parameters.block_px // parameters.cell_px
     if svm.weights.size != parameters.features:
         raise InputError(
             f"the classifier {svm.origin} has {svm.weights.size} weights; a window of these settings has "
-            f"{parameters.features}"
+            f"{parameters.features}; set people.* to its training layout"
         )
     weights = svm.weights.astype(np.float32).reshape(across, down, cells, cells, parameters.bins)
     return np.ascontiguousarray(weights.transpose(1, 0, 4, 3, 2)).reshape(down, across, -1)
 
 
 class Gradient:
-    """`functional.hog.gradient` and `angle` by a few passes of OpenCV, in bands that stay in the cache.
+    """Computes the gradient and the angle of HOG with OpenCV, in bands of rows that fit into the processor's cache.
 
-    It takes a quarter of the time that ONNX Runtime does for the same. One object a thread.
+    This takes a quarter of the time of the same computation in ONNX Runtime. Each thread needs an object of its own.
     """
 
     def __init__(self, gamma: bool, signed: bool) -> None:
-        """gamma: of square roots of the levels. signed: directions of a whole turn; false: folded into half of it."""
+        """Set the options. gamma: compute the gradient on the square roots of the grey levels.
+
+        signed: directions cover 360 degrees; otherwise opposite directions are equal, and directions cover 180 degrees.
+        """
         self.gamma, self.signed = gamma, signed
         self.held: dict[str, np.ndarray] = {}
 
     def scratch(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
-        """A contiguous array by its name: what it was given last, until it is asked for again."""
+        """Return a contiguous array that is reused by each call with the same name. It is not initialized."""
         size = math.prod(shape)
         held = self.held.get(name)
         if held is None or held.size < size or held.dtype != dtype:
@@ -240,9 +244,10 @@ class Gradient:
         return held[:size].reshape(shape)
 
     def __call__(self, planes: np.ndarray) -> np.ndarray:
-        """(2, H, W) float32 of planes uint8 (C, H + 2, W + 2): magnitude, and magnitude x direction in radians.
+        """Return (2, H, W) float32: the gradient's magnitude, and magnitude x direction in radians.
 
-        Valid until the next call. Of channels whose magnitudes are equal the first wins.
+        planes: (C, H + 2, W + 2) uint8. Each pixel takes the channel of largest magnitude, the first one if equal. The
+        result is valid until the next call.
         """
         height, width = planes.shape[1] - 2, planes.shape[2] - 2
         polar = self.scratch("polar", (2, height, width))
@@ -252,7 +257,7 @@ class Gradient:
 
     def _band(self, planes: np.ndarray, magnitude: np.ndarray, moment: np.ndarray) -> None:
         channels, height, width = planes.shape[0], planes.shape[1] - 2, planes.shape[2] - 2
-        # Planes stand above one another, each with its border: rows of the differences between two planes mean nothing.
+        # The planes are stacked vertically with their borders. Difference rows between two planes have no meaning.
         tall = channels * (height + 2)
         levels = self.scratch("levels", (tall, width + 2))
         dx, dy, square = (self.scratch(name, (tall - 2, width)) for name in ("dx", "dy", "square"))
@@ -264,7 +269,7 @@ class Gradient:
         best_dx, best_dy = dx[:height], dy[:height]
         if channels > 1:
             other = self.scratch("levels", square.shape)  # the levels are no longer needed
-            # Not `accumulateSquare`, which rounds but once: of channels nearly equal another would win.
+            # Do not use `accumulateSquare`: it rounds only once, so that another of nearly equal channels could win.
             cv2.add(cv2.multiply(dx, dx, dst=square), cv2.multiply(dy, dy, dst=other), dst=square)
             largest = square[:height]
             for begin in range(height + 2, tall, height + 2):

@@ -1,7 +1,7 @@
-"""Which windows of a picture are scored: the levels of its pyramid, all of them or parts of few, and where they lie.
+"""The image pyramid of the person detector: its levels, the parts of levels to search, and the windows in the parts.
 
-Levels and windows are those of OpenCV's `HOGDescriptor::detectMultiScale`, so that parts of the pyramid, asked for
-around what is expected, have the scores of a search everywhere.
+Levels and windows are those of OpenCV's `HOGDescriptor::detectMultiScale`. A search of parts of the pyramid therefore
+gives the same scores as a search of the whole pyramid.
 """
 
 import math
@@ -15,28 +15,28 @@ from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types import Float, Part
 
-# To make a pixel of a level takes so much of the time that it takes to search one (5 ms and 140 ms for 1634 x 919).
+# Time to resize a pixel of a level divided by the time to search it (5 ms and 140 ms for 1634 x 919).
 _RESIZED = 0.04
-_FEWEST_ALONG = 16  # windows in a row of a part; a row of fewer would be mostly border of what lies beside
+_FEWEST_ALONG = 16  # fewest windows along a side of a tile; smaller tiles would mostly overlap their neighbours
 
-# Counts windows of a level: (first column, first row, last column, last row).
+# A rectangle of windows of a level: (first column, first row, last column, last row).
 _Span = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
 class Level:
-    """A level of the pyramid. size: (width, height) in its own pixels. scale: picture px for one of them."""
+    """A level of the pyramid. size: (width, height) in level pixels. scale: picture pixels in one level pixel."""
 
     size: tuple[int, int]
     scale: float
 
 
 def levels(size: tuple[int, int], parameters: PeopleParameters) -> list[Level]:
-    """The levels of a picture of (width, height) px, largest first; they end where the window no longer fits.
+    """Return the pyramid levels of a picture of (width, height) px, largest first.
 
-    The picture itself is one of them, so that all that OpenCV's levels show is seen; those before it are the enlarged
-    ones. A level of the same rounded size as the one before is left out: it shows nothing new.
-    Raises InputError if not even the first holds a window.
+    The levels end where the window no longer fits. The picture at its own size is one of them, as in OpenCV; levels
+    before it are enlarged. A level with the same rounded size as the level before is left out.
+    Raises InputError if the first level is smaller than the window.
     """
     width, height = parameters.window_width_px, parameters.window_height_px
     found: list[Level] = []
@@ -57,23 +57,23 @@ def levels(size: tuple[int, int], parameters: PeopleParameters) -> list[Level]:
 
 
 def enlarged(parameters: PeopleParameters) -> float:
-    """How many times larger than the picture the first level is: whole scale steps, `people.enlarge` at most."""
+    """Return the scale of the first level: the largest power of the scale step that is at most `people.enlarge`."""
     return float(parameters.scale_step ** np.floor(np.log(parameters.enlarge) / np.log(parameters.scale_step) + 1e-9))
 
 
 def smallest_body_px(parameters: PeopleParameters) -> float:
-    """Height of the smallest body that a pyramid shows, in the picture's pixels."""
+    """Return the height, in picture pixels, of the smallest body that the detector can find."""
     return parameters.height_share * parameters.window_height_px / enlarged(parameters)
 
 
 def _padding(parameters: PeopleParameters) -> int:
-    """Of each level, in px: raised to a multiple of what windows and blocks lie on, as OpenCV does."""
+    """Return the padding of each level, px, rounded up to the common grid of windows and blocks as in OpenCV."""
     grid = math.gcd(parameters.window_stride_px, parameters.block_stride_px)
     return -(-parameters.padding_px // grid) * grid
 
 
 def everywhere(size: tuple[int, int], parameters: PeopleParameters) -> list[Part]:
-    """Every level as one part, with its padding."""
+    """Return every level as one part, with its padding."""
     pad = _padding(parameters)
     return [
         Part(level.size, -pad, -pad, level.size[0] + 2 * pad, level.size[1] + 2 * pad)
@@ -82,29 +82,29 @@ def everywhere(size: tuple[int, int], parameters: PeopleParameters) -> list[Part
 
 
 def count_windows(part: Part, parameters: PeopleParameters) -> tuple[int, int]:
-    """How many windows a part holds, across and down."""
+    """Return how many windows a part contains, across and down."""
     stride = parameters.window_stride_px
     across = max((part.width - parameters.window_width_px) // stride + 1, 0)
     return across, max((part.height - parameters.window_height_px) // stride + 1, 0)
 
 
 def cost(parts: Sequence[Part], parameters: PeopleParameters) -> int:
-    """How many windows the parts hold."""
+    """Return how many windows the parts contain."""
     return sum(math.prod(count_windows(part, parameters)) for part in parts)
 
 
 def pixels(parts: Sequence[Part]) -> float:
-    """What the parts cost to search: their pixels, and a share of each level's that any of them is on."""
+    """Return the cost of searching parts, in pixels: their own pixels, and a share of all pixels of their levels."""
     made = sum(width * height for width, height in {part.level for part in parts})
     return sum(part.width * part.height for part in parts) + _RESIZED * made
 
 
 def tiles(parts: Sequence[Part], most_px: float, parameters: PeopleParameters) -> list[Part]:
-    """The parts, cut where they have more pixels than this, but into no less than some windows along each side."""
+    """Cut parts into tiles of at most `most_px` pixels, but of at least _FEWEST_ALONG windows along each side."""
     stride, width, height = parameters.window_stride_px, parameters.window_width_px, parameters.window_height_px
 
     def along(room_px: float, window_px: int, most: int) -> int:
-        """How many windows in a row fit."""
+        """Return how many windows in a row fit into `room_px`, within _FEWEST_ALONG and `most`."""
         return min(max(int((room_px - window_px) // stride) + 1, _FEWEST_ALONG), most)
 
     cut = []
@@ -120,7 +120,7 @@ def tiles(parts: Sequence[Part], most_px: float, parameters: PeopleParameters) -
 
 
 def split_evenly(length: int, most: int) -> list[tuple[int, int]]:
-    """(begin, end) of the fewest stretches, of about equal length, that make up the whole."""
+    """Split a length into the fewest intervals (begin, end) of nearly equal length, each at most `most` long."""
     count = -(-length // most)
     return [(length * i // count, length * (i + 1) // count) for i in range(count)]
 
@@ -131,11 +131,11 @@ def within(
     size: tuple[int, int],
     parameters: PeopleParameters,
 ) -> list[Part]:
-    """The parts whose windows show a body that lies in a region: few of them, merged where they overlap.
+    """Return the parts whose windows can contain a body inside a region. Parts are merged if that saves pixels.
 
-    regions_px: x, y, width, height in the picture. heights_px: least and largest height of the body that is looked for
-    there; NaN: any that the region holds. Half a scale step more is allowed, so that there is always a level for a body
-    that the pyramid reaches. Windows stand where a search everywhere has them.
+    regions_px: x, y, width, height in the picture. heights_px: smallest and largest height of a body in the region;
+    NaN: any height that fits into the region. The heights are extended by half a scale step, so that at least one level
+    fits a body. Windows have the same positions as in a search of the whole picture.
     """
     regions_px, heights_px = np.asarray(regions_px, float).reshape(-1, 4), np.asarray(heights_px, float).reshape(-1, 2)
     slack = parameters.scale_step**0.5
@@ -145,7 +145,7 @@ def within(
     width, height = parameters.window_width_px, parameters.window_height_px
 
     def sides(span: _Span) -> tuple[int, int]:
-        """Width and height in px that the windows of a span cover."""
+        """Return the width and height in px that the windows of a span cover."""
         return (span[2] - span[0]) * stride + width, (span[3] - span[1]) * stride + height
 
     parts: list[Part] = []
@@ -154,7 +154,7 @@ def within(
         wanted = regions_px[(least <= body) & (body <= largest)]
         spans = sorted({span for region in wanted if (span := _span(region, level, parameters)) is not None})
         join = True
-        while join:  # as long as one around two costs no more than the two
+        while join:  # merge two spans while their common rectangle has no more pixels than both
             join = False
             for one, other in combinations(spans, 2):
                 both = min(one[0], other[0]), min(one[1], other[1]), max(one[2], other[2]), max(one[3], other[3])
@@ -167,13 +167,13 @@ def within(
 
 
 def _span(region: np.ndarray, level: Level, parameters: PeopleParameters) -> _Span | None:
-    """The windows whose body lies in the region, and the next ones outwards; None where the region is off the level."""
+    """Return the span of windows whose body lies in the region, rounded outwards; None outside the level."""
     width, height, stride = parameters.window_width_px, parameters.window_height_px, parameters.window_stride_px
     side = (1 - parameters.width_share) / 2 * width
     above, below = (parameters.feet_share - parameters.height_share) * height, (1 - parameters.feet_share) * height
     low = region[:2] / level.scale - (side, above)
     high = (region[:2] + region[2:]) / level.scale + (side, below) - (width, height)
-    high = np.maximum(low, high)  # a region smaller than the body still has the window that begins with it
+    high = np.maximum(low, high)  # a region smaller than the body still has the window at its start
     pad = _padding(parameters)
     last = (np.array(level.size) + 2 * pad - (width, height)) // stride
     begin = np.floor((low + pad) / stride).astype(int)
@@ -187,9 +187,10 @@ def _span(region: np.ndarray, level: Level, parameters: PeopleParameters) -> _Sp
 def windows(
     parts: Sequence[Part], maps: Sequence[np.ndarray], size: tuple[int, int], parameters: PeopleParameters
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The windows that score the threshold or more, each once: x, y, width, height in the picture (N, 4), scores (N,).
+    """Return the windows with a score of at least the threshold, (N, 4) x, y, width, height in the picture, and scores.
 
-    maps: (ny, nx) scores of each part. With OpenCV's grouping the windows are rounded to whole pixels, as there.
+    maps: (ny, nx) scores of each part. Windows that lie in several parts are returned once. With
+    `suppression = "opencv"` windows are rounded to whole pixels, as in OpenCV.
     """
     scale_of = {level.size: level.scale for level in levels(size, parameters)}
     stride, window = parameters.window_stride_px, np.array([parameters.window_width_px, parameters.window_height_px])
@@ -200,7 +201,7 @@ def windows(
         box = np.concatenate([place, np.broadcast_to(window, place.shape)], axis=1)
         if parameters.suppression == "opencv":
             boxes.append(np.rint(box * scale_of[part.level]))
-        else:  # the level's pixels are not exactly `scale` of the picture's, as its size was rounded
+        else:  # the level's size was rounded, so its exact scale differs from `scale`
             across, down = size[0] / part.level[0], size[1] / part.level[1]
             boxes.append(box * (across, down, across, down))
         scores.append(scored[row, column].astype(np.float64))

@@ -1,8 +1,8 @@
-"""Where people are searched in a frame: everywhere, around those seen before, around what moves; the feedback rule.
+"""Plan where to search for people in a frame: everywhere, around expected people, or around moving targets.
 
-The surroundings of expected people are searched in every frame, the rest of the picture a few levels at a time. A
-person scores at several neighbouring levels, and is found at the first of them: so a tenth of the levels in each frame
-finds newcomers sooner than all levels in each tenth frame.
+The surroundings of expected people are searched in every frame, and the rest of the picture a few levels at a time. A
+person scores at several neighbouring levels and is found as soon as one of them is searched. A search of a tenth of the
+levels in each frame therefore finds new people sooner than a search of all levels in every tenth frame.
 """
 
 import math
@@ -17,28 +17,30 @@ from torchvision_dddas.people import pyramid
 from torchvision_dddas.types import Adjustment, Float, Part, People
 
 Regions = tuple[np.ndarray, np.ndarray]
-"""region_px (R, 4), which a body must lie in; heights_px (R, 2), its least and largest height."""
+"""(region_px, heights_px): (R, 4) boxes that must contain a body, and (R, 2) its smallest and largest height."""
 
-# What a blob says of a body, in blob heights: it may be a group, or the legs alone, whose body is above them.
+# Range of the body height, and margins of the search region, in blob heights. A blob may be a group, or only the legs
+# of a body.
 _BLOB_HEIGHTS = (0.5, 2.5)
 _ABOVE, _BELOW, _BESIDE = 1.5, 0.5, 0.35
-_EXPLAINED = 0.5  # a blob of which those expected cover this share is theirs
+_EXPLAINED = 0.5  # a blob is not searched if expected people cover at least this share of it
 
-# Of the difference between where a person was expected and found, so much goes into place and size, and velocity.
-# Windows stand on a grid of 0.08 body heights: two looks alone would say little of a velocity.
+# Gains of the filter: shares of the innovation that correct position and size, and velocity. Windows lie on a grid of
+# 0.08 body heights, so two looks alone determine a velocity poorly.
 _PLACE_GAIN, _VELOCITY_GAIN = 0.6, 0.2
-_NEAR_HEIGHTS = 0.5  # a person expected no further from one that is found may be this one
+_NEAR_HEIGHTS = 0.5  # gate: largest distance between an expected and a found person, in body heights
 
-_DEAR = 0.8  # regions that cost more than this share of a whole look are not worth their name
-_CHANGED, _LITTLE = 2.0, 0.02  # a share that grew or shrank by this factor is worth a line; less than that is none
-_TURN = 0.382  # levels that have their turn in frames after one another are so far apart, as a share of the round
+_DEAR = 0.8  # if regions cost more than this share of a whole search, the whole picture is searched
+_CHANGED, _LITTLE = 2.0, 0.02  # a change of the share by this factor is recorded; smaller shares count as _LITTLE
+_TURN = 0.382  # distance between the levels searched in successive frames, as a share of all levels
 
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """The parts of a frame to search. regions_px: (R, 4), beside the levels whose turn it is; None: everywhere.
+    """The parts of a frame to search.
 
-    share: of all windows that are searched.
+    regions_px: (R, 4) regions that are searched in addition to the levels whose turn it is; None: the whole picture.
+    share: share of all windows that are searched.
     """
 
     parts: list[Part]
@@ -48,15 +50,16 @@ class SearchPlan:
 
 
 def _grown(box_px: Float[np.ndarray, "N 4"], beside: float, above: float, below: float) -> Float[np.ndarray, "N 4"]:
-    """Boxes with margins, in their heights."""
+    """Return boxes with margins, which are given in box heights."""
     return box_px + box_px[:, 3:] * np.array([-beside, -above, 2 * beside, above + below])
 
 
 class ExpectedPeople:
-    """Predicts where people are, from where they were found and their velocity.
+    """Predicts the positions of people from earlier positions and velocities.
 
-    A person who is not found stays expected for four times as many frames as they were found in, at most twice
-    `rescan_frames`: a person who was missed comes back, and a false alarm of one frame is soon forgotten.
+    A person who is not found stays expected for four times the number of frames in which they were found, at most for
+    twice `rescan_frames`. A person who was missed is thus searched again, and a false alarm of one frame is soon
+    dropped.
     """
 
     def __init__(self, parameters: PeopleParameters) -> None:
@@ -72,17 +75,17 @@ class ExpectedPeople:
         return len(self.found)
 
     def box_px(self, frame: int) -> np.ndarray:
-        """(N, 4) boxes at a frame."""
+        """Return the (N, 4) predicted boxes at a frame."""
         place = self.place_px + self.velocity_px * (frame - self.frame)
         return np.concatenate([place - self.size_px / 2, self.size_px], axis=1)
 
     def regions(self, frame: int) -> Regions:
-        """Around them."""
+        """Return the search regions around the predicted boxes."""
         box_px, scales = self.box_px(frame), self.parameters.region_scales
         return _grown(box_px, *[self.parameters.region_margin] * 3), box_px[:, 3:] * (1 / scales, scales)
 
     def update(self, frame: int, people: People) -> int:
-        """Correct by the people found; returns how many of those expected are among them."""
+        """Correct the predictions by the people found, and return how many expected people were found."""
         steps = max(frame - self.frame, 1)
         box_px = self.box_px(frame)
         place, size = people.box_px[:, :2] + people.box_px[:, 2:] / 2, people.box_px[:, 2:]
@@ -106,9 +109,9 @@ class ExpectedPeople:
 
 
 def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the expected and of the found boxes that are the same person: the nearest first, none beyond the gate.
+    """Pair expected and found boxes greedily, the nearest first, within the gate; return the rows of both.
 
-    SciPy would find the pairs that are nearest in all, and take 40 MB to be imported.
+    An optimal assignment would need SciPy, whose import takes 40 MB.
     """
     apart = expected_px[:, None, :2] + expected_px[:, None, 2:] / 2 - found_px[:, :2] - found_px[:, 2:] / 2
     height = expected_px[:, None, 3]
@@ -125,13 +128,14 @@ def _pairs(expected_px: np.ndarray, found_px: np.ndarray, scales: float) -> tupl
 
 
 class Search:
-    """Plans where to search frame after frame; `update` takes what was found by each plan.
+    """Plans where to search in each frame. Pass the people found by each plan to `update`.
 
-    `people.search = everywhere`: the whole picture. `regions`: around those expected, and the whole picture level by
-    level in `rescan_frames` frames; all of it in one look at first, and when all who were expected are lost, as after
-    a cut. With `people.look_share` below 1 no look takes more windows: then also these come in turns, levels in bands.
-    blobs: (N, 4) boxes of a frame's movers. With `everywhere` only their surroundings are then looked at; with
-    `regions` those too, where no one expected explains them.
+    With `people.search = everywhere` the plan is the whole picture, or, with blobs, only their surroundings. With
+    `regions` the plan is the surroundings of expected people, the surroundings of blobs that no expected person covers,
+    and some levels of the whole picture, so that all levels are searched once in `rescan_frames` frames. The whole
+    picture is searched in the first frame, and when all expected people are lost, as after a cut. With
+    `people.look_share` below 1 no frame costs more than this share of a whole search: regions and bands of levels are
+    then also searched in turns. blobs: returns the (N, 4) boxes of a frame's moving targets.
     """
 
     def __init__(self, parameters: PeopleParameters, blobs: Callable[[int], np.ndarray] | None = None) -> None:
@@ -140,26 +144,27 @@ class Search:
         self.expected = ExpectedPeople(parameters)
         self.plans = 0
         self.retune(parameters)
-        self.there = 0  # people whom the last look found
-        self.lost = 0  # how many the look before it had found, where it found none of them
-        self.reported = 1.0  # share of windows in the last line of the record
+        self.there = 0  # number of people found in the last frame
+        self.lost = 0  # number of people found in the frame before, if the last frame found none of them, else 0
+        self.reported = 1.0  # share of windows in the last recorded adjustment
 
     def retune(self, parameters: PeopleParameters) -> None:
-        """Search as these say from the next look on; whether in regions or everywhere stays as it was."""
+        """Use these parameters from the next frame on. The choice between regions and everywhere stays unchanged."""
         self.parameters = self.expected.parameters = parameters
 
     def update(self, frame: int, people: People, plan: SearchPlan) -> None:
-        """Add what was found by a plan."""
+        """Add the people found by a plan."""
         self.plans += 1
         if not self.steered:
             return
         again = self.expected.update(frame, people)
-        # One alone is often missed for a frame, and after a look that found nobody none is new.
+        # A single person is often missed for one frame, so only the loss of several people triggers a whole search. A
+        # whole search that finds nobody is not repeated.
         self.lost = self.there if self.there > 1 and not again and plan.regions_px is not None else 0
         self.there = len(people)
 
     def plan(self, frame: int, size: tuple[int, int]) -> SearchPlan:
-        """Where to search a frame of (width, height)."""
+        """Return where to search in a frame of (width, height)."""
         parameters = self.parameters
         everywhere = pyramid.everywhere(size, parameters)
         is_bound = parameters.look_share < 1
@@ -174,8 +179,8 @@ class Search:
         region_px, heights_px = (np.concatenate(parts) for parts in zip(*regions, strict=True))
         all_windows = pyramid.cost(everywhere, parameters)
         if self.steered and is_bound:
-            # A look that costs `people.look_share` of one at all: what is due, around those expected, around movers.
-            # Half of what it may take is for the rest of the picture.
+            # The cost is limited to `people.look_share` of a whole search. Half of the limit is for the levels whose
+            # turn it is; the rest is for the surroundings of expected people, and then of moving targets.
             whole = pyramid.pixels(everywhere)
             most = parameters.look_share * whole
             tiles = pyramid.tiles(everywhere, most / 2, parameters)
@@ -192,7 +197,7 @@ class Search:
             if not self.steered:
                 return SearchPlan(parts, region_px, around)
             if around > _DEAR:
-                why = f"{len(region_px)} regions would take {around:.0%} of the windows"
+                why = f"{len(region_px)} regions would need {around:.0%} of the windows"
                 return self._whole(frame, everywhere, why)
             due = self._due(everywhere, parameters.rescan_frames)
             levels = {part.level for part in due}
@@ -201,23 +206,23 @@ class Search:
         return SearchPlan(parts, region_px, share, self._report(frame, around))
 
     def _regions(self, frame: int) -> tuple[Regions, Regions]:
-        """Around those expected, and around what moves: bodies from half to 2.5 times as high as a blob."""
+        """Return the regions around expected people, and those around blobs that expected people do not cover."""
         known = moving = np.zeros((0, 4)), np.zeros((0, 2))
         if self.steered:
             known = self.expected.regions(frame)
         if self.blobs is not None:
             box_px = np.asarray(self.blobs(frame), float).reshape(-1, 4)
             if self.steered:
-                # Of each blob the share that those expected cover, those that overlap counted twice.
+                # Area of each blob that expected people cover. Overlaps of expected people count twice.
                 covered = shared_px(box_px[:, None], self.expected.box_px(frame)).sum(axis=1)
                 box_px = box_px[covered / box_px[:, 2:].prod(axis=1) < _EXPLAINED]
             moving = _grown(box_px, _BESIDE, _ABOVE, _BELOW), box_px[:, 3:] * _BLOB_HEIGHTS
         return known, moving
 
     def _thinned(self, parts: list[Part], most_px: float) -> list[Part]:
-        """Those on every so many-th level, others in each look, so that they cost about so much; on one at least.
+        """Return the parts on every k-th level, in turns, so that they cost about `most_px`; on one level at least.
 
-        A body scores at several levels that lie together.
+        This loses few people, because a body scores at several neighbouring levels.
         """
         levels = sorted({part.level for part in parts})
         every = min(math.ceil(pyramid.pixels(parts) / max(most_px, 1)), len(levels))
@@ -225,22 +230,22 @@ class Search:
         return [part for part in parts if part.level in due]
 
     def _due(self, parts: list[Part], rounds: int) -> list[Part]:
-        """Those whose turn it is: each comes once in so many looks, far from those before."""
+        """Return the parts whose turn it is: each once in `rounds` frames, far from the parts of the last frame."""
         step = min((k for k in range(1, rounds + 1) if math.gcd(k, rounds) == 1), key=lambda k: abs(k - _TURN * rounds))
         return parts[self.plans * step % rounds :: rounds]
 
     def _whole(self, frame: int, everywhere: list[Part], why: str) -> SearchPlan:
-        """A look at all, which the record explains."""
+        """Return the plan to search the whole picture, and record the reason."""
         old, self.reported = self.reported, 1.0
         moved = (Adjustment(frame, "people.regions_share", old, 1.0, why),) if old != 1.0 else ()
         return SearchPlan(everywhere, None, 1.0, moved)
 
     def _report(self, frame: int, share: float) -> tuple[Adjustment, ...]:
-        """A line of the record, where the share of windows in regions has changed much since the last one."""
+        """Record the share of windows in regions if it has changed much since the last record."""
         low, high = sorted((max(share, _LITTLE), max(self.reported, _LITTLE)))
         if high < _CHANGED * low:
             return ()
-        why = f"{_persons(len(self.expected))} expected" + ("" if self.blobs is None else ", and what moves")
+        why = f"{_persons(len(self.expected))} expected" + ("" if self.blobs is None else ", and moving targets")
         old, self.reported = self.reported, round(share, 4)
         return (Adjustment(frame, "people.regions_share", old, self.reported, why),)
 

@@ -1,4 +1,4 @@
-"""From windows that score to people: non-maximum suppression, one body box a person, and its probability."""
+"""Turn scored windows into people: suppress overlapping windows, and compute a body box and a probability each."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ from torchvision_dddas.config import PeopleParameters
 from torchvision_dddas.geometry import shared_px
 from torchvision_dddas.types import Float, Int, People
 
-# A little below one: whatever the rounding, a box inside another shares no more than all of itself.
+# A factor slightly below 1, so that rounding never makes the shared area larger than the smaller box.
 _WHOLE = 1 - 1e-9
-# A body nearer to the picture's border, in its own heights, may be cut by it: twice the error of foot rows.
+# A body closer than this to the picture's border, in body heights, may be cut by it: twice the error of foot rows.
 _NEAR = 0.05
 
 
@@ -18,12 +18,12 @@ def people_from_windows(
     size: tuple[int, int],
     parameters: PeopleParameters,
 ) -> People:
-    """The people that windows show, best first. size: (width, height) of the picture."""
+    """Return the people that windows show, the best score first. size: (width, height) of the picture."""
     window_px, margin = np.asarray(window_px, float).reshape(-1, 4), np.asarray(margin, float)
     if parameters.suppression == "nms":
         boxes = body_boxes(window_px, parameters)
         kept = non_maximum_suppression(boxes, margin, parameters.overlap, parameters.contained)
-        # The best windows are placed best: the cube leaves little weight to those just above the threshold.
+        # Windows with high scores are the most accurate. The cube gives little weight to scores near the threshold.
         window_px = refine_boxes(window_px, (margin - parameters.threshold) ** 3, kept, parameters.settle)
         margin = margin[kept]
     else:
@@ -36,20 +36,20 @@ def people_from_windows(
 
 
 def body_boxes(window_px: Float[np.ndarray, "N 4"], parameters: PeopleParameters) -> Float[np.ndarray, "N 4"]:
-    """The body's box in each window, by ratios that were calibrated on true boxes."""
+    """Return the body's box in each window, by ratios that were calibrated on true boxes."""
     x, y, width, height = window_px.T
     wide, tall = parameters.width_share * width, parameters.height_share * height
     return np.stack([x + (width - wide) / 2, y + parameters.feet_share * height - tall, wide, tall], axis=1)
 
 
 def probability(margin: Float[np.ndarray, " N"], parameters: PeopleParameters) -> Float[np.ndarray, " N"]:
-    """Probability that a window of this score shows a person (Platt scaling)."""
+    """Return the probability that a window with this score shows a person (Platt scaling)."""
     odds = parameters.probability_slope * (margin - parameters.probability_even)
     return 1 / (1 + np.exp(-np.clip(odds, -50, 50)))
 
 
 def is_cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarray:
-    """(N,) bool: the picture's border cuts the body, or comes so near that it may."""
+    """Return (N,) bool: whether the picture's border cuts the body, or is so near that it may."""
     near = _NEAR * box_px[:, 3:]
     low, high = box_px[:, :2], box_px[:, :2] + box_px[:, 2:]
     return (low < near).any(axis=1) | (high > np.array(size) - near).any(axis=1)
@@ -58,10 +58,10 @@ def is_cut(box_px: Float[np.ndarray, "N 4"], size: tuple[int, int]) -> np.ndarra
 def non_maximum_suppression(
     box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], overlap: float, contained: float = 1.0
 ) -> Int[np.ndarray, " K"]:
-    """Rows of the boxes that are kept, best first; of equal scores the first row.
+    """Return the rows of the boxes to keep, best score first, and by row for equal scores.
 
-    A box is dropped if a better kept one shares more than `overlap` of their union with it, or more than `contained` of
-    the smaller of the two: legs and heads score as small people inside the box of the whole person.
+    A box is dropped if its IoU with a better kept box exceeds `overlap`, or if both share more than `contained` of the
+    smaller box. The second rule is needed because legs and heads score as small people inside the box of a person.
     """
     order = np.argsort(-np.asarray(score, float), kind="stable")
     box = np.asarray(box_px, float).reshape(-1, 4)[order]
@@ -85,10 +85,11 @@ def refine_boxes(
     kept: Int[np.ndarray, " K"],
     overlap: float,
 ) -> Float[np.ndarray, "K 4"]:
-    """The kept boxes, each moved to the weighted mean of all those that share `overlap` of the union with it, or more.
+    """Return the kept boxes, each replaced by the weighted mean of all boxes whose IoU with it is at least `overlap`.
 
-    Windows stand on a grid, 6 % of their height and a step of scale apart; a person's is between several that score.
-    Centres are averaged, and logarithms of sizes. A kept box without weight stays where it is.
+    Windows lie on a grid with steps of 6 % of their height and of one scale; the best window of a person lies between
+    several grid positions. The mean is taken over centres and logarithms of sizes. A kept box whose weights are all 0
+    stays unchanged.
     """
     box_px, weight = np.asarray(box_px, float).reshape(-1, 4), np.asarray(weight, float)
     area = box_px[:, 2:].prod(axis=1)
@@ -107,12 +108,12 @@ def refine_boxes(
 def group_rectangles(
     box_px: Float[np.ndarray, "N 4"], score: Float[np.ndarray, " N"], least: int, distance: float = 0.2
 ) -> tuple[Float[np.ndarray, "G 4"], Float[np.ndarray, " G"]]:
-    """OpenCV's grouping of HOG detections: means of boxes that are alike, in whole pixels, and their best score.
+    """Group HOG detections like OpenCV, and return the mean box of each group, in whole pixels, and its best score.
 
-    box_px: whole numbers. least: groups of no more boxes are dropped; 0 leaves everything as it is. distance: boxes are
-    alike whose four edges differ by no more than this share of the mean of their smaller width and height; so are those
-    that a chain of such boxes links. A group inside another, which is larger and of more than three boxes, or itself of
-    less than three, is dropped.
+    box_px: whole numbers. least: drop groups of at most this many boxes; 0 returns the input unchanged. distance: two
+    boxes are alike if each of their four edges differs by at most this share of the mean of the smaller width and the
+    smaller height. Chains of alike boxes form a group. A group inside another group is dropped if the other has more
+    boxes and more than three, or if it has itself less than three boxes.
     Source: OpenCV, HOGDescriptor::groupRectangles (modules/objdetect, hog.cpp); detectMultiScale uses distance 0.2.
     """
     box_px, score = np.asarray(box_px, float), np.asarray(score, float)
@@ -139,17 +140,17 @@ def group_rectangles(
 
 
 def _alike(box_px: np.ndarray, distance: float, rows: int = 64) -> np.ndarray:
-    """(N,) the group of each box, numbered as they first appear."""
-    from scipy.sparse import coo_array  # here, as it takes 40 MB, and only OpenCV's grouping needs it
+    """Return the (N,) group numbers of boxes, in the order in which the groups first appear."""
+    from scipy.sparse import coo_array  # imported here because it takes 40 MB and only OpenCV's grouping needs it
     from scipy.sparse.csgraph import connected_components
 
     order = np.argsort(box_px[:, 3], kind="stable")
     box = box_px[order]
     low, high, height, around = box[:, :2], box[:, :2] + box[:, 2:], box[:, 3], box[:, 2:].sum(axis=1)
-    # Top and bottom both near: no box is alike that is taller by more than twice what an edge may be off.
+    # Alike boxes differ in height by at most twice the tolerance of an edge, which limits the pairs to compare.
     ends = np.searchsorted(height, height + distance * around, side="right")
     one, two = [], []
-    for start in range(0, len(box), rows):  # strips of the table of pairs, which may be large
+    for start in range(0, len(box), rows):  # process the table of pairs in strips, because it may be large
         here = slice(start, start + rows)
         others = slice(start, int(ends[here].max()))
         size = np.minimum(box[here, None, 2:], box[None, others, 2:])

@@ -1,4 +1,4 @@
-"""Scores of windows by `nn.PersonScorer`: batched over pictures of one size, differentiable, on a CPU or GPU."""
+"""Score windows by `nn.PersonScorer`: batched over pictures of equal size, differentiable, on a CPU or GPU."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from torchvision_dddas.people.pyramid import count_windows
 from torchvision_dddas.runtime import torch_device
 from torchvision_dddas.types import LinearSvm, Part
 
-# So many pixels of parts at once: about 150 bytes a pixel, and larger temporaries cost page faults on a CPU.
+# Pixels of parts that are scored at once, about 150 bytes a pixel. On a CPU larger temporaries cause page faults.
 _PIXELS = {"cpu": 1 << 18, "cuda": 1 << 24}
 
 
@@ -27,9 +27,9 @@ class TorchScorer:
     name = "torch"
 
     def __init__(self, parameters: PeopleParameters, svm: LinearSvm, device: str | torch.device | None = None) -> None:
-        """device: by default the GPU where there is one.
+        """Load the scorer. device: by default the GPU if there is one.
 
-        Raises InputError where cells, blocks and window do not fit one another, or the SVM is of another length.
+        Raises InputError if cells, blocks and window do not fit together, or if the SVM has another length.
         """
         self.parameters, self.svm = parameters, svm
         self.device = torch.device(device or torch_device())
@@ -37,13 +37,15 @@ class TorchScorer:
         if svm.weights.size != self.layout.features:
             raise InputError(
                 f"the classifier {svm.origin} has {svm.weights.size} weights; "
-                f"a window of these settings has {self.layout.features}"
+                f"a window of these settings has {self.layout.features}; set people.* to its training layout"
             )
         weights = torch.from_numpy(np.array(svm.weights, np.float32))
-        self.model = PersonScorer(weights, float(svm.bias), self.layout, parameters.window_stride_px).to(self.device)
+        self.model = PersonScorer(
+            weights, float(svm.bias), layout=self.layout, window_stride_px=parameters.window_stride_px
+        ).to(self.device)
 
     def scores(self, images: Sequence[np.ndarray], parts: Sequence[Sequence[Part]]) -> list[list[np.ndarray]]:
-        """The score map of each part of each picture. Pictures of one size that want the same part share a batch."""
+        """Return the score map of each part of each picture. Pictures of equal size and part share a batch."""
         maps = [
             [np.zeros(count_windows(part, self.parameters)[::-1], np.float32) for part in wanted] for wanted in parts
         ]
@@ -53,9 +55,9 @@ class TorchScorer:
                 if maps[picture][index].size:
                     places[images[picture].shape, part].append((picture, index))
 
-        @cache  # a picture goes to the device once, for all its parts
+        @cache  # copy a picture to the device once, for all its parts
         def levels(picture: int) -> Tensor:
-            # A copy: torch warns of memory that must not be written to.
+            # Make a copy, because torch warns about read-only memory.
             channels = torch.tensor(np.ascontiguousarray(np.atleast_3d(images[picture])))
             return channels.to(self.device).permute(2, 0, 1).float().contiguous()
 
@@ -70,9 +72,9 @@ class TorchScorer:
         return maps
 
     def score(self, levels: Tensor, part: Part) -> Tensor:
-        """(B, ny, nx) scores of one part of pictures of one size, with gradients to their levels and to the weights.
+        """Return the (B, ny, nx) scores of one part in pictures of equal size.
 
-        levels: (B, C, H, W) floats 0 .. 255, BGR.
+        levels: (B, C, H, W) floats 0 .. 255, BGR. Gradients reach the levels and the weights.
         """
         width, height = part.level
         rows = F.reflect_index(torch.arange(part.y - 1, part.y + part.height + 1, device=levels.device), height)
@@ -81,6 +83,6 @@ class TorchScorer:
 
 
 def layout(parameters: PeopleParameters) -> F.Layout:
-    """The descriptor of the settings. Raises InputError where they do not fit one another."""
+    """Return the descriptor layout of the settings. Raises InputError if its parameters do not fit together."""
     values: dict[str, Any] = parameters.descriptor
     return F.Layout(**values)

@@ -1,5 +1,6 @@
-"""A run: put together by `assemble...`, run over a clip by `Pipeline`."""
+"""Runs: `assemble...` builds their parts, and `Pipeline` processes a clip."""
 
+from torchvision_dddas.pipeline import advice
 from torchvision_dddas.pipeline.assembly import (
     AerialInput,
     Assembly,
@@ -9,20 +10,28 @@ from torchvision_dddas.pipeline.assembly import (
     clip_notes,
     locator_facts,
     map_site,
+    note_uncovered,
+    prepare_detection,
     read_locator,
 )
-from torchvision_dddas.pipeline.pipeline import Clip, Pipeline
+from torchvision_dddas.pipeline.further_uavs import open_uav, prepare_uav
+from torchvision_dddas.pipeline.pipeline import ClipSource, Pipeline
 
 __all__ = [
     "AerialInput",
     "Assembly",
-    "Clip",
+    "ClipSource",
     "Pipeline",
+    "advice",
     "assemble",
     "assemble_files",
     "assemble_mission",
     "clip_notes",
     "locator_facts",
     "map_site",
+    "note_uncovered",
+    "open_uav",
+    "prepare_detection",
+    "prepare_uav",
     "read_locator",
 ]

@@ -1,11 +1,12 @@
-"""Puts a run together: settings, engine, telemetry, camera, landmarks, elevation and colours, before the first picture.
+"""Assemble a run before the first picture: settings, engine, telemetry, camera, landmarks, elevation and colours.
 
-`assemble` takes records, as `Pipeline` is given them. `assemble_files` reads the files that `dddas run` takes beside
-the pictures; `read_locator` those of `dddas locate`. `assemble_mission` closes the loop around a source that can be
-steered. Commands, live runs, studies, the simulator and tuning all use these.
+`assemble` takes records, as given to `Pipeline`. `assemble_files` reads the files that `dddas run` takes beside
+the pictures; `read_locator` reads those of `dddas locate`. `assemble_mission` closes the loop around a source that can
+be steered. Commands, live runs, studies, the simulator and tuning all use these functions.
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -37,9 +38,9 @@ from torchvision_dddas.io.elevation import read_elevation, read_ortho
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.images import read_ignored
 from torchvision_dddas.io.joined_clips import JoinedSource
-from torchvision_dddas.io.output import NONE_LOCATED, Site
+from torchvision_dddas.io.output import NONE_LOCATED, MapSite
 from torchvision_dddas.io.telemetry import read_telemetry
-from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Source, Telemetry
+from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Scene, Source, Telemetry
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class AerialInput:
 
     @property
     def files(self) -> list[Path]:
-        """All that are given."""
+        """All files that are given."""
         return [file for file in vars(self).values() if file is not None]
 
     @property
@@ -67,10 +68,10 @@ class AerialInput:
 
 @dataclass(frozen=True)
 class Assembly:
-    """The parts of a run beside its pictures.
+    """The parts of a run, without its pictures.
 
-    settings: with the camera's focal length, where that is known. telemetry: None without a log. watch: None if nothing
-    is located; notes say why. mission: steers a source that can be steered. notes: what the user should know.
+    settings: with the camera's focal length, if it is known. telemetry: None without a log. watch: None if nothing
+    is located; notes say why. mission: steers a source that can be steered. notes: notes for the user.
     """
 
     settings: Settings
@@ -92,14 +93,21 @@ def assemble(
     colours: Colours | None = None,
     elevation: Elevation | None = None,
 ) -> Assembly:
-    """A run of records; nothing is located without landmarks or telemetry with places.
+    """Assemble a run from records; nothing is located without landmarks or telemetry with places.
 
-    Raises InputError as AerialLocator, and for landmarks that cannot be found.
+    Raise InputError as AerialLocator does, and for landmarks that cannot be found.
     """
     if landmarks is None and not has_places(telemetry):
         return Assembly(settings, load_engine(backend, settings), telemetry)
     locator = AerialLocator(
-        camera, telemetry, landmarks, elevation, settings, rate_hz=rate_hz, backend=backend, size_px=size_px
+        camera,
+        telemetry,
+        landmarks,
+        elevation=elevation,
+        settings=settings,
+        rate_hz=rate_hz,
+        backend=backend,
+        size_px=size_px,
     )
     if landmarks is not None:
         check_colours(landmarks, colours, telemetry is not None and settings.aerial.mode == "pose")
@@ -110,12 +118,12 @@ def _with_locator(
     locator: AerialLocator, colours: Colours | None, settings: Settings, backend: str, notes: list[str]
 ) -> Assembly:
     settings, more = with_focal_length(settings, locator)
-    watch, engine = LandmarkWatch(locator, colours, backend), load_engine(backend, settings)
+    watch, engine = LandmarkWatch(locator, colours), load_engine(backend, settings)
     return Assembly(settings, engine, locator.site.telemetry, watch, notes=[*notes, *more])
 
 
 def assemble_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool) -> Assembly:
-    """The closed loop around a source whose first frame has been read. Raises InputError as `build_mission`."""
+    """Assemble the closed loop around a source whose first frame was read. Raise InputError as `build_mission`."""
     mission = build_mission(source, settings, backend, by_landmarks)
     return Assembly(mission.settings, load_engine(backend, mission.settings), None, mission.watch, mission)
 
@@ -128,11 +136,11 @@ def assemble_files(
     backend: str,
     clip: str,
 ) -> Assembly:
-    """A run of the files beside a clip. given: None if nothing is located. Raises InputError for bad input."""
+    """Assemble a run from the files beside a clip. given: None: locate nothing. Raise InputError for bad input."""
     flight, of = None, source if isinstance(source, JoinedSource) else clip
     reason = "neither --telemetry nor --landmarks were given"
     if given is not None and given.landmarks is None:
-        flight, reason = _read_flight(given, settings, of)
+        flight, reason = _read_flight(given, settings, of, source.rate_hz)
     if given is not None and not (given.landmarks is None and reason):
         colours = read_colours(given.colours) if given.colours is not None else None
         frames = None if source.count is None else (1, source.count)
@@ -144,25 +152,20 @@ def assemble_files(
             check_colours(landmarks, colours, locator.site.telemetry is not None and settings.aerial.mode == "pose")
         if colours is not None and (bare := [n for n in landmarks.names if n not in colours.names]):
             notes.append(f"no colour is given for {', '.join(bare)}: not looked for in the pictures")
-        if getattr(source, "assumes_rate", False):
-            notes.append(
-                f"no frame rate is known: {source.rate_hz:g} frames a second are assumed, by which frames meet the log "
-                "and speeds are measured; --rate tells another"
-            )
-        return _with_locator(locator, colours, settings, backend, notes)
+        return _with_locator(locator, colours, settings, backend, notes + _rate_notes(source))
     if flight is None and telemetry is not None:
-        flight = _read_telemetry(telemetry, settings, of)
+        flight = _read_telemetry(telemetry, settings, of, source.rate_hz)
     if given is not None:
         _check_unused(given, source.size)
     settings, more = with_logged_focal(settings, flight, source.size)
-    notes = [*(flight.notes if flight is not None else ()), *more, f"{NONE_LOCATED}{reason}"]
+    notes = [*(flight.notes if flight is not None else ()), *more, *_rate_notes(source), f"{NONE_LOCATED}{reason}"]
     return Assembly(settings, load_engine(backend, settings), flight, notes=notes)
 
 
 def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Settings, list[str]]:
-    """Set gates.focal_px from telemetry, else from the camera, given telemetry, unless it is set.
+    """Set gates.focal_px from telemetry, or from the camera if there is telemetry, unless the user has set it.
 
-    Returns settings and notes.
+    Return settings and notes.
     """
     telemetry, camera = locator.site.telemetry, locator.camera
     settings, notes = with_logged_focal(settings, telemetry, camera.size_px)
@@ -171,24 +174,24 @@ def with_focal_length(settings: Settings, locator: AerialLocator) -> tuple[Setti
     focal = camera.focal_px[0]
     note = f"gates.focal_px is the camera's {focal:.0f} px, so that sizes in metres hold"
     if not locator.focal_known:
-        note = f"gates.focal_px is {focal:.0f} px by a guess: sizes in metres may be off by as much as the lens is"
+        note = f"gates.focal_px is guessed as {focal:.0f} px: sizes in metres are as uncertain as this focal length"
     return with_parameters(settings, {"gates.focal_px": focal}), [note]
 
 
 def _check_unused(given: AerialInput, size: tuple[int, int]) -> None:
-    """Raises InputError for a file that is wrong also where nothing can be located with it."""
+    """Raise InputError for a faulty file, even if nothing can be located with it."""
     if given.camera is not None:
         read_aerial_camera(given.camera, size)
     for path in (given.dem, given.background):
         if path is not None and not path.is_file():
-            raise InputError(f"{path} is no file; wanted a GeoTIFF")
+            raise InputError(f"{path} is not a file; give a GeoTIFF")
 
 
 def _read_flight(
-    given: AerialInput, settings: Settings, clip: str | JoinedSource | None
+    given: AerialInput, settings: Settings, clip: str | JoinedSource | None, rate_hz: float
 ) -> tuple[Telemetry | None, str]:
-    """The telemetry of a run without landmarks, and why it cannot locate anything; "" where it may."""
-    flight = None if given.telemetry is None else _read_telemetry(given.telemetry, settings, clip)
+    """Return the telemetry of a run without landmarks, and why it cannot locate anything; "" if it may."""
+    flight = None if given.telemetry is None else _read_telemetry(given.telemetry, settings, clip, rate_hz)
     if not has_places(flight):
         return flight, describe_no_place(flight)
     try:
@@ -198,17 +201,57 @@ def _read_flight(
     return flight, ""
 
 
-def _read_telemetry(path: Path, settings: Settings, clip: str | JoinedSource | None) -> Telemetry:
+def _read_telemetry(
+    path: Path, settings: Settings, clip: str | JoinedSource | None, rate_hz: float | None
+) -> Telemetry:
     aerial = settings.aerial
 
     def read(path: Path, clip: str | None) -> Telemetry:
-        return read_telemetry(path, aerial.clock_offset_s, clip, aerial.time_zone, aerial.order)
+        return read_telemetry(
+            path,
+            clock_offset_s=aerial.clock_offset_s,
+            clip=clip,
+            time_zone=aerial.time_zone,
+            order=aerial.order,
+            rate_hz=rate_hz,
+        )
 
     return clip.read_logs(read) if isinstance(clip, JoinedSource) else read(path, clip)
 
 
+def _rate_notes(source: Source) -> list[str]:
+    """Return a note if the number of pictures a second is unknown, as for a folder of pictures."""
+    if not getattr(source, "assumes_rate", False):
+        return []
+    assumed = f"no frame rate is known: {source.rate_hz:g} frames a second are assumed"
+    return [f"{assumed}, which affects speeds and the alignment with a log; set --rate before any clock offset"]
+
+
+def note_uncovered(scenes: Iterable[Scene], telemetry: Telemetry | None, notes: list[str]) -> Iterator[Scene]:
+    """Yield the scenes unchanged, and finally note how many lie outside the telemetry's time."""
+    covered = [0, 0]
+    try:
+        for scene in scenes:
+            covered[telemetry is None or telemetry.at(scene.frame.time_s) is not None] += 1
+            yield scene
+    finally:
+        if covered[0] and telemetry is not None:
+            span = "{:.1f} to {:.1f} s".format(*telemetry.time_s[[0, -1]])
+            outside = f"{covered[0]} of {sum(covered)} pictures lie outside the telemetry, which covers {span}"
+            notes.append(f"{outside}: they are searched as without telemetry")
+
+
+def prepare_detection(
+    telemetry: Path | None, settings: Settings, source: Source, clip: str
+) -> tuple[Settings, Telemetry | None, list[str]]:
+    """Return settings with the log's focal length, the telemetry, and notes. Raise InputError as `read_telemetry`."""
+    flight = None if telemetry is None else _read_telemetry(telemetry, settings, clip, source.rate_hz)
+    settings, more = with_logged_focal(settings, flight, source.size)
+    return settings, flight, [*(flight.notes if flight is not None else ()), *more, *_rate_notes(source)]
+
+
 def clip_notes(source: Source, interval: int, settings: Settings) -> list[str]:
-    """What keeps targets from being found in a clip that was read to its end: the interval, its size, or a mask."""
+    """Note causes of missing targets in a clip that was read to its end: the interval, its size, or a mask."""
     notes = []
     if settings.difference.ignore:
         share = (read_ignored(Path(settings.difference.ignore), source.size) > 0).mean()
@@ -235,30 +278,34 @@ def read_locator(
     colours: Colours | None = None,
     extent: tuple[float, float] | None = None,
 ) -> tuple[AerialLocator, list[str]]:
-    """Make the aerial locator from the files; also the notes that the user should read.
+    """Make the aerial locator from files, and return it with notes for the user.
 
     size: (width, height) of the pictures; rate_hz; frames: numbers of the first and last; each None if unknown.
-    what: whose frames these are, for messages. clip: the video, as for `read_telemetry`. colours: if given, they find
-    the landmarks in the pictures, whatever the table says. extent: as for `resolve_camera`.
-    Raises InputError for bad input.
+    what: owner of these frames, for messages. clip: the video, as for `read_telemetry`. colours: if given, landmarks
+    are found by colour in the pictures, even if the table has pixels. extent: as for `resolve_camera`.
+    Raise InputError for bad input.
     """
     offset = settings.aerial.clock_offset_s
     notes: list[str] = []
-    landmarks = None if given.landmarks is None else read_landmarks(given.landmarks, rate_hz, offset)
-    telemetry = _read_telemetry(given.telemetry, settings, clip) if given.telemetry is not None else None
+    landmarks = (
+        None if given.landmarks is None else read_landmarks(given.landmarks, rate_hz=rate_hz, clock_offset_s=offset)
+    )
+    telemetry = _read_telemetry(given.telemetry, settings, clip, rate_hz) if given.telemetry is not None else None
     if telemetry is not None:
         if rate_hz is None:
             raise InputError(
-                "the telemetry is by time, the table by frames; say with --rate how many frames a second there are"
+                "the telemetry has times, but the table has frames; give the number of frames a second with --rate"
             )
         if frames is not None and frames[1] > 0:
-            telemetry.check_overlap((frames[1] - 1) / rate_hz, (frames[0] - 1) / rate_hz, what)
+            telemetry.check_overlap((frames[1] - 1) / rate_hz, first_s=(frames[0] - 1) / rate_hz, what=what)
         notes += telemetry.notes
     if rate_hz is None:
-        notes.append("no --rate was given: 10 frames a second were taken, and velocities are by that")
+        notes.append("no --rate was given: 10 frames a second are assumed, and velocities depend on it")
     site = build_site(landmarks if landmarks is None or colours is None else without_pixels(landmarks), telemetry)
     if given.dem is not None:
-        site = replace(site, elevation=read_elevation(given.dem, site.places, site.origin_deg, view_reach_m(telemetry)))
+        site = replace(
+            site, elevation=read_elevation(given.dem, site.places, site.origin_deg, margin_m=view_reach_m(telemetry))
+        )
     known = read_aerial_camera(given.camera, size) if given.camera is not None else None
     site, more = complete_site(site, known, settings)
     notes += [*more, *describe_unknown_heights(site)]
@@ -268,9 +315,9 @@ def read_locator(
 
 
 def view_reach_m(telemetry: Telemetry | None) -> float:
-    """How far from the vehicle the ground is that its camera sees: 500 m, or more for a view to the side.
+    """Return the distance from the vehicle to which its camera sees the ground: 500 m, or more for an oblique view.
 
-    By the 95th percentile of the heights over the tangents of the pitch, at most 10 km.
+    It is the 95th percentile of height over tangent of the pitch, at most 10 km.
     """
     least_m, most_m = 500.0, 10_000.0
     if telemetry is None:
@@ -283,7 +330,7 @@ def view_reach_m(telemetry: Telemetry | None) -> float:
 
 
 def locator_facts(locator: AerialLocator) -> dict[str, Any]:
-    """An aerial locator as run.json records it."""
+    """Return an aerial locator in the form of run.json."""
     camera = locator.camera
     return {
         "origin_deg": locator.site.origin_deg,
@@ -292,10 +339,10 @@ def locator_facts(locator: AerialLocator) -> dict[str, Any]:
     }
 
 
-def map_site(locator: AerialLocator, background: Path | None) -> Site:
-    """What the maps show of the ground. Raises InputError for a background that cannot be read."""
+def map_site(locator: AerialLocator, background: Path | None) -> MapSite:
+    """Return the data that maps show of the ground. Raise InputError for a background that cannot be read."""
     site = locator.site
-    return Site(
+    return MapSite(
         names=site.landmarks.names,
         origin_deg=site.origin_deg,
         start_utc_s=site.telemetry.start_utc_s if site.telemetry is not None else math.nan,

@@ -1,4 +1,4 @@
-"""Appearance of targets: colour histograms of strips of a box, their similarity, and when they may decide."""
+"""Appearance of targets: colour histograms of three strips of a box, their similarity, and the rule for their use."""
 
 import cv2
 import numpy as np
@@ -6,32 +6,33 @@ import numpy as np
 from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.geometry import namespace, shared_px
 
-# Lower ends of the first two of three strips of a box: head, trunk, legs of a person; roof, body, wheels of a car.
+# Lower ends of the first two of three strips, as shares of a box's height: head, trunk and legs of a person; roof, body
+# and wheels of a car.
 _STRIP_ENDS = (0.2, 0.55)
-_BINS = np.array([16, 32, 32])  # of L, a and b
+_BINS = np.array([16, 32, 32])  # bins of L, a and b
 _FIRST_BIN = np.array([0, 16, 48])
 _STRIP_BINS = 80
 SIGNATURE = 3 * _STRIP_BINS
-"""Bins of a histogram of three strips."""
+"""Number of bins of a histogram of three strips."""
 _COLUMNS, _ROWS = 24, 48  # samples of a box
-_MIDDLE = 0.3  # widths from the middle at which a column weighs 1/e: the rest of a box is mostly background
+_MIDDLE = 0.3  # distance from the middle, in box widths, at which the weight is 1/e: the sides are mostly background
 
-# Association scores below the first are not worth a histogram; differences above the second exceed what appearance
-# can change.
+# Links with association scores below _LEAST_SCORE need no histogram. Appearance cannot change the order of links whose
+# scores differ by more than _CLEAR_LEAD.
 _LEAST_SCORE, _CLEAR_LEAD = -8.0, 7.0
-_WORST = -1.0  # light, shadow and turning change the appearance at once: it counts only so much against a link
+_WORST = -1.0  # lowest score of an appearance: light, shadow and a turn of the target can change it suddenly
 
 
 def strip_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N, SIGNATURE) float32 histograms of Lab colour over three strips, weighted to the middle columns of each box.
+    """Return (N, SIGNATURE) float32 histograms of Lab colour over three strips, with more weight in the middle columns.
 
     image: (H, W, 3) uint8 BGR or (H, W) grey. box_px: (N, 4) x, y, width, height; the part outside the image does not
-    count. Each row sums to 1, so that sum(sqrt(a b)) is the mean Bhattacharyya coefficient; a box wholly outside has
-    zeros.
+    count. Each row sums to 1, so that sum(sqrt(a b)) is the mean Bhattacharyya coefficient. A box wholly outside the
+    image has zeros.
     """
     count = len(box_px)
     samples = np.zeros((count, _ROWS, _COLUMNS, 3), np.uint8)
-    visible = np.zeros((count, 4))  # the part of each box inside the image, in pixels
+    visible = np.zeros((count, 4))  # the part of each box inside the image, px
     height, width = image.shape[:2]
     for n, (x, y, w, h) in enumerate(box_px.tolist()):
         left, right = max(int(np.floor(x)), 0), min(int(np.ceil(x + w)), width)
@@ -47,7 +48,7 @@ def strip_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     if not inside.any():
         return np.zeros((count, SIGNATURE), np.float32)
     lab = cv2.cvtColor(samples.reshape(-1, _COLUMNS, 3), cv2.COLOR_BGR2LAB).reshape(samples.shape)
-    # Where each sample lies in the whole box, of which the image's border may have cut off a part.
+    # Relative position of each sample in the whole box, of which the image's border may have cut off a part.
     across, down = (
         (visible[:, [axis]] - box_px[:, [axis]] + (np.arange(most) + 0.5) / most * visible[:, [axis + 2]])
         / box_px[:, [axis + 2]]
@@ -59,24 +60,24 @@ def strip_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
     place = start[:, :, None, None] + _FIRST_BIN + (lab * _BINS >> 8)
     weights = np.broadcast_to(weight[:, None, :, None], place.shape)
     counts = np.bincount(place.ravel(), weights.ravel(), count * SIGNATURE).reshape(count, 3, _STRIP_BINS)
-    # A strip counts the same however much of it is visible.
+    # Normalise each strip first, so that a partly visible strip has the same weight as a whole one.
     return _normalize(_normalize(counts).reshape(count, SIGNATURE)).astype(np.float32)
 
 
 def _normalize(counts: np.ndarray) -> np.ndarray:
-    """Shares of the sum over the last axis; zeros stay zeros."""
+    """Divide by the sum over the last axis; zeros stay zeros."""
     total = counts.sum(axis=-1, keepdims=True)
     return np.divide(counts, total, out=np.zeros_like(counts), where=total > 0)
 
 
 def similarity(signature: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN where either is unknown (zeros)."""
+    """Return the (N, M) Bhattacharyya coefficients of histograms (N, D) and (M, D); NaN for unknown ones (zeros)."""
     is_known = np.any(signature, axis=1)[:, None] & np.any(other, axis=1)
     return np.where(is_known, np.sqrt(signature) @ np.sqrt(other).T, np.nan)
 
 
 def appearance_scores(similarity: np.ndarray, visible: np.ndarray, parameters: TrackParameters) -> np.ndarray:
-    """(N, M) association scores of similarities, 0 for NaN. visible: (M,) shares of the boxes. Arrays or tensors."""
+    """Convert similarities (N, M) to association scores, 0 for NaN. visible: (M,) visible shares. Arrays or tensors."""
     functions = namespace(similarity)
     is_known = similarity == similarity
     score = parameters.appearance_weight * (functions.where(is_known, similarity, 1.0) - parameters.appearance_offset)
@@ -84,9 +85,10 @@ def appearance_scores(similarity: np.ndarray, visible: np.ndarray, parameters: T
 
 
 def ambiguity(score: np.ndarray, signature: np.ndarray) -> str:
-    """Why appearance may decide, from scores (N, M) without it and histograms (N, D) of the tracks; empty: it may not.
+    """Return why appearance is needed for the decision, in words; "" if it is not needed.
 
-    It may where a track or a detection has two likely links, and where a likely link is of a track without histogram.
+    score: (N, M) without appearance. signature: (N, D) histograms of the tracks. Appearance is needed if a track or a
+    detection has two likely links, or if a likely link belongs to a track without a histogram.
     """
     if not score.size:
         return ""
@@ -96,13 +98,13 @@ def ambiguity(score: np.ndarray, signature: np.ndarray) -> str:
         if (rivals.sum(axis=axis) > 1).any():
             return f"{one} has several likely {others}"
     unknown = ~np.any(signature, axis=1) if signature.shape[1] else np.ones(len(score), bool)
-    return "a likely link is of a track without a histogram" if likely[unknown].any() else ""
+    return "a likely link belongs to a track without a histogram" if likely[unknown].any() else ""
 
 
 def blend_histograms(signature: np.ndarray, seen: np.ndarray, visible: np.ndarray, hits: np.ndarray) -> np.ndarray:
-    """(N, D) histograms of tracks after a detection each, weighted by the share of it that was visible.
+    """Update (N, D) histograms of tracks with one detection each, weighted by the visible share of the detection.
 
-    hits: (N,) detections so far, this one included: the first few are averaged, then older ones fade.
+    hits: (N,) detections so far, including this one. The first few histograms are averaged; later the older ones decay.
     """
     gain = np.maximum(0.2, 1 / hits) * visible**2
     gain = np.where(np.any(signature, axis=1), np.where(np.any(seen, axis=1), gain, 0.0), 1.0)[:, None]
@@ -110,7 +112,7 @@ def blend_histograms(signature: np.ndarray, seen: np.ndarray, visible: np.ndarra
 
 
 def visible_shares(box_px: np.ndarray) -> np.ndarray:
-    """(N,) share of each box (N, 4) that no nearer box covers; a box is nearer if its bottom is lower in the image."""
+    """Return the (N,) share of each box (N, 4) that no nearer box covers. A nearer box has a lower bottom edge."""
     bottom = box_px[:, 1] + box_px[:, 3]
     nearer = bottom > bottom[:, None]
     covered = (shared_px(box_px[:, None], box_px) * nearer).sum(axis=1) / (box_px[:, 2] * box_px[:, 3])

@@ -1,9 +1,9 @@
 """Assignment over three layers: tracks, detections now, detections in the next frame.
 
 The default tracker chooses its links by prices of the next frame's detections (`choose_links`). The source's triplets
-are chosen exactly (`choose_triplets`): a column (i, j, k) names a node of each of three layers, -1 for none. Columns
-that share no node, not even through others, fall into groups that are solved one by one: small ones by branch and
-bound; all large ones at once by linear programming, and where that leaves fractions by integer programming (HiGHS).
+are chosen exactly (`choose_triplets`). A column (i, j, k) names one node in each of three layers, or -1 for none. The
+columns are divided into connected groups by shared nodes. Small groups are solved by branch and bound. All large groups
+are solved together by linear programming, and by integer programming (HiGHS) if the solution has fractions.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -17,24 +17,25 @@ from torchvision_dddas.types import Bool, Float, Int
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-_LEAST_SCORE = -2.0  # a link of a lower score is not made even if the next frame supports it
-_NEXT_WEIGHT = 0.8  # of the next frame's scores: at 1, a sharp turn is taken for an exchange of identities
-_RIVALS = 6  # links of a track or a detection that are weighed against each other: only stacked boxes have more
+_LEAST_SCORE = -2.0  # links with a lower score are never made, even if the next frame supports them
+_NEXT_WEIGHT = 0.8  # weight of the next frame's scores; with 1, a sharp turn looks like an exchange of identities
+_RIVALS = 6  # number of best links that are compared for a track or a detection; only stacked boxes have more
 _TIE_BREAK = 1e-6
-_ROUNDS, _CLOSE = 12, 1e-4  # of prices; share of the best choice that it may be below the bound
-# A group with no more columns is searched first, and given to HiGHS after so many steps: with fewer, HiGHS, whose call
-# alone takes 1 ms, runs in most windows of 30 targets (2.3 ms for 1.0); more gain nothing.
+_ROUNDS, _CLOSE = 12, 1e-4  # largest number of price updates; relative gap to the bound at which they stop
+# A group with at most _SEARCH_COLUMNS columns is searched by branch and bound, and passed to HiGHS after _SEARCH_STEPS
+# steps. With fewer steps HiGHS, whose call alone takes 1 ms, runs in most windows of 30 targets (2.3 ms instead of
+# 1.0); more steps gain nothing.
 _SEARCH_COLUMNS, _SEARCH_STEPS = 200, 1000
-# Tight prices bound the search; for fewer columns they take longer to find than they save.
+# Lowered prices bound the search more tightly. With at most _EASY_COLUMNS columns, lowering takes longer than it saves.
 _PRICE_ROUNDS, _EASY_COLUMNS = 6, 30
 
 
 def plausible_links(score: Float[np.ndarray, "N M"]) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
-    """Tracks and detections (P,) of the links worth following into the next frame, from association scores."""
+    """Return the tracks and detections (P,) of the plausible links, given association scores (N, M)."""
     row, column = (score > _LEAST_SCORE).nonzero()
     if not len(row) or min(np.bincount(row).max(), np.bincount(column).max()) < _RIVALS:
         return row, column
-    # Boxes that lie on each other have equal scores, and searching them all never ends.
+    # Stacked boxes have equal scores, and a search of all their links would take too long: keep the best few.
     distinct = score[row, column] - _TIE_BREAK * ((column - row) % score.shape[1])
     leading = _is_leading(distinct, row) | _is_leading(distinct, column)
     return row[leading], column[leading]
@@ -48,22 +49,23 @@ def choose_links(
     born: Float[np.ndarray, "M L"],
     bridging: Float[np.ndarray, "N L"],
 ) -> Bool[np.ndarray, "P"]:
-    """Which links belong to disjoint triplets with a large sum of scores (K = 3, one frame of delay).
+    """Return which links belong to disjoint triplets with a large sum of scores (K = 3, one frame of delay).
 
-    Prices of the next frame's detections (Lagrange multipliers of "each at most once") leave a two-frame assignment,
-    which is solved in a few rounds. The best choice so far is returned: the largest sum in nearly all windows, as the
-    prices' bound shows, but not always.
+    Prices of the next frame's detections (Lagrange multipliers of "each at most once") reduce the problem to a
+    two-frame assignment, which is solved repeatedly while the prices are updated. The best choice found is returned.
+    The bound from the prices shows that it has the largest sum in nearly all windows, but not always.
 
-    value, tracks, now: scores, tracks and detections of the plausible links of this frame. Scores to the L detections
-    of the next frame: onward, of the tracks after these links; born, of tracks that would begin with each of the M
-    detections; bridging, of tracks without a detection in this frame, the (i, k) links that the source's eq. 4 and 5
-    leave out. Only links of this frame are kept: the next frame decides its own in view of its successor.
+    value, tracks, now: scores, tracks and detections of the plausible links of this frame. The other arguments are
+    scores to the L detections of the next frame. onward: of the tracks after these links. born: of tracks that would
+    begin with each of the M detections. bridging: of tracks without a detection in this frame, which are the (i, k)
+    links that the source's eq. 4 and 5 leave out. Only links of this frame are returned, because the next frame decides
+    its own links with its own successor in view.
     """
     price = np.zeros(onward.shape[1])
     best, answer = -np.inf, np.zeros(len(value), bool)
     if not len(value):
         return answer
-    # Scores to the next frame, below one another. Only those above 0 can be chosen: a hundredth, of 1000 boxes a frame.
+    # Stack the scores to the next frame. Only scores above 0 can be chosen: one in a hundred with 1000 boxes a frame.
     parts, places = (onward, born, bridging), [(part > 0).nonzero() for part in (onward, born, bridging)]
     begin, free, end = np.cumsum([len(value), len(born), len(bridging)]).tolist()
     row = np.concatenate([at[0] + first for at, first in zip(places, (0, begin, free), strict=True)])
@@ -72,7 +74,7 @@ def choose_links(
     starts, born_row, old_row = _run_starts(row), begin + now, free + tracks
     filled = row[starts]
     for _ in range(_ROUNDS):
-        # The next frame's detections cost their price; what they are worth then is added to this frame's links.
+        # Subtract the prices of the next frame's detections, and add each node's best net gain to this frame's links.
         net, most = gain - price[column], np.zeros(end)
         if len(row):
             most[filled] = np.maximum(np.maximum.reduceat(net, starts), 0.0)
@@ -93,7 +95,7 @@ def choose_links(
             answer[chosen] = True
         if bound - best < _CLOSE * max(1.0, best):
             break
-        # What each node left would take: its dearest, of equal ones the first.
+        # Find the detection that each free node wants most, the first one if equal.
         dearest = (is_left & (net > 0) & (net == most[row])).nonzero()[0]
         wanted = column[dearest[_run_starts(row[dearest])]]
         excess = np.bincount(wanted, minlength=len(price)) - 1
@@ -107,10 +109,10 @@ def choose_links(
 def link_confidences(
     score: Float[np.ndarray, "N M"], tracks: Int[np.ndarray, "K"], detections: Int[np.ndarray, "K"]
 ) -> Float[np.ndarray, "K"]:
-    """(K,) confidences in [0, 1] of chosen links: .5 where an alternative is as likely.
+    """Return the (K,) confidences in [0, 1] of chosen links: .5 if an alternative is as likely.
 
-    score: association scores. The alternatives of a link are no link, another free detection or track, and an exchange
-    of detections with another link.
+    score: association scores. The alternatives to a link are: no link, a link to another free detection or track, and
+    an exchange of detections with another link.
     """
     if not len(tracks):
         return np.zeros(0)
@@ -131,16 +133,16 @@ def link_confidences(
 
 
 def _run_starts(values: np.ndarray) -> np.ndarray:
-    """Where a run of equal values begins."""
+    """Return the indices at which runs of equal values begin."""
     begins = np.ones(len(values), bool)
     np.not_equal(values[1:], values[:-1], out=begins[1:])
     return begins.nonzero()[0]
 
 
 def _best_entries(row: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Which entries, all above 0, are the one-to-one pairs with the largest sum; as `best_pairs`, by row.
+    """Return the indices of the entries that form one-to-one pairs with the largest sum, by row, like `best_pairs`.
 
-    row: ascending, and column within each row.
+    All values are above 0. row: ascending, and column is ascending within each row.
     """
     if not len(row):
         return row
@@ -157,7 +159,7 @@ def _best_entries(row: np.ndarray, column: np.ndarray, value: np.ndarray) -> np.
 
 
 def _is_leading(value: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """(P,) whether a value is among the largest _RIVALS of its group."""
+    """Return (P,) whether a value is among the largest _RIVALS values of its group."""
     order = np.lexsort((-value, group))
     starts = np.searchsorted(group[order], np.arange(group.max(initial=-1) + 2))
     limit = np.full(len(starts) - 1, -np.inf)
@@ -169,23 +171,26 @@ def _is_leading(value: np.ndarray, group: np.ndarray) -> np.ndarray:
 def choose_triplets(
     columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"], most_branches: int | None = None
 ) -> tuple[Int[np.ndarray, "Z"], bool]:
-    """The rows of the columns with the largest sum of scores that share no node, ascending; and whether it is certain.
+    """Choose columns that share no node and have the largest sum of scores.
 
-    A column that scores zero or less is never chosen; -inf forbids one. Exact, to rounding and HiGHS's 1e-7 of the
-    largest score, unless HiGHS would need more than `most_branches`. Among choices of the same sum the nodes' numbers
-    decide, not the order of the columns; of two equal columns the first is chosen.
+    Return the indices of the chosen columns, ascending, and whether their sum is certainly the largest. Columns with a
+    score of 0 or less are never chosen; -inf forbids a column. The result is exact to rounding and HiGHS's tolerance of
+    1e-7 of the largest score, unless HiGHS would need more than `most_branches`. Among choices with equal sums the node
+    numbers decide, not the order of the columns; of two equal columns the first is chosen.
     Raises InputError if the shapes do not fit, an index is below -1, a column has no node, or a score is NaN or +inf.
     """
     columns, score = np.asarray(columns), np.asarray(score, float)
     if columns.ndim != 2 or columns.shape[1] != 3 or score.shape != columns.shape[:1]:
         raise InputError(
             f"triplets need (C, 3) indices and (C,) scores; got {columns.shape} and {score.shape}. "
-            "Give one score a column."
+            "Give one score for each column."
         )
     if len(columns) and not np.issubdtype(columns.dtype, np.integer):
         raise InputError(f"triplets need integer indices; got {columns.dtype}. Convert them, with -1 for none.")
     if len(columns) and (columns.min() < -1 or columns.max(axis=1).min() < 0):
-        raise InputError("triplets need a node of some layer, -1 for none; got an index below -1 or a column of none.")
+        raise InputError(
+            "triplets need a node in some layer, and -1 for none; got an index below -1 or a column without a node."
+        )
     if np.isnan(score).any() or np.isposinf(score).any():
         raise InputError("triplets need scores below infinity; got NaN or +inf. Forbid a column with -inf.")
     order = np.lexsort((-score, columns[:, 2], columns[:, 1], columns[:, 0]))
@@ -204,7 +209,7 @@ def choose_triplets(
             chosen[[members[place] for place in found]] = True
     certain, hard = True, np.flatnonzero(unsolved >= 0)
     if len(hard):
-        # Linear first: it is integral in most windows; integer programming only for the groups where it is not.
+        # Try linear programming first: its solution is integral in most windows. Use integer programming for the rest.
         incidence, group = _incidence(kept[hard]), unsolved[hard]
         solution, certain = _solve(incidence, gain[hard])
         again = np.isin(group, group[np.abs(solution - solution.round()) > 1e-6])
@@ -216,17 +221,17 @@ def choose_triplets(
 
 
 def relaxed_shares(columns: Int[np.ndarray, "C 3"], score: Float[np.ndarray, "C"]) -> Float[np.ndarray, "C"]:
-    """(C,) share of each column in the best choice that may take parts of columns: 0 or 1 in most windows."""
+    """Return the (C,) shares of columns in the best fractional choice (linear programming): 0 or 1 in most windows."""
     return _solve(_incidence(columns), score)[0] if len(score) else np.zeros(0)
 
 
 def _solve(
     incidence: "csc_array", gain: Float[np.ndarray, "C"], integral: bool = False, **options: int
 ) -> tuple[Float[np.ndarray, "C"], bool]:
-    """(C,) share of each column in the best choice, 0 or 1 if `integral`; and whether it is certainly the best."""
-    from scipy.optimize import Bounds, LinearConstraint, milp  # here, as it takes half a second and 45 MB
+    """Return the (C,) share of each column in the best choice, 0 or 1 if `integral`, and whether HiGHS finished."""
+    from scipy.optimize import Bounds, LinearConstraint, milp  # imported here: it takes half a second and 45 MB
 
-    # Presolving costs more than it saves where the linear programme is the whole work.
+    # For linear programmes presolving takes more time than it saves.
     settings: Any = {"mip_rel_gap": 0.0, "presolve": integral, **options}
     solved = milp(
         -gain,
@@ -241,8 +246,8 @@ def _solve(
 
 
 def _connected_groups(held: list[list[int]]) -> list[list[int]]:
-    """The groups of columns that share nodes, by their places. held: the nodes of each column."""
-    home: dict[int, tuple[list[int], list[int]]] = {}  # of each node: its group's columns and nodes
+    """Return the connected groups of columns, as lists of indices. held: the nodes of each column."""
+    home: dict[int, tuple[list[int], list[int]]] = {}  # for each node the columns and the nodes of its group
     for column, nodes in enumerate(held):
         mine = home.get(nodes[0])
         if mine is None:
@@ -262,10 +267,10 @@ def _connected_groups(held: list[list[int]]) -> list[list[int]]:
 
 
 def _search(held: list[list[int]], gain: list[float]) -> list[int] | None:
-    """The best choice in one group, as places in its list; None if the search takes too long."""
+    """Return the best choice in one group, as indices into its list; None if the search takes too long."""
     if len(held) > _SEARCH_COLUMNS:
         return None
-    # Prices that pay for every column: gains shared evenly, then lowered where they exceed.
+    # Start with prices whose sum over each column is at least its gain: share the gains evenly, then lower the excess.
     price: dict[int, float] = {}
     for nodes, worth in zip(held, gain, strict=True):
         for node in nodes:
@@ -277,10 +282,10 @@ def _search(held: list[list[int]], gain: list[float]) -> list[int] | None:
         for _ in range(_PRICE_ROUNDS):
             least = level * 3
             np.minimum.at(least, at, np.repeat(np.add.reduceat(level[at], start) - gain, count))
-            # A column holds up to three nodes: a third each keeps it paid for.
+            # A column has up to three nodes. Lowering each by a third of the excess keeps the sum above the gain.
             level -= np.maximum(least, 0.0) / 3
         price = dict(zip(price, level.tolist(), strict=True))
-    # With one node a layer any two columns share one, unless a column is a single node: the best column wins.
+    # If the group has only one node in each layer, all columns of several nodes exclude each other: take the best one.
     if len({node % 3 for node in price}) == len(price) and min(map(len, held)) > 1:
         return [gain.index(max(gain))]
     return least_loss(held, gain, price, _SEARCH_STEPS)
@@ -293,11 +298,12 @@ def least_loss(
     steps: int,
     limit: float = float("inf"),
 ) -> list[int] | None:
-    """The best choice of columns that loses less than `limit`, as places in their list; empty if there is none.
+    """Return the best choice of columns with a loss below `limit`, as indices into the list.
 
-    held: the nodes of each column. price: of every node by its number. None if it takes more than so many steps.
-    The sum of all prices bounds any gain. A node that stays alone loses its price; a chosen column loses what its
-    nodes' prices exceed its gain by. Depth-first search, node by node, finds the least loss.
+    The result is empty if there is no such choice, and None if the search needs more than `steps` steps. held: the
+    nodes of each column. price: price of every node by its number. The sum of all prices is an upper bound of the gain.
+    A node without a column loses its price; a chosen column loses the sum of its nodes' prices minus its gain. A
+    depth-first search over the nodes finds the smallest loss.
     """
     dearest_first = sorted({node for nodes in held for node in nodes}, key=lambda node: (-price[node], node))
     bit = {node: 1 << place for place, node in enumerate(dearest_first)}
@@ -329,7 +335,7 @@ def least_loss(
 
 
 def _incidence(columns: Int[np.ndarray, "C 3"]) -> "csc_array":
-    """(nodes, C) which nodes of all layers each column holds."""
+    """Return the (nodes, C) incidence matrix: which nodes of all layers each column contains."""
     from scipy.sparse import csc_array
 
     there = columns >= 0

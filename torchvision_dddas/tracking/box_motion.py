@@ -1,9 +1,9 @@
-"""The camera's motion between looks, from the boxes alone: the shift that most tracks have in common.
+"""Estimate the camera's motion between looks from boxes alone, as the shift that most tracks have in common.
 
-Tracks learn the camera's motion with their velocities. What remains is its change, and its motion at the first looks,
-when no velocity is known yet. Shifts for which many tracks would land on detections are candidates; one is believed
-only if the links under it are so much likelier than without it. Without that, rows of vehicles alias: each takes the
-place of the next.
+The velocities of tracks contain the camera's steady motion. This module finds changes of that motion, and the motion at
+the first looks, when velocities are unknown. Candidates are shifts that bring many tracks onto detections. A candidate
+is accepted only if it makes the links much likelier. Otherwise rows of vehicles would alias, with each vehicle in the
+place of the next one.
 """
 
 from collections.abc import Sequence
@@ -12,24 +12,25 @@ import numpy as np
 
 from torchvision_dddas.geometry import best_pairs
 
-_REACH, _CELL = 4.0, 0.2  # largest shift, and the size of the votes' cells, in median heights
-_AXIS = np.arange(-np.ceil(_REACH / _CELL) - 1, np.ceil(_REACH / _CELL) + 2) * _CELL  # of the votes' cells
+_REACH, _CELL = 4.0, 0.2  # largest shift, and size of the cells for votes, in median heights
+_AXIS = np.arange(-np.ceil(_REACH / _CELL) - 1, np.ceil(_REACH / _CELL) + 2) * _CELL  # centres of the cells
 _AWAY = np.hypot(_AXIS[:, None], _AXIS)
-_AROUND = np.array([[row * len(_AXIS) + column] for row in (-1, 0, 1) for column in (-1, 0, 1)])  # a cell
-_STILL, _STILL_SHARE = 0.15, 0.7  # median heights; share of tracks so near to a detection that no shift is sought
-_MOST = 3  # candidates
-FEWEST, _SHARE = 3, 0.3  # tracks that vote, and their share that a candidate needs
+_AROUND = np.array([[row * len(_AXIS) + column] for row in (-1, 0, 1) for column in (-1, 0, 1)])  # of 9 cells
+# If more than _STILL_SHARE of the tracks lie within _STILL median heights of a detection, no shift is searched for.
+_STILL, _STILL_SHARE = 0.15, 0.7
+_MOST = 3  # largest number of candidates
+FEWEST, _SHARE = 3, 0.3  # smallest number, and smallest share, of the tracks that must vote for a candidate
 _LARGEST_SIZE_CHANGE = 0.35
-_FAR_PRICE = 0.02  # votes lost a height, for each track
-_GAIN, _GAIN_EACH, _GAIN_EACH_NEWBORN = 3.0, 2.0, 1.5  # of the links' scores, at least, and for each track
+_FAR_PRICE = 0.02  # votes subtracted from a shift for each track and each median height of its length
+_GAIN, _GAIN_EACH, _GAIN_EACH_NEWBORN = 3.0, 2.0, 1.5  # required gain of scores: constant, per track, per newborn
 
 
 def candidate_shifts(
     place_px: np.ndarray, height_px: np.ndarray, centre_px: np.ndarray, box_height_px: np.ndarray
 ) -> list[np.ndarray]:
-    """Shifts (2,) in pixels that bring many predicted places onto detections, the most votes first.
+    """Return shifts (2,) in pixels that bring many predicted positions onto detections, the most votes first.
 
-    place_px: (N, 2), height_px: (N,) of the tracks. centre_px: (M, 2), box_height_px: (M,) of the detections.
+    place_px: (N, 2) and height_px: (N,), of the tracks. centre_px: (M, 2) and box_height_px: (M,), of the detections.
     """
     if len(place_px) < FEWEST or len(centre_px) < FEWEST:
         return []
@@ -41,7 +42,7 @@ def candidate_shifts(
         return []
     near = (away < _REACH).nonzero()
     votes = np.stack([across[near], down[near]], axis=1)
-    # A vote counts for its cell and those around it; a track votes once for a cell.
+    # A vote counts for its cell and the cells around it. A track votes at most once for a cell.
     side = len(_AXIS)
     row, column = np.rint(votes / _CELL).astype(int).T + side // 2
     voted = np.zeros(len(place_px) * side**2, bool)
@@ -65,16 +66,16 @@ def candidate_shifts(
 
 
 def medians(values: np.ndarray) -> np.ndarray:
-    """The medians of columns of finite values (K, ...), K > 0: of a few values in a tenth of np.median's time."""
+    """Return the medians over the first axis of finite values (K, ...), K > 0. For small K, np.median is 10x slower."""
     ordered, count = np.sort(values, axis=0), len(values)
     return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
 
 
 def likelier_shift(still: np.ndarray, moved: Sequence[np.ndarray], newborn: bool) -> int | None:
-    """Which of one or more shifts makes the links so much likelier that it is believed; None if none does.
+    """Return the index of the shift that makes the links likelier by the required gain; None if no shift does.
 
-    still: (N, M) association scores without a shift. moved: the scores under each. newborn: whether no track has a
-    velocity yet: then rows of vehicles alias most easily.
+    still: (N, M) association scores without a shift. moved: the scores under each shift. newborn: whether no track has
+    a velocity yet, which changes the required gain.
     """
     before, *after = (float(score[tuple(best_pairs(score).T)].sum()) for score in (still, *moved))
     best = int(np.argmax(after))

@@ -1,7 +1,7 @@
-"""How the camera moved between sampled frames, however far apart they are.
+"""Estimate the camera's motion between sampled frames, at any distance in time.
 
-Boxes need the motion to a fraction of a pixel only, which costs less than segmentation needs: most steps of a standing
-camera are recognized on a tiny picture, and the others are registered on a reduced one.
+Tracking boxes needs less accuracy than segmentation. Most steps of a fixed camera are therefore recognized on a tiny
+picture, and the other steps are registered on a reduced picture.
 """
 
 from collections.abc import Sequence
@@ -13,53 +13,53 @@ import numpy as np
 
 from torchvision_dddas.types import Registration
 
-# Least shorter side of the registered picture: its corners differ by 0.1 to 0.4 px (median) from a registration at full
-# size, which takes two to three times as long.
+# Smallest shorter side of the registered picture. The corners differ by 0.1 to 0.4 px (median) from a registration at
+# full size, which takes two to three times as long.
 _REGISTERED_PX = 240
-# Least longer side of the picture on which a standing camera is recognized, and its largest reduction.
+# Smallest longer side of the picture on which a fixed camera is recognized, and its largest reduction.
 _TINY_PX, _LARGEST_REDUCTION = 160, 6
 _POINTS, _WINDOW_PX = 80, 15
-# The camera stands still if the median motion of a quarter of the picture is less. Moving cameras show 0.6 px and more
-# between successive frames, standing ones 0.01 to 0.05 px.
+# A quadrant of the picture stands still if its median motion is below this. Between successive frames moving cameras
+# have 0.6 px or more, fixed cameras 0.01 to 0.05 px.
 _STILL_PX = 0.25
 _LEAST_POINTS, _LEAST_QUARTERS = 5, 3
-# The anchor is replaced after so many frames: targets cover its points, and the light changes.
+# The anchor is replaced after this many frames, because targets cover its points and the light changes.
 _ANCHOR_FRAMES = 16
 
 
 class Registrar(Protocol):
-    """The part of a detection engine that registers pictures. A view has a `size`, (width, height) in pixels."""
+    """The methods of a detection engine that register pictures. A view has a `size`, (width, height) in pixels."""
 
     def prepare(self, image: np.ndarray) -> Any:
-        """The view of a picture, as `register` takes it."""
+        """Return the view of a picture for `register`."""
         ...
 
     def register(self, pairs: Sequence[tuple[Any, Any]]) -> list[Registration]:
-        """The motion of the background from the first to the second view of each pair."""
+        """Return the background's motion from the first to the second view of each pair."""
         ...
 
 
 class CameraMotion:
-    """Estimates the motion from each picture to the next. Give it the pictures in order.
+    """Estimates the motion from each picture to the next. Pass the pictures in order to `update`.
 
-    All pictures of a standing camera are compared with one earlier picture, the anchor, and so is the first that has
-    moved. So a slow pan is not lost in steps that are each too small to see, unless it takes longer than the anchor
-    lasts.
+    While the camera stands still, pictures are compared with one earlier picture, the anchor, and so is the first
+    picture after a motion. A slow pan is thus detected although each of its steps is too small to be seen, unless it
+    takes longer than the life of the anchor.
     """
 
     def __init__(self, engine: Registrar) -> None:
         self.engine = engine
-        self._anchor: _Picture | None = None
-        self._last: _Picture | None = None  # the latest with a known motion
-        self._lost: _Picture | None = None  # the latest with an unknown motion, after `_last`
-        self._age = 0  # pictures since the anchor
+        self._anchor: _TrackedPicture | None = None
+        self._last: _TrackedPicture | None = None  # the latest picture with a known motion
+        self._lost: _TrackedPicture | None = None  # the latest picture after `_last`, with an unknown motion
+        self._age = 0  # number of pictures since the anchor
 
     def update(self, image: np.ndarray) -> tuple[np.ndarray | None, str]:
-        """The (3, 3) pixel homography from the previous picture to this one, and a cause where it is unknown.
+        """Return the (3, 3) pixel homography from the previous picture to this one, and a cause if it is unknown.
 
-        The homography is None where the camera stood still (the cause is empty) or the motion is unknown.
+        The homography is None if the camera stood still (with an empty cause) or if the motion is unknown.
         """
-        picture = _Picture(image, self.engine)
+        picture = _TrackedPicture(image, self.engine)
         self._age += 1
         is_old = self._age >= _ANCHOR_FRAMES
         if self._anchor is None or self._last is None:
@@ -70,14 +70,14 @@ class CameraMotion:
                 self._begin(picture)
             self._last, self._lost = picture, None
             return None, ""
-        # The picture before may be the lost one, such as a flash. The tracker knows of no motion since `_last`, so that
-        # the motion from there counts first.
+        # The previous picture may be lost, for example by a flash. The tracker has applied no motion since `_last`, so
+        # the motion from `_last` is tried before that from the lost picture.
         earlier = [self._anchor, *(e for e in (self._last, self._lost) if e is not None and e is not self._anchor)]
         for other in earlier:
             (found,) = self.engine.register([(other.view, picture.view)])
             if found.reliable:
                 self._begin(picture)
-                # From the view's pixels to the picture's. Both count from the middle of their first pixel.
+                # Convert from pixels of the view to pixels of the picture; both count from the centre of the first one.
                 x, y = np.array(picture.grey.shape[::-1]) / picture.view.size
                 full_from_small = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
                 motion = full_from_small @ found.later_from_earlier @ np.linalg.inv(full_from_small)
@@ -87,13 +87,13 @@ class CameraMotion:
             self._begin(picture)
         return None, found.cause
 
-    def _begin(self, picture: "_Picture") -> None:
-        """Compare the next pictures with this one."""
+    def _begin(self, picture: "_TrackedPicture") -> None:
+        """Make this picture the anchor of the next pictures."""
         self._anchor, self._last, self._lost, self._age = picture, picture, None, 0
 
 
-class _Picture:
-    """A picture and what is computed from it when first needed."""
+class _TrackedPicture:
+    """A picture with its view, its tiny copy and the corners in that copy, computed on first use."""
 
     def __init__(self, image: np.ndarray, engine: Registrar) -> None:
         self.grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
@@ -114,12 +114,12 @@ class _Picture:
 
     @cached_property
     def points(self) -> np.ndarray:
-        """(N, 2) float32 corners of the tiny picture, spread over it."""
+        """The (N, 2) float32 corners of the tiny picture, spread over it."""
         found = cv2.goodFeaturesToTrack(self.tiny, _POINTS, 0.01, max(4, min(self.tiny.shape) // 12))
         return np.zeros((0, 2), np.float32) if found is None else found.reshape(-1, 2)
 
-    def is_still(self, anchor: "_Picture") -> bool:
-        """Whether three quarters of the picture have not moved; a moving target may cover the fourth."""
+    def is_still(self, anchor: "_TrackedPicture") -> bool:
+        """Return whether three quadrants of the picture have not moved. A moving target may cover the fourth."""
         start = anchor.points
         if len(start) < _LEAST_POINTS * _LEAST_QUARTERS:
             return False

@@ -1,8 +1,8 @@
-"""Identities of crowds on the ground, which last through meetings: when crowds meet and part, each keeps its identity.
+"""Identities of crowds on the ground. When crowds meet and part again, each crowd keeps its identity.
 
-In the picture, two crowds that meet are one blob with one identity, and which of them keeps it when they part is a
-matter of chance. On the ground each crowd is predicted by its position, velocity and radius. Crowds that share a blob
-move with it until there are as many blobs again.
+In the picture, two crowds that meet become one blob with one identity, and chance decides which crowd keeps it when
+they part. On the ground each crowd is predicted by its position, velocity and radius. Crowds that share a blob move
+with the blob until they are separate blobs again.
 """
 
 from dataclasses import dataclass, replace
@@ -13,26 +13,29 @@ import numpy as np
 from torchvision_dddas.geometry import best_pairs
 from torchvision_dddas.types import Float, Int, Tracks
 
-# Standard deviation of a crowd's place: a constant, a share of its radius, and a part that grows while it is unseen.
+# Standard deviation of a crowd's position: a constant, a share of its radius, and a part that grows while it is unseen.
 _SIGMA_M, _SIGMA_SHARE, _SIGMA_M_S = 0.8, 0.2, 0.7
-# Gate in these standard deviations; score lost for an e-fold change of radius, and at most.
+_UNKNOWN_M_S = 3.0  # that part for a target that was seen once: it may walk, or drive slowly
+# The gate, in these standard deviations; the penalty for an e-fold change of radius, and the largest penalty.
 _GATE, _SIZE_PENALTY, _LARGEST_SIZE_PENALTY = 3.0, 0.8, 1.2
-# Score for the same identity in the picture as before.
+# Score for the same picture identity as before.
 _SAME_TRACK_SCORE = 1.0
-# How long an unseen crowd is kept, and how long it is predicted to move on.
+# Time for which an unseen crowd is kept, and time for which it is predicted to move.
 _KEPT_S, _MOVES_S = 8.0, 3.0
-# How long a crowd may share a blob. One that was seen for less time before that was a part of the blob.
+# Longest time for which a crowd may share a blob. A crowd that was seen for less than _SHORT_S before counts as a part
+# of the blob.
 _SHARED_S, _SHORT_S = 10.0, 1.5
-# A blob of a smaller radius, this near to a larger crowd's edge, counts as a part of it for so long.
+# A blob with a radius below _PART_RADIUS_M, within _PART_GAP_M of a larger crowd's edge, counts as a part of that crowd
+# for _PART_S.
 _PART_RADIUS_M, _PART_GAP_M, _PART_S = 1.1, 4.5, 3.0
-# Gains of the filter. They are small because a blob's centre moves as parts of the crowd are hidden.
+# Smallest gains of the filter for straight paths. They are small because a blob's centre moves when parts are hidden.
 _PLACE_GAIN, _VELOCITY_GAIN, _RADIUS_GAIN, _SHARED_GAIN = 0.5, 0.15, 0.2, 0.3
 _PART = -1
 
 
 @dataclass
 class _Crowd:
-    """track: its identity in the picture. host: the crowd whose blob it shares, 0 for none."""
+    """A crowd. track: its identity in the picture. host: identity of the crowd whose blob it shares, 0 for none."""
 
     identity: int
     place_m: np.ndarray
@@ -44,29 +47,30 @@ class _Crowd:
     host: int = 0
     shared_s: float = -np.inf
     is_host: bool = False
+    looks: int = 1
 
     @property
     def last_s(self) -> float:
-        """When it was last seen, alone or in a shared blob."""
+        """The time at which the crowd was last seen, alone or in a shared blob."""
         return max(self.seen_s, self.shared_s)
 
 
 class CrowdIdentities:
-    """The crowds of a run. Feed it frames in order."""
+    """The crowds of a run. Pass the frames in order to `rename` or `update`."""
 
     def __init__(self) -> None:
         self._crowds: list[_Crowd] = []
-        self._identities: dict[int, int] = {}  # by identity in the picture
-        self._parts_since: dict[int, float] = {}  # when a possible part of a crowd was first seen, by track
+        self._identities: dict[int, int] = {}  # identity of the crowd by identity in the picture
+        self._parts_since: dict[int, float] = {}  # time at which a possible part of a crowd was first seen, by track
         self._new_identities = count(1)
         self._time_s = 0.0
 
     def rename(
         self, tracks: Tracks, time_s: float, place_m: Float[np.ndarray, "N 2"], radius_m: Float[np.ndarray, " N"]
     ) -> Tracks:
-        """The tracks of a frame under their crowds' identities, sorted by them; parts of crowds are left out.
+        """Return the tracks of a frame with the identities of crowds, sorted by identity, without parts of crowds.
 
-        place_m, radius_m: of the N tracks with a detection, as for `update`. A box that bridges a gap keeps the
+        place_m, radius_m: of the N tracks with a detection, see `update`. A box that fills a gap gets the latest crowd
         identity of its track.
         """
         seen = np.flatnonzero(tracks.row >= 0)
@@ -89,10 +93,10 @@ class CrowdIdentities:
         place_m: Float[np.ndarray, "N 2"],
         radius_m: Float[np.ndarray, " N"],
     ) -> Int[np.ndarray, " N"]:
-        """Identities of a frame's blobs, from 1, each at most once; 0 for a blob that counts as a part of a crowd.
+        """Return the identities of a frame's blobs, unique and from 1; 0 for a blob that counts as a part of a crowd.
 
-        track: identity of each blob in the picture. place_m, radius_m: NaN where the picture could not be located;
-        such a blob keeps the identity of its track.
+        track: identity of each blob in the picture. place_m, radius_m: position and radius on the ground, NaN if the
+        picture could not be located; such a blob keeps the crowd identity of its track.
         """
         elapsed_s, self._time_s = time_s - self._time_s, time_s
         for crowd in self._crowds:
@@ -124,7 +128,7 @@ class CrowdIdentities:
         return identity
 
     def _is_part(self, track: int, place_m: np.ndarray, radius_m: float) -> bool:
-        """Whether a new blob may be people who have fallen behind a crowd."""
+        """Return whether a new blob may be people who have fallen behind a crowd."""
         if self._time_s - self._parts_since.setdefault(track, self._time_s) > _PART_S:
             return False
         return radius_m < _PART_RADIUS_M and any(
@@ -135,14 +139,15 @@ class CrowdIdentities:
         )
 
     def _scores(self, track: np.ndarray, place_m: np.ndarray, radius_m: np.ndarray) -> np.ndarray:
-        """(K, N) association scores of crowds and blobs; -inf outside the gate."""
+        """Return the (K, N) association scores of crowds and blobs; -inf outside the gate."""
         scores = np.full((len(self._crowds), len(place_m)), -np.inf)
         for row, crowd in enumerate(self._crowds):
             unseen_s = self._time_s - crowd.last_s
-            # The centre of a blob that holds more than this crowd is off by as much as the blob is larger.
+            # A blob that contains other crowds too may have its centre off by the difference of the radii.
             excess = np.maximum(radius_m - crowd.radius_m, 0)
             off = np.maximum(np.linalg.norm(place_m - crowd.place_m, axis=1) - excess, 0)
-            off = off / (_SIGMA_M + _SIGMA_SHARE * crowd.radius_m + _SIGMA_M_S * min(unseen_s, _MOVES_S))
+            drift_m_s = _UNKNOWN_M_S if crowd.looks == 1 else _SIGMA_M_S
+            off = off / (_SIGMA_M + _SIGMA_SHARE * crowd.radius_m + drift_m_s * min(unseen_s, _MOVES_S))
             size = np.minimum(_SIZE_PENALTY * np.abs(np.log(radius_m / crowd.radius_m)), _LARGEST_SIZE_PENALTY)
             score = _GATE + _LARGEST_SIZE_PENALTY - off - size
             if not crowd.host:
@@ -151,7 +156,7 @@ class CrowdIdentities:
         return scores
 
     def _share_blobs(self, matched: dict[int, _Crowd], place_m: np.ndarray, radius_m: np.ndarray) -> None:
-        """Find the crowds that share another's blob, and move them along with it."""
+        """Find the crowds that share the blob of another crowd, and move them with the blob."""
         free = [crowd for crowd in self._crowds if all(crowd is not other for other in matched.values())]
         for crowd in matched.values():
             crowd.host, crowd.is_host = 0, False
@@ -165,7 +170,7 @@ class CrowdIdentities:
             if not inside or not is_fresh or self._time_s - crowd.seen_s > _SHARED_S:
                 crowd.host = 0
             elif crowd.seen_s - crowd.first_s < _SHORT_S:
-                crowd.seen_s = crowd.shared_s = -np.inf  # it was a part of the blob: forget it
+                crowd.seen_s = crowd.shared_s = -np.inf  # the crowd was a part of the blob, so drop it
             else:
                 host = matched[min(inside)[1]]
                 crowd.host, crowd.shared_s, host.is_host = host.identity, self._time_s, True
@@ -183,8 +188,9 @@ class CrowdIdentities:
         crowd.seen_s, crowd.track = self._time_s, track
         if crowd.is_host:
             return
+        crowd.looks += 1
+        pairs = crowd.looks * (crowd.looks + 1)
         innovation = place_m - crowd.place_m
-        crowd.place_m = crowd.place_m + _PLACE_GAIN * innovation
-        is_young = self._time_s - crowd.first_s < _SHORT_S
-        crowd.velocity_m_s = crowd.velocity_m_s + (2 if is_young else 1) * _VELOCITY_GAIN * innovation / max(gap_s, 0.2)
+        crowd.place_m = crowd.place_m + max(_PLACE_GAIN, (4 * crowd.looks - 2) / pairs) * innovation
+        crowd.velocity_m_s = crowd.velocity_m_s + max(_VELOCITY_GAIN, 6 / pairs) * innovation / max(gap_s, 0.2)
         crowd.radius_m += _RADIUS_GAIN * (radius_m - crowd.radius_m)

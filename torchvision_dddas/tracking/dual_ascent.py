@@ -1,20 +1,23 @@
 """Three-frame assignment of a dense score tensor by Lagrangian relaxation, with a certified gap (appendix C, eq. 1-3).
 
-A target that no triplet holds stays alone: it takes the dummy, index 0, on both other axes. What a triplet scores above
-its targets alone is its gain, and the problem is to choose triplets that share no target and gain the most.
+A target that is in no chosen triplet stays alone: it takes the dummy, index 0, on both other axes. The gain of a
+triplet is its score minus the scores of its targets alone. The problem is to choose triplets that share no target and
+have the largest total gain.
 
-Prices of targets (Lagrange multipliers of "every target at most once") that pay for every triplet's gain bound what any
-choice can gain by their sum. What they exceed a triplet's gain by is its loss: a triplet that loses more than
-bound - value is in no better choice than one of that value. The solver
+Targets have prices, the Lagrange multipliers of "every target at most once". If the prices of every triplet sum to at
+least its gain, the sum of all prices is an upper bound of the total gain. The loss of a triplet is the sum of its
+prices minus its gain. A triplet with a loss above (bound - value) cannot be in a choice with a gain above `value`. The
+solver
 
-1. finds prices by two-frame assignments, reads a choice off them, and improves it by further two-frame assignments;
-2. while the gap is too wide, lowers the prices by subgradient steps over the triplets that lose little, and rounds a
-   linear programme over the targets on which the steps do not agree;
-3. if it stays too wide, gives the triplets that can be in a better choice, if they are few enough, to the exact solver:
-   a search by the prices, then HiGHS. This may take seconds for 20 to 30 targets, where the programme is not integral.
+1. finds prices by two-frame assignments, derives a choice from them, and improves it by further two-frame assignments;
+2. while the gap is too wide, lowers the prices by subgradient steps over the triplets with small losses, and rounds a
+   linear programme over the targets for which the steps do not agree;
+3. if the gap stays too wide, passes the triplets that can be in a better choice, if they are few enough, to the exact
+   solver: a search by the prices, then HiGHS. This may take seconds for 20 to 30 targets if the programme is not
+   integral.
 
-HiGHS alone, with its linear programme solved by column generation, takes 1 to 5 s for 30 targets and 8 to 16 s for 100;
-this takes 0.1 s and 0.2 s.
+HiGHS alone, with its linear programme solved by column generation, takes 1 to 5 s for 30 targets and 8 to 16 s for 100.
+This solver takes 0.1 s and 0.2 s.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,35 +31,36 @@ from torchvision_dddas.types import Bool, Float, Int
 
 Gain = Float[np.ndarray, "N1 M1 L1"]
 Triplets = Int[np.ndarray, "C 3"]
-# Of each layer. The dummy, index 0, costs nothing.
+# One array of prices for each layer. The price of the dummy, index 0, is 0.
 Prices = Sequence[np.ndarray]
 
-_OTHERS = ((1, 2), (0, 2), (0, 1))  # the other two layers of each
-_TURNS = 3  # how often prices are lowered and a choice is rounded before the exact solver is asked
+_OTHERS = ((1, 2), (0, 2), (0, 1))  # the other two layers of each layer
+_TURNS = 3  # how often prices are lowered and a choice is rounded before the exact solver runs
 _STEPS = 20  # subgradient steps of the first turn; the next turns have twice and three times as many
-# Roundings in each turn after the first: with one, 9 of 20 simulated windows of 30 targets end above a gap of 0.5 %,
-# with twenty one does.
+# Roundings in each turn after the first. With one rounding, 9 of 20 simulated windows of 30 targets end with a gap
+# above 0.5 %; with twenty, 1 of 20.
 _DRAWS = 20
-_SHORTLIST = 60  # triplets a target that the subgradient steps look at, of those that lose least
-# Steps of the search before HiGHS: windows of 10 targets fall from 85 to 36 ms (75th percentile).
+_SHORTLIST = 60  # triplets per target, those with the smallest losses, that the subgradient steps use
+# Steps of the search before HiGHS. The search reduces the time of windows of 10 targets from 85 to 36 ms (75th
+# percentile).
 _SEARCH_STEPS = 20_000
-_SAME = 1e-9  # bound and value that differ by less, in units of the largest gain, are equal
-# Subgradient steps as a share of Polyak's, shrunk after so many steps without a lower bound; share of the last
-# direction in the next one, against zigzag.
+_SAME = 1e-9  # bound and value count as equal if they differ by less, in units of the largest gain
+# Length of subgradient steps as a share of Polyak's. It is multiplied by _SHRINK after _PATIENCE steps without a lower
+# bound. _MOMENTUM is the share of the last direction in the next one; it reduces zigzags.
 _STEP, _SHRINK, _PATIENCE, _MOMENTUM = 0.4, 0.7, 4, 0.4
-# Triplets a target that are rounded: whole ones, and pairs with each other layer, apart because equal dummies would
-# crowd out the whole ones.
+# Triplets per target that enter the rounding: whole triplets, and pairs with each other layer. They are counted
+# separately, because triplets with equal dummies would crowd out the whole ones.
 _PER_TARGET = np.array([4, 2, 2])
-_LOWERINGS = 4  # two-frame assignments that lower the first prices
+_LOWERINGS = 4  # number of two-frame assignments that lower the first prices
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Triplets and how far from the best they can be at most.
+    """Triplets, and an upper bound of the best solution.
 
-    triplets: (Z, 3) int64; every real target of each frame is in exactly one; rows are sorted by i, then j, then k.
-    value: the sum of their scores. bound: no solution scores more. gap: (bound - value) / max(|bound|, 1e-9).
-    exact: whether the exact solver was needed and finished.
+    triplets: (Z, 3) int64; every real target of each frame is in exactly one triplet; rows are sorted by i, j, k.
+    value: the sum of their scores. bound: upper bound of the sum for any solution. gap: (bound - value) / max(|bound|,
+    1e-9). exact: whether the exact solver was needed and finished.
     """
 
     triplets: Int[np.ndarray, "Z 3"]
@@ -67,13 +71,14 @@ class Solution:
 
 
 def assign_triplets(score: Gain, gap: float = 0.005, most_exact: int | None = 4000) -> Solution:
-    """The triplets with the largest sum of scores, to within `gap` of it, every real target in exactly one.
+    """Choose triplets with the largest sum of scores, to within `gap`; every real target is in exactly one triplet.
 
-    score: (N + 1, M + 1, L + 1); index 0 of each axis is the dummy, used any number of times; (0, 0, 0) is never used
-    and its score not read. Scores may be zero or negative. gap: the gap to stop at. most_exact: the exact solver is
-    asked only if at most so many triplets can be in a better solution, and branches at most a tenth as often; otherwise
-    the gap stays wider than asked for. With gap = 0 and most_exact = None the solution is exact, however long it takes.
-    Raises InputError if the score is no 3-D tensor with a dummy on each axis, or not finite.
+    score: (N + 1, M + 1, L + 1), zero and negative values allowed. Index 0 of each axis is the dummy, which may be used
+    any number of times. (0, 0, 0) is never used, and its score is not read. gap: relative gap at which to stop.
+    most_exact: run the exact solver only if at most this many triplets can be in a better solution, with at most a
+    tenth as many branches; otherwise the gap may stay wider. With gap = 0 and most_exact = None the solution is exact,
+    but the time is unlimited.
+    Raises InputError if the score is not a finite 3-D tensor with a dummy on each axis.
     """
     tensor = np.asarray(score, float)
     if tensor.ndim != 3 or 0 in tensor.shape:
@@ -85,7 +90,7 @@ def assign_triplets(score: Gain, gap: float = 0.005, most_exact: int | None = 40
     finite[0, 0, 0] = True
     if not finite.all():
         raise InputError("triplets need finite scores; got NaN or infinity. Give an impossible triplet a low score.")
-    # What each triplet scores above its targets alone: 0 for those, and for (0, 0, 0).
+    # Gain of each triplet: its score minus the scores of its targets alone. It is 0 for lone targets and (0, 0, 0).
     first, second, third = (single.copy() for single in (tensor[:, 0, 0], tensor[0, :, 0], tensor[0, 0, :]))
     first[0] = second[0] = third[0] = 0.0
     gain = tensor - (second[:, None] + third)
@@ -105,12 +110,12 @@ def assign_triplets(score: Gain, gap: float = 0.005, most_exact: int | None = 40
     triplets = add_lone_targets(chosen, tensor.shape).astype(np.int64)
     triplets = triplets[np.lexsort(triplets.T[::-1])]
     value = float(tensor[tuple(triplets.T)].sum())
-    bound = value if exact else max(bound, value)  # a bound below the value is rounding
+    bound = value if exact else max(bound, value)  # rounding may make the bound smaller than the value
     return Solution(triplets, value, bound, (bound - value) / max(abs(bound), 1e-9), exact)
 
 
 def add_lone_targets(chosen: Int[np.ndarray, "C K"], sizes: Sequence[int]) -> Int[np.ndarray, "Z K"]:
-    """The rows, and one more for each target that none of them holds, with dummies. sizes: of each axis, and dummy."""
+    """Append a row with dummies for each target that is in no row. sizes: length of each axis, including the dummy."""
     rows = [chosen]
     for axis, size in enumerate(sizes):
         rest = np.setdiff1d(np.arange(1, size), chosen[:, axis])
@@ -129,7 +134,7 @@ def _bound(prices: Prices) -> float:
 
 
 def _cheap(gain: Gain, prices: Prices, most: float) -> Int[np.ndarray, "C"]:
-    """Flat indices, ascending, of the triplets that lose no more than `most` and gain something."""
+    """Return the flat indices, ascending, of the triplets with a loss of at most `most` and a gain above 0."""
     across = prices[1][:, None] + prices[2]
     spare, index = np.empty_like(across), []
     for i, block in enumerate(gain):
@@ -140,15 +145,16 @@ def _cheap(gain: Gain, prices: Prices, most: float) -> Int[np.ndarray, "C"]:
 
 
 class _Relaxation:
-    """A choice of triplets, and prices, near enough to each other if a few turns suffice.
+    """Computes a choice of triplets and prices, in a few turns, until their gap is small enough.
 
-    gain: in units of the largest. gap: wanted. alone: what all targets score alone, in these units.
+    gain: gains in units of the largest gain. gap: relative gap to reach. alone: the sum of the scores of all targets
+    alone, in these units.
     """
 
     def __init__(self, gain: Gain, gap: float, alone: float) -> None:
         self.gain, self.gap, self.alone = gain, gap, alone
         here = _low_prices(gain)
-        self.prices = here  # of the lowest bound
+        self.prices = here  # the prices with the lowest bound so far
         self.chosen = _improve(gain, _reassign(gain, _settle(gain, here, 0)[1], 0))
         for turn in range(1, _TURNS + 1):
             if self.is_near():
@@ -165,37 +171,37 @@ class _Relaxation:
                     break
 
     def is_near(self) -> bool:
-        """Whether the gap is as small as wanted."""
+        """Return whether the gap is small enough."""
         bound = _bound(self.prices)
         return bound - _gained(self.gain, self.chosen) <= max(self.gap * abs(bound + self.alone), _SAME)
 
     def candidates(self) -> Triplets:
-        """The triplets that can be in a better choice."""
+        """Return the triplets that can be in a better choice."""
         index = _cheap(self.gain, self.prices, _bound(self.prices) - _gained(self.gain, self.chosen) + _SAME)
         return np.stack(np.unravel_index(index, self.gain.shape), axis=1)
 
     def _some_cheap(self, prices: Prices) -> Int[np.ndarray, "C"]:
-        """Flat indices of the triplets that lose least, at most about twice as many as wanted."""
+        """Return flat indices of the triplets with the smallest losses, at most twice _SHORTLIST per target."""
         gain = self.gain
         wanted, limit = _SHORTLIST * (sum(gain.shape) - 3), np.inf
-        random = np.random.default_rng(0)  # a fixed seed: the same scores give the same triplets in every run
+        random = np.random.default_rng(0)  # a fixed seed, so that equal scores give equal triplets in every run
         if gain.size > wanted:
             sample = random.integers(0, gain.size, 4000)
             i, j, k = np.unravel_index(sample, gain.shape)
             loss = prices[0][i] + prices[1][j] + prices[2][k] - gain.ravel()[sample]
             limit = max(float(np.quantile(loss, wanted / gain.size)), _SAME)
         index = _cheap(gain, prices, limit)
-        # Dummies that all score the same leave very many ties.
+        # If all dummies have equal scores, very many triplets tie: take a random part of them.
         return index if len(index) <= 2 * wanted else np.sort(random.permutation(index)[: 2 * wanted])
 
 
 def _solve_exactly(
     nodes: Triplets, gain: Gain, prices: Prices, value: float, most_exact: int | None
 ) -> tuple[Triplets, bool]:
-    """The best choice of these triplets, if it gains more than `value`, and whether that is certain."""
+    """Return the best choice of these triplets, if it gains more than `value`, and whether it is certainly the best."""
     worth, price = gain[tuple(nodes.T)], np.concatenate(prices)
     named = nodes + np.cumsum([0, *gain.shape[:2]])
-    # Targets that none of the triplets holds stay alone, and lose their prices in any case.
+    # Targets that are in none of the triplets stay alone, so they lose their prices in any case.
     spare = float(price.sum() - price[np.unique(named[nodes > 0])].sum())
     held = [row[real].tolist() for row, real in zip(named, nodes > 0, strict=True)]
     limit = price.sum() - value - spare + _SAME
@@ -210,19 +216,19 @@ def _solve_exactly(
 
 
 def _low_prices(gain: Gain) -> Prices:
-    """Prices that pay for every triplet, not far above the lowest sum there is.
+    """Return valid prices (their sum over each triplet is at least its gain) with a nearly minimal total.
 
-    Even shares of the gains pay for every triplet. From them, and from nine tenths of them, two layers at a time get
-    the least prices that the third's allow. Where all triplets are alike the shares are the best start, elsewhere the
-    lower one: the better end is returned.
+    Even shares of the gains are valid prices. Starting from them, and from 0.9 times them, set the prices of two layers
+    in turn to the smallest that the third layer allows. If all triplets are similar, the first start is better, else
+    the second. Return the result with the lower total.
     """
-    # For each target the largest even share of the gain of one of its triplets.
+    # For each target: the largest even share of the gain of one of its triplets.
     real = gain[1:, 1:, 1:]
     over_first, over_last = real.max(axis=0, initial=0.0), real.max(axis=(1, 2), initial=0.0)
     triple = over_last, over_first.max(axis=1, initial=0.0), over_first.max(axis=0, initial=0.0)
     shares = []
     for layer, (a, b) in enumerate(_OTHERS):
-        # The pairs of this layer and another: the third index is the dummy's.
+        # Gains of pairs of this layer and another layer, with the dummy (index 0) in the third layer.
         faces = [np.moveaxis(gain.take(0, axis=third), layer - (third < layer), 0)[1:] for third in (a, b)]
         pair = np.maximum(*(face.max(axis=1, initial=0.0) for face in faces))
         shares.append(np.concatenate([[0.0], np.maximum(triple[layer] / 3, pair / 2)]))
@@ -236,11 +242,12 @@ def _low_prices(gain: Gain) -> Prices:
 
 
 def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndarray, "P 2"]]:
-    """The least prices of the other two layers that go with those of `layer`, and the pairs that are worth them.
+    """Return prices with the smallest prices of the other two layers for those of `layer`, and the assigned pairs.
 
-    The prices are the mean of the assignment's two extreme dual solutions: extremes leave no room for the next layer.
+    The new prices are the mean of the two extreme dual solutions of the assignment, because an extreme solution would
+    leave no freedom to the next layer.
     """
-    # For each pair of the other two layers the most that it gains with one target of `layer`, less its price.
+    # For each pair of the other two layers: the largest gain with one target of `layer`, minus that target's price.
     spare, price = np.empty(gain.shape[1:]), prices[layer]
     if layer == 0:
         best = gain[0].copy()
@@ -249,7 +256,7 @@ def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndar
     else:
         best = np.empty((len(gain), gain.shape[3 - layer]))
         across = price[:, None] if layer == 1 else price
-        # Block by block: a block fits the cache, the tensor does not.
+        # Work block by block, because a block fits into the cache and the tensor does not.
         for block, row in zip(gain, best, strict=True):
             np.subtract(block, across, out=spare).max(axis=layer - 1, out=row)
     first, second, excess, row, column = _match(best)
@@ -267,8 +274,8 @@ def _settle(gain: Gain, prices: Prices, layer: int) -> tuple[Prices, Int[np.ndar
 
 
 def _match(best: Float[np.ndarray, "A B"]) -> tuple[np.ndarray, ...]:
-    """Gains (A,) and (B,) of targets without each other, what pairs gain above (A, B), and the best pairs (P,) (P,)."""
-    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+    """Return gains of lone targets (A,) and (B,), the extra gains of pairs (A, B), and the best pairs (P,), (P,)."""
+    from scipy.optimize import linear_sum_assignment  # imported here: it takes half a second and 45 MB
 
     first, second = np.maximum(best[1:, 0], 0.0), np.maximum(best[0, 1:], 0.0)
     excess = np.maximum(best[1:, 1:] - first[:, None] - second, 0.0)
@@ -276,7 +283,7 @@ def _match(best: Float[np.ndarray, "A B"]) -> tuple[np.ndarray, ...]:
 
 
 def _least_potential(excess: np.ndarray, row: np.ndarray, column: np.ndarray) -> Float[np.ndarray, "B"]:
-    """The least dual prices of the columns of an optimal assignment of non-negative scores (Bellman-Ford)."""
+    """Return the smallest dual prices of the columns of an optimal assignment of non-negative scores (Bellman-Ford)."""
     above = excess[row] - excess[row, column][:, None]
     potential = least = np.delete(excess, row, axis=0).max(axis=0, initial=0.0)
     for _ in range(len(row) + 1):
@@ -288,18 +295,18 @@ def _least_potential(excess: np.ndarray, row: np.ndarray, column: np.ndarray) ->
 
 
 class _Shortlist:
-    """Some triplets of a tensor, sorted by their pair of the last two layers, over which the prices are lowered.
+    """Some triplets of a tensor, sorted by their pair of the last two layers. The subgradient steps run over them.
 
-    index: (C,) flat indices into `gain`, at least one. nodes: (C, 3) their targets. With prices for the first layer
-    alone, the best choice of the other two is a two-frame assignment, in which a target of the first layer may be used
-    more than once, or never: it is then too cheap, or too dear.
+    index: (C,) flat indices into `gain`, at least one. nodes: (C, 3) their targets. If only the first layer has prices,
+    the best choice of the other two layers is a two-frame assignment. A target of the first layer may then be used more
+    than once, if its price is too low, or never, if its price is too high.
     """
 
     def __init__(self, index: Int[np.ndarray, "C"], gain: Gain) -> None:
         self.shape = gain.shape[1:]
         pairs = self.shape[0] * self.shape[1]
         cell = index % pairs
-        # Two bytes sort in linear time, and number the pairs of up to 255 targets.
+        # 16-bit integers are sorted in linear time. They can number the pairs of up to 255 targets.
         order = np.argsort(cell.astype(np.uint16) if pairs <= 2**16 else cell, kind="stable")
         index, cell = index[order], cell[order]
         self.nodes = np.stack(np.unravel_index(index, gain.shape), axis=1)
@@ -311,7 +318,7 @@ class _Shortlist:
         self.best = np.full(self.shape, -1.0)
 
     def _answer(self, price: Float[np.ndarray, "N1"]) -> tuple[float, Int[np.ndarray, "P"]]:
-        """The bound that these prices make over the shortlist, and which of its triplets reach it."""
+        """Return the bound of these prices over the shortlist, and the indices of the triplets that attain it."""
         left = self.gain - price[self.first]
         most = np.maximum.reduceat(left, self.start)
         self.best.ravel()[self.cell] = most
@@ -320,7 +327,7 @@ class _Shortlist:
         pairs = add_lone_targets(np.stack([row, column], axis=1)[worth > 0] + 1, self.shape)
         pair = pairs[:, 0] * self.shape[1] + pairs[:, 1]
         place = self.place[pair[self.best.ravel()[pair] > 0]]
-        # The first of the triplets that reach their pair's best.
+        # For each pair, take the first triplet with the best value.
         top = np.flatnonzero(left == np.repeat(most, self.count))
         reached = top[np.searchsorted(top, self.start[place])]
         return float(worth.sum() + second.sum() + third.sum() + price.sum()), reached
@@ -328,9 +335,10 @@ class _Shortlist:
     def descend(
         self, price: Float[np.ndarray, "N1"], value: float, steps: int
     ) -> tuple[Float[np.ndarray, "N1"], Float[np.ndarray, "C"]]:
-        """The prices of the lowest bound in so many steps, and each triplet's share of the answers in the later half.
+        """Run subgradient steps, and return the prices with the lowest bound and the shares of triplets.
 
-        value: the gain of some choice, which the steps of Polyak's length aim at.
+        The share of a triplet is how often it was in the answers of the later half of the steps. value: the gain of
+        some choice, which is the target value of Polyak's step length.
         """
         lowest, best, direction, length, idle = np.inf, price, np.zeros(len(price)), _STEP, 0
         share, answers = np.zeros(len(self.gain)), 0
@@ -350,7 +358,7 @@ class _Shortlist:
             direction = slope + _MOMENTUM * direction
             steepness = float(direction @ direction)
             if steepness == 0.0 or lowest - value < _SAME:
-                # Every target is used as often as it should be: this answer is the best choice.
+                # Every target is used at most once, so this answer is the best choice.
                 share[:] = 0
                 share[reached], answers = 1, 1
                 break
@@ -365,10 +373,10 @@ class _Shortlist:
 def _round(
     gain: Gain, nodes: Triplets, share: Float[np.ndarray, "C"], prices: Prices, draws: int
 ) -> Iterator[Triplets]:
-    """Choices from some triplets, each with its share of the answers of a descent.
+    """Yield choices of triplets, given the share of each triplet in the answers of a descent.
 
-    Those in every answer are taken. Of the rest a linear programme says how much of each triplet to take, and the
-    largest shares go first, in several draws.
+    Triplets that are in every answer are taken. A linear programme gives the shares of the other triplets, and triplets
+    are taken by decreasing share, which is randomised after the first draw.
     """
     agreed = nodes[share > 1 - 1e-9]
     uses = np.bincount(agreed[:, 0], minlength=gain.shape[0])
@@ -376,13 +384,13 @@ def _round(
     taken = ((nodes[:, layer] > 0) & np.isin(nodes[:, layer], agreed[:, layer]) for layer in range(3))
     nodes = nodes[~np.logical_or.reduce(list(taken))]
     loss = prices[0][nodes[:, 0]] + prices[1][nodes[:, 1]] + prices[2][nodes[:, 2]] - gain[tuple(nodes.T)]
-    # Ties in random order: the first of each target would all want the same partners.
+    # Order ties randomly, because otherwise the first triplets of all targets would have the same partners.
     nodes = nodes[np.argsort(loss + _SAME * np.random.default_rng(0).random(len(loss)))]
     nodes = nodes[_first_of_each_kind(nodes)]
     parts = relaxed_shares(nodes - 1, gain[tuple(nodes.T)])
     random = np.random.default_rng(0)
     for draw in range(draws):
-        # The first draw as the programme says, the others shaken: a triplet of which it takes half may go either way.
+        # The first draw orders by shares. The others add random numbers, so that a triplet with share .5 may come late.
         order = np.argsort(-(parts + random.random(len(parts)) if draw else parts), kind="stable")
         used: set[tuple[int, int]] = set()
         fitting = []
@@ -395,7 +403,7 @@ def _round(
 
 
 def _first_of_each_kind(nodes: Triplets) -> Bool[np.ndarray, "C"]:
-    """Which triplets are among the first of some target: of its whole ones, or of its pairs with another layer."""
+    """Return (C,) whether a triplet is among the first of a target's whole triplets, or of its pairs with a layer."""
     wanted, present = np.zeros(len(nodes), bool), nodes > 0
     for layer, (other, _) in enumerate(_OTHERS):
         kind = np.where(present.all(axis=1), 0, np.where(present[:, other], 1, 2))
@@ -408,7 +416,7 @@ def _first_of_each_kind(nodes: Triplets) -> Bool[np.ndarray, "C"]:
 
 
 def _improve(gain: Gain, chosen: Triplets) -> Triplets:
-    """A choice that reassigning one layer's targets to what is left of the triplets does not improve."""
+    """Improve a choice by reassigning the targets of one layer at a time until no layer gives a better choice."""
     value, idle, layer = _gained(gain, chosen), 0, 0
     while idle < 3:
         other = _reassign(gain, chosen[:, _OTHERS[layer]], layer)
@@ -420,8 +428,8 @@ def _improve(gain: Gain, chosen: Triplets) -> Triplets:
 
 
 def _reassign(gain: Gain, pairs: Int[np.ndarray, "P 2"], layer: int) -> Triplets:
-    """The best choice of triplets that holds these pairs of the other two layers, or their targets alone."""
-    from scipy.optimize import linear_sum_assignment  # here, as it takes half a second and 45 MB
+    """Return the best choice of triplets that keeps the given pairs, or lone targets, of the other two layers."""
+    from scipy.optimize import linear_sum_assignment  # imported here: it takes half a second and 45 MB
 
     pairs = add_lone_targets(pairs[(pairs > 0).all(axis=1)], [gain.shape[other] for other in _OTHERS[layer]])
     group = np.insert(pairs, layer, 0, axis=1)

@@ -1,12 +1,12 @@
-"""Kalman filter of many targets at once: position, velocity, size and growth, at constant velocity.
+"""Kalman filter of many targets at once: position, velocity, size and growth, with constant velocity.
 
-The velocity is constant in the world, not in the picture: a target that comes nearer grows, and moves faster the larger
-it is. With a growth of γ a look, after g looks a height h is h / (1 − γ g) and the displacement is v g / (1 − γ g),
-exactly for a straight walk at constant speed towards a pinhole camera, or past a camera that drives.
+The velocity is constant in the world and not in the picture: a target that comes nearer grows, and moves faster as it
+grows. With a growth of γ a look, after g looks a height h is h / (1 − γ g) and the displacement is v g / (1 − γ g).
+This is exact for a straight walk at constant speed towards a pinhole camera, or past a moving camera.
 
-States are (N, COLUMNS) float64 arrays, one row a target, in pixels and looks, or tensors with axes before N. The
-position's variances hold for each of the two axes, which are independent, in squares of the target's height: near
-targets move as far in their own heights as distant ones. The size's are of the logarithm of the height.
+States are (N, COLUMNS) float64 arrays with one row for each target, in pixels and looks, or tensors with leading axes.
+The variances of position and velocity are per axis, for two independent axes, in squared target heights, because near
+and distant targets move by the same number of their own heights. The variances of size are those of the log height.
 """
 
 from typing import Any
@@ -17,27 +17,27 @@ from torchvision_dddas.geometry import namespace
 
 X, Y, VX, VY, WIDTH, HEIGHT, GROWTH, SEEN = range(8)
 PP, PV, VV = 8, 9, 10  # position, velocity: variances and covariance
-SS, SG, GG = 11, 12, 13  # logarithm of the height, growth
+SS, SG, GG = 11, 12, 13  # log height, growth: variances and covariance
 COLUMNS = 14
 
 SIZE_SCATTER = 0.1
-"""Default sd of the logarithm of a detection's height."""
-_GROWTH = 0.15  # sd of the growth of a new target from look to look, as a share of its usual step
-_GROWTH_CHANGE = 0.4  # sd of the growth's change, as a share of the velocity's
+"""Default standard deviation of the log height of a detection."""
+_GROWTH = 0.15  # standard deviation of a new target's growth in a look, as a share of the usual step
+_GROWTH_CHANGE = 0.4  # standard deviation of the change of growth, as a share of that of the velocity's change
 _WIDTH_GAIN = 0.5
-_FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: no target is predicted nearer than half its distance
+_FARTHEST, _NEAREST = -1.0, 0.5  # bounds of γ g: the predicted distance is at least half of the current one
 
 Variances = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Variance of a value, its covariance with its rate, variance of the rate: (N,) each."""
+"""Variance of a value, covariance with its rate, and variance of the rate: (N,) each."""
 
 
 def start(
     box_px: np.ndarray, time: float, scatter: float, speed: float, size_scatter: float = SIZE_SCATTER
 ) -> np.ndarray:
-    """States of new targets, at rest.
+    """Return the states of new targets at rest.
 
-    box_px: (N, 4) x, y, width, height. scatter: sd of the centre, in heights. speed: sd of the velocity, in heights a
-    look. size_scatter: sd of the logarithm of the height.
+    box_px: (N, 4) x, y, width, height. scatter, speed, size_scatter: standard deviations of the centre in heights, of
+    the velocity in heights a look, and of the log height.
     """
     nothing = 0 * box_px[..., 0]
     return _table(
@@ -52,7 +52,7 @@ def start(
 
 
 def predict(state: np.ndarray, time: float, wander: float) -> np.ndarray:
-    """States at a later time. wander: sd of the change of velocity in one look, heights a look."""
+    """Predict states at a later time. wander: standard deviation of a look's change of velocity, heights a look."""
     gap = time - state[..., SEEN]
     stretch = 1 / (1 - (gap * state[..., GROWTH]).clip(_FARTHEST, _NEAREST))
     return _table(
@@ -67,7 +67,7 @@ def predict(state: np.ndarray, time: float, wander: float) -> np.ndarray:
 
 
 def _spread(state: np.ndarray, first: int, gap: np.ndarray, power: float) -> Variances:
-    """Variances after a gap (N,) of looks, the rate being a random walk of this power."""
+    """Return the variances after a gap (N,) of looks. The rate is a random walk with variance `power` a look."""
     place, both, rate = state[..., first], state[..., first + 1], state[..., first + 2]
     return (
         place + gap * (2 * both + gap * (rate + power / 3 * gap)),
@@ -84,11 +84,11 @@ def update(
     size_scatter: float = SIZE_SCATTER,
     is_cut: np.ndarray | bool = False,
 ) -> np.ndarray:
-    """Predicted states corrected by their boxes (N, 4).
+    """Correct predicted states by boxes (N, 4).
 
-    The velocity's gain is at most two over the gap: one innovation after a long gap says little of the present speed.
-    is_cut: (N,) whether the picture's border may cut the box. As such a target crosses the border it grows or shrinks
-    in the picture, but comes no nearer: it keeps no growth.
+    The gain of the velocity is at most 2 / gap, because one innovation after a long gap tells little about the current
+    speed. is_cut: (N,) whether the picture's border may cut the box. The growth of such a target is set to 0, because
+    its box changes in size without a change of distance.
     """
     functions = namespace(later)
     gap = functions.clip(time - later[..., SEEN], 1e-3, None)
@@ -111,7 +111,7 @@ def update(
 def _gains(
     later: np.ndarray, first: int, noise: float, most: np.ndarray | None
 ) -> tuple[tuple[np.ndarray, np.ndarray], Variances]:
-    """Gains (N,) of a value and its rate, and the variances after the update. most: bound of the second gain."""
+    """Return the gains (N,) of a value and of its rate, and the updated variances. most: bound of the rate's gain."""
     place, both, rate = later[..., first], later[..., first + 1], later[..., first + 2]
     total = place + noise
     gain, rate_gain = place / total, both / total
@@ -129,9 +129,9 @@ def _table(
     place_variances: Variances,
     size_variances: Variances,
 ) -> np.ndarray:
-    """States (N, COLUMNS) of their parts: (N, 2) the first three, (N,) the others."""
+    """Build states (N, COLUMNS) from their parts: the first three are (N, 2), the others (N,)."""
     rest = (growth, seen, *place_variances, *size_variances)
-    if isinstance(centre, np.ndarray):  # much faster than joining
+    if isinstance(centre, np.ndarray):  # filling an array is much faster than concatenation
         state = np.empty((*centre.shape[:-1], COLUMNS))
         state[..., X : Y + 1], state[..., VX : VY + 1], state[..., WIDTH : HEIGHT + 1] = centre, velocity, size
         for column, values in enumerate(rest, GROWTH):
@@ -142,9 +142,9 @@ def _table(
 
 
 def transform(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
-    """States after the camera has moved. now_from_before: (3, 3) pixel homography.
+    """Transform states by the camera's motion. now_from_before: (3, 3) pixel homography.
 
-    Velocities turn and stretch with the picture around each target, and sizes with its scale there.
+    Velocities are mapped by the derivative of the homography at each target, and sizes by its scale there.
     """
     place, derivative = _map_points(state[..., : Y + 1], now_from_before)
     velocity = namespace(state).einsum("...nij,...nj->...ni", derivative, state[..., VX : VY + 1])
@@ -153,14 +153,14 @@ def transform(state: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
 
 
 def transform_boxes(box_px: np.ndarray, now_from_before: np.ndarray) -> np.ndarray:
-    """Boxes (N, 4) after the camera has moved: centres move, sides stretch by the scale there and stay upright."""
+    """Transform boxes (N, 4) by the camera's motion: centres by the homography, sides by its scale, not rotated."""
     centre, derivative = _map_points(box_px[:, :2] + box_px[:, 2:] / 2, now_from_before)
     size = box_px[:, 2:] * _scale(derivative)
     return np.concatenate([centre - size / 2, size], axis=1)
 
 
 def _map_points(point: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 2) under a homography, and its derivative there, (N, 2, 2)."""
+    """Map points (N, 2) by a homography, and return also its derivatives there, (N, 2, 2)."""
     straight = namespace(point).swapaxes(h[..., :2], -1, -2)
     depth = point @ straight[..., 2:] + h[..., 2:, 2:]
     place = (point @ straight[..., :2] + h[..., None, :2, 2]) / depth

@@ -1,4 +1,4 @@
-"""The default tracker: association by scores, each frame decided in view of the next one."""
+"""The default tracker: it links detections by scores, and decides each frame with the next frame in view."""
 
 from collections import deque
 from collections.abc import Callable
@@ -19,9 +19,9 @@ from torchvision_dddas.tracking.appearance import (
 from torchvision_dddas.tracking.assignment import choose_links, link_confidences, plausible_links
 from torchvision_dddas.tracking.box_motion import FEWEST, candidate_shifts, likelier_shift
 from torchvision_dddas.tracking.kalman import HEIGHT, SEEN, VX, VY, WIDTH, X, Y, transform_boxes
-from torchvision_dddas.tracking.scene import Scene
+from torchvision_dddas.tracking.scene import SceneStatistics
 from torchvision_dddas.tracking.scores import (
-    Look,
+    BoxLook,
     association_scores,
     common_velocity,
     is_near_border,
@@ -31,21 +31,22 @@ from torchvision_dddas.tracking.scores import (
 from torchvision_dddas.tracking.smoother import FILLED, FixedLagSmoother
 from torchvision_dddas.types import AppearanceUse, Detections, Table, Tracks
 
-_RECENT = 3  # looks in which a track must have been seen to show how targets move
-_LEAVING_FRAMES, _LEAVING_LOOKS = 15, 3  # for which a target is predicted to go on; later it may have stopped or turned
-_DOUBTS = 500  # detections that the usual doubt is taken of
+_RECENT = 3  # velocities come from tracks that were seen within this many looks
+# A target is predicted outside the picture for the larger of these times. Later it may have stopped or turned.
+_LEAVING_FRAMES, _LEAVING_LOOKS = 15, 3
+_DOUBTS = 500  # number of detections whose median is the usual doubt
 _LEAST_DOUBT, _LEAST_SCORE = 0.01, 1e-3
-_DAMAGED_HITS = 5  # detections that confirm a track in damaged pictures: what looks like a target there is soon gone
-_LONE_LOOKS = 2  # after which a detection that was not continued stays alone
-_LONE_SHARE = 0.01  # of detections that stay alone, from which a single one confirms no track
+_DAMAGED_HITS = 5  # detections that confirm a track in damaged pictures, because false targets there are short-lived
+_LONE_LOOKS = 2  # a detection that is not continued within this many looks counts as alone
+_LONE_SHARE = 0.01  # if a larger share of detections stays alone, a single detection does not confirm a track
 
 
 @dataclass(frozen=True)
 class TrackStates(Table):
-    """The tracks that are remembered, one row a track.
+    """The tracks in memory, with one row for each track. state: (N, kalman.COLUMNS) at the last detection.
 
-    state: (N, kalman.COLUMNS) as last seen. signature: (N, D) histograms, zeros where unknown; D is 0 until one is
-    known. number: of the track, among all that were ever begun. hits: detections so far. look: when last seen.
+    signature: (N, D) histograms, zeros if unknown; D is 0 until the first histogram is known. number: serial number of
+    the track. hits: number of detections. look: look of the last detection.
     """
 
     state: np.ndarray = field(default_factory=lambda: np.zeros((0, kalman.COLUMNS)))
@@ -59,7 +60,7 @@ class TrackStates(Table):
 
 
 def _join(first: TrackStates, *others: TrackStates) -> TrackStates:
-    """All tracks in one table."""
+    """Join tables of tracks into one table."""
     tables = [first, *(tracks for tracks in others if len(tracks))]
     width = max(tracks.signature.shape[1] for tracks in tables)
     same = [
@@ -70,17 +71,18 @@ def _join(first: TrackStates, *others: TrackStates) -> TrackStates:
 
 
 def _widen(signature: np.ndarray, width: int) -> np.ndarray:
-    """Unknown histograms (N, 0) as zeros (N, width); others as they are."""
+    """Widen unknown histograms (N, 0) to zeros (N, width); return others unchanged."""
     return signature if signature.shape[1] == width else np.zeros((len(signature), width), np.float32)
 
 
 @dataclass
 class _Sample:
-    """A frame and those of its detections that count. row: of the frame's detections. step: motion from the one before.
+    """A sampled frame with the M detections that the tracker uses.
 
-    begins: (M,) which may begin a track. appearance: gives the (M, D) histograms. time: in looks. look: its number.
-    examined: why the histograms were computed; empty until then. signature: they, (M, 0) until needed. visible: share
-    of each box.
+    row: (M,) index of each in the frame's detections. begins: (M,) whether a detection may begin a track. step: (3, 3)
+    camera motion from the frame before, or None. appearance: returns the histograms of all detections. time: time in
+    looks. look: number of the look. examined: why the histograms were computed, "" until then. signature: the (M, D)
+    histograms, (M, 0) until they are computed. visible: visible share of each box.
     """
 
     frame: int
@@ -99,7 +101,7 @@ class _Sample:
         self.signature, self.visible = np.zeros((len(self.row), 0), np.float32), np.ones(len(self.row))
 
     def examine(self, cause: str) -> None:
-        """Compute the histograms, once."""
+        """Compute the histograms unless this was done before. cause: the reason, for the record."""
         if self.appearance is not None and len(self.row):
             self.examined = cause
             self.signature, self.visible = self.appearance()[self.row], visible_shares(self.box_px)
@@ -107,9 +109,9 @@ class _Sample:
 
 
 class DoubtRule:
-    """Which detections count: those whose doubt is not far above the usual one of the last detections.
+    """Selects the detections to track: their doubt must not be far above the usual doubt of recent detections.
 
-    Doubt is 1 / score - 1: the odds that a detection is false, if scores are probabilities.
+    The doubt is 1 / score - 1, which is the odds that a detection is false if scores are probabilities.
     """
 
     def __init__(self, parameters: TrackParameters) -> None:
@@ -117,40 +119,42 @@ class DoubtRule:
         self._recent: deque[float] = deque(maxlen=_DOUBTS)
 
     def apply(self, score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(M,) which detections of the next look are tracked, and (M,) which may begin a track."""
+        """Return (M,) whether detections of the next look are tracked, and (M,) whether they may begin a track."""
         doubt = 1 / np.clip(score, _LEAST_SCORE, 1.0) - 1
         self._recent.extend(doubt.tolist())
-        # The lower median: if half of the detections are unlikely, the mean of the middle two is nobody's doubt.
+        # Use the lower median: if half of the detections are unlikely, the mean of the middle two is not typical.
         usual = max(sorted(self._recent)[(len(self._recent) - 1) // 2] if self._recent else 0.0, _LEAST_DOUBT)
         return doubt <= self.parameters.doubt * usual, doubt <= self.parameters.birth_doubt * usual
 
 
 class ScoreTracker:
-    """The state of a run. Feed it frames in order; each call returns the frames that are settled by it, in order.
+    """The default tracker of a run. Pass frames in order to `feed`, which returns the settled frames in order.
 
-    A frame is settled at most `track.hits` + 2 sampled frames later.
+    A frame is settled when no later frame can change its tracks, at most `track.hits` + 2 sampled frames later.
     """
 
     def __init__(
         self, settings: Settings, interval: int, size: tuple[float, float] | None = None, confirmed: bool = False
     ) -> None:
-        """interval: usual distance of the frames fed. size: (width, height) of the picture, None if unknown.
+        """Start without tracks.
 
+        interval: usual number of frames between fed frames. size: (width, height) of the picture, None if unknown.
         confirmed: whether the detector has confirmed its detections over several frames.
         """
         self.parameters, self.interval, self.size = settings.track, interval, size
-        self.scene = Scene(size)
+        self.scene = SceneStatistics(size)
         self.tracks = TrackStates()
-        self.flow = self.tracks.state  # tracks that show how targets move
-        self.common_velocity = np.zeros(2)  # of them, in pixels a look
+        self.flow = self.tracks.state  # states of recent tracks, whose velocities show how targets move
+        self.common_velocity = np.zeros(2)  # their common velocity, pixels a look
         self.smoother = FixedLagSmoother(self.parameters.hits, self.parameters.smooth, interval)
         self.begun = self._looks = 0
         self._before: _Sample | None = None
         self._waiting: _Sample | None = None
         self._doubts = DoubtRule(settings.track)
         self._confirmed = confirmed
-        self._uses: dict[int, AppearanceUse] = {}  # of appearance, by frame, of those that are not settled
-        self._seen = self._lone = 0  # detections, and those of them that were followed by nothing
+        self._least = max(1, -(-settings.track.hits // interval)) if confirmed else 1
+        self._uses: dict[int, AppearanceUse] = {}  # use of appearance, by frame, in frames that are not settled
+        self._seen = self._lone = 0  # number of detections, and number of those that stayed alone
 
     def feed(
         self,
@@ -161,11 +165,12 @@ class ScoreTracker:
         at: float | None = None,
         damaged: bool = False,
     ) -> list[Tracks]:
-        """Add the detections of a frame, whose number is above the last one's.
+        """Add the detections of a frame, and return the settled frames. The frame number must increase.
 
-        now_from_before: (3, 3) pixel homography from the frame fed before; None: the camera stood still, or unknown.
-        appearance: gives the (N, D) histograms of the boxes, zeros where unknown; called once at most, maybe with the
-        next frame. at: its number if frames had come at a constant rate; None: they did. damaged: see Frame.
+        now_from_before: (3, 3) pixel homography from the frame fed before; None if the camera stood still or its motion
+        is unknown. appearance: returns the (N, D) histograms of the boxes, zeros if unknown. It is called at most once,
+        perhaps while the next frame is fed. at: the frame number at a constant frame rate; None: the number itself.
+        damaged: see Frame.
         """
         counts, begins = self._doubts.apply(detections.score)
         row = np.flatnonzero(counts)
@@ -184,7 +189,7 @@ class ScoreTracker:
         return self._settle()
 
     def end(self) -> list[Tracks]:
-        """The frames that were still waiting."""
+        """Return the remaining frames at the end of the run."""
         if self._waiting is not None:
             self._decide(self._waiting, None)
             self._waiting = None
@@ -196,7 +201,7 @@ class ScoreTracker:
         return [replace(tracks, appearance=use) if use else tracks for tracks, use in zip(settled, uses, strict=True)]
 
     def _decide(self, now: _Sample, ahead: _Sample | None) -> None:
-        """Link a frame's detections to the tracks, in view of the next frame where there is one."""
+        """Link a frame's detections to the tracks. ahead: the next frame, if it is known."""
         box, parameters = now.box_px, self.parameters
         self._follow_camera(now)
         score = self._scores(self.tracks, now, box)
@@ -209,7 +214,7 @@ class ScoreTracker:
             self._uses[now.frame] = AppearanceUse(bool(now.examined), now.examined or "no link is in doubt")
         tracks, detections = plausible_links(score)
         at_border = is_near_border(box, self.size)
-        # Tracks that would begin with each detection, without numbers yet, and those that would go on by each link.
+        # Tracks that would begin with each detection, without numbers yet, and tracks after each plausible link.
         state = kalman.start(box, now.time, parameters.scatter, self.scene.step, parameters.size_scatter)
         state[:, VX : VY + 1] = self.common_velocity
         count = len(box)
@@ -218,7 +223,7 @@ class ScoreTracker:
         continued = self._update(now, tracks, detections, at_border[detections])
         if ahead is not None and len(ahead.row):
             there = ahead.box_px
-            if ahead.step is not None:  # in the coordinates of this frame
+            if ahead.step is not None:  # convert the boxes to the coordinates of this frame
                 there = transform_boxes(there, np.linalg.inv(ahead.step))
             onward = self._scores(_join(continued, born, self.tracks), ahead, there)
             parts = np.split(onward, [len(continued), len(continued) + len(born)])
@@ -231,7 +236,7 @@ class ScoreTracker:
         self._before = now
 
     def _follow_camera(self, now: _Sample) -> None:
-        """Bring the tracks into the coordinates of a frame, and learn from its boxes."""
+        """Transform the tracks to the coordinates of a frame, and add its boxes to the scene statistics."""
         before = None if self._before is None else self._before.box_px
         if now.step is not None:
             self.tracks = replace(self.tracks, state=kalman.transform(self.tracks.state, now.step))
@@ -248,11 +253,11 @@ class ScoreTracker:
 
     @property
     def _trusts_single(self) -> bool:
-        """Whether a single certain detection confirms a track: not where many of these were followed by nothing."""
+        """Whether a single certain detection confirms a track. False if too many detections stayed alone."""
         return self._confirmed or self._lone <= _LONE_SHARE * (self._seen + _DOUBTS)
 
     def _shift(self, now: _Sample) -> np.ndarray | None:
-        """The camera's step that the boxes show beside the tracks' velocities, in pixels; None for none."""
+        """Return the camera's shift, px, that the boxes show beyond the tracks' velocities; None without a shift."""
         recent = self.tracks.look == now.look - 1
         known = recent & (self.tracks.hits > 1)
         newborn = bool(known.sum() < FEWEST)
@@ -268,11 +273,11 @@ class ScoreTracker:
         return None if chosen is None else shifts[chosen]
 
     def _scores(self, tracks: TrackStates, sample: _Sample, box_px: np.ndarray) -> np.ndarray:
-        """(N, M) scores of tracks and a frame's detections, whose boxes are given in the tracks' coordinates."""
+        """Return (N, M) scores of tracks and a frame's detections. box_px: the boxes in the tracks' coordinates."""
         if not len(tracks) or not len(box_px):
             return np.zeros((len(tracks), len(box_px)))
         scene, missed = self.scene.state(sample.time), sample.look - tracks.look - 1
-        look = Look.of(tracks.state, missed, box_px, scene, self.parameters)
+        look = BoxLook.of(tracks.state, missed, box_px, scene, self.parameters)
         score, once = np.empty((len(tracks), len(box_px))), tracks.hits == 1
         old, new = (~once).nonzero()[0], once.nonzero()[0]
         if len(old):
@@ -286,7 +291,7 @@ class ScoreTracker:
         return score
 
     def _update(self, now: _Sample, tracks: np.ndarray, detections: np.ndarray, is_cut: np.ndarray) -> TrackStates:
-        """The tracks (K,) after a detection (K,) each. is_cut: as in `kalman.update`."""
+        """Return the tracks (K,) updated by one detection (K,) each. is_cut: see `kalman.update`."""
         old, box, parameters = self.tracks, now.box_px[detections], self.parameters
         later = kalman.predict(old.state[tracks], now.time, parameters.wander * self.scene.step)
         state = kalman.update(later, box, now.time, parameters.scatter, parameters.size_scatter, is_cut)
@@ -296,6 +301,16 @@ class ScoreTracker:
         if width:
             signature = blend_histograms(signature, seen, now.visible[detections], hits)
         return TrackStates(state, signature, old.number[tracks], hits, np.full(len(tracks), now.look))
+
+    def _is_part(self, now: _Sample, linked: np.ndarray) -> np.ndarray:
+        """Return (M,) whether the centre of a detection lies in the predicted box of an established, linked track.
+
+        Targets may be detected in parts. If one part continues a track, the other parts must not begin new tracks.
+        """
+        old = self.tracks[linked[self.tracks.hits[linked] >= self._least]]
+        later = kalman.predict(old.state, now.time, 0.0)
+        offset = np.abs((now.box_px[:, :2] + now.box_px[:, 2:] / 2)[:, None] - later[:, X : Y + 1])
+        return np.asarray((offset <= later[:, WIDTH : HEIGHT + 1] / 2).all(axis=2).any(axis=1))
 
     def _commit(
         self,
@@ -307,9 +322,11 @@ class ScoreTracker:
         born: TrackStates,
         at_border: np.ndarray,
     ) -> None:
-        """Give these tracks (K,), now `continued`, these detections (K,); begin new tracks; drop old ones."""
+        """Link tracks (K,), now `continued`, to detections (K,), begin new tracks, and drop old tracks."""
         is_free = np.ones(len(now.row), bool)
         is_free[detections] = False
+        if self._confirmed:
+            is_free &= ~self._is_part(now, tracks)
         new = np.flatnonzero(is_free & now.begins)
         begun = replace(born[new], number=self.begun + np.arange(len(new)))
         self.begun += len(begun)
@@ -322,7 +339,7 @@ class ScoreTracker:
         link = np.concatenate([link, np.full(len(new), np.nan)])
         self.smoother.add(
             *(now.frame, number, now.box_px[at], now.score[at], now.row[at], now.step, link, self._trusts_single),
-            least=_DAMAGED_HITS if now.damaged else 1,
+            least=_DAMAGED_HITS if now.damaged else self._least,
         )
         looks = now.look - self.tracks.look
         self._seen += len(now.row)
@@ -334,7 +351,7 @@ class ScoreTracker:
             self._lone += int((~is_near_border(boxes, self.size)).sum())
         keep = is_remembered(self.tracks.state, now.time, looks, self.interval, self.size, self.parameters)
         late = looks > FILLED + 1
-        if late.any():  # those that were seen too seldom to be confirmed
+        if late.any():  # drop tracks that can no longer be confirmed
             keep &= ~late | self.smoother.are_confirmed(self.tracks.number)
         if not keep.all():
             self.smoother.forget(self.tracks.number[~keep])
@@ -349,10 +366,10 @@ def is_remembered(
     size: tuple[float, float] | None,
     parameters: TrackParameters,
 ) -> np.ndarray:
-    """(N,) which tracks are kept after a look; those that have left the picture go earlier.
+    """Return (N,) whether tracks are kept after a look. Tracks that have left the picture are dropped earlier.
 
-    state: (N, kalman.COLUMNS) as last seen. time: of the look. looks: (N,) since each was seen. interval: frames a
-    look. Arrays or tensors.
+    state: (N, kalman.COLUMNS) at the last detection. time: time of the look. looks: (N,) looks since the last
+    detection. interval: frames in a look. All may be arrays or tensors.
     """
     age = time - state[..., SEEN]
     frames = age * interval
@@ -366,7 +383,7 @@ def is_remembered(
 
 
 def _moved(state: np.ndarray, shift_px: np.ndarray) -> np.ndarray:
-    """States at places shifted by (2,) pixels, or (N, 2)."""
+    """Return states with positions shifted by (2,) or (N, 2) pixels."""
     state = state.copy()
     state[:, : Y + 1] += shift_px
     return state

@@ -1,13 +1,13 @@
-"""Association scores: how well a detection continues a track, as log-odds, 0 where the evidence is balanced.
+"""Association scores: log-odds that a detection continues a track, 0 if the evidence is balanced.
 
-The score of a link is a sum of three logarithms:
+The score of a link is the sum of the logarithms of three terms:
 
-- of the density of the target's next place where the detection is, over the density of new targets there;
-- of the likelihood of the detection's size;
-- of the odds that the target is still there and detected.
+- the density of the target's next position at the detection, divided by the density of new targets there;
+- the likelihood of the detection's size;
+- the odds that the target is still there and is detected.
 
-A target without a link scores 0. So no dummy has to be tuned, and dummies do not win by their number (appendix C gives
-dummies an affinity of their own, and its optimum is then to link nothing).
+A target without a link scores 0. Therefore no dummy needs tuning. (Appendix C gives dummies an affinity of their own,
+and its optimum is then to link nothing.)
 """
 
 import math
@@ -23,21 +23,22 @@ from torchvision_dddas.tracking.box_motion import medians
 from torchvision_dddas.tracking.kalman import HEIGHT, PP, SEEN, SS, VX, VY, WIDTH, X, Y
 from torchvision_dddas.tracking.scene import SceneState
 
-_LEAST_SCORE = -4.0  # of a pair that is near enough to be looked at
-_FEW = 4000  # pairs that are compared with the reach without sorting
+_LEAST_SCORE = -4.0  # pairs that cannot score more because of their distance are skipped
+_FEW = 4000  # up to this number, all pairs are compared without sorting
 _LARGEST_SIZE_PENALTY = 8.0
 _LARGEST_GONE = 0.95
-_NOISE_SHARE, _MOST_NOISE = 1.5, 0.95  # variance of places from errors, in `scatter` squared, and its largest share
-_BORDER = 0.3  # heights: a target this near to the border may cross it even at rest
+# Variance of positions that comes from detection errors, in `scatter` squared, and its largest share of the variance.
+_NOISE_SHARE, _MOST_NOISE = 1.5, 0.95
+_BORDER = 0.3  # a target this near to the border, in heights, may cross the border even at rest
 
-# A target that was detected once moves as one of its neighbours does, or stands still, or moves anyhow: the weights,
-# and the standard deviations in usual steps.
+# A target that was detected once moves like one of its neighbours, stands still, or moves with any velocity. Each pair
+# is the weight of the case, and its standard deviation in usual steps.
 _NEIGHBOURS, _FEWEST = 6, 3
 _AS_NEIGHBOURS, _AT_REST, _ANYHOW = (0.5, 0.25), (0.2, 0.125), (0.3, 0.7)
 
 
 def is_near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.ndarray:
-    """(N,) whether boxes (N, 4) are so close to the picture's border that a target may come or go there."""
+    """Return (N,) whether boxes (N, 4) are so near to the picture's border that targets may appear or leave there."""
     x, y, width, height = (box_px[..., side] for side in range(4))
     if size is None:
         return namespace(box_px).zeros_like(x, dtype=bool)
@@ -46,11 +47,12 @@ def is_near_border(box_px: np.ndarray, size: tuple[float, float] | None) -> np.n
 
 
 @dataclass(frozen=True)
-class Look:
-    """N tracks as last seen and at a look (later), and the M boxes there: what the scores of all links need.
+class BoxLook:
+    """The inputs for the scores of all links between N tracks and the M boxes of a look.
 
-    state, later: (N, kalman.COLUMNS). missed: (N,) looks without a detection since. x, y, log_height: (M,) of boxes.
-    arrival: (M,), survival: (N,) parts of the scores. Arrays, or tensors with a gradient in the parameters.
+    state, later: (N, kalman.COLUMNS) at the last detection, and predicted for the look. missed: (N,) looks without a
+    detection since then. x, y, log_height: (M,) centres and log heights of the boxes. arrival: (M,), and survival:
+    (N,), parts of the scores. All are arrays, or tensors with gradients to the parameters.
     """
 
     state: np.ndarray
@@ -64,30 +66,30 @@ class Look:
     scene: SceneState
 
     @classmethod
-    def of(cls, state: Any, missed: Any, box_px: Any, scene: SceneState, parameters: TrackParameters) -> "Look":
-        """The look of some boxes (M, 4)."""
+    def of(cls, state: Any, missed: Any, box_px: Any, scene: SceneState, parameters: TrackParameters) -> "BoxLook":
+        """Build the look for boxes (M, 4)."""
         later = kalman.predict(state, scene.time, parameters.wander * scene.step)
         survival = _survival(later, missed, scene, parameters)
         x, y, height = box_px[..., 0] + box_px[..., 2] / 2, box_px[..., 1] + box_px[..., 3] / 2, box_px[..., 3]
-        # Minus the logarithm of the density of new targets, a square pixel, at each detection.
+        # The negative logarithm of the density of new targets, per square pixel, at each detection.
         arrival = -namespace(x).log(scene.density * (scene.turnover + _crossing(x, y, height, scene, parameters)))
         return cls(state, missed, later, survival, x, y, namespace(x).log(height), arrival, scene)
 
-    def of_tracks(self, which: np.ndarray) -> "Look":
-        """The same boxes with some of the tracks (K,)."""
+    def of_tracks(self, which: np.ndarray) -> "BoxLook":
+        """Return the same boxes with the tracks of the given indices (K,)."""
         names = ("state", "missed", "later", "survival")
         return replace(self, **{name: getattr(self, name).take(which, 0) for name in names})
 
 
-def association_scores(look: Look, parameters: TrackParameters) -> np.ndarray:
-    """(N, M) scores of tracks with a known velocity and the detections of a look, without appearance.
+def association_scores(look: BoxLook, parameters: TrackParameters) -> np.ndarray:
+    """Return (N, M) scores of tracks with a known velocity and the detections of a look, without appearance.
 
-    In arrays, pairs that are too far apart for a link score -inf.
+    In arrays, pairs that are too far apart for a link have the score -inf.
     """
     later, functions = look.later, namespace(look.state)
     states, variance = later[None], (later[..., PP] + parameters.scatter**2)[None]
     if is_lost := (look.missed > 0).any():
-        # A lost target may have stood still behind an obstacle: then its last place is a better prediction.
+        # A lost target may have stood still behind an obstacle. Then its last position is a better prediction.
         drift = parameters.rest_drift**2 * (look.scene.time - later[..., SEEN])
         states = functions.stack([later, look.state])
         variance = functions.stack([variance[0], parameters.scatter**2 + drift])
@@ -101,8 +103,8 @@ def association_scores(look: Look, parameters: TrackParameters) -> np.ndarray:
     return pairs.matrix(score + pairs.of_boxes(look.arrival) + pairs.of_tracks(look.survival))
 
 
-def newborn_scores(look: Look, parameters: TrackParameters, velocities: np.ndarray) -> np.ndarray:
-    """(N, M) scores, as `association_scores`, of tracks with a single detection.
+def newborn_scores(look: BoxLook, parameters: TrackParameters, velocities: np.ndarray) -> np.ndarray:
+    """Return (N, M) scores like `association_scores`, for tracks with a single detection.
 
     velocities: (W, N, 2) from `likely_velocities`.
     """
@@ -111,10 +113,10 @@ def newborn_scores(look: Look, parameters: TrackParameters, velocities: np.ndarr
     gap = look.scene.time - state[..., SEEN]
     step, noise = look.scene.step * gap, 2 * parameters.scatter**2
     count = len(velocities) - 1
-    share = _AS_NEIGHBOURS[0] * count / (count + 2)  # few neighbours say little
+    share = _AS_NEIGHBOURS[0] * count / (count + 2)  # the weight is lower for few neighbours
     other = (1 - share) / (_AT_REST[0] + _ANYHOW[0])
-    # A track stays at rest, moves at any velocity, or moves as one of its neighbours. Each case has a place and a
-    # standard deviation, in steps.
+    # A target stays at rest, moves with any velocity, or moves like one of its neighbours. Each case has a position and
+    # a standard deviation.
     place = state[..., :2] + velocities[[0, *range(count + 1)]] * gap[..., None]
     spread = [_AT_REST[1] * step, _ANYHOW[1] * step, *[_AS_NEIGHBOURS[1] * step] * count]
     variance = noise + functions.stack(spread) ** 2
@@ -129,13 +131,13 @@ def newborn_scores(look: Look, parameters: TrackParameters, velocities: np.ndarr
 
 
 def likely_velocities(state: np.ndarray, flow: np.ndarray, common: np.ndarray) -> np.ndarray:
-    """(W, N, 2) velocities, in pixels a look, of targets that were detected once: the common one; their neighbours'.
+    """Return (W, N, 2) likely velocities, px a look, of targets that were detected once.
 
-    state: (N, kalman.COLUMNS). flow: (K, kalman.COLUMNS) other tracks, which show how targets move here. common: (2,)
-    their common velocity.
+    The first is the common velocity, the others are those of the nearest tracks. state: (N, kalman.COLUMNS). flow:
+    (K, kalman.COLUMNS) other tracks with known velocities. common: (2,) their common velocity.
     """
     right, down = flow[:, X] - state[:, X : X + 1], flow[:, Y] - state[:, Y : Y + 1]
-    if len(flow) > 8 * _NEIGHBOURS:  # sort those alone that are as near as the last of the nearest
+    if len(flow) > 8 * _NEIGHBOURS:  # find the nearest by a partition, and sort only these
         away = right * right
         away += down * down
         limit = np.partition(away, _NEIGHBOURS - 1, axis=1)[:, _NEIGHBOURS - 1 : _NEIGHBOURS]
@@ -151,13 +153,13 @@ def likely_velocities(state: np.ndarray, flow: np.ndarray, common: np.ndarray) -
 
 
 def common_velocity(flow: np.ndarray) -> np.ndarray:
-    """(2,) the velocity, in pixels a look, that tracks (K, kalman.COLUMNS) have in common; 0 of too few."""
+    """Return the (2,) median velocity, px a look, of tracks (K, kalman.COLUMNS); 0 for too few tracks."""
     return medians(flow[:, VX : VY + 1]) if len(flow) >= _FEWEST else np.zeros(2)
 
 
 @dataclass(frozen=True)
 class _Near:
-    """Those pairs of N tracks and M boxes that are near enough to be linked, for arrays. row, column: (P,)."""
+    """The P pairs of N tracks and M boxes that are near enough for a link, for arrays. row, column: (P,)."""
 
     row: np.ndarray
     column: np.ndarray
@@ -176,7 +178,7 @@ class _Near:
 
 
 class _All:
-    """All pairs, for tensors, which may have axes before those of the tracks and the boxes."""
+    """All pairs of tracks and boxes, for tensors, which may have leading axes."""
 
     @staticmethod
     def of_tracks(values: Any) -> Any:
@@ -192,16 +194,16 @@ class _All:
 
 
 def _pairs(
-    state: Any, place_px: np.ndarray, variance: np.ndarray, look: Look, parameters: TrackParameters
+    state: Any, place_px: np.ndarray, variance: np.ndarray, look: BoxLook, parameters: TrackParameters
 ) -> _Near | _All:
-    """The pairs whose scores are computed: those in a circle around all places where a target may be.
+    """Return the pairs whose scores are computed: boxes in a circle around all predicted positions of a target.
 
-    place_px: (W, N, 2), variance: (W, N) in squared heights.
+    place_px: (W, N, 2) positions. variance: (W, N) in squared heights.
     """
     if not isinstance(state, np.ndarray):
         return _All()
     unit = state[:, HEIGHT] ** 2 * variance
-    # Where the density has fallen to what makes the score the least of interest if all else fits.
+    # Radius at which the score falls to _LEAST_SCORE if the size fits perfectly.
     least = _LEAST_SCORE - look.arrival.max(initial=-np.inf) - look.survival
     narrow = min(1.0, parameters.upright**2) * np.minimum(state[:, WIDTH] / state[:, HEIGHT], 1.0)
     fall = (-np.log(2 * math.pi * (unit * narrow)) - least) / (1 + parameters.tail / 2)
@@ -213,7 +215,7 @@ def _pairs(
         across, along = look.x - x[0][:, None], look.y - y[0][:, None]
         row, column = (across * across + along * along < (radius * radius)[:, None]).nonzero()
         return _Near(row, column, shape)
-    # Of each track, the boxes between its left and its right reach: a run of those sorted by x.
+    # For each track, take the boxes between its left and right limits, which are a slice of the boxes sorted by x.
     by_x = look.x.argsort(kind="stable")
     sorted_x = look.x[by_x]
     first = sorted_x.searchsorted(x[0] - radius)
@@ -230,18 +232,18 @@ def _place_density(
     state: np.ndarray,
     place_px: np.ndarray,
     variance: np.ndarray,
-    look: Look,
+    look: BoxLook,
     parameters: TrackParameters,
 ) -> np.ndarray:
-    """Log density, a square pixel, of the boxes' centres around places (..., N, 2): Student's t in two dimensions.
+    """Return the log density, per square pixel, of the boxes' centres around positions: Student's t in two dimensions.
 
-    variance: (..., N) in squared heights of the tracks.
+    place_px: (..., N, 2). variance: (..., N) in squared heights of the tracks.
     """
     functions = namespace(state)
     width, height = state[..., WIDTH], state[..., HEIGHT]
     one = functions.ones_like(height)
-    # Errors of detection grow with the sides of a box. Motion goes with the height; standing people move less up and
-    # down in the picture than across it.
+    # Detection errors are proportional to the sides of a box, and motion to its height. Upright people move less up and
+    # down in the picture than sideways.
     noise = functions.minimum(_NOISE_SHARE * parameters.scatter**2 * one, _MOST_NOISE * variance)
     motion = variance - noise
     upright = functions.where(height > width, parameters.upright * one, one)
@@ -254,8 +256,8 @@ def _place_density(
     return pairs.of_tracks(peak) - (1 + parameters.tail / 2) * functions.log1p(away / parameters.tail)
 
 
-def _size_penalty(pairs: _Near | _All, state: np.ndarray, look: Look, scatter: Any) -> np.ndarray:
-    """Penalty for a height other than predicted."""
+def _size_penalty(pairs: _Near | _All, state: np.ndarray, look: BoxLook, scatter: Any) -> np.ndarray:
+    """Return the penalty for a height that differs from the prediction."""
     functions = namespace(state)
     variance = scatter**2 + state[..., SS]
     change = pairs.of_boxes(look.log_height) - pairs.of_tracks(functions.log(state[..., HEIGHT]))
@@ -264,7 +266,7 @@ def _size_penalty(pairs: _Near | _All, state: np.ndarray, look: Look, scatter: A
 
 
 def _survival(later: np.ndarray, missed: np.ndarray, scene: SceneState, parameters: TrackParameters) -> np.ndarray:
-    """(N,) log-odds that a target is still there and detected. missed: (N,) looks without a detection before."""
+    """Return the (N,) log-odds that a target is still there and detected. missed: (N,) looks without a detection."""
     functions = namespace(later)
     crossing = _crossing(later[..., 0], later[..., 1], later[..., HEIGHT], scene, parameters)
     gone = (scene.turnover + crossing).clip(max=_LARGEST_GONE)
@@ -277,7 +279,7 @@ def _survival(later: np.ndarray, missed: np.ndarray, scene: SceneState, paramete
 def _crossing(
     x: np.ndarray, y: np.ndarray, height_px: np.ndarray, scene: SceneState, parameters: TrackParameters
 ) -> np.ndarray:
-    """(N,) share of the targets at places x, y (N,) that come or go across the picture's border between looks."""
+    """Return the (N,) share of targets at x, y (N,) that cross the picture's border between two looks."""
     functions = namespace(x)
     if scene.size is None:
         return functions.zeros_like(x)

@@ -1,4 +1,4 @@
-"""Fixed-lag smoothing: decisions are held back while later frames may confirm a track, fill a gap or move a box."""
+"""Fixed-lag smoothing: delay frames, so that later frames can confirm tracks, fill gaps and smooth boxes."""
 
 import math
 from collections import deque
@@ -11,16 +11,17 @@ from torchvision_dddas.tracking.kalman import transform_boxes
 from torchvision_dddas.types import Tracks
 
 FILLED = 2
-"""Sampled frames that a gap may last to be filled."""
-_BEFORE = 8  # earlier boxes of a track that may smooth a box
-_WIDTHS = np.array([2.0, 5.0])  # sd of the weights of places and of sizes, which change more slowly
+"""Longest gap, in sampled frames, that is filled."""
+_BEFORE = 8  # number of earlier boxes of a track that are used to smooth a box
+_WIDTHS = np.array([2.0, 5.0])  # widths of the Gaussian weights of positions, and of sizes, which change more slowly
 
 
 @dataclass(slots=True)
 class _Observation:
-    """A box of a track. index: of the sampled frame, from 0. row: of the frame's detections, -1 in a filled gap.
+    """A box of a track.
 
-    link: confidence that the box belongs to the track, NaN if unknown.
+    index: index of the sampled frame, from 0. row: row among the frame's detections, -1 in a filled gap. link:
+    confidence that the box belongs to the track, NaN if unknown.
     """
 
     frame: int
@@ -33,7 +34,7 @@ class _Observation:
 
 @dataclass(slots=True)
 class _Pending:
-    """The decision on a sampled frame. tracks: by number."""
+    """A sampled frame that is not settled. tracks: the box of each track, by the track's number."""
 
     frame: int
     index: int
@@ -41,26 +42,27 @@ class _Pending:
 
 
 class FixedLagSmoother:
-    """Holds each sampled frame back for a fixed number of frames; `settle` returns those that are due."""
+    """Delays each sampled frame by a fixed number of sampled frames. `settle` returns the frames that are due."""
 
     def __init__(self, hits: int, smooth: bool, interval: int = 1) -> None:
-        """hits: detections that confirm a track. smooth: smooth boxes of a score below 1 along their track.
+        """Start without frames.
 
+        hits: detections that confirm a track. smooth: smooth the boxes with a score below 1 along their track.
         interval: frames from one sampled frame to the next.
         """
         self.hits, self.smooth, self.interval = hits, smooth, interval
         self.pending: deque[_Pending] = deque()
-        self.count = 0  # sampled frames so far
-        self.delay = hits - 1 + FILLED  # sampled frames for which one is held back
+        self.count = 0  # number of sampled frames so far
+        self.delay = hits - 1 + FILLED  # number of sampled frames by which a frame is delayed
         self.kept = self.delay + _BEFORE
         self.steps: deque[np.ndarray | None] = deque(maxlen=2 * self.kept)  # camera motion to each of the latest frames
-        self.has_moved = False  # whether the camera ever did
+        self.has_moved = False  # whether the camera has ever moved
         self.observations: dict[int, deque[_Observation]] = {}
         self.confirmed: set[int] = set()
         self.counts: dict[int, int] = {}
         self.identities: dict[int, int] = {}
         self.identity_count = 0
-        self.forgotten: deque[tuple[int, int]] = deque()  # (sampled frames before, track)
+        self.forgotten: deque[tuple[int, int]] = deque()  # (number of sampled frames before its end, track number)
 
     def add(
         self,
@@ -74,10 +76,10 @@ class FixedLagSmoother:
         trusts_single: bool = True,
         least: int = 1,
     ) -> None:
-        """Add a frame: numbers of tracks (N,), their boxes, scores and rows among the frame's detections.
+        """Add a frame with the numbers of its tracks (N,), their boxes, scores and rows among the frame's detections.
 
         link: (N,) as in Tracks; None: unknown. trusts_single: whether one detection of score 1 confirms a track; else
-        it takes two. least: how many it takes at least.
+        two are needed. least: smallest number of detections that confirm a track.
         """
         links = np.full(len(tracks), np.nan) if link is None else link
         certain = max(least, min(self.hits, 1 if trusts_single else 2))
@@ -99,7 +101,7 @@ class FixedLagSmoother:
             pending.tracks[number] = observation
 
     def _fill(self, number: int, before: _Observation, after: _Observation) -> None:
-        """Boxes of a track in the frames between two observations."""
+        """Interpolate the boxes of a track in the frames between two observations."""
         for gap in self.pending:
             if before.index < gap.index < after.index:
                 part = (gap.frame - before.frame) / (after.frame - before.frame)
@@ -108,17 +110,17 @@ class FixedLagSmoother:
                 gap.tracks[number] = _Observation(gap.frame, gap.index, start + part * (end - start), score, -1)
 
     def forget(self, numbers: np.ndarray) -> None:
-        """Drop tracks that have ended, as soon as no pending frame can hold them."""
+        """Mark tracks as ended. Their data are dropped when no pending frame can contain them."""
         for number in numbers.tolist():
             self.counts.pop(number, None)
             self.forgotten.append((self.count, number))
 
     def are_confirmed(self, numbers: np.ndarray) -> np.ndarray:
-        """(N,) which tracks are confirmed."""
+        """Return (N,) whether tracks are confirmed."""
         return np.array([number in self.confirmed for number in numbers.tolist()], bool)
 
     def settle(self, everything: bool = False) -> list[Tracks]:
-        """The frames that no later one can change; all of them at the end."""
+        """Return the frames that no later frame can change, or all frames at the end."""
         done = []
         while self.pending and (everything or len(self.pending) > self.delay):
             pending = self.pending.popleft()
@@ -137,7 +139,7 @@ class FixedLagSmoother:
                     np.array([seen.link for seen in confirmed.values()], float),
                 )
             )
-            # Drop what no pending frame can need.
+            # Drop the data that no pending frame can need.
             while self.forgotten and self.forgotten[0][0] < self.count - len(self.pending):
                 _, number = self.forgotten.popleft()
                 self.identities.pop(number, None)
@@ -148,7 +150,7 @@ class FixedLagSmoother:
         return done
 
     def _smoothed(self, confirmed: dict[int, _Observation], at: _Pending) -> np.ndarray:
-        """(K, 4) the boxes of confirmed tracks in a frame, those with a score below 1 smoothed along their tracks."""
+        """Return the (K, 4) boxes of confirmed tracks in a frame. Boxes with a score below 1 are smoothed."""
         given = np.array([seen.box_px for seen in confirmed.values()], float).reshape(-1, 4)
         oldest = self.count - len(self.steps)
         near: list[_Observation] = []
@@ -174,7 +176,7 @@ class FixedLagSmoother:
         return given
 
     def _boxes_at(self, box_px: np.ndarray, there: int, here: int) -> np.ndarray:
-        """Boxes (N, 4) observed in a sampled frame, in the coordinates of another one."""
+        """Transform boxes (N, 4) from the coordinates of the sampled frame `there` to those of the frame `here`."""
         low, high = sorted((there, here))
         oldest = self.count - len(self.steps)
         between = range(low + 1, high + 1) if self.has_moved else ()
@@ -187,13 +189,13 @@ class FixedLagSmoother:
 
 
 def smooth_boxes(box_px: np.ndarray, since: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """(K, 4) boxes at time 0, each by straight lines fitted to boxes around it; sides by their logarithm.
+    """Fit straight lines to the boxes of each track, and return the (K, 4) boxes at time 0.
 
-    box_px: (N, 4) the boxes of all tracks, one track after another. since: (N,) their times, in intervals. starts: (K,)
-    where each track begins. Weights are Gaussian, so that the fit is local; a slight pull towards no slope decides
-    where the times do not.
+    The lines are fitted to the centres and to the logarithms of the sides. box_px: (N, 4) the boxes of all tracks, one
+    track after another. since: (N,) their times, in intervals. starts: (K,) index of each track's first box. The
+    weights are Gaussian in time. A weak regularisation of the slope to 0 determines the fit if all times are equal.
     """
-    weight = np.exp(-0.5 * (since[:, None] / _WIDTHS) ** 2)  # (N, 2), of places and of sizes
+    weight = np.exp(-0.5 * (since[:, None] / _WIDTHS) ** 2)  # (N, 2), for positions and for sizes
     time, parts = since[:, None], np.empty((len(box_px), 14))
     parts[:, :2], parts[:, 2:4], parts[:, 4:6] = weight, weight * time, weight * time**2
     value = np.concatenate([box_px[:, :2] + box_px[:, 2:] / 2, np.log(box_px[:, 2:])], axis=1)

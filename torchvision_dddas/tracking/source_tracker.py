@@ -1,11 +1,12 @@
 """The source's tracker: association of absolute positions and RGB histograms, without torch (appendix C).
 
-With every sampled frame, the last K frames are assigned again; a target takes the identity of the older target that the
-newest link of that window names. What fails in it is kept: see the tests, and `score_tracker` for the improved one.
+With every sampled frame, the last K frames are assigned again. A target takes the identity of the older target to which
+its newest link in that window leads. The failures of this method are kept on purpose; the tests show them, and
+`score_tracker` is the improved tracker.
 
-Features are non-negative vectors, one row a target. Affinities have a dummy target at index 0 of each axis; axes and
-windows go from the newest frame to the oldest. `functional.affinity` holds the affinities for batches of tensors, and
-`torch_source_tracker` computes those of many windows at once.
+Features are non-negative vectors, one row for each target. Affinities have a dummy target at index 0 of each axis. Axes
+and windows are ordered from the newest frame to the oldest. `functional.affinity` computes affinities for batches of
+tensors, and `torch_source_tracker` computes those of many windows at once.
 """
 
 import math
@@ -28,17 +29,18 @@ from torchvision_dddas.types import AppearanceUse, Detections, Float, Int, Track
 
 Feature = Literal["location", "appearance"]
 
-_COMBINATION = 45  # bytes of memory for a combination of targets of a window
-_STEPS = 2.0**40  # that the share of a level in a histogram is rounded to
+_COMBINATION = 45  # bytes of memory for each combination of targets in a window
+_STEPS = 2.0**40  # the shares in a normalized histogram are rounded to multiples of 1 / _STEPS
 
 # -- features ----------------------------------------------------------------------------------------------------------
 
 
 def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N, 768) float32 counts of pixels: 256 levels of red, of green, of blue. Source: appendix C, eq. 3.
+    """Return (N, 768) float32 counts of pixels: 256 levels of red, then of green, then of blue.
 
-    image: (H, W, 3) uint8 BGR, or (H, W) grey, counted three times. box_px: (N, 4) x, y, width, height; edges are
-    rounded to whole pixels and clipped to the image. A box without a pixel inside has zeros.
+    image: (H, W, 3) uint8 BGR, or (H, W) grey, which is counted three times. box_px: (N, 4) x, y, width, height; edges
+    are rounded to whole pixels and clipped to the image. A box without a pixel in the image has zeros.
+    Source: appendix C, eq. 3.
     """
     counts = np.zeros((len(box_px), 3, 256), np.float32)
     for row, crop in zip(counts, crops(image, box_px), strict=True):
@@ -49,7 +51,7 @@ def rgb_histograms(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
 
 
 def crops(image: np.ndarray, box_px: np.ndarray) -> list[np.ndarray]:
-    """The part (h, w, 3) of the picture in each box, as `rgb_histograms` counts it."""
+    """Return the part (h, w, 3) of the picture in each box, with the rounding of `rgb_histograms`."""
     bgr = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     boxes = np.array(box_px, float).reshape(-1, 4)
     boxes[~np.isfinite(boxes).all(axis=1)] = 0.0
@@ -60,10 +62,10 @@ def crops(image: np.ndarray, box_px: np.ndarray) -> list[np.ndarray]:
 
 
 def normalize_channels(histogram: Float[np.ndarray, "N 768"]) -> Float[np.ndarray, "N 768"]:
-    """Each channel's 256 bins divided by their sum, in steps of 2^-40; zeros stay zeros.
+    """Divide the 256 bins of each channel by their sum, rounded to multiples of 2^-40; zeros stay zeros.
 
-    Sums of steps are exact. So affinities do not depend on the order of summation, which differs between libraries and
-    processors and would decide ties: the gate makes many.
+    Sums of such multiples are exact, so that affinities do not depend on the order of summation. That order differs
+    between libraries and processors, and would decide ties, which the gate makes frequent.
     """
     channels = np.asarray(histogram, float).reshape(len(histogram), 3, 256)
     total = channels.sum(axis=-1, keepdims=True)
@@ -71,30 +73,30 @@ def normalize_channels(histogram: Float[np.ndarray, "N 768"]) -> Float[np.ndarra
 
 
 def centres(box_px: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
-    """The boxes' centres (u, v) in pixels from the picture's corner, clipped to 0."""
+    """Return the boxes' centres (u, v) in pixels from the picture's corner, at least 0."""
     return np.maximum(box_px[:, :2] + box_px[:, 2:] / 2, 0.0)
 
 
 @dataclass(frozen=True)
 class PicturedBoxes:
-    """The boxes of a frame and its picture; calling it gives their histograms, as `Features` wants them."""
+    """The boxes of a frame and its picture. A call returns the boxes' histograms, as `Features` requires."""
 
     image: np.ndarray
     box_px: Float[np.ndarray, "N 4"]
 
     def __call__(self) -> Float[np.ndarray, "N 768"]:
-        """The histograms of `rgb_histograms`."""
+        """Return the boxes' histograms from `rgb_histograms`."""
         return rgb_histograms(self.image, self.box_px)
 
 
 class Features:
-    """The features of a frame's targets; histograms and dispersions are computed when first needed, and kept.
+    """The features of a frame's targets. Histograms and dispersions are computed on first use, and cached.
 
-    similarity: of the frame's targets to each other (N, N), by feature, where it was computed in a batch.
+    similarity: by feature, the (N, N) similarities of the frame's targets to each other, if computed in a batch.
     """
 
     def __init__(self, box_px: Float[np.ndarray, "N 4"], histograms: Callable[[], np.ndarray] | None) -> None:
-        """histograms: gives (N, 768) counts of pixels or shares; None where there is no picture."""
+        """Take the boxes. histograms: returns (N, 768) counts of pixels or shares; None without a picture."""
         self.centre_px = centres(box_px)
         self.source = histograms
         self.similarity: dict[Feature, np.ndarray] = {}
@@ -106,36 +108,36 @@ class Features:
 
     @property
     def has_picture(self) -> bool:
-        """Whether there are histograms."""
+        """Whether there is a picture for the histograms."""
         return self.source is not None
 
     @property
     def has_histograms(self) -> bool:
-        """Whether the histograms are computed, or need no computing."""
+        """Whether the histograms are computed, or known to be zeros."""
         return self._histograms is not None
 
     def take_histograms(self, histograms: Float[np.ndarray, "N 768"]) -> None:
-        """Keep histograms that were computed. Raises InputError if they are not (N, 768)."""
+        """Store computed histograms. Raises InputError if they are not (N, 768)."""
         if histograms.shape != (len(self), 768):
             raise InputError(
-                f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins a box; "
+                f"the source's association needs histograms ({len(self)}, 768), 3 x 256 bins for each box; "
                 f"got {histograms.shape}. Compute them with tracking.rgb_histograms."
             )
         self._histograms = np.asarray(histograms, float)
 
     def histogram(self, normalization: str) -> Float[np.ndarray, "N 768"]:
-        """The boxes' histograms by the reading that `paper.histogram` names."""
+        """Return the boxes' histograms, normalized as `paper.histogram` says."""
         if self._histograms is None and self.source is not None:
             self.take_histograms(self.source())
         assert self._histograms is not None
         return normalize_channels(self._histograms) if normalization == "channel" else self._histograms
 
     def values(self, feature: Feature, normalization: str) -> Float[np.ndarray, "N D"]:
-        """The vectors of a feature: centres in pixels, or histograms."""
+        """Return the vectors of a feature: centres in pixels, or histograms."""
         return self.centre_px if feature == "location" else self.histogram(normalization)
 
     def dispersion(self, feature: Feature, parameters: PaperParameters) -> float:
-        """The `dispersion` of the targets in a feature."""
+        """Return the `dispersion` of the targets in a feature, and cache it."""
         cut = parameters.location_cut if feature == "location" else histogram_cut(parameters)
         key = (feature, cut, parameters.histogram)
         if key not in self._dispersions:
@@ -152,11 +154,12 @@ class Features:
 
 
 def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.ndarray:
-    """Affinity of the targets of two or three frames by one feature, with a dummy first on each axis.
+    """Return the affinities of the targets of two or three frames by one feature, with a dummy first on each axis.
 
-    Two frames, eq. 1: similarities (N + 1, M + 1). Three, eq. 4 and 5: numerators of (a, b) and (b, c) added, and
-    denominators, (N + 1, M + 1, L + 1). An entry with a dummy is 0 with `paper.dummy` = zero, as the source says in
-    words; else it is as eq. 4 and 5 give it for a dummy of zeros, up to one half for (i, j, 0) and (0, j, k).
+    Two frames (eq. 1): similarities (N + 1, M + 1). Three frames (eq. 4 and 5): (N + 1, M + 1, L + 1), the sum of the
+    numerators of (a, b) and (b, c) over the sum of their denominators. With `paper.dummy` = zero, entries with a dummy
+    are 0, as in the source's text. Otherwise the dummy is a zero vector in eq. 4 and 5, which gives up to one half for
+    (i, j, 0) and (0, j, k).
     """
     if len(features) == 2:
         return np.pad(similarity(*features), ((1, 0), (1, 0)))
@@ -168,12 +171,12 @@ def affinity(features: Sequence[np.ndarray], parameters: PaperParameters) -> np.
 
 
 def similarity(a: Float[np.ndarray, "N D"], b: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N M"]:
-    """Generalized Jaccard similarity Σ min / Σ max in [0, 1], 0 for two vectors of zeros."""
+    """Return the generalized Jaccard similarities Σ min / Σ max in [0, 1]; 0 for two zero vectors."""
     return _share(*_overlap(a, b))
 
 
 def real_pairs(features: Sequence[np.ndarray], parameters: PaperParameters, feature: Feature) -> list[np.ndarray]:
-    """Similarities (N, M) and (M, L) that `gate` asks for with `paper.dummy` = real_pair; empty for two frames."""
+    """Return the similarities (N, M) and (M, L) for `gate` if `paper.dummy` is real_pair; none for two frames."""
     if parameters.dummy != "real_pair" or len(features) < 3:
         return []
     scale = parameters.histogram_scale if feature == "appearance" else 1.0
@@ -181,10 +184,10 @@ def real_pairs(features: Sequence[np.ndarray], parameters: PaperParameters, feat
 
 
 def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Σ min and Σ max of each pair: min + max = a + b and max - min = |a - b|."""
+    """Return Σ min and Σ max of each pair, from min + max = a + b and max - min = |a - b|."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b))), np.zeros((len(a), len(b)))
-    from scipy.spatial.distance import cdist  # here, as only the source's association needs it
+    from scipy.spatial.distance import cdist  # imported here because only the source's association needs it
 
     total = a.sum(axis=1)[:, None] + b.sum(axis=1)[None]
     apart = cdist(a, b, "cityblock")
@@ -196,11 +199,11 @@ def _share(smaller: np.ndarray, larger: np.ndarray) -> np.ndarray:
 
 
 def scale_histograms(affinity: Float[np.ndarray, "..."], scale: float) -> Float[np.ndarray, "..."]:
-    """A copy in which the dissimilarity of real targets is multiplied by `scale`; entries with a dummy do not change.
+    """Return a copy with the dissimilarity of real targets multiplied by `scale`. Entries with a dummy do not change.
 
-    In Fig. 6 of the source the accuracy does not change for thresholds above 0.4, so no true link is cut there. As
-    printed, histograms of 3 x 256 bins differ by more than 0.4 in 42 % of the true links of PETS09-S2L1 and in 7 % of
-    those of TUD-Stadtmitte, five frames apart. The source must therefore have used another scale.
+    In Fig. 6 of the source the accuracy is constant for thresholds above 0.4, so the gate cuts no true link there. With
+    the formula as printed, histograms of 3 x 256 bins differ by more than 0.4 in 42 % of the true links of PETS09-S2L1
+    and in 7 % of those of TUD-Stadtmitte, five frames apart. The source must therefore have used another scale.
     """
     scaled = np.array(affinity, float)
     real = np.index_exp[1:] * scaled.ndim
@@ -209,7 +212,7 @@ def scale_histograms(affinity: Float[np.ndarray, "..."], scale: float) -> Float[
 
 
 def histogram_cut(parameters: PaperParameters) -> float:
-    """The dissimilarity of histograms, before scaling, at which their clusters end."""
+    """Return the dissimilarity of histograms, before scaling, at which the cluster tree is cut."""
     return parameters.appearance_cut / parameters.histogram_scale
 
 
@@ -219,13 +222,13 @@ def gate(
     reading: Literal["one_dummy", "every_dummy", "off"],
     pairs: Sequence[np.ndarray] = (),
 ) -> Float[np.ndarray, "..."]:
-    """A copy in which an entry with a dummy is 1 - threshold where all real alternatives are below that (III-E).
+    """Raise entries with a dummy to 1 - threshold if all real alternatives are below (III-E), and return a copy.
 
-    score: two or three axes, index 0 of each the dummy. reading: one_dummy raises entries with exactly one dummy;
-    every_dummy is the text to the letter, so that entries with two dummies are raised too and the best assignment
-    leaves every target alone; off raises none. The entry of dummies alone is never raised. Of an entry with two dummies
-    the smaller of both indices' best alternatives counts. pairs: raise only entries of two successive targets that are
-    alike by 1 - threshold themselves [our reading of three frames].
+    score: two or three axes; index 0 of each is the dummy. reading: "one_dummy" raises entries with exactly one dummy;
+    "every_dummy" follows the text literally, so that entries with two dummies are raised too, and the best assignment
+    leaves every target alone; "off" raises no entry. The entry of only dummies is never raised. For an entry with two
+    dummies, the smaller of the best alternatives of its axes counts. pairs: raise only entries of two successive
+    targets whose own similarity is at least 1 - threshold [our reading for three frames].
     """
     score = np.array(score, float)
     if reading == "off":
@@ -249,22 +252,22 @@ def gate(
 
 
 def dispersion(feature: Float[np.ndarray, "N D"], cut: float) -> float:
-    """How far apart a frame's targets are in a feature (III-D): the normalized entropy of their clusters.
+    """Return the dispersion of a frame's targets in a feature (III-D): the normalized entropy of their clusters.
 
-    Clusters are of average linkage, the tree cut at a dissimilarity (eq. 10 and G).
+    The clusters come from average linkage; the tree is cut at the dissimilarity `cut` (eq. 10 and G).
     """
     return 1.0 if len(feature) < 2 else _cluster_entropy(similarity(feature, feature), cut)
 
 
 def _cluster_entropy(alike: Float[np.ndarray, "N N"], cut: float) -> float:
-    """The dispersion of two targets or more from their similarities."""
-    from scipy.cluster.hierarchy import fcluster  # here, as only the source's association needs it
+    """Return the dispersion of two or more targets from their similarities."""
+    from scipy.cluster.hierarchy import fcluster  # imported here because only the source's association needs it
 
     return normalized_entropy(fcluster(_tree(alike), cut, "distance"))
 
 
 def normalized_entropy(cluster: Int[np.ndarray, "N"]) -> float:
-    """Ndm of eq. 9: 1 when every target is a cluster of its own, 0 when all are one; 1 for one target or none."""
+    """Return Ndm of eq. 9: 1 if each target is its own cluster, 0 if all are one cluster, 1 for less than 2 targets."""
     if len(cluster) < 2:
         return 1.0
     share = np.unique(cluster, return_counts=True)[1] / len(cluster)
@@ -281,15 +284,16 @@ def _tree(alike: Float[np.ndarray, "N N"]) -> np.ndarray:
 
 
 def frames_considered(counts: Sequence[int], parameters: PaperParameters) -> int:
-    """Of how many frames of a window, from the newest on, the smallest dispersion counts, by `dispersion_of`."""
+    """Return the number of frames of a window, from the newest, whose smallest dispersion counts (`dispersion_of`)."""
     of_all = {"smallest": True, "newest": False, "smallest_if_counts_differ": len(set(counts)) > 1}
     return len(counts) if of_all[parameters.dispersion_of] else 1
 
 
 def location_weight(location: float, appearance: Callable[[], float], lowest: float) -> tuple[float, float | None]:
-    """The weight of location, and the dispersion of appearance where it had to be computed.
+    """Return the weight of location, and the dispersion of appearance or None if it was not needed.
 
-    1 while locations tell the targets apart; else 0 if appearance does; else one half. The second feedback rule.
+    The weight is 1 if locations distinguish the targets; otherwise 0 if appearance does, and one half if neither does.
+    This is the source's second feedback rule.
     """
     if location > lowest:
         return 1.0, None
@@ -298,7 +302,7 @@ def location_weight(location: float, appearance: Callable[[], float], lowest: fl
 
 
 def needs_appearance(window: Sequence[Features], parameters: PaperParameters) -> bool:
-    """Whether the association of a window asks for its histograms."""
+    """Return whether the association of a window needs its histograms."""
     if not all(frame.has_picture or not len(frame) for frame in window):
         return False
     if parameters.rule == "fixed":
@@ -307,13 +311,13 @@ def needs_appearance(window: Sequence[Features], parameters: PaperParameters) ->
 
 
 def smallest_dispersion(window: Sequence[Features], feature: Feature, parameters: PaperParameters) -> float:
-    """The least dispersion of the frames of a window that count."""
+    """Return the smallest dispersion of a window's frames, among those that `dispersion_of` selects."""
     considered = window[: frames_considered([len(frame) for frame in window], parameters)]
     return min(frame.dispersion(feature, parameters) for frame in considered)
 
 
 def weigh(window: Sequence[Features], parameters: PaperParameters) -> tuple[float, float, float | None]:
-    """The weight of location in a window, the dispersion of location, and of appearance where it was needed."""
+    """Return the weight of location in a window, the dispersion of locations, and that of appearances or None."""
     location = smallest_dispersion(window, "location", parameters)
     if not needs_appearance(window, parameters):
         return 1.0, location, None
@@ -330,7 +334,7 @@ def weigh(window: Sequence[Features], parameters: PaperParameters) -> tuple[floa
 def explain_weight(
     window: Sequence[Features], weight: float, location: float, appearance: float | None, parameters: PaperParameters
 ) -> AppearanceUse:
-    """What `weigh` found, and why."""
+    """Return the results of `weigh`, with the cause in words."""
     lowest, found = parameters.lowest_dispersion, f"dispersion of locations {location:.3f}"
     has_pictures = all(frame.has_picture or not len(frame) for frame in window)
     if parameters.rule == "fixed":
@@ -354,9 +358,9 @@ def explain_weight(
 
 @dataclass(frozen=True)
 class Association:
-    """How a window was assigned.
+    """The assignment of a window.
 
-    rows: (Z, K) indices from 1, 0 for the dummy. weight: of the location. appearance_dispersion: None where it was not
+    rows: (Z, K) indices from 1, 0 for the dummy. weight: weight of location. appearance_dispersion: None if it was not
     needed.
     """
 
@@ -367,10 +371,10 @@ class Association:
 
 
 def check_window(window: Sequence[Features]) -> None:
-    """Raise InputError if a window has more combinations of targets than memory may be taken for."""
+    """Raise InputError if a window has too many combinations of targets for the memory budget."""
     count, most = math.prod(len(frame) + 1 for frame in window), max(map(len, window))
     what = f"paper.window = {len(window)} with {most} targets in a frame has {count:,} combinations"
-    check_memory(_COMBINATION * count, what, 0, "take paper.window=2, or another --config")
+    check_memory(_COMBINATION * count, what, 0, "use paper.window=2, or another --config")
 
 
 def associate(
@@ -378,7 +382,7 @@ def associate(
 ) -> Association:
     """Assign the targets of two or three frames: weigh, gate, solve.
 
-    affinities: the window's by the features that count, where they were computed in a batch.
+    affinities: affinities of the window by feature, if they were computed in a batch.
     """
     weight, location, appearance = weigh(window, parameters)
 
@@ -400,10 +404,10 @@ def assign(
     parameters: PaperParameters,
     pairs: Mapping[Feature, Sequence[np.ndarray]] = MappingProxyType({}),
 ) -> Int[np.ndarray, "Z K"]:
-    """The best assignment of affinities with a dummy first on each axis; a feature of no weight may be None.
+    """Return the best assignment for affinities with a dummy first on each axis, as (Z, K) indices, 0 for the dummy.
 
-    appearance: as the histograms give it; it is scaled here. pairs: `real_pairs` by feature. Every real target is in
-    exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
+    A feature without weight may be None. appearance: affinities of histograms before scaling. pairs: `real_pairs` by
+    feature. Every real target is in exactly one row; rows are sorted. Source: eq. 2, 6 and 7 with the gate of III-E.
     """
     if appearance is not None:
         appearance = scale_histograms(appearance, parameters.histogram_scale)
@@ -424,13 +428,13 @@ def assign(
 
 
 class SourceTracker:
-    """The state of a run by the source's association; the interface of `ScoreTracker`, without delay."""
+    """The tracker of a run by the source's association. It has the interface of `ScoreTracker`, but no delay."""
 
     def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None = None) -> None:
-        """interval, size: not used; positions are compared in pixels of the picture."""
+        """Start without frames. interval, size: not used; positions are compared in pixels of the picture."""
         self.parameters = settings.paper
         self.window: deque[Features] = deque(maxlen=self.parameters.window)  # newest first
-        self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window - 1)  # of its frames but the newest
+        self.identities: deque[np.ndarray] = deque(maxlen=self.parameters.window - 1)  # of all frames but the newest
         self.next_identity = 1
 
     def feed(
@@ -440,10 +444,10 @@ class SourceTracker:
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
     ) -> list[Tracks]:
-        """Add the detections of a frame, and give them identities at once.
+        """Add the detections of a frame, and return it with identities at once.
 
-        now_from_before: not used. appearance: gives (N, 768) histograms of the boxes. It is called at most
-        once, where the dispersion of the locations requires it, maybe while one of the next frames is fed.
+        now_from_before: not used. appearance: returns (N, 768) histograms of the boxes. It is called at most once, and
+        only if the dispersion of the locations requires it, perhaps while a later frame is fed.
         """
         self.window.appendleft(Features(detections.box_px, appearance))
         check_window(self.window)
@@ -456,16 +460,16 @@ class SourceTracker:
         window: Sequence[Features],
         affinities: Mapping[Feature, np.ndarray] | None = None,
     ) -> Tracks:
-        """The identities of the newest frame of a window. affinities: as for `associate`."""
+        """Return the newest frame of a window with identities. affinities: see `associate`."""
         identity, use = np.zeros(len(detections), np.int64), None
         if len(window) > 1:
             found = associate(window, self.parameters, affinities)
             rows = found.rows
-            if len(window[0]) and any(map(len, window[1:])):  # else there was nothing to link, nor to decide
+            if len(window[0]) and any(map(len, window[1:])):  # otherwise there was nothing to link
                 dispersions = found.location_dispersion, found.appearance_dispersion
                 use = explain_weight(window, found.weight, *dispersions, self.parameters)
-            # The newest link counts: i to j, or i to k where j is the dummy, unless another target has that identity by
-            # its own link to j.
+            # A target takes the identity from its newest link: from frame i to j, or to k if j is the dummy. If another
+            # target has already taken that identity through a link to j, this target gets a new one.
             for older, known in enumerate(self.identities, 1):
                 direct = (rows[:, 0] > 0) & (rows[:, older] > 0) & (rows[:, 1:older] == 0).all(axis=1)
                 taken = known[rows[direct, older] - 1]
@@ -479,5 +483,5 @@ class SourceTracker:
         return Tracks(frame, identity, detections.box_px, detections.score, row, appearance=use)
 
     def end(self) -> list[Tracks]:
-        """Nothing: no frame waits."""
+        """Return nothing, because no frame waits."""
         return []

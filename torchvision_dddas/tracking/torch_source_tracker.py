@@ -1,7 +1,7 @@
 """The source's tracker with histograms and affinities of many frames at once, by `nn.HistogramAffinity`.
 
-The association reads what was computed; weights, clusters, gate and assignment are those of `source_tracker`. Counts
-of pixels and the sums of float64 that affinities are made of are exact: identities are the same.
+Weights, clusters, gate and assignment are those of `source_tracker`. Counts of pixels and the float64 sums in the
+affinities are exact, so the identities are the same.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,20 +30,20 @@ from torchvision_dddas.types import Detections, Tracks
 
 Window = Sequence[Features]
 
-# Frames that are settled together, fewer where their windows have more affinities than this.
+# Number of frames that are settled together. They are fewer if their windows have more than _AFFINITIES affinities.
 FRAMES, _AFFINITIES = 16, 1 << 22
-# Pixels of boxes on the device at once, at about 100 bytes each.
+# Largest number of box pixels on the device at once, about 100 bytes each.
 _PIXELS = 1 << 20
 
 
 class TorchSourceTracker(SourceTracker):
-    """As `SourceTracker`, but `feed` settles FRAMES frames together, and `end` the rest.
+    """A `SourceTracker` whose `feed` settles FRAMES frames together, and whose `end` settles the rest.
 
-    histograms_s: seconds spent on histograms.
+    histograms_s: computing time of histograms, seconds.
     """
 
     def __init__(self, settings: Settings, interval: int, size: tuple[float, float] | None = None) -> None:
-        """As `SourceTracker`."""
+        """Start without frames. The arguments are those of `SourceTracker`."""
         super().__init__(settings, interval, size)
         self.histograms_s = 0.0
         self._device = torch.device(torch_device())
@@ -57,7 +57,7 @@ class TorchSourceTracker(SourceTracker):
         now_from_before: np.ndarray | None = None,
         appearance: Callable[[], np.ndarray] | None = None,
     ) -> list[Tracks]:
-        """Add the detections of a frame. appearance: `PicturedBoxes`, or what gives (N, 768) histograms."""
+        """Add the detections of a frame. appearance: `PicturedBoxes`, or a function returning (N, 768) histograms."""
         self.window.appendleft(Features(detections.box_px, appearance))
         check_window(self.window)
         self._waiting.append((frame, detections, list(self.window)))
@@ -65,16 +65,16 @@ class TorchSourceTracker(SourceTracker):
         return self.end() if len(self._waiting) == FRAMES or affinities > _AFFINITIES else []
 
     def end(self) -> list[Tracks]:
-        """Settle the frames that wait."""
+        """Settle the waiting frames."""
         waiting, self._waiting = self._waiting, []
         known = self._affinities([window for _, _, window in waiting])
         return [self.identify(*each, by_feature) for each, by_feature in zip(waiting, known, strict=True)]
 
     @torch.inference_mode()
     def _affinities(self, windows: Sequence[Window]) -> list[dict[Feature, np.ndarray]]:
-        """Of each window the affinities that its association asks for, by feature.
+        """Return for each window the affinities that its association needs, by feature.
 
-        Histograms and similarities within a frame are kept by its `Features`.
+        Histograms and similarities within a frame are stored in its `Features`.
         """
         known: list[dict[Feature, np.ndarray]] = [{} for _ in windows]
         linked = [k for k, window in enumerate(windows) if len(window) > 1]
@@ -96,13 +96,13 @@ class TorchSourceTracker(SourceTracker):
         return known
 
     def _count_colours(self, frames: Iterable[Features]) -> None:
-        """Give frames their histograms."""
+        """Compute the histograms of frames, and store them in their `Features`."""
         start = perf_counter()
         some = [frame for frame in dict.fromkeys(frames) if not frame.has_histograms]
         pictured = [(frame, frame.source) for frame in some if isinstance(frame.source, PicturedBoxes)]
         inside = [crop for _, boxes in pictured for crop in crops(boxes.image, boxes.box_px)]
         found = np.zeros((len(inside), 768), np.float32)
-        # By size, so that little is padded.
+        # Sort the crops by size, so that little padding is needed.
         for rows in _parts(sorted(range(len(inside)), key=lambda k: inside[k].size), [crop.shape for crop in inside]):
             found[rows] = self._histograms([inside[k] for k in rows])
         ends = np.cumsum([len(frame) for frame, _ in pictured]).tolist()
@@ -111,7 +111,7 @@ class TorchSourceTracker(SourceTracker):
         self.histograms_s += perf_counter() - start
 
     def _histograms(self, inside: Sequence[np.ndarray]) -> np.ndarray:
-        """(N, 768) counts of crops, each of which is a picture with one box."""
+        """Return (N, 768) counts of crops, each of which is a picture with one box."""
         sides = np.array([crop.shape[1::-1] for crop in inside])
         width, height = sides.max(axis=0)
         padded = np.zeros((len(inside), height, width, 3), np.uint8)
@@ -124,7 +124,7 @@ class TorchSourceTracker(SourceTracker):
         return counts[:, 0]
 
     def _compare(self, frames: Iterable[Features], feature: Feature) -> None:
-        """Give frames of two targets or more the similarities of these to each other."""
+        """Compute the similarities of the targets within frames, and store them in their `Features`."""
         some = [frame for frame in dict.fromkeys(frames) if len(frame) > 1 and feature not in frame.similarity]
         if some:
             values, valid = self._padded([frame.values(feature, self.parameters.histogram) for frame in some])
@@ -134,12 +134,12 @@ class TorchSourceTracker(SourceTracker):
                 frame.similarity[feature] = similarity[: len(frame), : len(frame)]
 
     def _affinity(self, windows: Sequence[Window], feature: Feature) -> list[np.ndarray]:
-        """Of windows of one size what `source_tracker.affinity` gives, with a dummy first on each axis."""
+        """Return the results of `source_tracker.affinity` for windows of equal length."""
         if not windows:
             return []
         frames = list(dict.fromkeys(frame for window in windows for frame in window))
         rows = [frame.values(feature, self.parameters.histogram) for frame in frames]
-        # A dummy is a vector of zeros; one that is not valid has no affinity.
+        # A dummy is a zero vector. If it is marked as not valid, its affinities are 0.
         values, valid = self._padded([np.pad(row, ((1, 0), (0, 0))) for row in rows])
         valid[:, 0] = self.parameters.dummy != "zero"
         place = {frame: k for k, frame in enumerate(frames)}
@@ -151,7 +151,7 @@ class TorchSourceTracker(SourceTracker):
         ]
 
     def _padded(self, rows: Sequence[np.ndarray]) -> tuple[Tensor, Tensor]:
-        """(T, N, D) float64 rows of frames, zeros where a frame has fewer, and (T, N) which are there."""
+        """Return the rows of frames padded with zeros, (T, N, D) float64, and (T, N) whether a row is real."""
         most = max(map(len, rows))
         values = np.stack([np.pad(np.asarray(row, float), ((0, most - len(row)), (0, 0))) for row in rows])
         valid = np.arange(most) < np.array([len(row) for row in rows])[:, None]
@@ -159,7 +159,7 @@ class TorchSourceTracker(SourceTracker):
 
 
 def _parts(order: Sequence[int], shapes: Sequence[tuple[int, ...]]) -> Iterator[list[int]]:
-    """Crops with pixels, smallest first, in parts that hold _PIXELS at most when padded to one size, or one crop."""
+    """Yield indices of non-empty crops, in order, in parts of one crop or of at most _PIXELS pixels after padding."""
     part, height, width = list[int](), 0, 0
     for k in order:
         tall, wide = shapes[k][:2]
@@ -175,6 +175,6 @@ def _parts(order: Sequence[int], shapes: Sequence[tuple[int, ...]]) -> Iterator[
 
 
 def _considered(windows: Iterable[Window], parameters: PaperParameters) -> Iterable[Features]:
-    """The frames whose dispersions count."""
+    """Yield the frames of windows whose dispersions are used."""
     for window in windows:
         yield from window[: frames_considered([len(frame) for frame in window], parameters)]

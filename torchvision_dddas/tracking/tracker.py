@@ -1,4 +1,4 @@
-"""Identities of detections: the public tracker, and tracking of whole clips and tables."""
+"""Give detections identities: the public tracker, and functions that track whole clips and tables."""
 
 import math
 import time
@@ -31,30 +31,39 @@ from torchvision_dddas.types import (
     is_sampled,
 )
 
-_MOST_CLASSES = 10_000  # identities of which the class is kept; those seen longest ago are forgotten
-_TRIED = 100
+_MOST_CLASSES = 10_000  # number of identities whose class is kept; the ones seen longest ago are dropped
+_TRIED = 100  # number of boxes from arrays that are checked for their order of coordinates
 MOTION = "moving"
-"""The kind of detections that the motion detector makes."""
+"""The kind of the motion detector's detections."""
 WEIGHT, LOOKED = "paper.weight", "appearance.looked"
-"""What the association adjusts: the source's weight of location; in the default one, whether appearance is looked at.
+"""Names of the association's adjustments: the source's weight of location, and the default tracker's use of appearance.
 
-The latter is no parameter, but named like one in the record.
+The second is not a parameter, but the record names it like one.
 """
 
-# How far a time stamp may lie from its place at the constant rate, in frames.
+# Largest deviation of a time stamp from the constant rate, in frames, that counts as rounding.
 _ROUNDED = 0.05
 
 
 class Tracker:
-    """Gives detections lasting identities, one sampled frame after another.
+    """Gives detections identities, one sampled frame after another.
 
-    A frame is settled some frames later (with `track.mode = paper`, the source's three-frame association, at once, or
-    in torch's batches); `update` returns the frames that are settled by it, in order, and `flush` the rest.
+    A frame is settled when no later frame can change its tracks, which is some frames later. With `track.mode = paper`,
+    the source's three-frame association, a frame is settled at once, or in batches with torch. `update` returns the
+    settled frames in order, and `flush` returns the rest.
+
+    >>> tracker, tracks = td.Tracker(size=(640, 480)), []
+    >>> for k in range(12):
+    ...     tracks += tracker.update((np.array([[100.0 + 3 * k, 50, 40, 80]]), np.array([0.9])))
+    >>> tracks += tracker.flush()
+    >>> len(tracks), tracks[-1].id, tracks[-1].xyxy.round()
+    (12, array([1]), array([[133.,  50., 173., 130.]]))
     """
 
     def __init__(
         self,
         settings: Settings | None = None,
+        *,
         interval: int = 1,
         size: tuple[float, float] | None = None,
         motion: bool | None = None,
@@ -62,14 +71,14 @@ class Tracker:
         backend: str = "onboard",
         rate_hz: float | None = None,
     ) -> None:
-        """interval: frames from one sampled frame to the next. size: (width, height) of the pictures, None if unknown.
+        """Start without tracks.
 
-        motion: whether the detections are of the motion detector. Then they count as certain, and their boxes scatter
-        as blobs do; None: as the kind of the first ones says. certain: count every score as 1.
-        backend: torch computes the histograms and affinities of the source's association (`track.mode = paper`) of
-        some frames at once, which are then settled together; auto is torch where it sees a CUDA device. The default
-        association does not use it.
-        rate_hz: frames a second, where `update` is told times.
+        interval: frames from one sampled frame to the next. size: (width, height) of the pictures, None if unknown.
+        motion: whether the detections come from the motion detector. Then they count as certain, and
+        `track.own_scatter` applies to their boxes; None: decide by the kind of the first detections. certain: count
+        every score as 1. backend: with torch, the source's association (`track.mode = paper`) computes the histograms
+        and affinities of several frames at once, and settles these frames together; auto is torch if there is a CUDA
+        device. The default association ignores it. rate_hz: frames a second, needed if `update` gets times.
         Raises InputError for an interval below 1, a size that is not two positive numbers, and as `wants_torch`.
         """
         if not isinstance(interval, int | np.integer) or interval < 1:
@@ -82,31 +91,32 @@ class Tracker:
         self._histograms_s = 0.0
         self._tracker: ScoreTracker | SourceTracker | None = None
         self._frame: int | None = None
-        self._time_s, self._at = math.nan, math.nan  # of the last frame; its number if frames came at a constant rate
-        self._tried = np.zeros((0, 4))  # boxes that were given as arrays, until their order is beyond doubt
-        self._given: deque[Detections] = deque()  # of the frames that are not settled
-        self._classes: dict[int, tuple[str, int]] = {}  # of the detection before, by identity
+        self._time_s, self._at = math.nan, math.nan  # time of the last frame, and its number at a constant rate
+        self._tried = np.zeros((0, 4))  # the first boxes given as arrays, to check their order of coordinates
+        self._given: deque[Detections] = deque()  # detections of the frames that are not settled
+        self._classes: dict[int, tuple[str, int]] = {}  # class of the latest detection, by identity
 
     def update(
         self,
         detections: "Detections | np.ndarray | tuple[np.ndarray, np.ndarray]",
         camera_motion: np.ndarray | None = None,
+        *,
         image: np.ndarray | None = None,
         frame: int | None = None,
         interval: int | None = None,
         time_s: float = math.nan,
         damaged: bool = False,
     ) -> list[Tracks]:
-        """Add the detections of the next sampled frame; returns the frames that are settled by it.
+        """Add the detections of the next sampled frame, and return the frames that are now settled.
 
-        detections: a record, (N, 4) boxes x, y, width, height in pixels, or these and (N,) scores. camera_motion:
-        (3, 3) pixel homography from the frame before; None: the camera stood still, or it is unknown. image: (H, W, 3)
-        uint8 BGR or (H, W) grey, where appearance shall count. frame: its number; None: the last one's plus interval,
-        from 1. interval: distance from the frame before, where that is not the usual one. time_s: of the frame, where
-        frames do not follow each other at a constant rate; targets are predicted by it.
-        damaged: as in Frame; targets that are first seen there must be seen for longer.
-        Raises InputError for other shapes, boxes without a size, values that are not finite, and a number that is not
-        above the last one's.
+        detections: a Detections record, (N, 4) boxes x, y, width, height in pixels, or a tuple of boxes and (N,)
+        scores. camera_motion: (3, 3) pixel homography from the frame before; None if the camera stood still or its
+        motion is unknown. image: (H, W, 3) uint8 BGR or (H, W) grey, needed for the use of appearance. frame: the frame
+        number; None: the last number plus the interval, from 1. interval: frames since the frame before, if not the
+        usual interval. time_s: time of the frame, if the frame rate is not constant; it is used for prediction.
+        damaged: see Frame; targets that first appear in a damaged frame need more detections.
+        Raises InputError for other shapes, boxes without a size, values that are not finite, and a frame number that is
+        not above the last one.
         """
         is_moving = isinstance(detections, Detections) and detections.kind == MOTION
         is_array = not isinstance(detections, Detections)
@@ -119,7 +129,7 @@ class Tracker:
             camera_motion = np.asarray(camera_motion, float)
             if camera_motion.shape != (3, 3) or not np.isfinite(camera_motion).all():
                 raise InputError(f"camera_motion must be a finite (3, 3) homography; got shape {camera_motion.shape}")
-        image = None if image is None else as_picture(image, "image")
+        image = None if image is None else as_picture(image, name="image")
         expected = 1 if self._frame is None else self._frame + (interval or self.interval)
         number = expected if frame is None else frame
         if self._frame is not None and number <= self._frame:
@@ -130,7 +140,7 @@ class Tracker:
             settings, track = self.settings, self.settings.track
             if self._motion is None:
                 self._motion = detections.kind == MOTION
-            if self._motion:  # blobs come in parts, with shadows, and joined
+            if self._motion:  # blobs may be parts of targets, joined targets, or include shadows
                 own = {"scatter": track.own_scatter, "size_scatter": track.own_size_scatter}
                 settings = settings.model_copy(update={"track": track.model_copy(update=own)})
             if self._in_batches:
@@ -150,16 +160,16 @@ class Tracker:
         return self._as_given(self._tracker.feed(number, detections, camera_motion, appearance))
 
     def flush(self) -> list[Tracks]:
-        """The frames that are not settled yet, at the end of a run."""
+        """Return the frames that are not settled yet, at the end of a run."""
         return self._as_given(self._tracker.end()) if self._tracker is not None else []
 
     @property
     def appearance_s(self) -> float:
-        """Seconds spent on histograms, some of them for earlier frames."""
+        """Computing time of histograms so far, seconds. It may include histograms of earlier frames."""
         return self._histograms_s + getattr(self._tracker, "histograms_s", 0.0)
 
     def _moment(self, number: int, time_s: float) -> float:
-        """The number that a frame would have if frames had come at a constant rate."""
+        """Return the number that the frame would have at a constant frame rate."""
         if self._frame is None:
             return float(number)
         lapse = (time_s - self._time_s) * (self._rate_hz or math.nan)
@@ -183,7 +193,7 @@ class Tracker:
         return compute
 
     def _as_given(self, settled: list[Tracks]) -> list[Tracks]:
-        """The tracks with the scores and classes of their detections; bridges have the class that was seen last."""
+        """Return the tracks with the scores and classes of their detections. Filled gaps have the last known class."""
         found = []
         for tracks in settled:
             given, score = self._given.popleft(), np.array(tracks.score, float)
@@ -216,7 +226,7 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
     if box.ndim != 2 or box.shape[1] != 4:
         raise InputError(f"boxes must be (N, 4), x, y, width, height in pixels; got {box.shape}")
     if score.shape != (len(box),):
-        raise InputError(f"scores must be one a box, ({len(box)},); got {score.shape}")
+        raise InputError(f"there must be one score for each box, ({len(box)},); got {score.shape}")
     check_boxes(box, score, certain)
     if isinstance(given, Detections):
         return given
@@ -224,7 +234,7 @@ def _check_detections(given: "Detections | np.ndarray | tuple[np.ndarray, np.nda
 
 
 class FrameTracker:
-    """A tracker of whole records: it keeps each frame until its tracks are settled."""
+    """A tracker of whole frame records, which keeps each record until its tracks are settled."""
 
     def __init__(
         self,
@@ -237,22 +247,24 @@ class FrameTracker:
         backend: str = "onboard",
         rate_hz: float | None = None,
     ) -> None:
-        """As Tracker. pictures: whether settled frames keep their pictures, which are most of a long run's memory."""
+        """Like Tracker. pictures: whether settled frames keep their pictures, which take most of the memory."""
         self.interval, self.pictures = interval, pictures
-        self.tracker = Tracker(settings, interval, size, motion, certain, backend, rate_hz)
-        self._waiting: deque[list[TrackedFrame]] = deque()  # each with the frames that repeat it
-        self._settled: TrackedFrame | None = None  # the last one
+        self.tracker = Tracker(
+            settings, interval=interval, size=size, motion=motion, certain=certain, backend=backend, rate_hz=rate_hz
+        )
+        self._waiting: deque[list[TrackedFrame]] = deque()  # frames that are not settled, each with its repeats
+        self._settled: TrackedFrame | None = None  # the frame that was settled last
         self._picture = 0  # number of the frame whose picture was added last
         paper = settings.paper
-        self._in_force = {  # by what an Adjustment calls it
+        self._in_force = {  # current values by the name in an Adjustment
             WEIGHT: paper.weight if paper.rule == "fixed" else 1.0,
             LOOKED: float(settings.track.appearance == "always"),
         }
 
     def update(self, given: TrackedFrame) -> Iterator[TrackedFrame]:
-        """Add a frame, whose tracks are not known yet; yields the frames that are settled by it.
+        """Add a frame without tracks, and yield the frames that are now settled.
 
-        A frame that repeats the one added before is none to the tracker, and gets its tracks.
+        A frame that repeats the frame added before is not tracked; it gets a copy of that frame's tracks.
         """
         if given.repeats and given.repeats == self._picture:
             if self._waiting:
@@ -266,7 +278,12 @@ class FrameTracker:
         image = frame.image if frame is not None else None
         time_s = math.nan if frame is None else frame.time_s
         settled = self.tracker.update(
-            *(given.detections, given.now_from_before, image, given.number, interval, time_s),
+            given.detections,
+            given.now_from_before,
+            image=image,
+            frame=given.number,
+            interval=interval,
+            time_s=time_s,
             damaged=frame is not None and frame.damaged,
         )
         appearance_s = self.tracker.appearance_s - before
@@ -275,7 +292,7 @@ class FrameTracker:
         yield from self._settle(settled)
 
     def flush(self) -> Iterator[TrackedFrame]:
-        """The frames that were still waiting."""
+        """Yield the remaining frames at the end."""
         yield from self._settle(self.tracker.flush())
 
     def _settle(self, settled: list[Tracks]) -> Iterator[TrackedFrame]:
@@ -293,12 +310,12 @@ class FrameTracker:
 
     @staticmethod
     def _copied(repeat: TrackedFrame, settled: TrackedFrame) -> TrackedFrame:
-        """A frame that repeats a settled one, with the tracks of that one."""
+        """Return a repeated frame with the tracks of the settled frame that it repeats."""
         tracks = replace(settled.tracks, frame=repeat.number, appearance=None)
         return replace(repeat, detections=settled.detections, tracks=tracks)
 
     def _changes(self, tracks: Tracks) -> tuple[Adjustment, ...]:
-        """What is new in how a frame used appearance."""
+        """Return the adjustments of a frame's use of appearance."""
         use = tracks.appearance
         if use is None:
             return ()
@@ -308,12 +325,12 @@ class FrameTracker:
 
 
 def without_picture(frame: Frame) -> Frame:
-    """The frame with a black picture of the same size, which takes no memory."""
+    """Return the frame with a black picture of the same size that takes no memory."""
     return replace(frame, image=np.broadcast_to(np.uint8(0), frame.image.shape))
 
 
 class SceneTracker:
-    """Gives the targets of a clip's own scenes identities, at frames 1, 1 + interval, ... Registrations are chained."""
+    """Tracks the targets of a clip's scenes at frames 1, 1 + interval, ... It chains the scenes' registrations."""
 
     def __init__(
         self,
@@ -323,18 +340,19 @@ class SceneTracker:
         pictures: bool = True,
         backend: str = "onboard",
         rate_hz: float | None = None,
+        motion: bool | None = True,
+        certain: bool = False,
     ) -> None:
+        """Start without scenes. The arguments are those of FrameTracker; the default is motion = True."""
         self._interval = interval
-        self._tracker = FrameTracker(
-            settings, interval, size, True, pictures=pictures, backend=backend, rate_hz=rate_hz
-        )
+        self._tracker = FrameTracker(settings, interval, size, motion, certain, pictures, backend, rate_hz)
         self._steps: list[np.ndarray] = []
         self._adjustments: tuple[Adjustment, ...] = ()
         self._seconds: dict[str, float] = {}
 
     def update(self, scene: Scene) -> Iterator[TrackedFrame]:
-        """Add the next scene; yields the frames that are settled by it."""
-        # An unknown step is left out: the product of the others is nearer to the truth than a camera that stood still.
+        """Add the next scene, and yield the frames that are now settled."""
+        # Leave out unknown steps: the product of the other steps is more accurate than no motion at all.
         if scene.step is not None and scene.step.reliable:
             self._steps.append(scene.step.later_from_earlier)
         self._adjustments += scene.adjustments
@@ -351,7 +369,7 @@ class SceneTracker:
         yield from self._tracker.update(given)
 
     def flush(self) -> Iterator[TrackedFrame]:
-        """The frames that were still waiting."""
+        """Yield the remaining frames at the end."""
         yield from self._tracker.flush()
 
 
@@ -364,7 +382,7 @@ def track_scenes(
     backend: str = "onboard",
     rate_hz: float | None = None,
 ) -> Iterator[TrackedFrame]:
-    """Identities of a clip's own detections, as by `SceneTracker`. backend, rate_hz: as for `Tracker`."""
+    """Track the targets of a clip's scenes by a `SceneTracker`. backend, rate_hz: see `Tracker`."""
     tracker = SceneTracker(settings, interval, size, pictures, backend, rate_hz)
     for scene in scenes:
         yield from tracker.update(scene)
@@ -394,7 +412,7 @@ class _TableTracker(FrameTracker):
         cause: str = "",
         seconds: dict[str, float] | None = None,
     ) -> Iterator[TrackedFrame]:
-        """Add the rows of these frames."""
+        """Add the table's rows of the given frames, and yield the frames that are now settled."""
         for number in numbers:
             lines = self.table.line[self.table.rows(number)]
             rows, tracks = self.table.at(number), Tracks(number)
@@ -409,10 +427,10 @@ def track_clip(
     interval: int,
     backend: str = "onboard",
 ) -> Iterator[TrackedFrame]:
-    """Identities of a table of detections along its clip, at frames 1, 1 + interval, ...
+    """Track a table of detections along its clip, at frames 1, 1 + interval, ...
 
-    The camera's motion is estimated from one picture to the next that can be read. Frames that cannot be read, or lie
-    after the clip's end, are tracked without picture. backend: as for `Tracker`.
+    The camera's motion is estimated between successive readable pictures. Frames that cannot be read, or lie after the
+    clip's end, are tracked without a picture. backend: see `Tracker`.
     """
     rate_hz = getattr(source, "rate_hz", None)
     tracker = _TableTracker(table, settings, interval, source.size, backend, rate_hz)
@@ -432,10 +450,10 @@ def track_clip(
 
 
 def track_table(table: DetectionTable, settings: Settings, interval: int) -> Iterator[TrackedFrame]:
-    """Identities of a table alone, from its first to its last row: no camera motion, no appearance.
+    """Track the rows of a table from its first to its last frame, without camera motion and without appearance.
 
-    Frames without rows are empty. Of a long stretch of these, those between the frame when all tracks are forgotten and
-    the one before the next row are left out: one stray row must not cost a million empty frames.
+    Frames without rows are yielded without detections. In a long gap, frames are skipped from the end of all tracks to
+    the frame before the next row, so that one stray row does not cause a million empty frames.
     """
     if not len(table):
         return

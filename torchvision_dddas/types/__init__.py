@@ -20,6 +20,7 @@ from torchvision_dddas.types.ground import (
     Confirmation,
     Elevation,
     Fix,
+    FusedTargets,
     GroundCrowds,
     GroundLocations,
     LandmarkObservations,
@@ -31,10 +32,13 @@ from torchvision_dddas.types.ground import (
     Sightings,
 )
 from torchvision_dddas.types.people import LinearSvm, Part, People, PeopleFrame
+from torchvision_dddas.types.record import Record
 from torchvision_dddas.types.table import Boxes, Table
 from torchvision_dddas.types.telemetry import COLUMNS_OF_TELEMETRY, Flight, Telemetry
 from torchvision_dddas.types.tracks import AppearanceUse, FrameResult, TrackedFrame, Tracks
+from torchvision_dddas.types.views import SharedFrame, ViewMap, identities_of
 from torchvision_dddas.types.worlds import Bodies, Command, GroundPicture, Order, Truth
+from torchvision_dddas.types.zones import Zone, ZoneEvent, most_common
 
 __all__ = [
     "COLUMNS_OF_TELEMETRY",
@@ -57,6 +61,7 @@ __all__ = [
     "Float",
     "Frame",
     "FrameResult",
+    "FusedTargets",
     "GroundCrowds",
     "GroundLocations",
     "GroundPicture",
@@ -73,8 +78,10 @@ __all__ = [
     "Poses",
     "Positions",
     "Problem",
+    "Record",
     "Registration",
     "Scene",
+    "SharedFrame",
     "Sightings",
     "Source",
     "Table",
@@ -82,9 +89,14 @@ __all__ = [
     "TrackedFrame",
     "Tracks",
     "Truth",
+    "ViewMap",
+    "Zone",
+    "ZoneEvent",
     "are_corners",
     "as_picture",
     "check_boxes",
+    "identities_of",
     "is_sampled",
+    "most_common",
     "share_orders",
 ]

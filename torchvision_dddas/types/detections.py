@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.types.table import Boxes, complete_table
+from torchvision_dddas.types.table import Boxes, Table, complete_table
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,14 @@ class Detections(Boxes):
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
     middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. class_id: (N,)
-    int64, its number, -1 if unknown. Other unknown values are NaN. Raises InputError for arrays of other lengths.
+    int64, its number, -1 if unknown. Other unknown values are NaN. Lists and tensors become arrays. Raises InputError
+    for other shapes.
+
+    >>> found = td.Detections([[40, 60, 20, 20], [80, 60, 10, 20]], [0.9, 0.5], label=["car", "person"])
+    >>> found
+    Detections(2 rows, box_px: 10 to 80, score: 0.5 to 0.9, label: car, person, class_id: -1)
+    >>> found[found.label == "car"].xyxy
+    array([[40., 60., 60., 80.]])
     """
 
     box_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -34,12 +41,12 @@ class Detections(Boxes):
     class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
+        for name, values in vars(self).copy().items():
+            if name != "kind" and not isinstance(values, np.ndarray):
+                object.__setattr__(self, name, _as_column(name, values))
         nan = np.nan
         unknown = {"area_px": nan, "heading_rad": nan, "speed_px": nan, "middle_px": nan, "label": "", "class_id": -1}
         complete_table(self, len(self.box_px), **unknown)
-
-    def __len__(self) -> int:
-        return len(self.box_px)
 
     @classmethod
     def from_supervision(cls, detections: Any) -> Self:
@@ -90,6 +97,18 @@ class Detections(Boxes):
         return cls(box_px, score, area_px, kind="given", label=label, class_id=number.astype(np.int64))
 
 
+def _as_column(name: str, values: Any) -> np.ndarray:
+    """A list or a tensor as the array of this name. Raises InputError for what cannot be that."""
+    try:
+        array = np.array(_off_device(values), {"label": object, "class_id": np.int64}.get(name, np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} of Detections cannot be an array: {error}") from None
+    array = array.reshape(0, 4) if name == "box_px" and not array.size else array
+    if array.ndim != (2 if name in ("box_px", "middle_px") else 1):
+        raise InputError(f"{name} of Detections must have a row for each box, got the shape {array.shape}")
+    return array
+
+
 _FOREIGN = (("xyxy", "boxes", "bboxes"), ("confidence", "conf", "scores"), ("class_id", "cls", "labels"))
 """What supervision, ultralytics, torchvision, transformers and mmdetection call edges, scores and classes."""
 
@@ -103,13 +122,22 @@ def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
     held = held or {name: getattr(given, name) for name in names if hasattr(given, name)}
     name = next((name for name in held if held[name] is not None), next(iter(held), ""))
     value: Any = held.get(name)
-    return name, value.detach().cpu().numpy() if hasattr(value, "detach") else value
+    return name, _off_device(value)
+
+
+def _off_device(value: Any) -> Any:
+    return value.detach().cpu().numpy() if hasattr(value, "detach") else value
 
 
 def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
     """Raises InputError for boxes (N, 4) and scores (N,) that no detector of pixels and probabilities gives.
 
     certain: whether the scores do not count, so that they may have any scale.
+
+    >>> types.check_boxes(np.array([[40.0, 60, 20, 20]]), np.array([90.0]), certain=False)
+    Traceback (most recent call last):
+        ...
+    torchvision_dddas.errors.InputError: scores must be probabilities in [0, 1], ...
     """
     if not (np.isfinite(box_px).all() and np.isfinite(score).all()):
         raise InputError("boxes and scores must be finite; leave out detections that are unknown")
@@ -129,14 +157,22 @@ def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
 
 
 def share_orders(box: np.ndarray) -> list[str]:
-    """The orders of columns in which boxes (N, 4) lie in a picture with sides of 1; none where they are pixels."""
+    """The orders of columns in which boxes (N, 4) lie in a picture with sides of 1; none where they are pixels.
+
+    >>> types.share_orders(np.array([[0.1, 0.1, 0.3, 0.5]]))
+    ['xyxy', 'xywh']
+    """
     first, last = box[:, :2], box[:, 2:]
     orders = {"yolo": (first - last / 2, first + last / 2), "xyxy": (first, last), "xywh": (first, first + last)}
     return [n for n, (low, high) in orders.items() if len(box) and ((low > -0.01) & (low < high) & (high < 1.01)).all()]
 
 
 def are_corners(box: np.ndarray, size: tuple[float, float] | None) -> bool:
-    """Whether the last two columns are right and bottom edges: they follow the first two, or sizes would not fit."""
+    """Whether the last two columns are right and bottom edges: they follow the first two, or sizes would not fit.
+
+    >>> types.are_corners(np.array([[600.0, 400, 630, 460]] * 3), size=(640, 480))
+    True
+    """
     first, last = box[:, :2], box[:, 2:]
     if not len(box) or not (last > first).all():
         return False
@@ -150,7 +186,7 @@ _STRAYS, _ENOUGH_ROWS = 3, 30
 
 
 @dataclass(frozen=True)
-class DetectionTable:
+class DetectionTable(Table):
     """Boxes of a clip, sorted by frame; rows of one frame keep the file's order.
 
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, else 1.
@@ -160,6 +196,11 @@ class DetectionTable:
     label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
     kind: (N,) str, what a row is; of `dddas track` detection, bridge (nothing was seen there: a box between two
     detections) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
+
+    >>> box_px = np.tile([10.0, 20, 5, 9], (3, 1))
+    >>> table = td.DetectionTable("boxes.csv", np.array([1, 1, 2]), box_px, np.ones(3), line=np.array([1, 2, 3]))
+    >>> table.first, table.last, len(table.at(1))
+    (1, 2, 2)
     """
 
     path: str
@@ -176,9 +217,6 @@ class DetectionTable:
     kind: np.ndarray | None = None
     class_id: np.ndarray | None = None
     notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
     def of_kind(self, *kinds: str) -> np.ndarray:
         """(N,) bool, whether a row is of one of these kinds."""

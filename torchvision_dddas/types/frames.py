@@ -9,16 +9,20 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types.detections import Detections
+from torchvision_dddas.types.record import Record
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Record):
     """One picture of a clip.
 
     number: 1-based position in the clip. time_s: seconds since the clip's first frame.
     image: uint8, (H, W) grey or (H, W, 3) BGR. skipped: frames before it that were left out on purpose.
     taken_s: capture time by the monotonic clock; NaN for a recording. damaged: the decoder concealed errors in it or in
     an earlier picture that it builds on.
+
+    >>> td.Frame(1, 0.0, np.zeros((480, 640, 3), np.uint8))
+    Frame(number=1, time_s=0, image: 480x640x3 0)
     """
 
     number: int
@@ -29,10 +33,17 @@ class Frame:
     damaged: bool = False
 
 
-def as_picture(image: Any, name: str = "frame") -> np.ndarray:
+def as_picture(image: Any, *, name: str = "frame") -> np.ndarray:
     """A picture as every part of the program takes it: uint8, (H, W) or (H, W, 3) BGR; (H, W, 1) becomes (H, W).
 
     Raises InputError for anything else, with the code that converts it, where `frame` is what was given.
+
+    >>> types.as_picture(np.zeros((48, 64, 1), np.uint8)).shape
+    (48, 64)
+    >>> types.as_picture(np.zeros((48, 64)))
+    Traceback (most recent call last):
+        ...
+    torchvision_dddas.errors.InputError: frame must be uint8 of shape (H, W) or (...
     """
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.size:
         if image.ndim == 2 or image.shape[2:] == (3,):
@@ -71,8 +82,12 @@ def as_picture(image: Any, name: str = "frame") -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """A recoverable fault while reading a clip: the first affected frame, 1-based, and a description."""
+class Problem(Record):
+    """A recoverable fault while reading a clip: the first affected frame, 1-based, and a description.
+
+    >>> str(types.Problem(12, "frame 12 cannot be decoded"))
+    'frame 12 cannot be decoded'
+    """
 
     frame: int
     what: str
@@ -117,17 +132,24 @@ def is_sampled(frame: int, interval: int) -> bool: ...
 @overload
 def is_sampled(frame: np.ndarray, interval: int) -> np.ndarray: ...
 def is_sampled(frame: int | np.ndarray, interval: int) -> bool | np.ndarray:
-    """Whether a frame number, or each of an array, is one of 1, 1 + interval, 1 + 2 interval, ..."""
+    """Whether a frame number, or each of an array, is one of 1, 1 + interval, 1 + 2 interval, ...
+
+    >>> types.is_sampled(np.arange(1, 8), 3)
+    array([ True, False, False,  True, False, False,  True])
+    """
     return (frame - 1) % interval == 0
 
 
 @dataclass(frozen=True)
-class Registration:
+class Registration(Record):
     """The background's motion from one frame to a later one.
 
     later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
     tracked, inliers: numbers of keypoints tracked, and of those that fit the homography.
     error_px: median error of the inliers. flow_px: median background displacement. cause: why it is not reliable.
+
+    >>> td.Registration(np.eye(3), tracked=120, inliers=110, error_px=0.2, flow_px=3.5)
+    Registration(later_from_earlier: 3x3 0 to 1, tracked=120, inliers=110, error_px=0.2, flow_px=3.5)
     """
 
     later_from_earlier: np.ndarray
@@ -140,8 +162,13 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class Adjustment:
-    """A parameter changed by feedback at a frame, and the reason."""
+class Adjustment(Record):
+    """A parameter changed by feedback at a frame, and the reason.
+
+    >>> change = td.Adjustment(12, "interval.frames", 3, 5, "altitude 50 m")
+    >>> change.describe()
+    'interval.frames 3 -> 5'
+    """
 
     frame: int
     parameter: str
@@ -156,7 +183,7 @@ class Adjustment:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Record):
     """The result of motion detection for one frame.
 
     mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
@@ -167,6 +194,11 @@ class Scene:
     core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.
     repeats: the number of the earlier frame whose picture this one repeats, and whose result it has; 0: none. It is no
     look at the scene: leave it out of what follows targets.
+
+    >>> image = np.zeros((48, 64), np.uint8)
+    >>> scene = td.Scene(td.Frame(1, 0.0, image), image.astype(np.uint16), td.Detections(), interval_frames=3)
+    >>> len(scene.detections), scene.camera_motion is None
+    (0, True)
     """
 
     frame: Frame

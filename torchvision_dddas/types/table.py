@@ -1,28 +1,57 @@
 """Tables: records of columns of one length, and boxes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.types.record import Record
+
+# What all rows of a table have in common, and a column of tables that are joined.
+_COMMON = ("time_s", "frame", "by")
+# What the values of columns mean: tables that differ in it cannot be joined.
+_MEANING = ("names", "classes", "geographic", "origin_deg", "height_zero")
 
 
-class Table:
-    """A record whose arrays have one row an item each: rows can be selected, and tables of one kind joined."""
+class Table(Record):
+    """A record whose arrays have one row an item each: rows can be selected, and tables of one kind joined.
 
-    def __getitem__(self, rows: np.ndarray | slice) -> Self:
-        """The selected rows (indices, mask or slice); fields that are not arrays are kept."""
+    >>> boxes = td.Detections([[40, 60, 20, 20], [80, 60, 10, 20]], [0.9, 0.5])
+    >>> len(boxes), boxes[0].score, boxes[boxes.score > 0.8].score, [float(row.score[0]) for row in boxes]
+    (2, array([0.9]), array([0.9]), [0.9, 0.5])
+    >>> len(td.Detections.concat([boxes, boxes[1:]]))
+    3
+    """
+
+    def __len__(self) -> int:
+        values = (getattr(self, name) for name in self.__dataclass_fields__)  # type: ignore[attr-defined]
+        return next(len(value) for value in values if isinstance(value, np.ndarray | list))
+
+    def __iter__(self) -> Iterator[Self]:
+        return (self[row] for row in range(len(self)))
+
+    def __getitem__(self, rows: int | slice | Sequence[int] | np.ndarray) -> Self:
+        """The selected rows (a number, indices, mask or slice); fields that are not arrays are kept."""
+        if isinstance(rows, int | np.integer):
+            rows = [range(len(self))[rows]]
         return replace(self, **{name: column[rows] for name, column in columns_of(self).items()})  # type: ignore[type-var]
 
     @classmethod
     def concat(cls, tables: Sequence[Self]) -> Self:
-        """All rows in one table; other fields come from the first, but the frames of rows become an array."""
-        columns = [columns_of(table) for table in tables]
+        """All rows in one table; fields that are not arrays come from the first, but frames and times become arrays.
+
+        Raises InputError without tables, and for tables whose columns or their meaning differ.
+        """
+        if not tables:
+            raise InputError(f"{cls.__name__}.concat got no tables; wanted at least one")
+        columns = [columns_of(table) | _common_columns(table) for table in tables]
         for table, column in zip(tables, columns, strict=True):
-            if hasattr(table, "frame"):
-                column["frame"] = np.broadcast_to(table.frame, len(table))  # type: ignore[arg-type]
+            wrong = sorted(column.keys() ^ columns[0].keys())
+            wrong += [name for name in _MEANING if getattr(table, name, None) != getattr(tables[0], name, None)]
+            if wrong:
+                raise InputError(f"tables of {cls.__name__} that are joined must have the same {', '.join(wrong)}")
         joined = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
@@ -31,12 +60,12 @@ class Table:
 
         The frame is a column, and `label` is called `class`, as in the tables of runs.
         """
-        columns: dict[str, np.ndarray] = {}
-        if hasattr(self, "frame"):
-            columns["frame"] = np.broadcast_to(self.frame, len(self))  # type: ignore[arg-type]
+        columns = _common_columns(self)
         for name, values in columns_of(self).items():
             flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
             many = (name,) if values.ndim == 1 else tuple(f"{name}_{k}" for k in range(flat.shape[1]))
+            if name == "place":
+                many = _SPLIT["lonlat_deg" if getattr(self, "geographic", False) else "east_north_m"]
             columns |= dict(zip(_SPLIT.get(name, many), flat.T, strict=True))
         return columns
 
@@ -58,12 +87,20 @@ _SPLIT = {
     "image_px": ("u_px", "v_px"),
     "east_north_m": ("east_m", "north_m"),
     "lonlat_deg": ("longitude_deg", "latitude_deg"),
+    "velocity_m_s": ("velocity_east_m_s", "velocity_north_m_s"),
+    "state": ("east_m", "north_m", "velocity_east_m_s", "velocity_north_m_s"),
+    "place_m": ("east_m", "north_m", "up_m"),
     "covariance_m2": ("var_east_m2", "cov_east_north_m2", "cov_north_east_m2", "var_north_m2"),
 }
 
 
 class Boxes(Table):
-    """A table with boxes, box_px (N, 4), scores, and classes: names and numbers."""
+    """A table with boxes, box_px (N, 4), scores, and classes: names and numbers.
+
+    >>> boxes = td.Detections([[40, 60, 20, 20]], [0.9])
+    >>> boxes.xyxy, boxes.foot_px
+    (array([[40., 60., 60., 80.]]), array([[49.5, 79. ]]))
+    """
 
     box_px: np.ndarray
     score: np.ndarray
@@ -74,6 +111,11 @@ class Boxes(Table):
     def xyxy(self) -> np.ndarray:
         """(N, 4) left, top, right and bottom edge in pixels, as torchvision and supervision have boxes."""
         return np.concatenate([self.box_px[:, :2], self.box_px[:, :2] + self.box_px[:, 2:]], axis=1)
+
+    @property
+    def foot_px(self) -> np.ndarray:
+        """(N, 2) u, v of the middle of the lower edge, from the first pixel's centre."""
+        return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - (0.5, 1.0)
 
     def to_supervision(self) -> Any:
         """A supervision.Detections of the boxes, as its annotators draw it; class_id is 0 if no class is known.
@@ -96,6 +138,12 @@ def columns_of(table: Any) -> dict[str, np.ndarray]:
     """The columns of a table by name."""
     values = ((name, getattr(table, name)) for name in table.__dataclass_fields__)  # `fields` takes much longer
     return {name: value for name, value in values if isinstance(value, np.ndarray)}
+
+
+def _common_columns(table: Any) -> dict[str, np.ndarray]:
+    """The values that all rows of a table have in common, as columns."""
+    values = {name: getattr(table, name) for name in _COMMON if name in table.__dataclass_fields__}
+    return {name: np.full(len(table), v) for name, v in values.items() if not isinstance(v, np.ndarray)}
 
 
 def complete_table(table: Any, count: int, **unknown: Any) -> None:

@@ -7,10 +7,12 @@ from typing import Literal
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.types.record import Record
+from torchvision_dddas.types.table import Table
 
 
 @dataclass(frozen=True)
-class Telemetry:
+class Telemetry(Table):
     """The vehicle's own reports, one row per sample, sorted by time; NaN where unknown. Arrays are (N,).
 
     time_s: since the clip's first frame. altitude_m: above height_zero: "ground", that below the vehicle, or "takeoff",
@@ -19,13 +21,20 @@ class Telemetry:
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
     heading_rad, pitch_rad, roll_rad: of the camera, as in Camera; straight down the pitch is pi/2 and the heading that
     of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
-    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m: standard deviations, NaN: those of the group `aerial`.
+    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m, position_sigma_m: standard deviations, the last of east and of
+    north; NaN: those of the group `aerial`.
     heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
     is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. start_local_s: the same by a clock of unknown zone.
     latest_utc_s: the latest that start_utc_s can be where the dates lack a zone. origin: the file.
     notes: remarks for the user.
     Raises InputError for columns of other lengths and times that decrease.
+
+    >>> log = td.Telemetry([0.0, 1.0], altitude_m=[40.0, 42.0], speed_m_s=[5.0, 5.0])
+    >>> log
+    Telemetry(2 rows, time_s: 0 to 1, altitude_m: 40 to 42, speed_m_s: 5)
+    >>> log.at(0.5).altitude_m
+    41.0
     """
 
     time_s: np.ndarray
@@ -42,6 +51,7 @@ class Telemetry:
     heading_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     tilt_sigma_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
     altitude_sigma_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    position_sigma_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
     above_ellipsoid_m: np.ndarray = field(default_factory=lambda: np.zeros(0))
     height_zero: Literal["ground", "takeoff", "unknown"] = "ground"
     heading_from: str = ""
@@ -65,9 +75,6 @@ class Telemetry:
                 raise InputError(f"{name} of telemetry must have the shape {wanted}, a row a time, got {given.shape}")
             object.__setattr__(self, name, given)
 
-    def __len__(self) -> int:
-        return len(self.time_s)
-
     def focal_px(self, size: tuple[int, int]) -> np.ndarray:
         """(N,) focal length in pixels by the field of view, NaN where unknown. size: (width, height) of pictures."""
         return (max(size) if self.is_nominal else size[0]) / 2 / np.tan(self.hfov_rad / 2)
@@ -77,7 +84,7 @@ class Telemetry:
         """How long before its first and after its last sample the log still tells a place: half an interval."""
         return min(0.5 * float(np.median(np.diff(self.time_s))) + 1e-6, 1.0) if len(self) > 1 else 1.0
 
-    def at(self, time_s: float, tolerance_s: float = 1.0) -> "Flight | None":
+    def at(self, time_s: float, *, tolerance_s: float = 1.0) -> "Flight | None":
         """The state at a time by linear interpolation, angles and longitudes the short way round.
 
         A field is NaN if it is in either neighbour. Up to tolerance_s outside the span the nearest sample is used;
@@ -117,10 +124,11 @@ class Telemetry:
             between(self.heading_sigma_rad),
             between(self.tilt_sigma_rad),
             between(self.altitude_sigma_m),
+            between(self.position_sigma_m),
             self.heading_from,
         )
 
-    def check_overlap(self, last_s: float, first_s: float = 0.0, what: str = "clip") -> None:
+    def check_overlap(self, last_s: float, *, first_s: float = 0.0, what: str = "clip") -> None:
         """Raises InputError, with both spans, where no sample lies near a clip or table from first_s to last_s."""
         if len(self) == 0:
             raise InputError(f"the telemetry has no samples; the {what} lasts from {first_s:.1f} to {last_s:.1f} s")
@@ -154,13 +162,18 @@ COLUMNS_OF_TELEMETRY = (
     "heading_sigma_rad",
     "tilt_sigma_rad",
     "altitude_sigma_m",
+    "position_sigma_m",
     "above_ellipsoid_m",
 )
 
 
 @dataclass(frozen=True)
-class Flight:
-    """Telemetry at one moment; fields as in Telemetry, NaN where unknown."""
+class Flight(Record):
+    """Telemetry at one moment; fields as in Telemetry, NaN where unknown.
+
+    >>> round(td.Flight(altitude_m=50.0, pitch_rad=np.radians(30)).distance_m, 6)
+    100.0
+    """
 
     altitude_m: float
     speed_m_s: float = float("nan")
@@ -174,6 +187,7 @@ class Flight:
     heading_sigma_rad: float = float("nan")
     tilt_sigma_rad: float = float("nan")
     altitude_sigma_m: float = float("nan")
+    position_sigma_m: float = float("nan")
     heading_from: str = ""
 
     @property

@@ -1,22 +1,28 @@
 """Tracks, and the results of a frame."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from torchvision_dddas.types.detections import Detections
 from torchvision_dddas.types.frames import Adjustment, Frame
-from torchvision_dddas.types.ground import AerialLocations, Confirmation, GroundCrowds
+from torchvision_dddas.types.ground import AerialLocations, Confirmation, FusedTargets, GroundCrowds
+from torchvision_dddas.types.record import Record
 from torchvision_dddas.types.table import Boxes, complete_table
 from torchvision_dddas.types.worlds import Command
+from torchvision_dddas.types.zones import ZoneEvent
 
 
 @dataclass(frozen=True)
-class AppearanceUse:
+class AppearanceUse(Record):
     """Whether the association of a frame looked at the targets' appearance, and the reason.
 
     weight: of their locations in the source's association; NaN in the default one, where appearance adds to scores.
     location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN where not computed.
+
+    >>> td.AppearanceUse(looked=True, cause="two boxes overlap")
+    AppearanceUse(looked=True, cause='two boxes overlap')
     """
 
     looked: bool
@@ -37,6 +43,13 @@ class Tracks(Boxes):
     label, class_id: of the detection, as there; of a bridging box those of the identity before. frame: its number, of
     a table that `concat` joins (N,).
     appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
+
+    >>> box_px = np.array([[10.0, 20, 5, 9], [40, 20, 5, 9]])
+    >>> tracks = td.Tracks(3, np.array([7, 9]), box_px, np.ones(2), np.array([0, 1]))
+    >>> tracks[tracks.id == 9].xyxy
+    array([[40., 20., 45., 29.]])
+    >>> td.Tracks.concat([tracks, tracks[:1]]).id
+    array([7, 9, 7])
     """
 
     frame: int
@@ -52,9 +65,6 @@ class Tracks(Boxes):
     def __post_init__(self) -> None:
         complete_table(self, len(self.identity), link=np.nan, label="", class_id=-1)
 
-    def __len__(self) -> int:
-        return len(self.identity)
-
     @property
     def id(self) -> np.ndarray:
         """(N,) the identities."""
@@ -62,7 +72,7 @@ class Tracks(Boxes):
 
 
 @dataclass(frozen=True)
-class TrackedFrame:
+class TrackedFrame(Record):
     """The result of tracking for one frame.
 
     number: 1-based position in the clip. frame: the picture, or None. detections: the tracker's input.
@@ -70,6 +80,11 @@ class TrackedFrame:
     now_from_before: (3, 3) pixel homography from the frame tracked before; None: no motion, or unknown.
     lines: (N,) int64, lines of the detections in their file; empty for own ones.
     cause: why there is no result. adjustments, seconds, repeats: as in Scene.
+
+    >>> found = td.Detections([[10, 20, 5, 9], [40, 20, 5, 9]], [0.9, 0.8])
+    >>> tracks = td.Tracks(3, np.array([7]), found.box_px[:1], found.score[:1], np.array([0]))
+    >>> td.TrackedFrame(3, None, found, tracks).untracked
+    [1]
     """
 
     number: int
@@ -91,7 +106,7 @@ class TrackedFrame:
 
 
 @dataclass(frozen=True)
-class FrameResult:
+class FrameResult(Record):
     """The result of the whole pipeline for one frame.
 
     tracked: its targets, without the landmarks. locations: where they are on the ground; None if nothing locates them.
@@ -100,6 +115,13 @@ class FrameResult:
     confirmed: the UGVs' verdict on each row of locations.positions; None without UGV cameras.
     crowds: by the people that the UGVs see; None without UGV cameras.
     command: the order to the vehicles after this frame; None: no change.
+    events: what targets did at zones, as far as this frame settles it.
+    fused: the targets as all platforms know them at this frame; None without ground platforms.
+
+    >>> tracks = td.Tracks(3, np.array([7]), np.array([[10.0, 20, 5, 9]]), np.ones(1), np.zeros(1, int))
+    >>> result = td.FrameResult(td.TrackedFrame(3, None, td.Detections(), tracks))
+    >>> result.number, result.tracks.id
+    (3, array([7]))
     """
 
     tracked: TrackedFrame
@@ -109,6 +131,8 @@ class FrameResult:
     confirmed: Confirmation | None = None
     command: "Command | None" = None
     crowds: GroundCrowds | None = None
+    events: tuple[ZoneEvent, ...] = ()
+    fused: FusedTargets | None = None
 
     @property
     def frame(self) -> Frame | None:
@@ -119,6 +143,13 @@ class FrameResult:
     def number(self) -> int:
         """1-based number of the frame."""
         return self.tracked.number
+
+    @property
+    def time_s(self) -> float:
+        """The time of the frame by the telemetry's clock where it was located, else by the clip's; NaN if unknown."""
+        if self.locations is not None:
+            return self.locations.time_s
+        return math.nan if self.frame is None else self.frame.time_s
 
     @property
     def repeats(self) -> int:

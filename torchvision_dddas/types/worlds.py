@@ -5,14 +5,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchvision_dddas.types.ground import Camera, CameraPose
+from torchvision_dddas.types.record import Record
+from torchvision_dddas.types.table import Table
 
 
 @dataclass(frozen=True)
-class Order:
+class Order(Record):
     """An order to a ground vehicle: drive to a goal and look at a point.
 
     goal, look_at: (2,) in the vehicles' own coordinates, longitude and latitude or local metres; look_at None: ahead.
     picture: whether a picture is requested.
+
+    >>> types.Order("ugv1", goal=np.array([10.0, 20.0]), speed_m_s=2.0, picture=True)
+    Order(vehicle='ugv1', goal: 2 10 to 20, speed_m_s=2, picture=True)
     """
 
     vehicle: str
@@ -23,11 +28,14 @@ class Order:
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(Record):
     """A command to the vehicles; a simulator executes it, a recording ignores it. None: no change.
 
     every: process every so many frames. fly_to: (2,) position of the UAV. look_at: (2,) ground point in the picture's
     centre. Coordinates as in Order.
+
+    >>> types.Command(every=2, fly_to=np.array([10.0, 20.0]))
+    Command(every=2, fly_to: 2 10 to 20)
     """
 
     every: int = 1
@@ -38,8 +46,13 @@ class Command:
 
 
 @dataclass(frozen=True)
-class GroundPicture:
-    """A ground vehicle's picture at a frame of the aerial camera; camera has the reported pose at that moment."""
+class GroundPicture(Record):
+    """A ground vehicle's picture at a frame of the aerial camera; camera has the reported pose at that moment.
+
+    >>> camera = td.Camera("ugv1", (640, 480), (500.0, 500.0), (319.5, 239.5))
+    >>> types.GroundPicture("ugv1", 12, np.zeros((480, 640, 3), np.uint8), camera)
+    GroundPicture(vehicle='ugv1', frame=12, image: 480x640x3 0, camera=Camera(...))
+    """
 
     vehicle: str
     frame: int
@@ -48,13 +61,19 @@ class GroundPicture:
 
 
 @dataclass(frozen=True)
-class Bodies:
+class Bodies(Table):
     """Everything that moves in a simulated world at one moment, one row per body.
 
     number: (N,) int64 from 1, constant. kind: (N,) person, car or ugv. target: (N,) int64 from 1, shared by the people
     of a crowd. place_m: (N, 3) of the feet, local east, north, up. velocity_m_s: (N, 2). facing_rad: (N,) clockwise
     from north. height_m: (N,) of a person. phase: (N,) of the gait, in strides. colour: (N, 3) BGR, 0 to 255.
     plate: (N, 3) BGR of a landmark's marker, or NaN. hidden: (N,) bool, the marker is covered.
+
+    >>> one, pair, triple = np.ones(2), np.zeros((2, 2)), np.zeros((2, 3))
+    >>> number, kind = np.array([1, 2]), np.array(["person", "car"])
+    >>> bodies = types.Bodies(number, kind, number, triple, pair, one, 1.7 * one, one, triple, triple, one < 0)
+    >>> bodies[bodies.kind == "person"].height_m
+    array([1.7])
     """
 
     number: np.ndarray
@@ -69,16 +88,19 @@ class Bodies:
     plate: np.ndarray
     hidden: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.number)
-
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Record):
     """Ground truth of a simulated frame.
 
     mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all in the world.
     pose: of the camera at mid-exposure. events: faults, crowds that join or split, in words.
+
+    >>> none, pair, triple = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
+    >>> nobody = types.Bodies(none, none, none, triple, pair, none, none, none, triple, triple, none)
+    >>> mask, pose = np.zeros((48, 64), np.uint16), td.CameraPose(np.zeros(3), np.eye(3))
+    >>> types.Truth(1, 0.0, mask, mask, nobody, pose)
+    Truth(frame=1, time_s=0, mask: 48x64 0, people: 48x64 0, bodies=Bodies(0 rows), pose=CameraPose(...))
     """
 
     frame: int

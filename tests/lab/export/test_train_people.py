@@ -19,7 +19,7 @@ from torchvision_dddas.people.suppression import people_from_windows
 from torchvision_dddas.types import LinearSvm, Part
 
 CHANGED = {"window_width_px": 32, "window_height_px": 64, "scale_step": 1.2, "enlarge": 1.0}
-SMALL = PeopleParameters(**CHANGED)  # type: ignore[arg-type]
+SMALL = PeopleParameters(**CHANGED)
 SET = ["--set", *(f"people.{name}={value}" for name, value in CHANGED.items())]
 
 
@@ -106,7 +106,7 @@ def test_the_same_pictures_and_seed_give_the_same_numbers_as_text_too(folders, t
 
 
 def test_the_file_tells_its_layout(trained):
-    with pytest.raises(InputError, match=r"window of 32 x 64, the settings say 64 x 128"):
+    with pytest.raises(InputError, match=r"window of 32 x 64, but the settings say 64 x 128"):
         load_classifier(PeopleParameters(classifier=str(trained)))
 
 
@@ -146,7 +146,7 @@ def error_line(capsys, *words):
         ("absent", "rest", "svm.npz", "is no folder"),
         ("people", "empty", "svm.npz", "empty holds no images"),
         ("broken", "rest", "svm.npz", "a.png cannot be decoded"),
-        ("people", "rest", "empty", "is a folder; wanted the name of a file"),
+        ("people", "rest", "empty", "is a folder; give the name of a file"),
         ("people", "rest", "none/svm.npz", "cannot write"),
         ("people", "rest", "people/0.png", "among the pictures"),
     ],

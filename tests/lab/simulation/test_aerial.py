@@ -271,3 +271,40 @@ def test_motion_blur_draws_out_by_the_length_of_the_way_there_and_moves_nothing(
     (before, own), (after, now) = spread(dot), spread(motion_blur(dot, np.broadcast_to(np.float32(way), (3, 3, 2))))
     assert np.abs(after - before).max() < (0.6 if way is ACROSS else 0.1)
     assert now - own == pytest.approx(np.square(middle_way) / 12, abs=1.25 if way is ACROSS else 0.6)
+
+
+def waves(world, time_s):
+    given = {"camera": CLEAR | {"quality": 100}, "seed": 5, "world": {"shore_m": 5.0}}
+    scenario = Scenario.model_validate(given)
+    picture, *_ = AerialCamera(world, scenario).take(replace(empty(heading=0.0, roll=0.0), time_s=time_s))
+    return picture.astype(int)
+
+
+def test_waves_travel_and_the_ground_beside_them_stays(bare):
+    before, after = waves(bare, 1.0), waves(bare, 1.4)
+    changed = np.abs(after - before).max(axis=2)
+    assert np.median(changed[-60:]) > 4  # the picture's lower edge is 20 m south
+    assert changed[:200].max() == 0
+
+
+def test_the_own_shadow_lies_where_the_sun_is_behind_the_vehicle(bare):
+    def take(size_m):
+        given = {"camera": CLEAR | {"quality": 100}, "seed": 5, "uav": {"size_m": size_m}}
+        scenario = Scenario.model_validate(given)
+        return AerialCamera(bare, scenario).take(above)[0].astype(int)
+
+    above = empty(altitude=15.0, pitch=45.0, heading=320.0, roll=0.0)
+    dark = (take(0.0) - take(0.8)).max(axis=2)
+    place = above.pose.place_m - above.pose.place_m[2] / bare.to_sun[2] * bare.to_sun
+    view = view_from_pose(above.pose, AerialCamera(bare, Scenario.model_validate({"camera": CLEAR})).camera)
+    wanted = view.project(np.array([[*place[:2], bare.up_m(place[None, :2])[0]]]))[0]
+    assert dark.max() > 40
+    assert np.hypot(*(middle(dark > 0.5 * dark.max()) - wanted)) < 8
+
+
+def test_a_thermal_camera_shows_people_bright_and_casts_no_shadow(bare):
+    crowd = people(PLACES, bare)
+    picture, mask, _ = camera_of(bare, thermal=True).take(moment(crowd))
+    assert picture[mask > 0].mean() > 170
+    beside = picture[cv2.dilate((mask > 0).astype(np.uint8), np.ones((5, 5))) == 0]
+    assert beside.min() > 60 and beside.max() < 90 and (picture[..., 0] == picture[..., 2]).all()

@@ -344,3 +344,12 @@ def test_nobody_is_run_over():
         ahead = np.array([np.sin(bodies.facing_rad[car]), np.cos(bodies.facing_rad[car])])
         to = bodies.place_m[bodies.kind == "person", :2] - bodies.place_m[car, :2]
         assert ((np.abs(to @ ahead) > 2.2) | (np.abs(to @ (ahead[1], -ahead[0])) > 0.9)).all()
+
+
+def test_after_a_cut_the_film_and_its_log_go_on_elsewhere():
+    found = faulty("cut", size=12.0)
+    after = next(k for k, one in enumerate(found) if is_on(one))
+    before, now = found[after - 1], found[after]
+    assert now.pose.place_m[0] - before.pose.place_m[0] == pytest.approx(12, abs=1)
+    lonlat = np.array([before.flight.place, now.flight.place])
+    assert np.ptp(geometry.east_north(lonlat, busy().world.origin_deg)[:, 0]) == pytest.approx(12, abs=1)

@@ -6,7 +6,7 @@ import pytest
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.simulation.scenario import WorldParameters
-from torchvision_dddas.lab.simulation.world import build_world, shadow_above_ground, sun_direction
+from torchvision_dddas.lab.simulation.world import build_world, shadow_above_ground, shore_north_m, sun_direction
 from torchvision_dddas.types import Elevation, Ortho
 
 PARAMETERS = WorldParameters(side_m=60, bushes_per_ha=300, trees_per_ha=20, buildings=1)
@@ -169,3 +169,10 @@ def test_a_photo_of_elsewhere_is_refused():
     away = Ortho(np.full((50, 50, 3), 90, np.uint8), np.array([[0.1, 0, 500], [0, -0.1, 40]]))
     with pytest.raises(InputError, match="shows nothing of the world: it lies from 500 m to 505 m east"):
         build_world(BARE, seed=0, photo=away)
+
+
+def test_poles_are_thin_and_high_and_nothing_stands_in_the_water():
+    things = build_world(bare(poles=12, trees_per_ha=40.0, shore_m=10.0), seed=4).things
+    poles = things.radius_m < 0.3
+    assert poles.sum() >= 6 and (things.height_m[poles] > 4).all()
+    assert (things.east_north_m[:, 1] > shore_north_m(things.east_north_m[:, 0], 10.0)).all()

@@ -79,11 +79,11 @@ def test_a_descent_that_was_broken_off_resumes_with_the_same_steps(tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"plan": replace(QUICK, steps=13)}, "other steps, 12 and not 13"),
+        ({"plan": replace(QUICK, steps=13)}, "other steps, 12 instead of 13"),
         ({"examples": pieces(("one",))}, "other examples"),
         ({"parameters": Parameters(Settings(), [THRESHOLD])}, "other knobs"),
         ({"parameters": parameters(13.0)}, "other settings"),
-        ({"family": Bowl(task="tracking")}, "other task, motion and not tracking"),
+        ({"family": Bowl(task="tracking")}, "other task, motion instead of tracking"),
     ],
 )
 def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict, words: str) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.lab.tuning.worlds import filmed_clip, flown, seen, walk
-from tests.overflight import Overflight
+from tests.lab.tuning.worlds import filmed_clip, seen, walk
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
@@ -38,7 +37,6 @@ class Case:
 # Without pictures, and whoever hides, these tracking parameters have no effect.
 IDLE_SCORES = "appearance_weight appearance_offset rest_drift rest_price hiding"
 IDLE = frozenset(f"track.{name}" for name in IDLE_SCORES.split())
-IDLE_POSITIONS = "aerial.focal_sigma aerial.own_sigma ground.body_height_sigma_m ground.height_sigma ground.feet_sigma"
 CASES = {
     "motion": Case("motion", lambda place, _: filmed_clip(place, 9), list(range(1, 10)), "no masks", MOTION),
     "tracking": Case(
@@ -58,13 +56,6 @@ CASES = {
         softness=1.0,
         idle=IDLE,
         change=lambda family: family.at(5, "tracking"),
-    ),
-    "location": Case(
-        "location",
-        lambda place, _: flown(place, Overflight(frames=3, gps_m=0.5), sigma=False),
-        [1, 2, 3],
-        "no true positions",
-        idle=frozenset(name for name in TUNABLE if "guess" in name) | frozenset(IDLE_POSITIONS.split()),
     ),
 }
 Made = tuple[Case, Family, Clip, list[Example]]
@@ -117,5 +108,5 @@ def test_a_clip_without_truth_is_refused_by_name(made: Made) -> None:
 
 
 def test_a_family_that_is_none_is_refused_with_those_that_are() -> None:
-    with pytest.raises(InputError, match="wanted one of motion"):
+    with pytest.raises(InputError, match="give one of motion"):
         load_family("weather")

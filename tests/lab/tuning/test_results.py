@@ -70,7 +70,8 @@ def test_parameters_that_did_not_move_change_nothing(clips) -> None:
     same = {THRESHOLD: load_config("fast").difference.threshold}
     spec = read_spec(clips)
     verdict = judge(spec, clips.parent, GOAL, same, ("held",), (), 1, clips.parent / "cache")
-    assert verdict.tuned.says == "the same" and verdict.held is None
+    assert verdict.tuned.says == "no change" and verdict.held is None
+    assert math.isnan(verdict.tuned.frame_ms[1])  # nothing was measured again
     assert verdict.tuned.changes is not None and verdict.tuned.changes["tasks"]["motion"]["same"] == ["held"]
 
 

@@ -21,7 +21,7 @@ from torchvision_dddas.lab.tuning.tracking import Stretches, TrackingFamily, lin
 from torchvision_dddas.tracking import kalman, track_table
 from torchvision_dddas.tracking.scene import SceneState
 from torchvision_dddas.tracking.score_tracker import ScoreTracker
-from torchvision_dddas.tracking.scores import Look, association_scores, newborn_scores
+from torchvision_dddas.tracking.scores import BoxLook, association_scores, newborn_scores
 from torchvision_dddas.types import DetectionTable
 
 LEARNED = ("time", "step", "density", "missing", "turnover")
@@ -158,11 +158,11 @@ def test_a_batch_of_tensors_is_scored_as_arrays_are(scores: Any):
     at_rest = np.zeros((1, *state.shape[:2], 2))
     more = (at_rest,) if scores is newborn_scores else ()
     rows = zip(state, missed, box[:, 2], scenes, strict=True)
-    wanted = [scores(Look.of(*row, parameters), parameters, *(part[:, 0] for part in more)) for row in rows]
+    wanted = [scores(BoxLook.of(*row, parameters), parameters, *(part[:, 0] for part in more)) for row in rows]
     together = {name: torch.tensor([[getattr(scene, name)] for scene in scenes]).double() for name in LEARNED}
     size: Any = torch.tensor([scene.size for scene in scenes]).double().T[..., None].unbind()
     tensors: Any = [torch.as_tensor(part) for part in (state, missed, box[:, 2])]
-    look = Look.of(tensors[0], tensors[1], tensors[2], SceneState(**together, size=size), parameters)
+    look = BoxLook.of(tensors[0], tensors[1], tensors[2], SceneState(**together, size=size), parameters)
     found = scores(look, parameters, *(torch.as_tensor(part) for part in more))
     near = np.isfinite(wanted)
     assert near.mean() > 0.5 and (found.numpy()[~near] < -4).all()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from torchvision_dddas.geometry import circular_error_90, error_category
 from torchvision_dddas.io.maps.ground_tracks import (
     GroundTracks,
     Place,
@@ -25,40 +26,58 @@ from torchvision_dddas.io.overlay import identity_colour
 
 
 def geojson(
-    tracks: GroundTracks, ellipses: bool = False, landmarks: GroundTracks | None = None, names: Sequence[str] = ()
+    tracks: GroundTracks, landmarks: GroundTracks | None = None, names: Sequence[str] = (), name: str = "tracks"
 ) -> dict[str, Any]:
     """A FeatureCollection, a feature a target: a line, or a point where it was located once.
 
     `frames` has the frame of each place and `times` its time where a clock is known, else `seconds` since the clip's
     first frame where that is; `sigma_m` how well it is known: the root of the covariance's trace, null where it is not.
     A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
-    ellipses: with those that hold the true place with 95 %, as in `ellipse_rows`. landmarks: they too, by their
-    names. `bbox` goes from west to east, over 180 degrees where the places do.
+    landmarks: they too, by their names. name: of the layer.
+    `bbox` goes from west to east, over 180 degrees where the places do.
     Raises ValueError where there is no geographic origin.
     """
     features = [_geojson_track(tracks, rows, {"target": target}) for target, rows in tracks.of.items()]
-    for ellipse in map_ellipses(tracks, ellipse_rows(tracks)) if ellipses else ():
+    if landmarks is not None and landmarks.lonlat_deg is not None:
+        features += [_geojson_track(landmarks, rows, {"landmark": names[k]}) for k, rows in landmarks.of.items()]
+    return _collection(name, features)
+
+
+def ellipses_geojson(tracks: GroundTracks) -> dict[str, Any]:
+    """A FeatureCollection of the ellipses that hold the true place with 95 %, as in `ellipse_rows`.
+
+    They have a file of their own because GDAL and QGIS read a file as one layer with one type of shape.
+    Raises ValueError where there is no geographic origin.
+    """
+    features = []
+    for ellipse in map_ellipses(tracks, ellipse_rows(tracks)):
         row = ellipse.row
         properties: dict[str, Any] = {
-            "ellipse_of": int(tracks.target[row]),
+            "target": int(tracks.target[row]),
             "probability": 0.95,
             "frame": int(tracks.frame[row]),
             "semi_major_m": round(ellipse.major_m, 3),
             "semi_minor_m": round(ellipse.minor_m, 3),
+            "circular_error90_m": round(float(tracks.circular_error90_m[row]), 2),
+            "error_category": str(error_category(tracks.circular_error90_m[row])),
             "bearing_deg": round(math.degrees(ellipse.bearing_rad), 1) % 180,
         }
         if tracks.times_utc is not None:
             properties["time"] = tracks.times_utc[row]
         features.append(_feature("Polygon", [[ring] for ring in ellipse.rings], properties))
-    if landmarks is not None and landmarks.lonlat_deg is not None:
-        features += [_geojson_track(landmarks, rows, {"landmark": names[k]}) for k, rows in landmarks.of.items()]
-    places = [place for feature in features for place in _places(feature["geometry"]["coordinates"])]
-    return {"type": "FeatureCollection", **({"bbox": _box(places)} if places else {}), "features": features}
+    return _collection("ellipses", features)
 
 
 def encode_geojson(collection: dict[str, Any]) -> bytes:
     """The bytes of the file."""
     return (json.dumps(collection, separators=(",", ":")) + "\n").encode()
+
+
+def _collection(name: str, features: list[dict[str, Any]]) -> dict[str, Any]:
+    """name: GDAL takes it for that of the layer."""
+    places = [place for feature in features for place in _places(feature["geometry"]["coordinates"])]
+    box = {"bbox": _box(places)} if places else {}
+    return {"type": "FeatureCollection", "name": name, **box, "features": features}
 
 
 def _geojson_track(tracks: GroundTracks, rows: slice, name: dict[str, Any]) -> dict[str, Any]:
@@ -68,6 +87,12 @@ def _geojson_track(tracks: GroundTracks, rows: slice, name: dict[str, Any]) -> d
         "frames": tracks.frame[rows].tolist(),
         "sigma_m": [sigma if math.isfinite(sigma) else None for sigma in sigma_m],
     }
+    for key, heights in (
+        ("above_sea_m", tracks.above_sea_m[rows]),
+        ("above_ellipsoid_m", tracks.above_ellipsoid_m[rows]),
+    ):
+        if np.isfinite(heights).any():
+            properties[key] = [round(up, 2) if math.isfinite(up) else None for up in heights.tolist()]
     if tracks.times_utc is not None:
         properties["times"] = tracks.times_utc[rows]
     elif np.isfinite(tracks.time_s[rows]).all():
@@ -213,15 +238,17 @@ def _coordinates(places: list[Place]) -> str:
 
 UNKNOWN = "9999999.0"
 """A height or an error that is not known."""
-STALE_S = 10.0
-"""How long an event is valid."""
+STALE_S, MARK_STALE_S = 10.0, 600.0
+"""How long a target and a mark are valid."""
 _KIND = "a-u-G"  # an atom on the ground of unknown affiliation
+_MARK = "b-m-p-s-m"  # a spot on the map
 
 
 def cot(tracks: GroundTracks, source: str = "dddas") -> str:
     """`<events>` in the order of time, a line each, at most one per target and second.
 
-    ce is one standard deviation along the ellipse's longer axis; how="m-f" is fused from several machine sources.
+    ce is one standard deviation along the ellipse's longer axis, remarks name the category of the
+    90 % error; how="m-f" is fused from several machine sources.
     uid: the source, the start of the clip, the target. Raises ValueError without a geographic origin or a clock.
     Source: MITRE, Event-PUBLIC.xsd, version 2.0.
     """
@@ -232,11 +259,12 @@ def cot(tracks: GroundTracks, source: str = "dddas") -> str:
     axes, _ = semi_axes(tracks.covariance_m2[rows], chi2=1.0)
     stale = iso_utc(tracks.start_utc_s + tracks.time_s[rows] + STALE_S)
     lines = []
-    for row, (sigma_m, _), until in zip(rows.tolist(), axes.tolist(), stale, strict=True):
+    for row, sigma_m, until in zip(rows.tolist(), axes, stale, strict=True):
         longitude, latitude = tracks.degrees[row].tolist()
         uid = event_uid(source, tracks.start_utc_s, tracks.target[row])
         when = tracks.times_utc[row], until
-        lines.append(event(uid, tracks.target[row], when, (longitude, latitude), sigma_m, tracks.velocity_m_s[row]))
+        place = longitude, latitude, float(tracks.above_ellipsoid_m[row])
+        lines.append(event(uid, tracks.target[row], when, place, sigma_m, tracks.velocity_m_s[row]))
     return '<?xml version="1.0" encoding="UTF-8"?>\n<events>\n' + "".join(lines) + "</events>\n"
 
 
@@ -249,21 +277,46 @@ def event(
     uid: str,
     target: int,
     when: tuple[str, str],
-    lonlat_deg: tuple[float, float],
-    sigma_m: float,
+    place: tuple[float, float, float],
+    sigma_m: np.ndarray,
     velocity_m_s: np.ndarray,
 ) -> str:
-    """One event, a line. when: its time, and the time until which it is valid. sigma_m: becomes ce."""
-    longitude, latitude = lonlat_deg
-    time, stale = when
-    error = f"{sigma_m:.2f}" if math.isfinite(sigma_m) else UNKNOWN
+    """One event, a line. when: its time, and the time until which it is valid.
+
+    sigma_m: (2,) standard deviations along the axes, the longer becomes ce; the remark has the 90 % error's category.
+
+    place: longitude, latitude, and metres above the ellipsoid, NaN where unknown.
+    """
+    within_m = circular_error_90(sigma_m)
+    category = error_category(within_m)[0]
+    remark = f"<remarks>{category}, 90 % within {within_m[0]:.1f} m</remarks>" if category else ""
     east, north = velocity_m_s.tolist()
     track = ""
     if math.isfinite(east) and math.isfinite(north):
         course = round(math.degrees(math.atan2(east, north)), 1) % 360
         track = f'<track course="{course:.1f}" speed="{math.hypot(east, north):.2f}"/>'
+    return _event(uid, _KIND, f"target {target}", when, place, float(sigma_m[0]), track + remark)
+
+
+def mark(uid: str, name: str, when: tuple[str, str], place: tuple[float, float]) -> str:
+    """An event that marks a spot on the map. when: as for `event`. place: longitude, latitude."""
+    return _event(uid, _MARK, name, when, (*place, math.nan), math.nan)
+
+
+def _event(
+    uid: str,
+    kind: str,
+    name: str,
+    when: tuple[str, str],
+    place: tuple[float, float, float],
+    sigma_m: float,
+    detail: str = "",
+) -> str:
+    longitude, latitude, above_ellipsoid_m = place
+    time, stale = when
+    error, hae = (f"{value:.2f}" if math.isfinite(value) else UNKNOWN for value in (sigma_m, above_ellipsoid_m))
     return (
-        f'<event version="2.0" uid="{uid}" type="{_KIND}" how="m-f" time="{time}" start="{time}" stale="{stale}">'
-        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{UNKNOWN}" ce="{error}" le="{UNKNOWN}"/>'
-        f'<detail><contact callsign="target {target}"/>{track}</detail></event>\n'
+        f'<event version="2.0" uid="{uid}" type="{kind}" how="m-f" time="{time}" start="{time}" stale="{stale}">'
+        f'<point lat="{latitude:.8f}" lon="{longitude:.8f}" hae="{hae}" ce="{error}" le="{UNKNOWN}"/>'
+        f'<detail><contact callsign="{xml_text(name)}"/>{detail}</detail></event>\n'
     )

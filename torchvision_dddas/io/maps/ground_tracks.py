@@ -23,6 +23,7 @@ _ROW = np.dtype(
     [
         *(("frame", "i8"), ("target", "i8"), ("time_s", "f8"), ("east_north_m", "f8", 2)),
         *(("covariance_m2", "f8", (2, 2)), ("lonlat_deg", "f8", 2), ("velocity_m_s", "f8", 2)),
+        *(("above_sea_m", "f8"), ("above_ellipsoid_m", "f8")),
     ]
 )
 
@@ -33,7 +34,8 @@ class GroundTracks:
 
     target, frame: (N,) int64. time_s: (N,) since the clip's first frame, NaN where unknown. east_north_m: (N, 2).
     covariance_m2: (N, 2, 2), velocity_m_s: (N, 2), NaN where unknown. lonlat_deg: (N, 2); None where there is no
-    geographic origin. start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
+    geographic origin. above_sea_m, above_ellipsoid_m: (N,) heights of the ground, NaN where unknown.
+    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
     """
 
     target: np.ndarray
@@ -43,6 +45,8 @@ class GroundTracks:
     covariance_m2: np.ndarray
     lonlat_deg: np.ndarray | None
     velocity_m_s: np.ndarray
+    above_sea_m: np.ndarray
+    above_ellipsoid_m: np.ndarray
     start_utc_s: float = math.nan
 
     def __len__(self) -> int:
@@ -61,6 +65,11 @@ class GroundTracks:
         return np.sqrt(self.covariance_m2[:, 0, 0] + self.covariance_m2[:, 1, 1])
 
     @cached_property
+    def circular_error90_m(self) -> np.ndarray:
+        """(N,) radius of the circle about each place that holds the true one with 90 %; NaN where it is not known."""
+        return geometry.circular_error_90(semi_axes(self.covariance_m2, 1.0)[0])
+
+    @cached_property
     def times_utc(self) -> list[str] | None:
         """When each place was taken, ISO 8601 to the millisecond; None where no clock is known."""
         if not (math.isfinite(self.start_utc_s) and np.isfinite(self.time_s).all()):
@@ -77,6 +86,13 @@ class GroundTracks:
     def places(self, rows: slice) -> list[Place]:
         """The longitudes and latitudes of some rows."""
         return [*np.round(self.degrees[rows], 8).tolist()]
+
+    def pieces(self, rows: slice) -> list[slice]:
+        """Split a target's rows where it was not located for more than four times its usual step of frames."""
+        steps = np.diff(self.frame[rows])
+        longest = 4 * max(float(np.median(steps)), 1.0) if len(steps) else 0.0
+        cuts = rows.start + 1 + np.flatnonzero(steps > longest)
+        return [slice(*edge) for edge in pairwise([rows.start, *cuts.tolist(), rows.stop])]
 
     def spaced(self, seconds: float, rows: slice) -> list[int]:
         """The first of a target's rows with a known time, and those that follow at least so long after another."""
@@ -97,7 +113,7 @@ def iso_utc(utc_s: np.ndarray) -> list[str]:
 
 
 class Gathered:
-    """Collects rows of GroundTracks, 104 bytes each, and up to three times that while the array grows."""
+    """Collects rows of GroundTracks, 120 bytes each, and up to three times that while the array grows."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(256, _ROW)
@@ -113,6 +129,7 @@ class Gathered:
         rows["east_north_m"], rows["covariance_m2"] = positions.east_north_m, positions.covariance_m2
         rows["lonlat_deg"] = np.nan if positions.lonlat_deg is None else positions.lonlat_deg
         rows["velocity_m_s"] = np.nan if velocity_m_s is None else velocity_m_s
+        rows["above_sea_m"], rows["above_ellipsoid_m"] = positions.above_sea_m, positions.above_ellipsoid_m
         self._count = count
 
     def tracks(self, geographic: bool, start_utc_s: float = math.nan) -> GroundTracks:

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchvision_dddas.geometry import rays, undistort_pixels
 from torchvision_dddas.io.maps.ground_tracks import GroundTracks, ring_m, semi_axes
-from torchvision_dddas.io.overlay import LETTERS, Colour, identity_colour
+from torchvision_dddas.io.overlay import Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho
 
 FINE = 2
@@ -20,7 +20,21 @@ LEFT, RIGHT, TOP, BOTTOM = 86, 24, 46, 106
 SHORTEST, TALLEST = 420, 880
 INK, GRID, PAPER = (60, 60, 60), (222, 222, 222), (255, 255, 255)
 MARK, LOOK, VIEW, PATH = (30, 30, 200), (150, 110, 40), (0, 130, 240), (120, 120, 120)
-VERDICTS: dict[str, Colour] = {"human": (60, 130, 20), "not_human": (40, 70, 190)}
+EVENTS: dict[str, tuple[str, str, Colour]] = {
+    "enter": ("E", "entered", (60, 130, 20)),
+    "leave": ("L", "left", (40, 70, 190)),
+    "cross": ("X", "crossed", (170, 90, 30)),
+    "dwell": ("D", "dwelt", (0, 130, 200)),
+    "present": ("P", "inside at first", (110, 110, 110)),
+    "join": ("J", "joined", (120, 40, 120)),
+    "split": ("S", "split off", (150, 110, 0)),
+    "gather": ("G", "gathered", (120, 40, 120)),
+    "scatter": ("C", "scattered", (150, 110, 0)),
+    "human": ("H", "told human", (60, 130, 20)),
+    "not_human": ("N", "told not human", (40, 70, 190)),
+}
+"""The letter, the name and the colour of an event at a zone or of crowds, and of what ground vehicles told."""
+AREA, FUSED = (150, 60, 120), (110, 130, 0)
 _LINES_ACROSS = 12
 _SUB = 3  # bits of a pixel's fraction that OpenCV draws with
 _MOST_SIGNS = 400
@@ -29,20 +43,22 @@ _LOWEST = math.sin(math.radians(3))  # flatter rays end where one at 3 degrees r
 
 
 class Signs:
-    """Map signs of what ground vehicles did: where a target was found human or not, and from where they looked.
+    """Map signs: the zones of the run, events at them, and what ground vehicles said of targets and where they looked.
 
-    Each vehicle has a look every 2 m; there are at most 400 looks and 400 verdicts.
+    zones: names, rings (N, 2) and whether they are lines. There are at most 800 events, of either sort, and 400 looks,
+    of each vehicle one every 2 m.
     """
 
     def __init__(self) -> None:
-        self.verdicts: list[tuple[str, np.ndarray]] = []
         self.looks: list[tuple[np.ndarray, np.ndarray]] = []
+        self.zones: list[tuple[str, list[np.ndarray], bool]] = []
+        self.events: list[tuple[str, np.ndarray]] = []
         self._last: dict[str, np.ndarray] = {}
 
-    def add_verdict(self, kind: str, east_north_m: np.ndarray) -> None:
-        """Add the place where a target was first found human or not_human, or otherwise than before."""
-        if len(self.verdicts) < _MOST_SIGNS:
-            self.verdicts.append((kind, np.array(east_north_m, float)))
+    def add_event(self, kind: str, east_north_m: np.ndarray) -> None:
+        """Add the place, if known, of an event at a zone or of a target first found human or not, or otherwise."""
+        if len(self.events) < 2 * _MOST_SIGNS and np.isfinite(east_north_m).all():
+            self.events.append((kind, np.array(east_north_m, float)))
 
     def add_look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
         """Add the places of a vehicle and of a target that it saw."""
@@ -56,10 +72,14 @@ class Signs:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The camera's places (M, 2), and the outline of its last view (K, 2), east and north in m; empty if unknown."""
+    """The camera's places (M, 2), and the outline of its last view (K, 2), east and north in m; empty if unknown.
+
+    views: some of its views with their frame numbers and times.
+    """
 
     east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     view_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    views: Sequence[tuple[int, float, np.ndarray]] = ()
 
 
 def map_picture(
@@ -77,12 +97,14 @@ def map_picture(
     many lie outside. Lines are broken where a target was not located for a while.
     """
     camera, signs = camera or CameraPath(), signs or Signs()
-    frame = frame_around(_extent(tracks.east_north_m, landmarks.east_north_m, camera))
+    frame = frame_around(extent(tracks, landmarks, camera, signs))
     picture = np.full(((frame.height + TOP + BOTTOM) * FINE, WIDTH * FINE, 3), 255, np.uint8)
     plot = picture[frame.plot]
     if photo is not None:
-        _draw_photo(plot, frame, photo)
+        # A faded photo lets what is drawn over it stand out.
+        plot[:] = (0.75 * ground_photo(frame, photo) + 0.25 * 255).astype(np.uint8)
     _draw_grid(picture, frame, photo is not None)
+    _draw_zones(plot, frame, signs)
     if len(camera.view_m):
         _dashes(plot, frame.pixels(np.concatenate([camera.view_m, camera.view_m[:1]])), VIEW, 2)
     if len(camera.east_north_m):
@@ -90,28 +112,26 @@ def map_picture(
     for rows in landmarks.of.values():
         _line(plot, frame.pixels(landmarks.east_north_m[rows]), PATH, 1)
     for target, rows in tracks.of.items():
-        steps = np.diff(tracks.frame[rows])
-        longest = 4 * max(float(np.median(steps)), 1.0) if len(steps) else 0.0
-        for piece in np.split(tracks.east_north_m[rows], np.flatnonzero(steps > longest) + 1):
-            _line(plot, frame.pixels(piece), _dark(target), 2, halo=True)
+        for piece in tracks.pieces(rows):
+            _line(plot, frame.pixels(tracks.east_north_m[piece]), _dark(target), 2, halo=True)
     last = {target: tracks.east_north_m[rows.stop - 1] for target, rows in tracks.of.items()}
     marked = {mark: landmarks.east_north_m[rows.stop - 1] for mark, rows in landmarks.of.items()}
-    for target, place in last.items():
-        covariance_m2 = tracks.covariance_m2[tracks.of[target].stop - 1]
-        if np.isfinite(covariance_m2).all():
-            ring = place + ring_m(*semi_axes(covariance_m2[None]), points=72)[0]
+    for (target, place), ring in zip(last.items(), _last_rings(tracks), strict=True):
+        if np.isfinite(ring).all():
             _line(plot, frame.pixels(np.concatenate([ring, ring[:1]])), _dark(target), 1, halo=True)
         _disc(plot, frame.pixels(place), 4, _dark(target))
     for from_m, at_m in signs.looks:
         _draw_look(plot, frame.pixels(from_m), frame.pixels(at_m))
-    for kind, place in signs.verdicts:
-        _draw_verdict(plot, frame.pixels(place), kind)
-    labels = _Labels(picture, frame, [*(place for _, place in signs.verdicts), *last.values(), *marked.values()])
+    for kind, place in signs.events:
+        _draw_letter(plot, frame.pixels(place), EVENTS[kind][0], EVENTS[kind][2])
+    labels = _Labels(picture, frame, [*(place for _, place in signs.events), *last.values(), *marked.values()])
     for mark, place in marked.items():
         _draw_landmark(plot, frame.pixels(place))
         labels.add(place, names[mark], MARK)
     for target, place in last.items():
         labels.add(place, str(target), _dark(target))
+    for name, rings, _ in signs.zones:
+        labels.add(rings[0][0], name, AREA)
     _draw_scale(picture, frame)
     if len(camera.east_north_m):
         _draw_camera(plot, frame.pixels(camera.east_north_m[-1]))
@@ -121,6 +141,7 @@ def map_picture(
     outside = int(((places < 0) | (places > (frame.width, frame.height))).any(axis=1).sum())
     count = f"{len(tracks.of)} identities, {len(tracks)} places" + (f", {outside} outside the map" if outside else "")
     _write(picture, count, (LEFT, TOP + frame.height + BOTTOM - 12), 0.5)
+    _draw_event_legend(picture, LEFT + 30 + _text_width(count, 0.5), TOP + frame.height + BOTTOM - 17, signs)
     return cv2.resize(picture, None, fx=1 / FINE, fy=1 / FINE, interpolation=cv2.INTER_AREA)
 
 
@@ -167,6 +188,12 @@ class MapFrame:
         return (np.asarray(east_north_m, float) - (self.west_m, self.south_m)) * (fine, -fine) + (0, self.height * FINE)
 
     @property
+    def box_m(self) -> list[float]:
+        """West, south, east and north edge in local metres."""
+        wide, high = self.width * self.metres_a_pixel, self.height * self.metres_a_pixel
+        return [self.west_m, self.south_m, self.west_m + wide, self.south_m + high]
+
+    @property
     def plot(self) -> tuple[slice, slice]:
         """Rows and columns of the plot in the enlarged picture."""
         return slice(TOP * FINE, (TOP + self.height) * FINE), slice(LEFT * FINE, (LEFT + self.width) * FINE)
@@ -184,22 +211,29 @@ def frame_around(east_north_m: np.ndarray) -> MapFrame:
     return MapFrame(float(west), float(south), float(metres), width, height)
 
 
-def _extent(targets: np.ndarray, landmarks: np.ndarray, camera: CameraPath) -> np.ndarray:
-    """Places that the map must show: the camera's way and view too, unless they go far beyond all others."""
-    targets = targets[np.isfinite(targets).all(axis=1)]
+def extent(tracks: GroundTracks, landmarks: GroundTracks, camera: CameraPath, signs: Signs) -> np.ndarray:
+    """Places that the map must show: the camera's way, view, zones and ellipses too, unless they go far beyond."""
+    targets = tracks.east_north_m[np.isfinite(tracks.east_north_m).all(axis=1)]
     if len(targets):
         low, high = np.percentile(targets, (2, 98), axis=0)
         reach = np.maximum(high - low, 20.0)
         targets = targets[((targets >= low - reach) & (targets <= high + reach)).all(axis=1)]
-    shown = np.concatenate([targets, landmarks])
-    for more in (camera.east_north_m, camera.view_m):
+    shown = np.concatenate([targets, landmarks.east_north_m])
+    zones = [np.concatenate(rings)[None] for _, rings, _ in signs.zones]
+    for more in (camera.east_north_m[None], camera.view_m[None], *zones, _last_rings(tracks)):
         if len(shown) == 0:
-            shown = more
-        elif len(more):
+            shown = more.reshape(-1, 2)
+        elif more.size:
             reach = 1.5 * max(float(np.ptp(shown, axis=0).max()), 20.0)
-            if (np.abs(more - (shown.min(axis=0) + shown.max(axis=0)) / 2) <= reach).all():
-                shown = np.concatenate([shown, more])
+            is_near = np.abs(more - (shown.min(axis=0) + shown.max(axis=0)) / 2) <= reach
+            shown = np.concatenate([shown, more[is_near.all(axis=(1, 2))].reshape(-1, 2)])
     return shown
+
+
+def _last_rings(tracks: GroundTracks) -> np.ndarray:
+    """(T, 72, 2) the 95 % ellipse of each target's last place; NaN where it is not known."""
+    last = [rows.stop - 1 for rows in tracks.of.values()]
+    return tracks.east_north_m[last, None] + ring_m(*semi_axes(tracks.covariance_m2[last]), points=72)
 
 
 def round_step(span: float, lines: int) -> float:
@@ -208,25 +242,23 @@ def round_step(span: float, lines: int) -> float:
     return next(power * k for k in (1, 2, 5, 10) if power * k >= span / lines)
 
 
-def _draw_photo(plot: np.ndarray, frame: MapFrame, photo: Ortho) -> None:
-    """The photo, a little faded, so that what is drawn over it stands out."""
-    fine = FINE / frame.metres_a_pixel
-    plot_from_metres = np.array([[fine, 0, -frame.west_m * fine], [0, -fine, plot.shape[0] + frame.south_m * fine]])
+def ground_photo(frame: MapFrame, photo: Ortho) -> np.ndarray:
+    """(H, W, 3) the photo as the frame's plot shows it, in pixels of the enlarged picture; paper beside the photo."""
+    fine, size = FINE / frame.metres_a_pixel, (frame.width * FINE, frame.height * FINE)
+    plot_from_metres = np.array([[fine, 0, -frame.west_m * fine], [0, -fine, size[1] + frame.south_m * fine]])
     whole = np.vstack([photo.east_north_from_pixel, [0, 0, 1]])
     image, plot_from_pixel = photo.image, np.vstack([plot_from_metres @ whole, [0, 0, 1]])
     # Warping takes single pixels: a photo that is much finer than the map is reduced first.
     coarser = int(1 / max(np.sqrt(abs(np.linalg.det(plot_from_pixel[:2, :2]))), 1e-3))
     if coarser > 1:
-        size = max(image.shape[1] // coarser, 1), max(image.shape[0] // coarser, 1)
-        share = np.array([image.shape[1] / size[0], image.shape[0] / size[1]])
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        small = max(image.shape[1] // coarser, 1), max(image.shape[0] // coarser, 1)
+        share = np.array([image.shape[1] / small[0], image.shape[0] / small[1]])
+        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
         # Pixels count from the centre of the first one.
         plot_from_pixel = plot_from_pixel @ np.array(
             [[share[0], 0, (share[0] - 1) / 2], [0, share[1], (share[1] - 1) / 2], [0, 0, 1]]
         )
-    size = plot.shape[1], plot.shape[0]
-    warped = cv2.warpAffine(image, plot_from_pixel[:2], size, flags=cv2.INTER_LINEAR, borderValue=PAPER)
-    plot[:] = (0.75 * warped + 0.25 * 255).astype(np.uint8)
+    return cv2.warpAffine(image, plot_from_pixel[:2], size, flags=cv2.INTER_LINEAR, borderValue=PAPER)
 
 
 def _draw_grid(picture: np.ndarray, frame: MapFrame, over_photo: bool) -> None:
@@ -280,14 +312,11 @@ def _draw_legend(picture: np.ndarray, frame: MapFrame, camera: CameraPath, has_l
     def look(picture: np.ndarray, at: np.ndarray) -> None:
         _draw_look(picture, at - (9.0 * FINE, 0.0), at)
 
-    kinds = {kind for kind, _ in signs.verdicts}
     entries: list[tuple[bool, str, Callable[[np.ndarray, np.ndarray], None]]] = [
         (True, "target: number, way, 95 % ellipse of the last place", target),
         (has_landmarks, "landmark", _draw_landmark),
         (len(camera.east_north_m) > 0, "camera", _draw_camera),
         (len(camera.view_m) > 0, "what it saw last", view),
-        ("human" in kinds, "told human", lambda picture, at: _draw_verdict(picture, at, "human")),
-        ("not_human" in kinds, "told not human", lambda picture, at: _draw_verdict(picture, at, "not_human")),
         (len(signs.looks) > 0, "seen from here", look),
     ]
     x, y = LEFT + 8.0, TOP + frame.height + 62
@@ -296,6 +325,34 @@ def _draw_legend(picture: np.ndarray, frame: MapFrame, camera: CameraPath, has_l
         draw(picture, np.array([x, y]) * FINE)
         _write(picture, text, (x + 20, y + 5), 0.5)
         x += 20 + _text_width(text, 0.5) + (40 if len(shown) < 6 else 22)
+
+
+def _draw_event_legend(picture: np.ndarray, x: float, y: float, signs: Signs) -> None:
+    kinds = {kind for kind, _ in signs.events}
+    for kind, (letter, text, colour) in EVENTS.items():
+        if kind in kinds:
+            _draw_letter(picture, np.array([x, y]) * FINE, letter, colour)
+            _write(picture, text, (x + 14, y + 5), 0.5)
+            x += 34 + _text_width(text, 0.5)
+
+
+def _draw_zones(plot: np.ndarray, frame: MapFrame, signs: Signs) -> None:
+    """Areas tinted and outlined; lines with an arrow to their right, the direction to_right."""
+    areas = [[frame.pixels(ring) for ring in rings] for _, rings, is_line in signs.zones if not is_line]
+    tinted = plot.copy()
+    for rings in areas:
+        cv2.fillPoly(tinted, [_fixed(ring) for ring in rings], AREA, cv2.LINE_AA, _SUB)
+    cv2.addWeighted(tinted, 0.12, plot, 0.88, 0, dst=plot)
+    for ring in (ring for rings in areas for ring in rings):
+        _line(plot, np.concatenate([ring, ring[:1]]), AREA, 2)
+    for line in (frame.pixels(ring) for _, rings, is_line in signs.zones if is_line for ring in rings):
+        _line(plot, line, AREA, 3)
+        k = len(line) // 2
+        middle, way = (line[k - 1] + line[k]) / 2, line[k] - line[k - 1]
+        right = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)  # y grows downward
+        tip, across = middle + 26 * FINE * right, way / max(float(np.hypot(*way)), 1e-9)
+        _line(plot, np.array([middle, tip]), AREA, 2)
+        _fill(plot, tip + FINE * np.array([8 * right, 5 * across, -5 * across]), AREA)
 
 
 # --------------------------------------------------------------------------------------------------------------------
@@ -358,10 +415,9 @@ def _draw_look(picture: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray) -> N
     _dashes(picture, shape[[1, 0, -1]], LOOK, 1, dash=400.0 * FINE)
 
 
-def _draw_verdict(picture: np.ndarray, at: np.ndarray, kind: str) -> None:
-    """A disc with H for human or N for not human."""
-    _disc(picture, at, 9, VERDICTS.get(kind, INK))
-    letter = LETTERS.get(kind, "?")
+def _draw_letter(picture: np.ndarray, at: np.ndarray, letter: str, colour: Colour) -> None:
+    """A disc with a letter, as H for human."""
+    _disc(picture, at, 9, colour)
     (wide, high), _ = cv2.getTextSize(letter, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * FINE, 2 * FINE)
     x, y = np.round(np.clip(np.nan_to_num(at), -30_000, 30_000)).astype(int).tolist()
     cv2.putText(picture, letter, (x - wide // 2, y + high // 2), 0, 0.5 * FINE, PAPER, 2 * FINE, cv2.LINE_AA)

@@ -1,7 +1,7 @@
 """What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
 from torchvision_dddas.io.atomic_files import Part
-from torchvision_dddas.io.output.map_files import Site
+from torchvision_dddas.io.output.map_files import MapSite
 from torchvision_dddas.io.output.recorder import PartOf, RunRecorder, parse_save
 from torchvision_dddas.io.output.recorders import (
     AerialRecorder,
@@ -11,6 +11,7 @@ from torchvision_dddas.io.output.recorders import (
     PeopleRecorder,
     PipelineRecorder,
     TrackRecorder,
+    ViewsRecorder,
 )
 from torchvision_dddas.io.output.run_record import (
     EVENTS,
@@ -29,8 +30,9 @@ from torchvision_dddas.io.output.run_record import (
     versions,
     without_numbers,
 )
-from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES
+from torchvision_dddas.io.output.tables import CONFIRMATION_NAMES, confirmed_positions, fused_table
 from torchvision_dddas.io.output.timelines import NOTICED, PROBLEM
+from torchvision_dddas.io.output.zone_events import ZoneCounts
 
 __all__ = [
     "CONFIRMATION_NAMES",
@@ -46,6 +48,7 @@ __all__ = [
     "DetectionRecorder",
     "Event",
     "GroundRecorder",
+    "MapSite",
     "Part",
     "PartOf",
     "PeopleRecorder",
@@ -53,11 +56,14 @@ __all__ = [
     "RunRecord",
     "RunRecorder",
     "SessionLog",
-    "Site",
     "TrackRecorder",
+    "ViewsRecorder",
+    "ZoneCounts",
     "clip_facts",
+    "confirmed_positions",
     "describe_nothing_located",
     "finite",
+    "fused_table",
     "make_session_folder",
     "parse_save",
     "read_run_record",

@@ -10,22 +10,26 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.errors import readable
+from torchvision_dddas.geometry import edges_of, is_inside, lonlat
 from torchvision_dddas.io.atomic_files import Part, write_whole
-from torchvision_dddas.io.maps.formats import cot, encode_geojson, geojson, kml
+from torchvision_dddas.io.maps.formats import cot, ellipses_geojson, encode_geojson, geojson, kml
 from torchvision_dddas.io.maps.ground_tracks import Gathered, GroundTracks, iso_utc, semi_axes
-from torchvision_dddas.io.maps.map_picture import CameraPath, map_picture, view_of
+from torchvision_dddas.io.maps.map_page import map_data
+from torchvision_dddas.io.maps.map_picture import CameraPath, Signs, map_picture, view_of
 from torchvision_dddas.io.output.run_log import RunStory
 from torchvision_dddas.io.output.run_record import RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, RunReport, location_tables
 from torchvision_dddas.io.output.timelines import Timeline
-from torchvision_dddas.types import AerialLocations, Camera, Fix, GroundLocations, Ortho, Positions
+from torchvision_dddas.io.zone_files import zone_rings
+from torchvision_dddas.types import AerialLocations, Camera, Fix, FusedTargets, GroundLocations, Ortho, Positions, Zone
 
-GEOJSON, KML, COT, MAP = "tracks.geojson", "tracks.kml", "tracks.cot.xml", "map.png"
-_LARGE_BYTES = 400_000  # of a map.png; the report has a larger one as JPEG
+GEOJSON, ELLIPSES, KML, COT, MAP = "tracks.geojson", "ellipses.geojson", "tracks.kml", "tracks.cot.xml", "map.png"
+FUSED = "fused.geojson"
+_MOST_VIEWS = 400  # of the camera, in the report
 
 
 @dataclass(frozen=True)
-class Site:
+class MapSite:
     """The ground that maps show, and what is known of the run.
 
     names: of the landmarks. origin_deg: longitude and latitude of the local metres, None where there are none.
@@ -49,23 +53,35 @@ class Site:
 
 
 class AerialMaps(Part[AerialLocations]):
-    """tracks.geojson, tracks.kml, tracks.cot.xml, map.png and report.html of targets located from the air.
+    """Three GeoJSON, tracks.kml, tracks.cot.xml, map.png and report.html of targets located from the air.
 
-    Memory: 104 bytes per place of a target or landmark, three times that while the array grows, and about 800 while
+    Memory: 120 bytes per place of a target or landmark, three times that while the array grows, and about 800 while
     the files are written; 200 bytes per frame.
     record: of the run; set before the end.
     """
 
-    files = (GEOJSON, KML, COT, MAP, REPORT)
+    files = (GEOJSON, ELLIPSES, FUSED, KML, COT, MAP, REPORT)
     record: RunRecord
 
-    def __init__(self, folder: Path, save: Sequence[str], site: Site, story: RunStory | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        save: Sequence[str],
+        site: MapSite,
+        story: RunStory | None = None,
+        zones: Sequence[Zone] = (),
+    ) -> None:
         """story: the timeline, events and key frames of the run, which the report shows; None without them."""
         self._folder, self._save, self._site, self._story = folder, save, site, story
         self._timeline = Timeline() if story is None else story.timeline
-        self._targets, self._landmarks = Gathered(), Gathered()
-        self._camera_path: list[np.ndarray] = []
+        self._targets, self._landmarks, self._way, self._fused = Gathered(), Gathered(), Gathered(), Gathered()
+        self._views: list[tuple[int, float, np.ndarray]] = []
+        self._due, self._stride = 0, 1  # of views
         self._last: Fix | None = None
+        self._zones = {zone.name: zone_rings(zone, site.origin_deg) for zone in zones if zone.unit != "px"}
+        self._unseen = dict(self._zones) if site.camera is not None else {}
+        if story is not None:
+            story.signs.zones += [(z.name, self._zones[z.name], z.is_line) for z in zones if z.unit != "px"]
 
     def write(self, located: AerialLocations) -> None:
         """Keep a frame's places for the maps."""
@@ -79,41 +95,72 @@ class AerialMaps(Part[AerialLocations]):
         places = Positions(number, marks.landmark[at], marks.east_north_m[at], own, np.ones(len(at)))
         self._landmarks.add(places, located.time_s)
         if fix.pose is not None:
-            self._camera_path.append(np.array(fix.pose.place_m[:2], float))
+            place, unknown = np.reshape(fix.pose.place_m[:2], (1, 2)), np.full((1, 2, 2), np.nan)
+            here = Positions(np.array([located.frame]), np.zeros(1, int), place, unknown, np.ones(1))
+            self._way.add(here, located.time_s)
         if fix.pose is not None or fix.image_from_ground is not None:
             self._last = fix
+            self._add_view(located, self._site.camera)
+
+    def add_fused(self, fused: FusedTargets) -> None:
+        """Keep the fused places of the targets that a platform saw within the last second."""
+        seen = np.array([len(by) > 0 for by in fused.seen_by], bool)
+        place, frame = fused.state[seen, :2], np.full(seen.sum(), fused.frame)
+        degrees = None if fused.origin_deg is None else lonlat(place, fused.origin_deg)
+        unsure, ones = fused.covariance[seen, :2, :2], np.ones(len(place))
+        places = Positions(frame, fused.target[seen], place, unsure, ones, lonlat_deg=degrees)
+        self._fused.add(places, fused.time_s, fused.state[seen, 2:])
+
+    def _add_view(self, located: AerialLocations, camera: Camera | None) -> None:
+        """Keep the view for the report, and look for zones in it."""
+        is_due = "report" in self._save and self._due % self._stride == 0
+        self._due += 1
+        if camera is None or not (is_due or self._unseen):
+            return
+        view = view_of(located.fix, camera)
+        self._unseen = {name: rings for name, rings in self._unseen.items() if not _shows(view, rings)}
+        if is_due and len(view):
+            size_m = float(np.ptp(view, axis=0).max())
+            outline = cv2.approxPolyDP(view.astype(np.float32)[:, None], 0.01 * size_m, True)[:, 0]
+            self._views.append((located.frame, located.time_s, outline))
+            if len(self._views) > _MOST_VIEWS:
+                self._views, self._stride = self._views[::2], 2 * self._stride
 
     def close(self, complete: bool) -> None:
         """Write all files."""
-        site, save, names = self._site, self._save, tuple(self._site.names)
+        site, save, names, way = self._site, self._save, tuple(self._site.names), self._way.tracks(geographic=False)
+        for name, rings in self._unseen.items():
+            away = np.concatenate(rings).mean(axis=0) - (way.east_north_m[-1] if len(way) else 0.0)
+            where = f"its middle lies {np.hypot(*away):.0f} m from where the camera was last"
+            self.record.notes.append(f"{name} is in no located picture, so that nothing is seen there: {where}")
         has_degrees = site.origin_deg is not None
         targets = self._targets.tracks(has_degrees, site.start_utc_s)
+        fused = self._fused.tracks(has_degrees, site.start_utc_s)
         landmarks = self._landmarks.tracks(has_degrees and site.to_degrees is not None, site.start_utc_s)
         if landmarks.lonlat_deg is not None and site.to_degrees is not None and len(landmarks):
             landmarks.lonlat_deg[:] = site.to_degrees(landmarks.east_north_m)
-        picture = self._draw(targets, landmarks) if "map" in save or "report" in save else b""
+        view = view_of(self._last, site.camera) if self._last and site.camera is not None else np.zeros((0, 2))
+        camera = CameraPath(way.east_north_m, view, self._views)
+        signs = Signs() if self._story is None else self._story.signs
         makers: dict[str, Callable[[], bytes]] = {}
         if has_degrees:
-            makers[GEOJSON] = lambda: encode_geojson(geojson(targets, True, landmarks, names))
+            makers[GEOJSON] = lambda: encode_geojson(geojson(targets, landmarks, names))
+            makers[ELLIPSES] = lambda: encode_geojson(ellipses_geojson(targets))
+            if len(fused):
+                makers[FUSED] = lambda: encode_geojson(geojson(fused, name="fused"))
             makers[KML] = lambda: kml(targets, self.record.input_name or "tracks", landmarks, names).encode()
             if "cot" in save and targets.times_utc is not None:
                 makers[COT] = lambda: cot(targets).encode()
+        photo, title = site.background, self.record.input_name
         if "map" in save:
-            makers[MAP] = lambda: picture
+            picture = map_picture(targets, landmarks, names, camera, photo, title, signs)
+            makers[MAP] = lambda: cv2.imencode(".png", picture)[1].tobytes()
         if "report" in save:
-            makers[REPORT] = lambda: readable(self._report(targets, picture, complete)).encode()
+            data = map_data(targets, landmarks, names, camera, way, photo, signs, site.to_degrees, fused)
+            makers[REPORT] = lambda: readable(self._report(targets, data, complete)).encode()
         _write(self._folder, makers)
 
-    def _draw(self, targets: GroundTracks, landmarks: GroundTracks) -> bytes:
-        last, site = self._last, self._site
-        view = view_of(last, site.camera) if last is not None and site.camera is not None else np.zeros((0, 2))
-        path = CameraPath(np.reshape(self._camera_path, (-1, 2)), view)
-        signs = None if self._story is None else self._story.signs
-        name = self.record.input_name
-        picture = map_picture(targets, landmarks, site.names, path, site.background, name, signs)
-        return cv2.imencode(".png", picture)[1].tobytes()
-
-    def _report(self, targets: GroundTracks, picture: bytes, complete: bool) -> str:
+    def _report(self, targets: GroundTracks, data: dict[str, Any] | None, complete: bool) -> str:
         record = self.record
         by = {name: count for name, count in record.counts["by"].items() if name != "nothing"}
         counts = {"frames": record.frames, "located": sum(by.values()), "identities located": len(targets.of)}
@@ -128,11 +175,7 @@ class AerialMaps(Part[AerialLocations]):
             figures.append(("95 % ellipse, median semi-axes", f"{longer:.2f} × {shorter:.2f} m"))
         title = "Located from the air" + (f": {record.input_name}" if record.input_name else "")
         report = RunReport(title, record, complete, self._timeline, figures, location_tables(record))
-        if len(picture) > _LARGE_BYTES:  # as over a photo
-            image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
-            assert image is not None
-            picture = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
-        report.map_picture = picture
+        report.map, report.map_file = data, MAP if "map" in self._save else ""
         if self._story is not None:
             self._story.extend(report)
         return report.html()
@@ -157,6 +200,14 @@ class GroundMaps(Part[GroundLocations]):
         tracks = self._gathered.tracks(geographic=True)
         makers = {GEOJSON: lambda: encode_geojson(geojson(tracks)), KML: lambda: kml(tracks).encode()}
         _write(self._folder, makers if self._has_degrees else {})
+
+
+def _shows(view_m: np.ndarray, rings: Sequence[np.ndarray]) -> bool:
+    """Whether a view of the ground (K, 2) and a zone have a place in common, by their corners and middles."""
+    if len(view_m) < 3:
+        return False
+    view, places = edges_of([view_m], closed=True), np.concatenate([*rings, [np.concatenate(rings).mean(axis=0)]])
+    return bool(is_inside(places, view).any() or is_inside(view_m, edges_of(rings, closed=True)).any())
 
 
 def _write(folder: Path, makers: Mapping[str, Callable[[], bytes]]) -> None:

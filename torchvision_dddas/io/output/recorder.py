@@ -1,4 +1,4 @@
-"""The output folder of a run: claimed before any work, filled item by item, valid whenever it is closed."""
+"""The output folder of a run: claimed before any work, filled item by item, and valid at every close."""
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from torchvision_dddas.io.images import NUMBERED
 from torchvision_dddas.io.interrupts import KEPT, is_stop, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, read_run_record
 
-# A disk or an encoder that takes longer to write or close counts as stuck.
+# A disk or an encoder that needs longer than this to write or close counts as stuck.
 _WRITING_S = 20.0
 
 Item = TypeVar("Item")
@@ -21,7 +21,7 @@ Whole = TypeVar("Whole")
 
 
 class PartOf(Generic[Whole, Item]):
-    """A part that is given one field of each item."""
+    """A part that receives one field of each item."""
 
     def __init__(self, part: Part[Item], field: Callable[[Whole], Item]) -> None:
         self._part, self._field = part, field
@@ -33,7 +33,7 @@ class PartOf(Generic[Whole, Item]):
 
 
 class _Picture(Generic[Item]):
-    """A part that shows the results and holds none: where it fails, that is a problem of the run and ends only it."""
+    """A part that only shows results: its failure is recorded as a problem of the run, and ends this part alone."""
 
     def __init__(self, name: str, part: Part[Item], record: RunRecord) -> None:
         self.failure = ""
@@ -63,26 +63,26 @@ class _Picture(Generic[Item]):
 
 
 class RunRecorder(Generic[Item]):
-    """Records a run in a folder: begin, write items, and leave the context.
+    """Record a run in a folder: begin, write items, and leave the context.
 
-    Leaving it normally, by a signal (see `interrupts`) or by LostInputError keeps what there is; any other exception
-    discards what is not whole. With the first item run.json says `running`, and the files of an earlier run are
-    removed: from then on all files in the folder are of one run. Bad input before the first item changes nothing.
-    files: names of the files that a run may leave in the folder. numbered: folders of its pictures, 000001.png and so
-    on. Both may be patterns. saved: what `--save` may name.
+    Leaving the context normally, by a signal (see `interrupts`) or by LostInputError keeps the results; any other
+    exception discards unfinished files. With the first item run.json says `running`, and the files of an earlier run
+    are removed: from then on all files in the folder belong to one run. Bad input before the first item changes
+    nothing. files: names of the files that a run may leave in the folder. numbered: folders of its pictures, 000001.png
+    and so on. Both may be patterns. saved: names that `--save` accepts.
     """
 
     files: ClassVar[tuple[str, ...]] = ()
     numbered: ClassVar[tuple[str, ...]] = ()
     saved: ClassVar[tuple[str, ...]] = ()
     pictures: ClassVar[tuple[str, ...]] = ("overlay", "video")
-    """Parts without which the results are whole."""
+    """Parts that the results do not need."""
 
     def __init__(self, folder: Path, save: Sequence[str] | None = None) -> None:
         """Claim a folder. save: which of `saved` to write, all by default.
 
-        Raises InputError if another run writes into the folder, it cannot be written, or holds such files of another
-        program.
+        Raise InputError if another run writes into the folder, if it cannot be written, or if it holds such files of
+        another program.
         """
         self.folder = folder
         self.save = self.saved if save is None else tuple(save)
@@ -115,7 +115,7 @@ class RunRecorder(Generic[Item]):
         raise NotImplementedError
 
     def _replace_earlier(self) -> None:
-        """Say in run.json that a run is under way, and remove the files of an earlier one, once."""
+        """Write `running` to run.json and remove the files of an earlier run, once."""
         if not self.record.has_begun:
             self.record.begin()
             for path in _files_of_runs(self.folder, self.files, self.numbered):
@@ -123,7 +123,7 @@ class RunRecorder(Generic[Item]):
                     path.unlink(missing_ok=True)
 
     def write(self, item: Item) -> None:
-        """Write an item to every part, or to none if a signal came before. Raises InputError if the disk refuses."""
+        """Write an item to every part, or to none if a signal came before. Raise InputError if the disk refuses."""
         with uninterrupted(), self._lock, self._refusals():
             if self._is_closed:  # by `_rescue`: the process ends
                 return
@@ -133,7 +133,7 @@ class RunRecorder(Generic[Item]):
                 part.write(item)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place, run.json last. Raises InputError if the disk refuses."""
+        """Move everything to its place, run.json last. Raise InputError if the disk refuses."""
         with uninterrupted(), self._lock, self._refusals():
             if self._is_closed:
                 return
@@ -144,7 +144,7 @@ class RunRecorder(Generic[Item]):
             self.record.close(complete)
 
     def discard(self) -> None:
-        """Leave only what is whole, and no folder that was made for a run that never began."""
+        """Keep only complete files, and no folder that was created for a run that never began."""
         with uninterrupted(), self._lock:
             self._is_closed = True
             for part in reversed(self._parts):
@@ -177,7 +177,7 @@ class RunRecorder(Generic[Item]):
             record.problems.append(str(refusal))
             self.discard()
             raise
-        except KeyboardInterrupt as stop:  # came while the files were closed, and waited until they were whole
+        except KeyboardInterrupt as stop:  # a signal during the closing of files, which waited for its end
             stop.add_note(KEPT)
             raise
         if error is not None:
@@ -186,7 +186,7 @@ class RunRecorder(Generic[Item]):
             raise InputError(f"{failed[0]}; all else is in {self.folder}")
 
     def _rescue(self) -> bool:
-        """Close the run from another thread, once the main thread is not writing."""
+        """Close the run from another thread, when the main thread is not writing."""
         if self._record is None or not self._record.frames or not self._lock.acquire(timeout=_WRITING_S):
             return False
         try:
@@ -208,9 +208,9 @@ class RunRecorder(Generic[Item]):
 
 
 def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
-    """What to save, from `masks,overlay`, `all` (or None) or `none`.
+    """Return the names to save, from `masks,overlay`, `all` (or None) or `none`.
 
-    Raises InputError on a name that is not known, and on no name.
+    Raise InputError for an unknown name, and without any name.
     """
     chosen = [n.strip() for n in ("all" if names is None else names).split(",") if n.strip()]
     if not chosen:
@@ -222,13 +222,13 @@ def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def _files_of_runs(folder: Path, files: Iterable[str], numbered: Iterable[str]) -> list[Path]:
-    """The files in a folder that runs leave there; arguments as in RunRecorder."""
+    """Return the files in a folder that runs leave there; arguments as in RunRecorder."""
     pictures = [path for name in numbered for path in sorted(folder.glob(f"{name}/*")) if NUMBERED.fullmatch(path.name)]
     return [path for name in files for path in folder.glob(name)] + pictures
 
 
 def _claim(folder: Path, files: Sequence[str], numbered: Sequence[str]) -> ClaimedFolder:
-    """Claim a folder. Raises InputError if that fails, or if it holds such files of another program."""
+    """Claim a folder. Raise InputError if that fails, or if it holds such files of another program."""
     claim = ClaimedFolder(folder)
     foreign = _files_of_runs(folder, files, {"masks", *numbered})
     if foreign and read_run_record(folder) is None:

@@ -1,4 +1,4 @@
-"""What each command writes into its output folder."""
+"""The output folder of each command."""
 
 import math
 from collections import Counter
@@ -12,7 +12,7 @@ import numpy as np
 from torchvision_dddas.io.atomic_files import Part
 from torchvision_dddas.io.images import Masks
 from torchvision_dddas.io.output import tables
-from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, Site
+from torchvision_dddas.io.output.map_files import COT, AerialMaps, GroundMaps, MapSite
 from torchvision_dddas.io.output.recorder import PartOf, RunRecorder
 from torchvision_dddas.io.output.run_log import LOG_TXT, RunStory
 from torchvision_dddas.io.output.run_record import (
@@ -24,6 +24,9 @@ from torchvision_dddas.io.output.run_record import (
     without_numbers,
 )
 from torchvision_dddas.io.output.run_report import REPORT
+from torchvision_dddas.io.output.scale_record import ScaleRecord
+from torchvision_dddas.io.output.summary import SUMMARY, Summary
+from torchvision_dddas.io.output.zone_events import EventFiles, ZoneCounts
 from torchvision_dddas.io.overlay import LIKELY, RunPictures, draw_people, draw_scene
 from torchvision_dddas.io.overlay_video import OverlayPicture, OverlayVideo
 from torchvision_dddas.io.tables import detection_tables
@@ -34,7 +37,9 @@ from torchvision_dddas.types import (
     GroundLocations,
     PeopleFrame,
     Scene,
+    SharedFrame,
     TrackedFrame,
+    Zone,
 )
 
 
@@ -52,7 +57,9 @@ class DetectionRecorder(RunRecorder[Scene]):
             "masks": Masks(self.folder),
             "overlay": OverlayVideo(self.folder, rate_hz, draw_scene),
         }
-        return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+        record = self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+        record.scale = ScaleRecord(facts.get("settings", {}))
+        return record
 
     def _count(self, item: Scene) -> None:
         cause = None if item.reliable else item.cause
@@ -73,7 +80,10 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
             "appearance": tables.appearance_table(self.folder),
             "overlay": OverlayVideo(self.folder, rate_hz, lambda tracked: pictures(FrameResult(tracked))),
         }
-        return self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+        record = self.start({**facts, "outputs": ["tables", *self.save]}, parts)
+        if facts.get("detections") is None:
+            record.scale = ScaleRecord(facts.get("settings", {}))
+        return record
 
     def _count(self, item: TrackedFrame) -> None:
         _count_tracks(self.record, item)
@@ -82,8 +92,8 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
 class PeopleRecorder(RunRecorder[PeopleFrame]):
     """The folder of `dddas people`: tables, overlay.
 
-    The record counts people that are unlikely, those whom the picture's border cuts, and how much was searched:
-    windows of all windows of all frames.
+    The record counts unlikely people, people cut by the picture's border, and the searched share of the windows of all
+    frames.
     """
 
     files = ("detections.txt", "detections.csv", "overlay.png", "overlay.mp4", RUN_JSON)
@@ -121,7 +131,7 @@ class PeopleRecorder(RunRecorder[PeopleFrame]):
 class GroundRecorder(RunRecorder[GroundLocations]):
     """The folder of `dddas locate ground`: tables, maps.
 
-    The record counts rows of positions.csv, and sightings by what gave their distance, `bearing` where nothing did.
+    The record counts rows of positions.csv, and sightings by the source of their distance, `bearing` without distance.
     """
 
     files = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
@@ -145,7 +155,7 @@ class GroundRecorder(RunRecorder[GroundLocations]):
 
 
 class ConfirmationRecorder(RunRecorder[Confirmation]):
-    """The folder of `dddas confirm`: the blobs' table with what was found of them, and how many of each kind."""
+    """The folder of `dddas confirm`: the blobs' table with the findings, and the number of blobs of each kind."""
 
     files = ("confirmed.csv", RUN_JSON)
 
@@ -163,16 +173,56 @@ class ConfirmationRecorder(RunRecorder[Confirmation]):
         self.record.note(item.frame, len(item.kind), {})
 
 
+class ViewsRecorder(RunRecorder[SharedFrame]):
+    """The folder of `dddas views`: the table of each view with shared identities, the pairs, and the maps of views."""
+
+    files = ("view*.csv", "pairs.csv", "maps.csv", RUN_JSON)
+
+    def begin(
+        self, facts: Mapping[str, Any], own: str, cells: Sequence[tuple[list[str], list[list[str]]]]
+    ) -> RunRecord:
+        """Start the run. own: the column of a table's own identities. cells: names and cells of each table."""
+        parts: dict[str, Part[SharedFrame]] = {
+            f"view{k}": tables.view_table(self.folder, k, own, *view) for k, view in enumerate(cells)
+        }
+        record = self.start(
+            facts, {**parts, "pairs": tables.pair_table(self.folder), "maps": tables.map_table(self.folder)}
+        )
+        self._views: dict[int, set[int]] = {}
+        self._registered: Counter[str] = Counter()
+        record.counts = {"identities": 0, "shared": 0, "registered": {}}
+        return record
+
+    def _count(self, item: SharedFrame) -> None:
+        for k, shared in enumerate(item.shared):
+            for number in shared.tolist():
+                self._views.setdefault(number, set()).add(k)
+        for (i, j), found in item.maps.items():
+            self._registered[f"{i + 1}-{j + 1}"] += found.b_from_a is not None
+        several = sum(len(views) > 1 for views in self._views.values())
+        self.record.counts |= {"identities": len(self._views), "shared": several, "registered": dict(self._registered)}
+        self.record.note(item.moment, sum(map(len, item.views)), {})
+
+    def note_overlap(self) -> None:
+        """Note views that were not registered, and in how many moments."""
+        for pair, count in self._registered.items():
+            if count < self.record.frames:
+                why = "the overlap was not found, or too few targets were in it" if count else "no overlap was found"
+                moments = f"in {self.record.frames - count} of {self.record.frames} moments"
+                hint = "" if count else "; do the clips begin at the same time, and are five targets in both?"
+                self.record.notes.append(f"views {pair}: {why} {moments}{hint}")
+
+
 class AerialRecorder(RunRecorder[AerialLocations]):
-    """The folder of `dddas locate aerial`: tables, maps, a report."""
+    """Write the output folder of `dddas locate aerial`: tables, maps and a report."""
 
     files = ("positions.csv", "fixes.csv", *AerialMaps.files, RUN_JSON)
     saved = ("cot", "map", "report")
 
-    def begin(self, facts: Mapping[str, Any], site: Site) -> RunRecord:
+    def begin(self, facts: Mapping[str, Any], site: MapSite) -> RunRecord:
         """Start the run."""
         maps = AerialMaps(self.folder, self.save, site)
-        places = tables.aerial_tables(self.folder, site.origin_deg is not None)
+        places = tables.aerial_tables(self.folder, site.origin_deg is not None, _grid(facts))
         parts: dict[str, Part[AerialLocations]] = {"maps": maps, "tables": places}
         record = maps.record = self.start({**site.facts, **facts}, parts)
         record.notes += _missing_maps(site, self.save)
@@ -189,38 +239,45 @@ class AerialRecorder(RunRecorder[AerialLocations]):
 
 
 class PipelineRecorder(RunRecorder[FrameResult]):
-    """The folder of `dddas run`: tables, overlay, log, and where targets are located maps and a report of them."""
+    """The folder of `dddas run`: tables, overlay, log, and, if targets are located, maps and a report of them."""
 
     found_files: ClassVar[tuple[str, ...]] = (
-        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", "appearance.csv"),
+        *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", "appearance.csv", SUMMARY, *EventFiles.files),
         *(LOG_TXT, REPORT, "overlay.mp4", RUN_JSON),
     )
-    """Files of a run that locates nothing."""
+    """Files of a run that does not locate targets."""
     files: ClassVar[tuple[str, ...]] = (
-        *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv"),
+        *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv", "fused.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
     numbered: ClassVar[tuple[str, ...]] = ("masks",)  # as of PeopleRecorder
     saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
 
     def begin(
-        self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int], site: Site | None = None
+        self,
+        facts: Mapping[str, Any],
+        rate_hz: float,
+        size: tuple[int, int],
+        site: MapSite | None = None,
+        zones: Sequence[Zone] = (),
     ) -> RunRecord:
         """Start the run. rate_hz, size: of the overlay, (width, height). site: None if nothing is located."""
         folder, save = self.folder, self.save
         names = () if site is None else site.names
-        pictures = RunPictures(size, names)
+        pictures = RunPictures(size, names, zones)
         self.story = RunStory(folder, names, pictures if "report" in save else None, site is not None)
         parts: dict[str, Part[FrameResult]] = {}
+        start_utc_s = math.nan if site is None else site.start_utc_s
         if site is not None:
             has_degrees = site.origin_deg is not None
-            maps = AerialMaps(folder, save, site, self.story)
+            maps = AerialMaps(folder, save, site, self.story, zones)
             parts |= {
                 "maps": PartOf(maps, _locations),
-                "positions": PartOf(tables.aerial_tables(folder, has_degrees), _locations),
+                "positions": PartOf(tables.aerial_tables(folder, has_degrees, _grid(facts)), _locations),
                 **({"landmarks": tables.landmark_table(folder, names, has_degrees)} if names else {}),
                 "confirmed": tables.confirmed_positions(folder, has_degrees),
                 "crowds": tables.crowd_table(folder, has_degrees),
+                "fused": PartOf(tables.fused_table(folder, has_degrees), attrgetter("fused")),
             }
         parts |= {
             "detections": PartOf(detection_tables(folder), _scene),
@@ -228,11 +285,21 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             "appearance": PartOf(tables.appearance_table(folder), attrgetter("tracked")),
             "overlay": OverlayVideo(folder, rate_hz, pictures),
             "story": self.story,
+            "summary": Summary(folder, start_utc_s),
         }
+        has_crowds = site is not None and facts.get("settings", {}).get("crowds", {}).get("join_m", 0) > 0
+        if zones or has_crowds:
+            parts["events"] = EventFiles(folder, zones, start_utc_s, site is not None and site.origin_deg is not None)
         record = self.story.record = self.start({**(site.facts if site is not None else {}), **facts}, parts)
+        record.scale = ScaleRecord(facts.get("settings", {}))
+        self._zones = ZoneCounts(zones)
+        if zones:
+            record.counts["zones"] = self._zones.rows
+        if has_crowds:
+            record.counts["crowd_events"] = self._zones.crowds
         self._locations = None
         if site is not None:
-            maps.record = record
+            maps.record, self._maps = record, maps
             record.notes += _missing_maps(site, save)
             self._locations, self._not_found = _LocationCounts(record, names), Spans(is_exact=True)
             record.counts["nothing_found"] = self._not_found.rows
@@ -240,10 +307,13 @@ class PipelineRecorder(RunRecorder[FrameResult]):
 
     def _count(self, item: FrameResult) -> None:
         tracked = item.tracked
+        self._zones.add(item.events)
         if self._locations is None:
             _count_tracks(self.record, tracked)
             return
         self._locations.add(_locations(item))
+        if item.fused is not None:
+            self._maps.add_fused(item.fused)
         _count_identities(self.record.counts, tracked)
         if tracked.cause:
             self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
@@ -258,7 +328,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
 def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
     """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity.
 
-    Of the decisions whether to look at appearance: how many there were, by their causes, and the range of dispersions.
+    For the decisions whether to use appearance: their number, their causes, and the range of dispersions.
     """
     counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
     counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
@@ -276,7 +346,7 @@ def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
 
 
 def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
-    """Add a frame of a run that gives identities and locates nothing."""
+    """Add a frame of a run with identities and without places."""
     counts, targets = record.counts, len(tracked.detections)
     counts.setdefault("first_frame", tracked.number)
     counts["last_frame"] = tracked.number
@@ -286,13 +356,13 @@ def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
 
 
 class _LocationCounts:
-    """Counts what is located from the air in a record.
+    """Counts in a record what is located from the air.
 
-    positions: rows of positions.csv. unplaced: targets of located frames that have none. frames_without_position: those
-    that are not located, as where a log covers only a part of a clip. by: frames by what gave the
-    camera's pose, `nothing` for those not located. weak: spans of frames that were located with something amiss.
-    repairs: what was changed and why. landmarks: of each, in how many frames it was seen, used, and left out of those
-    located; and the spans of frames in which it was reassigned or excluded.
+    positions: rows of positions.csv. unplaced: targets of located frames without a place. frames_without_position:
+    frames that are not located, for example if a log covers only a part of a clip. by: frames by the source of the
+    camera's pose, `nothing` for frames that are not located. weak: spans of frames that were located with a warning.
+    repairs: changes and their reasons. landmarks: for each, the number of frames in which it was seen, used, and left
+    out (of located frames); and the spans of frames in which it was reassigned or excluded.
     """
 
     def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
@@ -350,7 +420,7 @@ class _LocationCounts:
             record.notes.append(describe_nothing_located(causes, unplaced))
 
 
-def _missing_maps(site: Site, save: Sequence[str]) -> list[str]:
+def _missing_maps(site: MapSite, save: Sequence[str]) -> list[str]:
     """Notes on maps that are left out."""
     if site.origin_deg is None:
         return ["no longitude and latitude are known: no maps for other tools, but local metres"]
@@ -368,3 +438,8 @@ def _scene(result: FrameResult) -> Scene:
     """The part of a scene that tables of detections need."""
     assert result.tracked.frame is not None
     return Scene(result.tracked.frame, np.zeros((0, 0), np.uint16), result.tracked.detections, 1)
+
+
+def _grid(facts: Mapping[str, Any]) -> str:
+    """The grid that the settings of a run ask for."""
+    return str(facts.get("settings", {}).get("aerial", {}).get("grid", ""))

@@ -1,4 +1,4 @@
-"""What happened in a run: log.txt, and the events, key frames and timelines of its report and map."""
+"""The events of a run: log.txt, and the events, key frames and timelines of its report and map."""
 
 import math
 import re
@@ -15,7 +15,18 @@ from torchvision_dddas.io.atomic_files import Part, write_whole
 from torchvision_dddas.io.maps.map_picture import Signs
 from torchvision_dddas.io.output.run_record import NO_POSE, RunRecord
 from torchvision_dddas.io.output.run_report import REPORT, KeyFrames, RunReport, describe_state, format_span
-from torchvision_dddas.io.output.timelines import ADJUSTED, NOTICED, ORDERED, PROBLEM, VERDICT, WORLD, Timeline
+from torchvision_dddas.io.output.timelines import (
+    ADJUSTED,
+    CROWD,
+    NOTICED,
+    ORDERED,
+    PROBLEM,
+    VERDICT,
+    WORLD,
+    ZONE,
+    Timeline,
+)
+from torchvision_dddas.io.output.zone_events import zone_table
 from torchvision_dddas.io.overlay import RunPictures, ToMetres, command_metres
 from torchvision_dddas.types import Adjustment, FrameResult
 
@@ -23,12 +34,13 @@ LOG_TXT = "log.txt"
 REPAIRED = "repaired"  # a landmark that was reassigned or excluded
 LANDMARK = "landmark"  # a landmark that the picture does not show
 
-_WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, VERDICT: 1.0, PROBLEM: 1.0, ORDERED: 1.0, REPAIRED: 0.5}
+_WEIGHTS = {WORLD: 3.0, ADJUSTED: 2.0, NOTICED: 2.0, CROWD: 2.0, VERDICT: 1.0, PROBLEM: 1.0, ORDERED: 1.0, ZONE: 1.0}
+_WEIGHTS[REPAIRED] = 0.5
 """Weights of entries for the choice of key frames."""
-_LEAST_UNSEEN = 3  # a landmark that is unseen in fewer frames is not worth a line
+_LEAST_UNSEEN = 3  # a landmark that is unseen in fewer frames gets no line
 _MOST_CAPTION = 260
 _CLOSE_FRAMES = 10
-_FAR_M = 15.0  # a goal that moved by less counts as the same: it follows a crowd
+_FAR_M = 15.0  # a goal that moved by less counts as unchanged: it follows a crowd
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
@@ -36,7 +48,7 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 class Entry:
     """An event at a frame, or in `count` frames from `first` to `last`.
 
-    time_s: None where it follows from the frame. short: a few words for a picture's caption.
+    time_s: None: computed from the frame. short: a few words for a picture's caption.
     """
 
     first: int
@@ -62,7 +74,7 @@ class RunLog:
         self.entries.append(Entry(frame, kind, text, frame, time_s=time_s, short=short or text))
 
     def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
-        """Add an event that may last: repeated within a few frames it stays one entry, also if its numbers differ.
+        """Add an event that may last: repeated within a few frames it stays one entry, even if its numbers differ.
 
         step: frames since the last one processed. key: identifies the event, by default its text without numbers.
         """
@@ -101,7 +113,7 @@ class RunLog:
                 self.add(frame, ORDERED, text, short=f"{order.vehicle} sent")
 
     def _is_new(self, vehicle: str, goal: np.ndarray, to_metres: ToMetres | None) -> bool:
-        """Whether a goal is far from that of the vehicle's last order."""
+        """Return whether a goal is far from that of the vehicle's last order."""
         place, far = (np.asarray(goal, float), 0.0) if to_metres is None else (to_metres(goal), _FAR_M)
         if vehicle in self._goal and float(np.linalg.norm(place - self._goal[vehicle])) <= far:
             return False
@@ -109,21 +121,21 @@ class RunLog:
         return True
 
     def ordered(self) -> list[Entry]:
-        """All entries by frame, those of one frame in the order of their logging; no landmark that is hardly unseen."""
+        """Return all entries by frame, without landmarks that are rarely unseen."""
         entries = [e for e in self.entries if e.kind != LANDMARK or e.count >= _LEAST_UNSEEN]
         return sorted(entries, key=lambda entry: entry.first)
 
 
-class Clock:
+class LogClock:
     """The times of frames, interpolated between those that were processed."""
 
     def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
-        """frame, time_s: (N,) of the processed frames, growing; NaN where a time is not known."""
+        """frame, time_s: (N,) of the processed frames, increasing; NaN if a time is unknown."""
         self._processed, known = frame, np.isfinite(time_s)
         self._frame, self._time_s = frame[known], time_s[known]
 
     def time_s(self, entry: Entry) -> float:
-        """The time of an entry, extrapolated beyond the first and the last frame; NaN where no time is known."""
+        """Return the time of an entry, extrapolated beyond the first and the last frame; NaN without known times."""
         number, frame, time_s = entry.first, self._frame, self._time_s
         if entry.time_s is not None:
             return entry.time_s
@@ -136,7 +148,7 @@ class Clock:
         return float(np.interp(number, frame, time_s))
 
     def occurrence(self, entry: Entry) -> str:
-        """`in 3 of 8 frames`: the processed frames in which it occurred; empty if in all."""
+        """Return `in 3 of 8 frames`, counting processed frames; empty if the event occurred in all of them."""
         first, end = (
             np.searchsorted(self._processed, entry.first),
             np.searchsorted(self._processed, entry.last, "right"),
@@ -148,8 +160,8 @@ class Clock:
         )
 
 
-def format_log(entries: Iterable[Entry], clock: Clock, heading: str) -> str:
-    """The text of log.txt. heading: its first line."""
+def format_log(entries: Iterable[Entry], clock: LogClock, heading: str) -> str:
+    """Return the text of log.txt. heading: its first line."""
     out = [f"# {heading}", "", f"{'time s':>9}  {'frame':>7}  {'what':<9} how and why"]
     for entry in entries:
         time_s, occurrence = clock.time_s(entry), clock.occurrence(entry)
@@ -160,9 +172,9 @@ def format_log(entries: Iterable[Entry], clock: Clock, heading: str) -> str:
 
 
 class RunStory(Part[FrameResult]):
-    """A part that writes log.txt, and collects events, timeline, key frames and map signs for report.html.
+    """Writes log.txt, and collects the events, the timeline, the key frames and the map's signs for report.html.
 
-    Of a run that locates nothing it writes report.html too.
+    If a run locates nothing, no map exists, and this part writes report.html itself.
     record: of the run; set before the first frame.
     """
 
@@ -183,12 +195,12 @@ class RunStory(Part[FrameResult]):
     def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
         """Log an event that the results do not hold, best before its frame is written.
 
-        time_s: None where it follows from the frame. kind: as log.txt names them.
+        time_s: None: computed from the frame. kind: as named in log.txt.
         """
         self.log.add(frame, kind, text, time_s)
 
     def score(self, measures: Mapping[str, Any], sentences: Sequence[str] = ()) -> None:
-        """Set how good the run was against the truth: measures by name, and the main ones in sentences."""
+        """Set the score of the run against the truth: measures by name, and the main ones as sentences."""
         self._measures, self._sentences = dict(measures), tuple(sentences)
 
     def write(self, result: FrameResult) -> None:
@@ -199,6 +211,9 @@ class RunStory(Part[FrameResult]):
             self.log.add_adjustment(moved)
         if tracked.cause:
             self._add_lasting(tracked.number, PROBLEM, f"nothing found: {tracked.cause}")
+        for event in result.events:
+            self.log.add(event.frame, ZONE if event.zone else CROWD, event.describe(), event.time_s)
+            self.signs.add_event(event.kind, event.east_north_m)
         self._log_location(result)
         self._log_confirmations(result)
         self._explained |= {moved.parameter.partition(".")[0] for moved in adjustments}
@@ -208,7 +223,7 @@ class RunStory(Part[FrameResult]):
         self._before = tracked.number
 
     def close(self, complete: bool) -> None:
-        """Write log.txt and add the run's counts to its record. Raises OSError if it cannot be written."""
+        """Write log.txt and add the run's counts to its record. Raise OSError if it cannot be written."""
         record, entries, clock = self.record, self.log.ordered(), self._clock()
         heading = f"{record.input_name or 'run'}: {describe_state(complete)}, {len(self.timeline)} frames looked at"
         text = format_log(entries, clock, f"{heading}; settings and totals are in run.json")
@@ -236,6 +251,8 @@ class RunStory(Part[FrameResult]):
             self.timeline.events.setdefault(entry.kind, []).append((entry.first, entry.text))
         title = f"What happened and why ({LOG_TXT})"
         report.tables.insert(0, (title, ("time, s", "frames", "what", "how and why"), rows, "nothing"))
+        if "zones" in self.record.counts:
+            report.first_tables.append(zone_table(self.record.counts["zones"]))
         kinds = Counter(self._kind_of.values())
         report.figures += [(f"told {kind.replace('_', ' ')}", f"{count}") for kind, count in kinds.items()]
         report.figures.append(("adjustments", f"{sum(e.kind == ADJUSTED for e in entries)}"))
@@ -248,14 +265,14 @@ class RunStory(Part[FrameResult]):
             report.first_tables.append(("Against the truth", *measures))
         report.key_frames = self._key_frames.chosen()
 
-    def _clock(self) -> Clock:
-        return Clock(self.timeline["frame"], self.timeline["time_s"])
+    def _clock(self) -> LogClock:
+        return LogClock(self.timeline["frame"], self.timeline["time_s"])
 
     def _add_lasting(self, frame: int, kind: str, text: str, key: str = "") -> None:
         self.log.add_lasting(frame, frame - self._before, kind, text, key)
 
     def _log_location(self, result: FrameResult) -> None:
-        """Log why a frame was not located or only partly, repairs, and unseen landmarks."""
+        """Log why a frame was not located, or located with a warning, repairs, and unseen landmarks."""
         located = result.locations
         if located is None:
             return
@@ -272,7 +289,7 @@ class RunStory(Part[FrameResult]):
                 self._add_lasting(frame, LANDMARK, f"{name} is not seen in the picture", key=name)
 
     def _log_confirmations(self, result: FrameResult) -> None:
-        """Count confirmations by ground vehicles, and log a target's if it is new."""
+        """Count confirmations by ground vehicles, and log a confirmation that is new for its target."""
         confirmed, located = result.confirmed, result.locations
         if confirmed is None or located is None:
             return
@@ -294,7 +311,7 @@ class RunStory(Part[FrameResult]):
             text += f", seen by {' and '.join(by)}" if by else ""
             text += f"; it was told {before.replace('_', ' ')} before" if before else ""
             self.log.add(located.frame, VERDICT, text, short=short)
-            self.signs.add_verdict(kind, at.east_north_m[row])
+            self.signs.add_event(kind, at.east_north_m[row])
 
     def _consider_key_frame(self, result: FrameResult, pictures: RunPictures) -> None:
         """World events and targets each are a kind; adjustments and problems are grouped by parameter or first word."""

@@ -20,20 +20,21 @@ import numpy as np
 from torchvision_dddas.errors import InputError, readable, without_secrets
 from torchvision_dddas.io.atomic_files import write_whole
 from torchvision_dddas.io.maps.ground_tracks import iso_utc
+from torchvision_dddas.io.output.scale_record import ScaleRecord
 from torchvision_dddas.runtime import VERSION
 from torchvision_dddas.types import Adjustment, Source
 
 RUN_JSON = "run.json"
 NONE_LOCATED = "0 located, because "
-"""How the note begins that says why a run has no position."""
+"""Beginning of the note that explains why a run has no position."""
 NO_POSE = "the camera's pose is unknown"
-"""The cause of a frame that is not located and says nothing of why."""
+"""The cause of a frame that is not located, if no other cause is known."""
 _STEP = math.log(1.01)
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Durations:
-    """Total and median of a stage's times, in fixed memory: counts in bins 1 % wide."""
+    """Total and median of a stage's times in constant memory: counts in bins of 1 % width."""
 
     def __init__(self) -> None:
         self.total_s = 0.0
@@ -55,12 +56,12 @@ class Durations:
 
 
 def without_numbers(text: str) -> str:
-    """A text with # for each number."""
+    """Replace each number in a text by #."""
     return _NUMBER.sub("#", text)
 
 
 class Spans:
-    """Remarks on frames. The same remark on successive frames is one row, with the first and the last of them.
+    """Remarks on frames. The same remark on successive frames is one row, with the first and the last frame.
 
     is_exact: whether remarks with different numbers are different remarks.
     """
@@ -71,7 +72,10 @@ class Spans:
         self._open: dict[str, dict[str, Any]] = {}
 
     def add(self, frame: int, before: int, text: str, **cells: Any) -> None:
-        """Add a remark on a frame. before: the number of the frame that came before it. cells: further ones."""
+        """Add a remark on a frame, or extend the row of an equal remark on the frame before it.
+
+        before: the number of the frame before this one. cells: further columns of the row.
+        """
         key = text if self._is_exact else without_numbers(f"{text} {cells}")
         row = self._open.get(key)
         if row is not None and row["last"] in (before, frame):
@@ -82,14 +86,14 @@ class Spans:
 
 
 def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
-    """Why a run that locates targets has no position, in words.
+    """Return why a run that locates targets has no position.
 
-    causes: of frames that were not located, with their number. unplaced: targets without a place in the others.
+    causes: causes of frames that were not located, with counts. unplaced: targets without a place in the other frames.
     """
     if unplaced:
         reason = (
-            "all targets lie above the horizon or off the known ground, or how far away they are is uncertain by a "
-            "fifth, as near the horizon or from a low vehicle"
+            "all targets lie above the horizon or off the known ground, or their distance is uncertain by more than "
+            "a fifth, as near the horizon or from a low vehicle"
         )
     elif causes:
         first = sorted(causes, key=lambda cause: -causes[cause])[:3]
@@ -100,19 +104,19 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
 
 
 class AdjustmentList:
-    """The first adjustments of each parameter, as run.json lists them, and how many there were.
+    """The first adjustments of each parameter, as listed in run.json, and the number of all adjustments.
 
     rows: a dictionary each. made: by parameter.
     """
 
     def __init__(self, most: int = 1000) -> None:
-        """most: of a parameter that are listed; the others are counted."""
+        """most: how many adjustments of a parameter are listed; the others are only counted."""
         self.rows: list[dict[str, Any]] = []
         self.made: Counter[str] = Counter()
         self._most = most
 
     def add(self, adjustments: Sequence[Adjustment]) -> list[Adjustment]:
-        """Count adjustments; returns those that are listed."""
+        """Count adjustments, and return those that are listed."""
         listed = []
         for a in adjustments:
             self.made[a.parameter] += 1
@@ -123,14 +127,15 @@ class AdjustmentList:
 
 
 class RunRecord:
-    """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run shows.
+    """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run is visible.
 
-    counts: what a command counts beside frames and targets. notes: what the user should know of the run.
+    counts: further counts of a command beside frames and targets. scale: for a run that detects movers. notes: notes
+    for the user.
     has_begun: whether run.json is this run's.
     """
 
     def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
-        """facts: what is known before the run, such as input, backend, settings and outputs."""
+        """facts: facts known before the run, such as input, backend, settings and outputs."""
         self.facts = {name: without_secrets(v) if isinstance(v, str) else v for name, v in facts.items()}
         self._path = folder / RUN_JSON
         self._begun = time.perf_counter()
@@ -141,6 +146,7 @@ class RunRecord:
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.counts: dict[str, Any] = {}
+        self.scale: ScaleRecord | None = None
         self.last_frame = 0
         self.has_begun = False
 
@@ -159,19 +165,21 @@ class RunRecord:
         adjustments: Sequence[Adjustment] = (),
         cause: str | None = None,
     ) -> None:
-        """Count a frame. cause: why nothing could be concluded from it; None where all is well."""
+        """Count a frame. cause: why nothing could be concluded from it; None if it was concluded."""
         self.frames += 1
         self.targets += targets
         for stage, spent in seconds.items():
             self._stages.setdefault(stage, Durations()).add(spent)
         self.adjustments.add(adjustments)
+        if self.scale is not None:
+            self.scale.add(adjustments)
         if cause is not None:
             self.unreliable_frames += 1
             self.unreliable.add(number, self.last_frame, cause)
         self.last_frame = number
 
     def begin(self) -> None:
-        """Write that the run is under way."""
+        """Write that the run is in progress."""
         self._save("running")
         self.has_begun = True
 
@@ -196,6 +204,7 @@ class RunRecord:
             "frames": {"written": self.frames, "unreliable": self.unreliable_frames},
             "targets": self.targets,
             **self.counts,
+            **({} if self.scale is None else {"scale": self.scale.facts()}),
             "notes": self.notes,
             "ok": not self.problems,
             "problems": self.problems,
@@ -208,13 +217,13 @@ class RunRecord:
 
 
 def write_run_record(path: Path, state: str, record: Mapping[str, Any]) -> None:
-    """Replace run.json. state: running, complete, interrupted, stopped or failed. Raises OSError."""
+    """Replace run.json. state: running, complete, interrupted, stopped or failed. Raise OSError."""
     content = finite({"state": state, "versions": versions(), **record})
     write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def read_run_record(folder: Path) -> dict[str, Any] | None:
-    """The content of run.json in a folder; None if there is none that dddas wrote."""
+    """Return the content of run.json in a folder; None if there is none written by dddas."""
     try:
         record = json.loads((folder / RUN_JSON).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -224,12 +233,12 @@ def read_run_record(folder: Path) -> dict[str, Any] | None:
 
 
 def clip_facts(source: Source) -> dict[str, Any]:
-    """What run.json says of a clip."""
+    """Return the description of a clip for run.json."""
     return {"name": source.name, "size": source.size, "rate_hz": source.rate_hz, "announced_frames": source.count}
 
 
 def finite(value: Any) -> Any:
-    """A value that JSON can hold: numbers that are not finite become null, unknown types become text.
+    """Convert a value for JSON: numbers that are not finite become null, unknown types become text.
 
     Texts are without passwords, and readable in any encoding.
     """
@@ -249,7 +258,7 @@ def finite(value: Any) -> Any:
 
 
 def versions() -> dict[str, str]:
-    """Versions of this package, of Python, and of those libraries that the run has loaded."""
+    """Return the versions of this package, of Python, and of the libraries that the run has loaded."""
     found = {"torchvision_dddas": VERSION, "python": platform.python_version(), "machine": platform.machine()}
     for name in ("numpy", "scipy", "cv2", "torch", "kornia", "onnxruntime", "av"):
         if version := getattr(sys.modules.get(name), "__version__", None):
@@ -266,7 +275,7 @@ RESULTS, EVENTS = "results.jsonl", "events.log"
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened. utc_s: seconds since 1970. frame: 0 if it belongs to none. kind: one word."""
+    """An event of a session. utc_s: seconds since 1970. frame: 0 if it belongs to none. kind: one word."""
 
     utc_s: float
     frame: int
@@ -275,7 +284,7 @@ class Event:
 
 
 def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
-    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raises InputError if none can be made."""
+    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raise InputError if that is impossible."""
     name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -297,7 +306,7 @@ class SessionLog:
     """events.log and run.json of a session. A method that raises OSError, as on a full disk, may be called again."""
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
-        """facts: what run.json says of the run from its start."""
+        """facts: entries of run.json that are known at the start."""
         self.folder, self.facts = folder, facts
         self._events = -1
 
@@ -315,7 +324,7 @@ class SessionLog:
             while rest:
                 rest = rest[os.write(self._events, rest) :]
         except OSError:
-            with suppress(OSError):  # a line that a full disk broke off is written again whole
+            with suppress(OSError):  # remove an incomplete line, which is written again later
                 os.ftruncate(self._events, size)
             raise
 

@@ -47,7 +47,8 @@ class KeyFrame:
 class RunReport:
     """The content of a run's report; facts, notes and problems are those of its record.
 
-    figures: names and values. map_picture: PNG or JPEG. first_tables: shown before the map.
+    figures: names and values. map: as map_data makes it. map_file: the picture that is printed in its place.
+    first_tables: shown before the map.
     """
 
     title: str
@@ -56,21 +57,25 @@ class RunReport:
     timeline: Timeline
     figures: list[tuple[str, str]]
     tables: list[Table] = field(default_factory=list)
-    map_picture: bytes | None = None
+    map: dict[str, Any] | None = None
+    map_file: str = ""
     first_tables: list[Table] = field(default_factory=list)
     key_frames: list[KeyFrame] = field(default_factory=list)
 
     def html(self) -> str:
-        """The page."""
+        """The HTML text of the report."""
         facts = self.record.facts
         told = [(name, value) for name, value in facts.items() if name not in _FOLDED_FACTS]
+        if self.record.scale is not None:
+            told.append(("scale", self.record.scale.line().removeprefix("scale: ")))
         return render_page(
             "run.html",
             title=self.title,
             state=describe_state(self.complete),
             figures=self.figures,
             notes=[*self.record.notes, *self.record.problems],
-            map_picture=self.map_picture,
+            map=finite(self.map),
+            map_file=self.map_file,
             key_frames=self.key_frames,
             first_tables=[_html_table(one) for one in self.first_tables],
             tables=[_html_table(one) for one in self.tables],
@@ -81,7 +86,7 @@ class RunReport:
 
 
 def describe_state(complete: bool) -> str:
-    """How a run ended, in words."""
+    """The words that say whether a run was completed or interrupted."""
     return "complete" if complete else "interrupted: up to the last whole frame"
 
 
@@ -144,7 +149,10 @@ def _text(value: Any) -> str:
 
 
 class KeyFrames:
-    """Chooses a few of the frames of a run, given in order: some spread over it and some at its events."""
+    """Choose a few frames of a run for its report: some at even distances and some at events.
+
+    Frames must be added in order.
+    """
 
     def __init__(self) -> None:
         self._even: list[KeyFrame] = []

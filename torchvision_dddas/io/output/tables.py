@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.geometry import circular_error_90, error_category, lonlat
+from torchvision_dddas.io.maps.grids import COLUMNS, check_grid, grid_rows
+from torchvision_dddas.io.maps.ground_tracks import semi_axes
 from torchvision_dddas.io.overlay import Trails
 from torchvision_dddas.io.tables import (
     BOX,
@@ -36,9 +38,11 @@ from torchvision_dddas.types import (
     CameraPose,
     Confirmation,
     FrameResult,
+    FusedTargets,
     GroundLocations,
     PeopleFrame,
     Positions,
+    SharedFrame,
     TrackedFrame,
 )
 
@@ -95,6 +99,8 @@ CONFIRMATION = (
 """Columns that confirmed.csv adds to the blobs' own; theirs of the same names are replaced."""
 CONFIRMATION_NAMES = tuple(column.name for column in CONFIRMATION)
 
+_HEIGHTS = (Column("above_sea_m", ".2f"), Column("above_ellipsoid_m", ".2f"))
+_ERROR = (Column("circular_error90_m", ".2f"), Column("error_category"))
 _VELOCITY = (Column("velocity_east_m_s", ".4f"), Column("velocity_north_m_s", ".4f"))
 _AERIAL = (
     *(Column("time_s", ".4f"), Column("relative_sigma_m", ".6g"), *_VELOCITY),
@@ -110,8 +116,8 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
         trail = trails.places[identity]
         if len(trail) < 2:
             return math.nan, math.nan
-        (before, u0, v0), (now, u1, v1) = trail
-        return compass_deg(math.atan2(v1 - v0, u1 - u0)), math.hypot(u1 - u0, v1 - v0) / (now - before)
+        (_, u0, v0), (_, u1, v1) = trail
+        return compass_deg(math.atan2(v1 - v0, u1 - u0)), trails.speed(identity)
 
     def rows(tracked: TrackedFrame) -> Rows:
         trails.add(tracked)
@@ -157,13 +163,19 @@ def people_tables(folder: Path) -> TableFiles[PeopleFrame]:
     return TableFiles({folder / "detections.txt": (MOT, rows), folder / "detections.csv": (PEOPLE, rows)})
 
 
-def aerial_tables(folder: Path, has_degrees: bool) -> TableFiles[AerialLocations]:
-    """positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known."""
-    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *_AERIAL, *_CLASS)
+def aerial_tables(folder: Path, has_degrees: bool, grid: str = "") -> TableFiles[AerialLocations]:
+    """positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known. grid: as in `grids`.
+
+    Raises InputError as `check_grid`.
+    """
+    check_grid(grid, has_degrees)
+    columns = *_AERIAL, *_CLASS, *_HEIGHTS, *_ERROR, *COLUMNS[grid]
+    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, *columns)
 
     def rows(located: AerialLocations) -> Rows:
         return {
             **_position_rows(located.positions),
+            **(grid_rows(grid, located.positions.lonlat_deg) if located.positions.lonlat_deg is not None else {}),
             **_named(_VELOCITY, located.velocity_m_s),
             "time_s": located.time_s,
             "relative_sigma_m": np.sqrt(np.trace(located.relative_m2, axis1=1, axis2=2)),
@@ -209,7 +221,10 @@ def upper_edge_deg(pose: CameraPose) -> float:
 
 def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> TableFiles[GroundLocations]:
     """positions.csv and sightings.csv. cameras: their names."""
-    schema = Schema("positions", *_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *_CLASS)
+    schema = Schema(
+        "positions",
+        *(*_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *_CLASS, *_HEIGHTS, *_ERROR),
+    )
 
     def rows(located: GroundLocations) -> Rows:
         return {**_position_rows(located.positions), "cameras": (located.members >= 0).sum(axis=1)}
@@ -274,6 +289,61 @@ def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequenc
     return TableFiles({folder / "confirmed.csv": (schema, rows)})
 
 
+def view_table(
+    folder: Path, view: int, own: str, header: Sequence[str], cells: Sequence[Sequence[str]]
+) -> TableFiles[SharedFrame]:
+    """view1.csv and so on: the rows of a view's table, sorted by frame, with the shared identities before its own."""
+    names = [f"own_{name}" if name == own else name for name in header if name != "frame"]
+    schema = Schema("views", FRAME, Column(own, "d"), *(Column(name) for name in names))
+    columns = [[row[k] for row in cells] for k, name in enumerate(header) if name != "frame"]
+    frames, done = [int(float(row[header.index("frame")])) for row in cells], 0
+
+    def rows(item: SharedFrame) -> Rows:
+        nonlocal done
+        here = slice(done, done := done + len(item.views[view]))
+        return {
+            "frame": frames[here],
+            own: item.shared[view],
+            **{n: c[here] for n, c in zip(names, columns, strict=True)},
+        }
+
+    return TableFiles({folder / f"view{view + 1}.csv": (schema, rows)})
+
+
+def pair_table(folder: Path) -> TableFiles[SharedFrame]:
+    """pairs.csv: the targets that two views see at one moment."""
+    names = ("moment", "view", "other_view", "identity", "own_identity", "other_identity")
+
+    def rows(item: SharedFrame) -> Rows:
+        found = []
+        for i, j in item.maps:
+            numbers, a, b = np.intersect1d(item.shared[i], item.shared[j], return_indices=True)
+            found += [
+                (item.moment, i + 1, j + 1, *row) for row in zip(numbers, item.own[i][a], item.own[j][b], strict=True)
+            ]
+        return dict(zip(names, np.array(found, np.int64).reshape(-1, 6).T, strict=True))
+
+    return TableFiles({folder / "pairs.csv": (Schema("pairs", *(Column(name, "d") for name in names)), rows)})
+
+
+def map_table(folder: Path) -> TableFiles[SharedFrame]:
+    """maps.csv: the homography to the other view from a view, row by row, at each moment at which it is known."""
+    terms = [f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
+    whole = [Column(name, "d") for name in ("moment", "view", "other_view")]
+    schema = Schema("maps", *whole, Column("quality", ".3f"), *(Column(name, ".9g") for name in terms))
+
+    def rows(item: SharedFrame) -> Rows:
+        known = [
+            (item.moment, i + 1, j + 1, found.quality, *found.b_from_a.ravel())
+            for (i, j), found in item.maps.items()
+            if found.b_from_a is not None
+        ]
+        cells = np.array(known, float).reshape(-1, 13).T.tolist()
+        return dict(zip(schema.names, [*(list(map(int, column)) for column in cells[:3]), *cells[3:]], strict=True))
+
+    return TableFiles({folder / "maps.csv": (schema, rows)})
+
+
 def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
     """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
 
@@ -284,8 +354,42 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResu
         own = _position_rows(located.positions)
         return {name: np.asarray(values)[confirmed.row] for name, values in own.items()} | _confirmation_rows(confirmed)
 
-    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION, *_CLASS)
+    schema = Schema("positions", *_position_columns(has_degrees), *CONFIRMATION, *_CLASS, *_HEIGHTS, *_ERROR)
     return TableFiles({folder / "confirmed.csv": (schema, rows)}, is_optional=True)
+
+
+def fused_table(folder: Path, has_degrees: bool) -> TableFiles[FusedTargets | None]:
+    """fused.csv, of the targets as all platforms know them together; no file without ground platforms."""
+    own = (Column("speed_m_s", ".4f"), Column("speed_sigma_m_s", ".4f"), Column("class"), Column("probability", ".4f"))
+    places = (*EAST_NORTH, *COVARIANCE, *(DEGREES if has_degrees else ()), *_VELOCITY)
+    schema = Schema("fused", Column("time_s", ".4f"), FRAME, TARGET, *places, *own, Column("seen_by"))
+
+    def rows(fused: FusedTargets | None) -> Rows | None:
+        if fused is None or not len(fused):
+            return None
+        place = fused.state[:, :2]
+        degrees = np.full(place.shape, np.nan) if fused.origin_deg is None else lonlat(place, fused.origin_deg)
+        speed, sigma = fused.speed_m_s
+        best = fused.probability.argmax(axis=1)
+        return {
+            **_named(EAST_NORTH, place),
+            **_named(COVARIANCE, _variances(fused.covariance[:, :2, :2])),
+            **_named(DEGREES, degrees),
+            **_named(_VELOCITY, fused.state[:, 2:]),
+            "time_s": fused.time_s,
+            "frame": fused.frame,
+            "target": fused.target,
+            "speed_m_s": speed,
+            "speed_sigma_m_s": sigma,
+            "class": [fused.classes[k] for k in best],
+            "probability": fused.probability[np.arange(len(best)), best],
+            "seen_by": [
+                ";".join(f"{name}:{number}" if number > 0 else name for name, number in seen.items())
+                for seen in fused.seen_by
+            ],
+        }
+
+    return TableFiles({folder / "fused.csv": (schema, rows)}, is_optional=True)
 
 
 def crowd_table(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
@@ -340,7 +444,7 @@ def _position_columns(has_degrees: bool) -> tuple[Column, ...]:
 
 
 def _position_rows(positions: Positions) -> dict[str, Any]:
-    degrees = positions.lonlat_deg
+    degrees, error_m = positions.lonlat_deg, circular_error_90(semi_axes(positions.covariance_m2, 1.0)[0])
     return {
         **_named(EAST_NORTH, positions.east_north_m),
         **_named(COVARIANCE, _variances(positions.covariance_m2)),
@@ -348,6 +452,10 @@ def _position_rows(positions: Positions) -> dict[str, Any]:
         "frame": positions.frame,
         "target": positions.target,
         "score": positions.score,
+        "above_sea_m": positions.above_sea_m,
+        "above_ellipsoid_m": positions.above_ellipsoid_m,
+        "circular_error90_m": error_m,
+        "error_category": error_category(error_m),
         **_class_rows(positions.label, positions.class_id),
     }
 

@@ -18,8 +18,10 @@ PROBLEM = "problem"  # something that went wrong
 NOTICED = "noticed"  # an instrument that is silent or frozen
 VERDICT = "told"  # a target's confirmation by ground vehicles
 ORDERED = "ordered"  # an order to a vehicle
+ZONE = "zone"  # what a target did at a zone
+CROWD = "crowd"  # what crowds did
 
-_EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2}
+_EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2, ZONE: 8, CROWD: 6}
 _KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours
 _COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)  # of stages and parameters
 _MOST_PARAMETERS, _MOST_STAGES = 12, 7
@@ -111,6 +113,7 @@ class Timeline:
         found = [("found", "found", 6), ("tracked", "with an identity", 1), ("placed", "located", 2)]
         kinds = [(kind, kind.replace("_", " "), colour) for kind, colour in _KINDS.items()]
         sigmas = [("sigma_m", "absolute", 2), ("relative_m", "relative to the team", 3)]
+        seen = [("seen", "seen", 6), ("used", "used", 1)] if (self["seen"] > 0).any() else []
         limit = Line("95 % limit", self.axis()[0], self["limit"], 6, dashed=True)
         return [
             ("what happened", self._events()),
@@ -118,7 +121,7 @@ class Timeline:
             ("targets by what ground vehicles say", self._lines(kinds)),
             *self._parameters(),
             ("time spent on a frame, ms, stacked", self._time_spent()),
-            ("landmarks", self._lines([("seen", "seen", 6), ("used", "used", 1)])),
+            ("landmarks", self._lines(seen)),
             ("standard deviation of a target's place, m (median of the frame)", self._lines(sigmas, band=True)),
             ("chi-squared of the landmarks", [*self._lines([("chi2", "chi-squared", 7)], band=True), limit]),
         ]
@@ -188,11 +191,10 @@ def _location_figures(located: AerialLocations) -> dict[str, float]:
 
 
 def chi2_limit(freedom: int) -> float:
-    """The 95 % quantile of chi-squared to 1 %, NaN without degrees of freedom. Source: Wilson and Hilferty."""
-    if freedom < 1:
-        return math.nan
-    part = 2 / (9 * freedom)
-    return freedom * (1 - part + 1.6449 * math.sqrt(part)) ** 3
+    """The 95 % quantile of chi-squared, NaN without degrees of freedom."""
+    from scipy.special import chdtri  # it would slow down the start of runs without positions
+
+    return float(chdtri(freedom, 0.05)) if freedom >= 1 else math.nan
 
 
 def _median_sigma(covariance_m2: np.ndarray) -> float:

@@ -9,6 +9,7 @@ Charts are in `charts`. Templates lie in `templates/`, the macros that they shar
 
 import base64
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -26,13 +27,17 @@ TALL_ROWS = 30
 """A table with more rows scrolls inside the page."""
 
 
+_TEMPLATES = Path(__file__).parent / "templates"
+
+
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table. value: what it sorts by, None last. small: a second line."""
+    """A cell of a table. value: what it sorts by, None last. small: a second line. best: shown in bold."""
 
     text: str
     value: float | str | None = None
     small: str = ""
+    best: bool = False
 
     @property
     def sort_key(self) -> str:
@@ -47,6 +52,21 @@ class Column:
     name: str
     meaning: str = ""
     text: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page that can be a file, too. caption: its name. foot: rows that stay below the others."""
+
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    foot: Sequence[Sequence[Cell]] = ()
+
+    @property
+    def markup(self) -> Markup:
+        """The HTML."""
+        return table(self.caption, self.columns, self.rows, self.foot)
 
 
 def render_page(template: str, **context: Any) -> str:
@@ -109,17 +129,25 @@ def data_url(picture: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
+def read_vendored(name: str) -> Markup:
+    """The text of a library's file in templates/, without addresses of other files."""
+    text = (_TEMPLATES / name).read_text(encoding="utf-8")
+    return Markup(re.sub(r"url\([^)]*\)|//# sourceMappingURL=\S+", "", text))
+
+
 @cache
 def environment() -> "Environment":
     """The templates of this kit, with filters for numbers and pictures."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # here, as loading it takes 60 ms
 
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
+    environment.globals["read_vendored"] = read_vendored
     environment.filters |= {"number": format_number, "data_url": data_url, "format_count": format_count}
     return environment

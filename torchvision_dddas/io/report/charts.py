@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
@@ -55,14 +55,13 @@ class Line:
 
 @dataclass(frozen=True)
 class Dots:
-    """(N,) points, each with a text that is shown under the pointer. sign: disc, cross or ring."""
+    """(N,) points, each a disc or a ring."""
 
     name: str
     x: np.ndarray
     y: np.ndarray
     colour: int = 1
-    texts: Sequence[str] = field(default_factory=tuple)
-    sign: str = "disc"
+    is_ring: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,9 +112,9 @@ def chart(
         kept = np.unique(np.linspace(0, len(line.x) - 1, min(len(line.x), MOST_POINTS)).round().astype(int))
         parts += plot.curve(replace(line, x=line.x[kept], y=line.y[kept]))
     for one in dots:
-        for k, (a, b) in enumerate(zip(*plot.place(one.x, one.y), strict=True)):
+        for a, b in zip(*plot.place(one.x, one.y), strict=True):
             if math.isfinite(a) and math.isfinite(b):
-                parts.append(_sign(one, a, b, one.texts[k] if k < len(one.texts) else ""))
+                parts.append(_sign(one, a, b))
     label = f"{title}: {up.name} against {across.name}" + "".join(f", {one.name}" for one in named[:8])
     return _svg(WIDTH, plot.low + 40, label, parts)
 
@@ -155,7 +154,7 @@ def interval_chart(
         parts.append(f'<circle cx="{x:.1f}" cy="{y:g}" r="4.5" class="f1">{_hint(said)}</circle>')
         parts.append(_text(WIDTH - 4, y + 4, format_number(row.value), "end"))
     values = "; ".join(f"{row.name} {format_number(row.value)}" for row in shown[:12])
-    return _svg(WIDTH, plot.low + 36, f"{title}, clip by clip: {values}", parts)
+    return _svg(WIDTH, plot.low + 36, f"{title}: {values}", parts)
 
 
 def time_chart(panels: Sequence[Panel], at: np.ndarray, has_gap: np.ndarray, unit: str) -> Markup:
@@ -348,11 +347,9 @@ def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float
     return parts, 17 * (row + 1) if series else 0
 
 
-def _sign(dots: Dots, x: float, y: float, hint: str = "") -> str:
-    if dots.sign == "cross":
-        return f'<path d="M{x - 3:.1f} {y - 3:.1f}l6 6m0-6l-6 6" class="line c{dots.colour}">{_hint(hint)}</path>'
-    style = f"line c{dots.colour}" if dots.sign == "ring" else f"f{dots.colour}"
-    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="{style}">{_hint(hint)}</circle>'
+def _sign(dots: Dots, x: float, y: float) -> str:
+    style = f"line c{dots.colour}" if dots.is_ring else f"f{dots.colour}"
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" class="{style}"/>'
 
 
 def _text(x: float, y: float, text: str, anchor: str, style: str = "") -> str:

@@ -1,4 +1,4 @@
-"""A frame as messages: a line of JSON (docs/stream.md has its fields), rows of MOTChallenge text, Cursor-on-Target."""
+"""Encode a frame as messages: a line of JSON (docs/stream.md lists its fields), MOTChallenge text, Cursor-on-Target."""
 
 import json
 import math
@@ -8,17 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from torchvision_dddas.io.maps.formats import STALE_S, event, event_uid
+from torchvision_dddas.geometry import lonlat
+from torchvision_dddas.io.maps.formats import MARK_STALE_S, STALE_S, event, event_uid, mark
 from torchvision_dddas.io.maps.ground_tracks import iso_utc, semi_axes
 from torchvision_dddas.io.output.tables import track_rows
+from torchvision_dddas.io.output.zone_events import event_fields
 from torchvision_dddas.io.tables import MOT_TRACKS, compass_deg
-from torchvision_dddas.types import AppearanceUse, FrameResult, TrackedFrame
+from torchvision_dddas.types import AppearanceUse, FrameResult, FusedTargets, TrackedFrame
 
 PEOPLE_FROM = 1_000_000
-"""Added to the identities of people, who are tracked apart from targets: MOT text has no column for a kind."""
+"""Added to the identities of people, which are separate from those of targets: MOT text has no column for a kind."""
 
 EVERY_S = 1.0
-"""Seconds between two events of a target."""
+"""Seconds between two messages on a target."""
 
 _FARTHEST_PX = 1e7
 _LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four digits for a year
@@ -26,9 +28,9 @@ _LATEST_UTC_S = 253_402_300_799.0  # the end of the year 9999: ISO 8601 has four
 
 @dataclass
 class About:
-    """What messages need to know of the run.
+    """Facts of the run that messages need.
 
-    start_utc_s: seconds since 1970 at time_s = 0, NaN while no clock is known. A live run sets it with its first
+    start_utc_s: seconds since 1970 at time_s = 0, NaN without a known clock. A live run sets it at its first
     picture, and again when the machine's clock is set. geographic: whether targets get longitudes and latitudes.
     landmarks: their names.
     """
@@ -38,7 +40,7 @@ class About:
     landmarks: tuple[str, ...] = ()
 
     def utc(self, time_s: float) -> str | None:
-        """ISO 8601 to the millisecond; None where no such time is known."""
+        """Return ISO 8601 to the millisecond; None if the time is unknown."""
         utc_s = self.start_utc_s + time_s
         return iso_utc(np.array([utc_s]))[0] if 0 <= utc_s < _LATEST_UTC_S else None
 
@@ -50,9 +52,9 @@ def json_lines(
     age_s: float = math.nan,
     most_bytes: int = 0,
 ) -> list[bytes]:
-    """The lines of a frame, ASCII and with their line ends: one, or one each where the two are of different frames.
+    """Return the lines of a frame, ASCII with line ends: one line, or two if result and people are of different frames.
 
-    result, people: as in Stream.write. age_s: from the capture of the frame to now. most_bytes: a longer line is split
+    result, people: as in Stream.write. age_s: time since the capture of the frame. most_bytes: a longer line is split
     into parts, each with some of the targets and people, its number `part` from 1 and their count `parts`; 0: never.
     A line of one target is never split. Numbers that are not finite are null.
     """
@@ -75,6 +77,7 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
     elif located is not None:
         time_s = located.time_s
     adjustments = (*tracked.adjustments, *(located.adjustments if located is not None else ()))
+    events = () if result is None else result.events
     return {
         "frame": tracked.number,
         "time_s": _number(time_s, 4),
@@ -95,11 +98,13 @@ def _frame(about: About, result: FrameResult | None, people: TrackedFrame | None
             }
             for one in dict.fromkeys(adjustments)
         ],
+        **({} if result is None or result.fused is None else {"fused": _fused(result.fused)}),
+        **({"events": [event_fields(event, about.start_utc_s) for event in events]} if events else {}),
     }
 
 
 def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
-    """The boxes that have an identity, then those that have none."""
+    """Yield the boxes that have an identity, then those without."""
     tracks, found = tracked.tracks, tracked.detections
     columns = (tracks.identity, tracks.row, tracks.box_px, tracks.score, tracks.link)
     identified = zip(*(column.tolist() for column in columns), strict=True)
@@ -121,7 +126,7 @@ def _boxes(tracked: TrackedFrame) -> Iterator[dict[str, Any]]:
 
 
 def _targets(result: FrameResult) -> list[dict[str, Any]]:
-    """The boxes with their places and confirmations."""
+    """Return the boxes with their places and confirmations."""
     places: dict[int, dict[str, Any]] = {}
     if (located := result.locations) is not None:
         at = located.positions
@@ -138,6 +143,23 @@ def _targets(result: FrameResult) -> list[dict[str, Any]]:
             for row, kind, human in zip(confirmed.row.tolist(), confirmed.kind, confirmed.probability, strict=True):
                 places[int(at.target[row])] |= {"confirmed": kind, "human": _number(human, 4)}
     return [fields | places.get(fields["id"], {}) for fields in _boxes(result.tracked)]
+
+
+def _fused(fused: FusedTargets) -> dict[str, Any]:
+    """Return the targets as fused over all platforms, at an earlier time."""
+    degrees = None if fused.origin_deg is None else lonlat(fused.state[:, :2], fused.origin_deg)
+    rows = []
+    for row, target in enumerate(fused.target.tolist()):
+        at, spread = fused.state[row], fused.covariance[row]
+        fields = {
+            "id": target,
+            "east_north_m": _numbers(at[:2], 3),
+            "covariance_m2": _numbers([spread[0, 0], spread[0, 1], spread[1, 1]], 6),
+            "velocity_m_s": _numbers(at[2:], 3),
+            "seen_by": fused.seen_by[row],
+        }
+        rows.append(fields if degrees is None else {**fields, "lonlat_deg": _numbers(degrees[row], 9)})
+    return {"frame": fused.frame, "time_s": _number(fused.time_s, 4), "targets": rows}
 
 
 def _ground(result: FrameResult, about: About) -> dict[str, Any] | None:
@@ -180,12 +202,12 @@ def _numbers(values: Sequence[float] | np.ndarray, digits: int) -> list[float] |
 
 
 def _encode(fields: dict[str, Any]) -> bytes:
-    # ASCII: special characters of names, also line ends, are escaped and cannot break a line.
+    # ASCII: special characters of names, including line ends, are escaped and cannot break a line.
     return (json.dumps(fields, separators=(",", ":"), allow_nan=False) + "\n").encode("ascii")
 
 
 def _split(fields: dict[str, Any], most_bytes: int) -> list[bytes]:
-    """The same in several lines; fields of the whole frame are in the first."""
+    """Return the fields in several lines; fields of the whole frame are in the first."""
     lists = {name: fields[name] for name in ("targets", "people")}
     rest = {name: fields[name] for name in ("frame", "time_s", "utc", "age_s", "cause")}
 
@@ -208,7 +230,7 @@ def _split(fields: dict[str, Any], most_bytes: int) -> list[bytes]:
 def mot_lines(
     result: FrameResult | None, people: TrackedFrame | None, age_s: float = math.nan, most_bytes: int = 0
 ) -> list[bytes]:
-    """`frame,identity,x,y,width,height,score,-1,-1,-1`, a line per box with an identity: targets, then people.
+    """Return `frame,identity,x,y,width,height,score,-1,-1,-1`, a line a box with an identity: targets, then people.
 
     One message per frame, or several of whole lines if it is longer than most_bytes. Infinite boxes are left out.
     """
@@ -233,12 +255,13 @@ class CotEvents:
     def __init__(self, about: About) -> None:
         self._about = about
         self._sent_s: dict[int, float] = {}
+        self._marks = 0
         self._begun_utc_s: float | None = None  # stays when the clock is set, so that targets keep their uid
 
     def __call__(
         self, result: FrameResult | None, people: TrackedFrame | None = None, age_s: float = 0.0, most_bytes: int = 0
     ) -> list[bytes]:
-        """The events of a frame, a message with its line end each; none for places without longitude and latitude."""
+        """Return the events of a frame, one message with a line end each; none without longitude and latitude."""
         located = None if result is None else result.locations
         degrees = None if located is None else located.positions.lonlat_deg
         if located is None or degrees is None or self._about.utc(located.time_s) is None:
@@ -257,6 +280,14 @@ class CotEvents:
                 continue
             self._sent_s[target] = now_s
             uid = event_uid("dddas", self._begun_utc_s, target)
-            sigma_m, velocity = axes[row, 0], located.velocity_m_s[row]
-            messages.append(event(uid, target, (time, stale), (longitude, latitude), sigma_m, velocity).encode())
+            sigma_m, velocity = axes[row], located.velocity_m_s[row]
+            place = longitude, latitude, float(at.above_ellipsoid_m[row])
+            messages.append(event(uid, target, (time, stale), place, sigma_m, velocity).encode())
+        for one in result.events if result is not None else ():
+            if np.isfinite(one.lonlat_deg).all():
+                self._marks += 1
+                uid = f"{event_uid('dddas', self._begun_utc_s, one.target)}-{self._marks}"
+                when = iso_utc(self._about.start_utc_s + np.array([one.time_s, one.time_s + MARK_STALE_S]))
+                where = one.lonlat_deg[0], one.lonlat_deg[1]
+                messages.append(mark(uid, one.describe(), (when[0], when[1]), where).encode())
         return messages

@@ -1,4 +1,4 @@
-"""Where messages go without ever waiting for a slow reader: files, pipes, standard output, and UDP datagrams."""
+"""Outlets for messages that never wait for a slow reader: files, pipes, standard output, and UDP datagrams."""
 
 import errno
 import os
@@ -18,17 +18,17 @@ from urllib.parse import parse_qsl, urlsplit
 from torchvision_dddas.errors import InputError
 
 KEPT_BYTES = 1 << 20
-"""Lines that wait for a slow reader or for room on the disk; beyond this the oldest are lost."""
+"""Bytes of lines that wait for a slow reader or for disk space; beyond this the oldest are lost."""
 
 MOST_BYTES = 65_507
-"""The longest content of a datagram over IPv4: 65535 less the headers of IP and UDP."""
+"""The longest content of an IPv4 datagram: 65535 minus the headers of IP and UDP."""
 
 LEAST_BYTES = 512
-"""The least limit of a datagram, which holds one target."""
+"""The smallest limit of a datagram, which holds one target."""
 
 WANTED = "wanted udp://HOST:PORT, or udp://[IPV6]:PORT, with ?ttl=1 to 255, bytes=512 to 65507 or interface=NAME, by &"
 
-# Of a family of addresses: level of its options, hops of datagrams to one host and to many, interface of the latter.
+# By address family: level of the options, hops of unicast and of multicast datagrams, interface of multicast.
 _OPTIONS = {
     socket.AF_INET: (socket.IPPROTO_IP, socket.IP_TTL, socket.IP_MULTICAST_TTL, socket.IP_MULTICAST_IF),
     socket.AF_INET6: (
@@ -36,14 +36,14 @@ _OPTIONS = {
         *(socket.IPV6_MULTICAST_HOPS, socket.IPV6_MULTICAST_IF),
     ),
 }
-_AT_ONCE = 4096  # Linux: a pipe that is ready takes so much without waiting, and in one piece
-_LAST_S = 1.0  # how long closing may wait for a reader
+_AT_ONCE = 4096  # Linux: a ready pipe accepts this many bytes in one piece without blocking
+_LAST_S = 1.0  # longest wait for a reader when closing
 
 
 class Outlet(ABC):
-    """Takes messages one after another.
+    """Accept messages one after another.
 
-    most_bytes: of a message, 0 for any. lost: messages lost so far. reason: why the last of them was lost.
+    most_bytes: longest message, 0 for any. lost: messages lost so far. reason: why the last loss occurred.
     """
 
     most_bytes = 0
@@ -58,19 +58,19 @@ class Outlet(ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Send as much as is accepted now, each message whole or not at all. Raises OSError on trouble."""
+        """Send as much as is accepted now, each message whole or not at all. Raise OSError on trouble."""
 
     @abstractmethod
     def mend(self) -> None:
-        """Reopen after trouble. Raises OSError if that fails."""
+        """Reopen after trouble. Raise OSError if that fails."""
 
     def handle(self) -> int | None:
-        """A new descriptor of the file to be synced, which the caller closes; None if there is no file."""
+        """Return a new descriptor of the file to sync, which the caller closes; None without a file."""
         return None
 
     @abstractmethod
     def close(self) -> None:
-        """Send what can be sent soon and count the rest as lost. Never raises."""
+        """Send what can be sent soon and count the rest as lost. Never raise."""
 
     def _lose(self, messages: int, reason: str) -> None:
         if messages:
@@ -79,14 +79,14 @@ class Outlet(ABC):
 
 
 class LineOutlet(Outlet):
-    """Lines into a file, a pipe, or standard output, which is never closed."""
+    """Write lines into a file, a pipe, or standard output, which is never closed."""
 
     def __init__(self, path: Path | None) -> None:
-        """Open for appending. path: None for standard output. Raises OSError if it cannot be opened."""
+        """Open for appending. path: None for standard output. Raise OSError if it cannot be opened."""
         super().__init__()
         self._path = path
         self._kept_bytes = 0
-        self._begun = 0  # bytes of the first line kept that are written already
+        self._begun = 0  # bytes of the first kept line that are already written
         self._file = 1
         if path is not None:
             self._file = -1
@@ -94,23 +94,23 @@ class LineOutlet(Outlet):
         self._regular = stat.S_ISREG(os.fstat(self._file).st_mode)
 
     def put(self, messages: Sequence[bytes]) -> None:
-        """Keep lines, KEPT_BYTES of them."""
+        """Keep lines, up to KEPT_BYTES."""
         self._kept += messages
         self._kept_bytes += sum(map(len, messages))
         while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
-            # A line that is partly written stays, so that the next one does not begin in its middle.
+            # A partly written line stays, so that the next one does not begin in its middle.
             oldest = 1 if self._begun else 0
             self._kept_bytes -= len(self._kept[oldest])
             del self._kept[oldest]
             self._lose(1, "it is read too slowly")
 
     def flush(self) -> None:
-        """Write lines while somebody takes them; the file is opened anew if it was renamed, as log rotation does."""
+        """Write lines while the reader accepts them; reopen the file if it was renamed, as log rotation does."""
         if self._path is not None and self._regular and not self._begun and not self._is_at(self._path):
             self.mend()
         while self._kept and self._is_ready():
             line = self._kept[0]
-            # A file takes a line at once; a pipe no more than it surely has room for.
+            # A file accepts a whole line; a pipe gets at most what it certainly has room for.
             end = len(line) if self._regular else self._begun + _AT_ONCE
             try:
                 self._begun += os.write(self._file, line[self._begun : end])
@@ -125,11 +125,11 @@ class LineOutlet(Outlet):
                 self._begun = 0
 
     def mend(self) -> None:
-        """Open a file anew, and end a line that whoever wrote before left unfinished."""
+        """Reopen a file, and end an unfinished line of an earlier writer."""
         if self._path is None:
             return
         self._shut()
-        # Without O_NONBLOCK a named pipe that nobody reads would be waited for.
+        # Without O_NONBLOCK, opening a named pipe without a reader would block.
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             self._file = os.open(self._path, flags, 0o666)
@@ -201,7 +201,7 @@ def _ends_within_a_line(path: Path) -> bool:
                 return False
             file.seek(-1, os.SEEK_END)
             return file.read(1) != b"\n"
-    except PermissionError:  # it may be written and not read
+    except PermissionError:  # the file may be writable but not readable
         return False
 
 
@@ -220,7 +220,7 @@ class DatagramOutlet(Outlet):
     def __init__(
         self, host: str, port: int, ttl: int | None = None, most_bytes: int = MOST_BYTES, interface: str = ""
     ) -> None:
-        """Raises OSError if the host's name is not known or there is no way to it.
+        """Raise OSError if the host's name is not known or there is no way to it.
 
         ttl: how many routers may pass them on; None: as the system has it, to a multicast address the own network only.
         most_bytes: of a datagram. interface: by which network a multicast goes out; empty: as the system has it.
@@ -314,7 +314,7 @@ class DatagramOutlet(Outlet):
 
 
 def open_datagrams(text: str, asked: str) -> DatagramOutlet:
-    """Open `udp://HOST:PORT?ttl=4`. asked: the whole option, for the message of an InputError. Raises OSError too."""
+    """Open `udp://HOST:PORT?ttl=4`. asked: the whole option, for the message of an InputError. Raise OSError too."""
     try:
         parts = urlsplit(text)
         host, port = parts.hostname, parts.port

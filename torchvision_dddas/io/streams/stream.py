@@ -1,4 +1,4 @@
-"""Streams of `--emit`, such as `json:-` or `cot:udp://239.2.3.1:6969`: results in, messages out, with retries."""
+"""Streams of `--emit`, such as `json:-` or `cot:udp://239.2.3.1:6969`: they send results as messages, with retries."""
 
 import math
 import os
@@ -20,18 +20,18 @@ Notify = Callable[[str, str], object]
 """Called with the kind `sink` and a message for the user."""
 
 Encoder = Callable[[FrameResult | None, TrackedFrame | None, float, int], Sequence[bytes]]
-"""Messages with line ends of targets and people of a frame. Third: its age, s. Fourth: their longest length, 0: any."""
+"""Returns the messages of a frame's targets and people. Third: its age, s. Fourth: longest message, 0: no limit."""
 
 WANTED = "wanted json, mot or cot, a colon, and - for standard output, a FILE or udp://HOST:PORT, as in json:-"
 
 _BEGINS = {"json": b"{", "mot": b"0123456789", "cot": b"<"}
-_MOST_WAIT_S = 2.0  # a datagram costs nothing to try
-_NOTIFY_S, _SELDOM_S = 30.0, 3600.0  # between two messages on the same loss, at first and at last
+_MOST_WAIT_S = 2.0  # longest wait for datagrams, which cost nothing to try
+_NOTIFY_S, _SELDOM_S = 30.0, 3600.0  # time between messages on the same loss, initially and finally
 _NUMBER = re.compile(r"\d+")
 
 
 class Stream:
-    """Sends results, given in order. Trouble of the outlet never ends the run: it is reported once and retried later.
+    """Send results, given in order. Trouble of the outlet never ends the run: it is reported once and retried later.
 
     name: as the user wrote it, without passwords. One thread writes and closes.
     """
@@ -46,7 +46,7 @@ class Stream:
         retry_most_s: float = 30.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """retry_s: a broken outlet is tried again after this, then twice that, up to retry_most_s."""
+        """retry_s: wait before a broken outlet is tried again; it doubles at each try, up to retry_most_s."""
         self.name = without_secrets(name)
         self._encode, self._outlet, self._notify, self._clock = encode, outlet, notify, clock
         self._retry_s, self._retry_most_s = retry_s, retry_most_s
@@ -57,21 +57,21 @@ class Stream:
         self._failed = self._reported_lost = 0
         self._reason = self._reported_reason = ""
         self._lost_wait_s, self._lost_due_s = 0.0, -math.inf
-        self._lost_s = -math.inf  # when a message was lost last
+        self._lost_s = -math.inf  # time of the last loss
 
     @property
     def lost(self) -> int:
-        """Messages lost for good."""
+        """Number of permanently lost messages."""
         return self._outlet.lost + self._failed
 
     def trouble(self) -> str:
-        """Why messages cannot be sent, or were lost in the last 30 s; empty if all is well. Any thread may ask."""
+        """Return why messages cannot be sent, or were lost in the last 30 s; empty if all is well. Thread-safe."""
         if self._trouble or self._clock() - self._lost_s < _NOTIFY_S:
             return f"{self.name}: {self._trouble or f'{self._reason}; messages are lost'}"
         return ""
 
     def write(self, result: FrameResult | None, people: TrackedFrame | None = None) -> None:
-        """Send a frame: its targets and people, each None if it has none to send. Never raises."""
+        """Send a frame: its targets and people, each None if there are none to send. Never raise."""
         tracked = result.tracked if result is not None else people
         if tracked is None:
             return
@@ -81,7 +81,7 @@ class Stream:
         try:
             messages = self._encode(result, people, age_s, self._outlet.most_bytes)
         except Exception as error:  # a defect of this package must not end a run
-            defect = f"frame {tracked.number} cannot be told, {type(error).__name__}: {error}"
+            defect = f"frame {tracked.number} cannot be encoded, {type(error).__name__}: {error}"
         with self._lock:
             if defect:
                 self._failed += 1
@@ -97,7 +97,7 @@ class Stream:
                 self._report_lost()
 
     def sync(self) -> None:
-        """Flush what was sent to the disk while `write` goes on. Never raises; another thread may call it."""
+        """Flush sent messages to the disk while `write` continues. Never raise; another thread may call it."""
         file = None
         try:
             with self._lock:
@@ -112,7 +112,7 @@ class Stream:
                 os.close(file)
 
     def close(self) -> None:
-        """Send what can be sent soon, and report what was lost. Never raises."""
+        """Send what can be sent soon, and report losses. Never raise."""
         with self._lock:
             self._outlet.close()
             if self.lost > self._reported_lost:
@@ -134,7 +134,7 @@ class Stream:
 
     def _retry_later(self, error: OSError) -> None:
         trouble, now_s = error.strerror or str(error), self._clock()
-        # An outlet that works for a moment only is not tried more often.
+        # An outlet that works only for a moment is not tried more often.
         steady = not self._trouble and now_s > self._mended_s + self._retry_most_s
         self._wait_s = self._retry_s if steady else min(2 * self._wait_s, self._retry_most_s)
         self._due_s = now_s + self._wait_s
@@ -143,7 +143,7 @@ class Stream:
         self._trouble = trouble
 
     def _report_lost(self) -> None:
-        """Report losses, less and less often while the reason stays the same."""
+        """Report losses, less often as long as the reason stays the same."""
         now_s, key = self._clock(), _NUMBER.sub("", self._reason)
         again = key == self._reported_reason
         if again and now_s < self._lost_due_s:
@@ -165,7 +165,7 @@ def open_streams(
     retry_most_s: float = 30.0,
     option: str = "--emit",
 ) -> list[Stream]:
-    """Open all streams or none. Raises InputError as open_stream does, and if two would write to one file."""
+    """Open all streams or none. Raise InputError as open_stream does, and if two would write to one file."""
     places: dict[str, str] = {}
     for text in texts:
         place = text.partition(":")[2]
@@ -191,7 +191,7 @@ def open_stream(
 ) -> Stream:
     """Open a stream. notify: called when it breaks and when it works again. retry_s, retry_most_s: as in Stream.
 
-    Raises InputError: an unknown kind, a file that cannot be written or holds something else, an unknown host, or
+    Raise InputError: an unknown kind, a file that cannot be written or holds something else, an unknown host, or
     events without places.
     """
     kind, colon, place = text.partition(":")
@@ -242,6 +242,6 @@ def _open_lines(place: str, kind: str, asked: str) -> LineOutlet:
     if path.is_file() and os.access(path, os.R_OK):
         with path.open("rb") as file:
             first = file.read(1)
-        if first not in _BEGINS[kind]:  # of an empty file nothing is in all
+        if first not in _BEGINS[kind]:  # true for an empty file
             raise InputError(f"{asked}: the file holds something else than {kind}; choose another file")
     return LineOutlet(path)

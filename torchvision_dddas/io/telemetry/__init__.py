@@ -1,7 +1,7 @@
-"""What the vehicle reports of itself, from whatever recorded it, as one record.
+"""Read the reports of a vehicle, from any recorder, as one record.
 
-Own tables, DJI's subtitles, logs of MAVLink, PX4 and ArduPilot, MISB ST 0601 inside MPEG-TS, NMEA 0183. The kind is
-found by the content of the file, then by its name.
+Supported: own tables, DJI's subtitles, logs of MAVLink, PX4 and ArduPilot, MISB ST 0601 inside MPEG-TS, NMEA 0183, and
+the metadata of still pictures. The content of the file determines its kind, then its name.
 """
 
 import codecs
@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.telemetry import dataflash, px4
+from torchvision_dddas.io.telemetry import dataflash, photos, px4
 from torchvision_dddas.io.telemetry.clocks import parse_time_zone
 from torchvision_dddas.io.telemetry.mavlink import looks_like_tlog, read_tlog
 from torchvision_dddas.io.telemetry.misb import KEY, read_misb, spacing
@@ -26,21 +26,30 @@ _STREAMS = {".ts": (188, 0), ".mpg": (188, 0), ".m2ts": (192, 4), ".mts": (192, 
 
 def read_telemetry(
     path: str | Path,
+    *,
     clock_offset_s: float = 0.0,
     clip: str | Path | None = None,
     time_zone: str = "",
     order: str = "auto",
+    rate_hz: float | None = None,
 ) -> Telemetry:
-    """What a vehicle reports of itself. clock_offset_s: added to its times to get those since the clip's first frame.
+    r"""Read the reports of a vehicle. clock_offset_s: added to its times so that they count from the first frame.
 
-    clip: the video that it belongs to; of use for a table that counts frames instead of telling times. time_zone: of
-    dates that say none, a name of the IANA data base or hours from UTC; "" leaves their clock unknown. order: "lat-lon"
-    or "lon-lat" for two coordinates in one field, whose order else the program tells.
-    Raises InputError in one line where the file cannot be read or nothing in it can be used. What can be read of a
-    damaged file is returned, and its notes say what could not.
+    path: a file, or a folder of still pictures. clip: the video that the log belongs to. rate_hz: its frames a second.
+    Tables with frame numbers but no times, and folders of pictures, need one of the two. time_zone: zone of dates
+    without one, a name of the IANA data base or hours from UTC; "" leaves their clock unknown. order: "lat-lon" or
+    "lon-lat" for two coordinates in one field; by default the numbers or the dialect decide.
+    Raise InputError in one line if the file cannot be read or has no usable data. The readable part of a damaged file
+    is returned, and its notes say what is missing.
+
+    >>> written = pathlib.Path("log.csv").write_text("time_s,altitude_m,speed_m_s\n0,40,5\n1,42,5\n")
+    >>> td.read_telemetry("log.csv").at(0.5).altitude_m
+    41.0
     """
     path, clip = Path(path), Path(clip) if clip is not None else None
     zone = parse_time_zone(time_zone)
+    if path.is_dir():
+        return photos.read_photos(path, clock_offset_s, clip, rate_hz, zone)
     try:
         with path.open("rb") as file:
             beginning = file.read(1 << 16)
@@ -48,7 +57,9 @@ def read_telemetry(
         raise InputError(f"telemetry {path} cannot be read: {error.strerror}") from None
     head, suffix = beginning[:4096], path.suffix.lower()
     if not head.strip() and suffix != ".csv":
-        raise InputError(f"telemetry {path} is empty; wanted {KINDS}")
+        raise InputError(f"telemetry {path} is empty; give {KINDS}")
+    if head.startswith(photos.MAGIC):
+        return photos.read_photos(path, clock_offset_s, clip, rate_hz, zone)
     if head.startswith(px4.MAGIC):
         return px4.read_ulog(path, clock_offset_s)
     if dataflash.MAGIC in head:
@@ -56,7 +67,7 @@ def read_telemetry(
     if head.startswith(KEY):
         return read_misb(path, None, clock_offset_s)
     text = _text(beginning)
-    # What is damaged at its beginning still has its name. In text a letter may stand where packets begin.
+    # A file damaged at its beginning still has its name. A letter in a text may equal the sync byte of packets.
     if (layout := (spacing(head) if text is None else None) or _STREAMS.get(suffix)) is not None:
         return read_misb(path, layout, clock_offset_s)
     if KEY in beginning or suffix == ".klv":
@@ -73,17 +84,17 @@ def read_telemetry(
         advice = "give the .tlog or .bin itself, or tables by mavlogdump.py --format csv --types GPS"
         raise InputError(f"telemetry {path} holds the messages of an autopilot as text; {advice}")
     if suffix == ".csv" or (text is not None and re.search(r"[,;\t|]|^\W{0,9}\w{0,20}time\w{0,20} ", text)):
-        return read_telemetry_table(path, clock_offset_s, clip, zone, order)
+        return read_telemetry_table(path, clock_offset_s, clip, zone, order, rate_hz)
     if suffix == ".ulg":
-        raise InputError(f"telemetry {path} does not begin as a PX4 log does: it is none, or damaged there")
+        raise InputError(f"telemetry {path} does not begin like a PX4 log: it is another file, or damaged there")
     if b"ftyp" in head[:12]:
         hint = "give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt"
         raise InputError(f"telemetry {path} is a video; {hint}")
-    raise InputError(f"telemetry {path} is none of the kinds that can be read; wanted {KINDS}")
+    raise InputError(f"telemetry {path} is of no supported kind; give {KINDS}")
 
 
 def _text(content: bytes) -> str | None:
-    """The content as text; None where it is none. A few garbled letters do not make it something else."""
+    """Return the content as text; None if it is not text. A few garbled letters are accepted."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16", errors="replace")
     if content.count(b"\0") > len(content) // 1000 + 3:

@@ -1,7 +1,7 @@
 """Attitudes: rotations of vehicles and of the cameras on them.
 
-A turned body has axes forward, right and down, given in north, east and down. Its angles are heading (clockwise from
-north), pitch (positive below the horizon, as in the record) and roll (clockwise, seen from behind), in this order.
+A turned body has the axes forward, right and down, given in north, east and down. Its angles are heading (clockwise
+from north), pitch (positive below the horizon, as in the record) and roll (clockwise, seen from behind), in this order.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from torchvision_dddas.types import Float
 def axes(
     heading_rad: Float[np.ndarray, "N"], pitch_rad: Float[np.ndarray, "N"], roll_rad: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N 3 3"]:
-    """The axes as columns."""
+    """Return the axes as columns."""
     cos_h, sin_h = np.cos(heading_rad), np.sin(heading_rad)
     cos_p, sin_p = np.cos(pitch_rad), np.sin(pitch_rad)
     cos_r, sin_r = np.cos(roll_rad)[..., None], np.sin(roll_rad)[..., None]
@@ -24,7 +24,7 @@ def axes(
 
 
 def angles(turned: Float[np.ndarray, "N 3 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heading, pitch and roll. Straight down the heading is that of the picture's upper edge, and the roll 0."""
+    """Return heading, pitch and roll. Straight down, the heading is that of the picture's upper edge, and roll is 0."""
     forward, right, down = np.moveaxis(turned, -1, 0)
     steep = np.hypot(forward[..., 0], forward[..., 1]) < 1e-6
     upwards = -np.sign(forward[..., 2])
@@ -35,7 +35,7 @@ def angles(turned: Float[np.ndarray, "N 3 3"]) -> tuple[np.ndarray, np.ndarray, 
 
 
 def axes_of_quaternion(wxyz: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """The axes of a body whose attitude is a quaternion from itself to north, east, down; NaN if it is none."""
+    """Return the axes of a body from its attitude, a quaternion to north, east, down; NaN if it is not a unit one."""
     length = np.linalg.norm(wxyz, axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         w, x, y, z = np.moveaxis(wxyz / np.where(np.abs(length - 1) < 0.1, length, np.nan), -1, 0)
@@ -48,7 +48,7 @@ def axes_of_quaternion(wxyz: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3
 
 
 def heading_at(time_s: np.ndarray, known_s: np.ndarray, heading_rad: np.ndarray, most_s: float = 1.0) -> np.ndarray:
-    """A heading at other times, the short way round; NaN where the nearest known one is further away than most_s."""
+    """Interpolate a heading the short way round; NaN if the nearest known heading is more than most_s away."""
     if len(known_s) == 0:
         return np.full(len(time_s), np.nan)
     after = np.searchsorted(known_s, time_s).clip(0, len(known_s) - 1)

@@ -1,4 +1,4 @@
-"""What autopilots report: the messages and fields that are read, and which receiver and which gimbal is used."""
+"""Reports of autopilots: the messages and fields that are read, and the choice of receiver and gimbal."""
 
 import math
 import re
@@ -18,6 +18,7 @@ Topics = dict[str, dict[str, Topic]]
 _E7, _DEGREES = "longitude_deg=lon/1e7 latitude_deg=lat/1e7 ", "longitude_deg=lon/1 latitude_deg=lat/1 "
 _ARDUPILOT = "longitude_deg=Lng/1 latitude_deg=Lat/1 above_sea_m=Alt/1 altitude_m=RelHomeAlt/1 altitude_m=RelAlt/1"
 _RECEIVER = f"{_E7} above_sea_m=alt/1e3 above_ellipsoid_m=alt_ellipsoid/1e3 speed_m_s=vel/1e2 speed_m_s=vel_m_s/1"
+_ACCURACY = "accuracy_m=eph/1"  # of PX4's receivers; those of its estimates take slow errors for noise
 _SINCE_PX4_1_14 = "above_sea_m=altitude_msl_m/1 above_ellipsoid_m=altitude_ellipsoid_m/1 speed_m_s=vel_m_s/1"
 # By message: each quantity, its field, and how many units of the field make one. The best messages come first: the
 # autopilots' estimates, then receivers, of which the one with most fixes counts, then others with a height or speed.
@@ -29,14 +30,14 @@ _PLACES: tuple[dict[str, str], ...] = (
         "POS": _ARDUPILOT,
     },
     {
-        **dict.fromkeys(("GPS_RAW_INT", "GPS2_RAW"), _RECEIVER),
+        **dict.fromkeys(("GPS_RAW_INT", "GPS2_RAW"), f"{_RECEIVER} accuracy_m=h_acc/1e3"),
         **dict.fromkeys(
             ("vehicle_gps_position", "sensor_gps"),
-            f"longitude_deg=longitude_deg/1 latitude_deg=latitude_deg/1 {_SINCE_PX4_1_14} {_RECEIVER}",
+            f"longitude_deg=longitude_deg/1 latitude_deg=latitude_deg/1 {_SINCE_PX4_1_14} {_RECEIVER} {_ACCURACY}",
         ),
         **dict.fromkeys(("GPS", "GPS2"), f"{_ARDUPILOT} speed_m_s=Spd/1"),
     },
-    {"VFR_HUD": "speed_m_s=groundspeed/1", "BARO": "altitude_m=Alt/1"},
+    {"VFR_HUD": "speed_m_s=groundspeed/1", "BARO": "altitude_m=Alt/1", "GPA": "accuracy_m=HAcc/1"},
 )
 _DEGREES_A_RADIAN = 180 / math.pi
 # The heading of the vehicle's nose: message, field and its units per radian; "q" is a quaternion. The best come first.
@@ -57,10 +58,10 @@ _GIMBALS: dict[str, tuple[tuple[str, ...], float]] = {
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _PLACE, _RECEIVERS = ("longitude_deg", "latitude_deg"), 1
 # The fix that a quantity needs, else one in three dimensions. A place beyond these is damage.
-_LEAST_FIX = {"altitude_m": 0, "speed_m_s": 2, "longitude_deg": 2, "latitude_deg": 2}
+_LEAST_FIX = {"altitude_m": 0, "speed_m_s": 2, "accuracy_m": 2, "longitude_deg": 2, "latitude_deg": 2}
 _MOST = {"longitude_deg": 180, "latitude_deg": 90}
 # What stands for an unknown value, and the fields by which one sender tells several devices apart.
-_UNKNOWN = {"vel": 65535, "hdg": 65535, "alt_ellipsoid": 0, "altitude_ellipsoid_m": 0}
+_UNKNOWN = {"vel": 65535, "hdg": 65535, "alt_ellipsoid": 0, "altitude_ellipsoid_m": 0, "h_acc": 0}
 _DEVICES, _MOST_DEVICES = ("gimbal_device_id", "camera_device_id", "I"), 16
 NAMES = {*_PLACES[0], *_PLACES[1], *_PLACES[2], *_GIMBALS, *(name for name, *_ in _HEADINGS), "CAMERA_FOV_STATUS"}
 """The messages that are read."""

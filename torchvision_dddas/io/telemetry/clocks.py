@@ -1,4 +1,4 @@
-"""Times in flight logs: dates in any order, clocks of 12 and 24 hours, durations, numbers since a start or 1970."""
+"""Times in flight logs: dates in any order, 12- and 24-hour clocks, durations, seconds since a start or since 1970."""
 
 import math
 import re
@@ -17,7 +17,7 @@ from torchvision_dddas.io.telemetry.fields import POSSIBLE, UNITS, Known
 from torchvision_dddas.io.telemetry.record import SPLIT_S, Log, is_clock
 
 UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
-"""The note on a log whose dates say no zone."""
+"""The note on a log whose dates have no zone."""
 
 _DAY_S = 86_400.0
 _DAY_FORM = r"(\d{1,4})[./-](\d{1,2})[./-](\d{1,4})"
@@ -30,10 +30,10 @@ _CLOCK = re.compile(rf"(?=\d+:\d+:|.*[AaPp]){_CLOCK_FORM}")  # 12:05.3 are minut
 _SPAN = re.compile(r"(?:(\d{1,6}):)?(\d{1,6}):(\d{1,6}(?:[.,]\d{1,9})?)")
 _UNIT_SPAN = re.compile(r"([-+]?\d{1,9}(?:[.,]\d{1,9})?) ?([a-zµ'\"]{1,12})[ ,]{0,3}")
 _SPAN_UNITS = UNITS["time"] | {"m": 60.0, "'": 60.0, "d": 86_400.0, "day": 86_400.0, "days": 86_400.0, '"': 1.0}
-# Hours from UTC of the names of zones that mean one zone; CST, IST and BST mean several.
+# Hours from UTC of unambiguous zone names; CST, IST and BST are ambiguous.
 _NAMED = "PST-8 PDT-7 MST-7 MDT-6 EST-5 EDT-4 Z+0 UTC+0 GMT+0 CET+1 CEST+2 EET+2 EEST+3 MSK+3 JST+9 KST+9 AEST+10"
 _ZONES = {re.sub(r"[-+].*", "", zone): int(re.sub(r"[A-Z]", "", zone)) for zone in _NAMED.split()}
-# Dates in other forms: of EXIF, without signs between, and with the name of the month.
+# Dates in other forms: that of EXIF, without separators, and with the name of the month.
 _MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 _MONTH = rf"({'|'.join(_MONTHS)})[a-z]{{0,6}}\.?"
 _ODD_DATE = re.compile(
@@ -45,26 +45,26 @@ _ODD_DATE = re.compile(
     re.IGNORECASE,
 )
 _DIGITS = re.compile(r"([01]?\d|2[0-3])([0-5]\d)([0-5]\d)(?:\.?(\d*))")  # hours, minutes and seconds in one number
-# From 2001 to 2100: an earlier clock was never set.
+# From 2001 to 2100: an earlier value comes from a clock that was never set.
 _SINCE_1970 = (1e9, 4.1e9)
-# A larger number is no time of a log, since its start or since 1970.
+# A larger number is not a time of a log, neither since its start nor since 1970.
 _LONGEST_S = 1e10
-# How far the rows of a flight log may be apart, and on how many days they may be.
+# Limits for a flight log: step between rows in seconds, and number of days.
 _STEP_S, _DAYS = (0.002, 10.0), 2
 _SCALES = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "days": _DAY_S}
-# Days at the beginning of 1970 of spreadsheets, MATLAB, Julian days and modified Julian days.
+# The beginning of 1970 in days: of spreadsheets, MATLAB, Julian days and modified Julian days.
 _EPOCHS = (25_569.0, 719_529.0, 2_440_587.5, 40_587.0, 0.0)
-DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50  # dates that leave the times by more are those of another flight
-# Where this share of rows has the time of the row above, and times are multiples of a step of this, rows are spread.
+DATE_JUMP_S, _MOST_FLIGHTS = 10.0, 50  # a larger difference of dates and times marks another flight
+# Rows are spread if at least this share repeats the time above, and times are multiples of at least this step.
 _MORE, _TICK_S = 0.1, 0.1
 
 
 def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], bool, str]:
-    """Of each text the first date with a time: seconds since 1970, and whether it has a zone; else UTC is assumed.
+    """Find the first date with a time in each text: seconds since 1970, and whether it has a zone; else UTC is assumed.
 
-    None without a date. Also returns whether the order of day and month is known, and what is assumed of the years.
-    Fractions come as `.123`, as `,123` or as milli- and microseconds, `,774,808`. In dates with dots the day comes
-    before the month.
+    None for a text without a date. Also return whether the order of day and month is known, and the assumption about
+    years. Fractions have the form `.123`, `,123`, or milli- and microseconds, `,774,808`. In dates with dots, the day
+    comes before the month.
     """
     if any(map(_ODD_DATE.search, texts[:5])):
         texts = [_ODD_DATE.sub(_usual_date, text) for text in texts]
@@ -78,11 +78,11 @@ def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], 
         away_s = _zone_s(zone) if zone else None
         dates.append((seconds - (away_s or 0.0), away_s is not None) if math.isfinite(seconds) else None)
     is_short = any(re.fullmatch(r"\d\d?\D\d\d?\D\d\d", day) for day in days)
-    return dates, is_sure, "the years of two digits are taken to come last" * is_short
+    return dates, is_sure, "years of two digits are assumed to come last" * is_short
 
 
 def _usual_date(found: re.Match[str]) -> str:
-    """The usual form of a date in another one, 2022-08-26 18:12:57; the text behind it stays."""
+    """Return a date of another form as 2022-08-26 18:12:57; the text behind it stays."""
     part = found.groups(default="")
     forms = ([part[k] for k in places] for places in ((0, 1, 2), (3, 4, 5), (12, 11, 10), (16, 13, 14)))
     year, month, day = next(filter(all, forms))
@@ -92,7 +92,7 @@ def _usual_date(found: re.Match[str]) -> str:
 
 
 def _zone_s(zone: str) -> float | None:
-    """Seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for other names and for none."""
+    """Return the seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for other names and without a name."""
     if found := re.fullmatch(r"(?:Z|UTC|GMT)?([+-])([01]?\d)(?::?([0-5]\d))?", zone):
         return float(f"{found[1]}{int(found[2]) * 3600 + int(found[3] or 0) * 60}")
     return 3600.0 * _ZONES[zone] if zone in _ZONES else None
@@ -100,7 +100,7 @@ def _zone_s(zone: str) -> float | None:
 
 @lru_cache(maxsize=100)
 def midnight_s(first: str, second: str, third: str, day_first: bool = False) -> float:
-    """Seconds from 1970 to a date, NaN if it is none. A year of two digits comes last and is of this century."""
+    """Return the seconds from 1970 to a date, NaN if invalid. A two-digit year comes last, in this century."""
     last = (third, second, first) if day_first else (third, first, second)
     year, month, day = (first, second, third) if len(first) == 4 else last
     try:
@@ -111,7 +111,7 @@ def midnight_s(first: str, second: str, third: str, day_first: bool = False) -> 
 
 
 def _clock_s(hour: str, minute: str, second: str, fraction: str, micro: str, half: str) -> float:
-    """Seconds since midnight, NaN if there are none such. half: a or p of a clock of 12 hours."""
+    """Return the seconds since midnight, NaN if invalid. half: a or p of a 12-hour clock."""
     hours, minutes, seconds = int(hour), int(minute), int(second or 0)
     if hours > (12 if half else 23) or minutes > 59 or seconds > 60:
         return math.nan
@@ -120,7 +120,7 @@ def _clock_s(hour: str, minute: str, second: str, fraction: str, micro: str, hal
 
 
 def parse_time_zone(text: str) -> tzinfo | None:
-    """The zone of a name, Europe/Berlin, or of hours from UTC, +02:00; None for "". Raises InputError otherwise."""
+    """Return the zone for a name, Europe/Berlin, or hours from UTC, +02:00; None for "". Raise InputError otherwise."""
     text = text.strip()
     if not text:
         return None
@@ -136,7 +136,7 @@ def parse_time_zone(text: str) -> tzinfo | None:
 
 
 def to_utc(local_s: float, zone: tzinfo) -> float:
-    """Seconds since 1970 of a date in a time zone that `parse_date` has taken for UTC."""
+    """Return the seconds since 1970 of a date in a time zone that `parse_date` read as UTC."""
     moment = datetime.fromtimestamp(local_s, UTC).replace(tzinfo=zone)
     return local_s - (moment.utcoffset() or timedelta()).total_seconds()
 
@@ -146,10 +146,10 @@ def to_utc(local_s: float, zone: tzinfo) -> float:
 
 
 class TimeColumn(NamedTuple):
-    """A column of times. values: (N,), NaN where there is none. scale: to seconds, NaN if it is not known.
+    """A column of times. values: (N,), NaN if missing. scale: factor to seconds, NaN if unknown.
 
-    kind: "number" or "span"; "date" for what counts from 1970, "day" without a time, "clock" without a day. is_utc:
-    whether it is in UTC. is_sure: whether the order of day and month, or the unit, is known. remark: what is assumed.
+    kind: "number" or "span"; "date" for times since 1970, "day" without a time, "clock" without a day. is_utc: whether
+    it is in UTC. is_sure: whether the order of day and month, or the unit, is known. remark: the assumption made.
     """
 
     title: str
@@ -162,7 +162,7 @@ class TimeColumn(NamedTuple):
 
 
 def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
-    """Read a column of times. known: what its name means."""
+    """Read a column of times. known: the meaning of its name."""
     numbers = parse_numbers(cells)
     is_number = np.isfinite(numbers)
     if is_number.any() and 2 * is_number.sum() >= len(cells) - cells.count(""):
@@ -192,7 +192,7 @@ def read_times(title: str, cells: Sequence[str], known: Known) -> TimeColumn:
 
 
 def _span_s(text: str) -> float:
-    """Seconds of `1:02:03.5`, `1h 2m 3.5s`, `500 ms` or `PT0.5S`; NaN for anything else."""
+    """Return the seconds of `1:02:03.5`, `1h 2m 3.5s`, `500 ms` or `PT0.5S`; NaN for any other text."""
     if found := _SPAN.fullmatch(text):
         hours, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups())
         return hours * 3600 + minutes * 60 + seconds
@@ -206,9 +206,9 @@ def _span_s(text: str) -> float:
 
 
 def _spelled(cells: Sequence[str], is_utc: bool) -> list[str] | None:
-    """Dates and times of day that are written as one number, 20220826181257 or 181257.5, with signs between the parts.
+    """Add separators to dates and times that are written as one number, 20220826181257 or 181257.5.
 
-    None for other numbers: where a part is too large, or the rows would be too far apart.
+    Return None for other numbers: if a part is too large, or if the rows would be too far apart.
     """
     some = [cell for cell in cells if cell]
     if all(found is not None and len(found[0]) == len(cell) for cell in some for found in [_ODD_DATE.match(cell)]):
@@ -220,30 +220,30 @@ def _spelled(cells: Sequence[str], is_utc: bool) -> list[str] | None:
         return None
     clock_s = np.array([int(h) * 3600 + int(m) * 60 + float(f"{s}.{part}0") for h, m, s, part in parts])
     steps = np.abs(np.diff(clock_s)) % (_DAY_S - _STEP_S[1])
-    # Or the minutes went on, and no seconds were over 59.
+    # The numbers are also times if the minutes advanced and no seconds exceeded 59.
     is_told = is_utc or any(cell[0] == "0" for cell in some) or len({part[:2] for part in parts}) > 1
     is_near = bool((steps > 0).any()) and np.median(steps[steps > 0]) <= _STEP_S[1]
     return [_DIGITS.sub(r"\1:\2:\3.\g<4>0", cell) for cell in cells] if is_told and is_near else None
 
 
 def _day_order(dates: Iterable[str]) -> tuple[bool, bool]:
-    """Whether the day comes first in dates that end with the year, and whether that is known."""
+    """Return whether the day comes first in dates that end with the year, and whether that is certain."""
     parts = [part for date in dates if len((part := re.split(r"[./-]", date))[0]) != 4 and "." not in date]
     first, second = ({int(part[place]) for part in parts} for place in (0, 1))
     if max([*first, *second], default=0) > 12:
         return max(first) > 12, True
-    # Within a flight the day changes and not the month.
+    # Within a flight the day may change, but hardly the month.
     return len(first) > len(second), len(first) != len(second) or first == second
 
 
 def settle_times(
     log: Log, columns: Sequence[TimeColumn], step_m: float, is_far: np.ndarray, zone: tzinfo | None
 ) -> tuple[np.ndarray, float, list[str]]:
-    """Seconds since the first time, (N,), NaN where there is none; when that was since 1970; the columns that tell it.
+    """Return seconds since the first time, (N,), NaN if missing; that time since 1970; and the columns used.
 
-    The finest times that do not run back tell the seconds, dates the clock. step_m: how far the vehicle goes in a row.
-    is_far: (N,) whether it jumps before the row, as between flights. zone: of dates that say none. Raises InputError
-    where the unit of all times is unknown.
+    Seconds come from the finest times that do not run back, the clock from dates. step_m: distance of the vehicle
+    between rows. is_far: (N,) whether it jumps before the row, as between flights. zone: of dates without one. Raise
+    InputError if the unit of all times is unknown.
     """
     day = next((one for one in columns if one.kind == "day"), None)
     whole = [one for one in columns if one.kind != "day"]
@@ -278,7 +278,7 @@ def settle_times(
 
 
 def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[Sequence[TimeColumn], list[str]]:
-    """The columns, those of whole seconds with a column of fractions of a second added; and the title of this one."""
+    """Add a column of fractions of a second to the columns of whole seconds; return the columns and its title."""
     for one in columns:
         known = one.values[np.isfinite(one.values)] * one.scale
         is_back = one.kind == "number" and one.scale < 1 and (np.diff(known) < -0.1).any()
@@ -291,17 +291,17 @@ def _with_fractions(columns: Sequence[TimeColumn]) -> tuple[Sequence[TimeColumn]
 
 
 def _restarts(values: np.ndarray) -> list[int]:
-    """Rows in which a column of times begins again; none if there are many, as it is no column of times."""
+    """Return rows in which a column of times restarts; none if there are many, because it holds no times then."""
     known = np.flatnonzero(np.isfinite(values))
     back = known[1:][np.diff(values[known]) < -1.0]
     highest = np.fmax.accumulate(values)
-    # Behind a single damaged time the times go on.
+    # After a single damaged time, the times continue.
     is_few = len(back) <= min(1 + len(known) // 20, _MOST_FLIGHTS)
     return [int(row) for row in back[: len(back) * is_few] if (values[row : row + 3] < highest[row - 1]).sum() == 3]
 
 
 def sort_flights(log: Log, time_s: np.ndarray) -> None:
-    """Let a log be sorted by time where a whole flight stands behind a later one."""
+    """Let a log be sorted by time if a whole flight stands after a later one."""
     if rows := _restarts(time_s):
         spans = sorted((np.nanmin(part), np.nanmax(part)) for part in np.split(time_s, rows))
         log.jitter_s = math.inf if all(before[1] < after[0] for before, after in pairwise(spans)) else log.jitter_s
@@ -310,10 +310,10 @@ def sort_flights(log: Log, time_s: np.ndarray) -> None:
 def _continued(
     splits: dict[str, list[float]], one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray
 ) -> TimeColumn:
-    """A column of which the times begin again with another flight: later by the dates, or else by a second.
+    """Continue a column of times that restarts with another flight: by the dates, or else one second later.
 
-    is_far: (N,) whether the vehicle jumps away before the row. Without dates and a jump the times stay as they are.
-    splits: title -> times at which the flights part, added to.
+    is_far: (N,) whether the vehicle jumps before the row. Without dates and a jump, the times are unchanged.
+    splits: title -> times that separate flights; extended here.
     """
     values = one.values.copy()
     for row in _restarts(one.values) if one.kind != "date" else ():
@@ -327,7 +327,7 @@ def _continued(
 
 
 def _spread(log: Log, title: str, time_s: np.ndarray) -> np.ndarray:
-    """Times of which several rows have the same, evenly up to the next; with a note."""
+    """Spread rows with equal times evenly up to the next time, and add a note."""
     known = np.flatnonzero(np.isfinite(time_s))
     ticks, first, count = np.unique(time_s[known], return_index=True, return_counts=True)
     more = len(known) - len(ticks)
@@ -349,7 +349,7 @@ def _trust(clock: TimeColumn) -> tuple[bool, bool]:
 
 
 def _rank(one: TimeColumn) -> tuple[bool, int]:
-    """The lowest is best: whole columns of times that do not run back, then the most different ones."""
+    """Return a sorting key: complete columns of times that do not run back first, then those with most values."""
     known = one.values[np.isfinite(one.values)]
     back = int((known < np.maximum.accumulate(known) - 1.0).sum()) if len(known) else 0
     is_open = one.kind == "number" and not one.is_sure
@@ -357,7 +357,7 @@ def _rank(one: TimeColumn) -> tuple[bool, int]:
 
 
 def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
-    """A column in seconds. span_s: that of the dates of the same rows, 0 where there are none."""
+    """Convert a column to seconds. span_s: span of the dates in the same rows, 0 without dates."""
     known = one.values[np.isfinite(one.values)]
     if one.kind == "clock":  # time goes on over midnight
         return one._replace(values=one.values + _DAY_S * np.cumsum(np.diff(one.values, prepend=math.nan) < -_DAY_S / 2))
@@ -366,7 +366,7 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
     steps = np.diff(known)
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
     scale, length, middle = one.scale, float(np.ptp(known)), float(np.median(known))
-    # A step of hours or of microseconds shows that the values have another unit than the name.
+    # A step of hours or of microseconds shows that the values have another unit than the name suggests.
     if math.isnan(scale) or step * scale > 3600 or step * scale < 1e-5:
         since = [n for n, s in _SCALES.items() if _SINCE_1970[0] < middle * s < _SINCE_1970[1]]
         near = [n for n, s in _SCALES.items() if span_s > 2 and abs(length * s - span_s) < max(1.5, 0.1 * span_s)]

@@ -1,4 +1,4 @@
-"""ArduPilot's DataFlash logs, binary and as text: messages whose columns the log itself describes."""
+"""ArduPilot's DataFlash logs, binary and as text: the log itself describes the columns of its messages."""
 
 import re
 import struct
@@ -12,23 +12,23 @@ from torchvision_dddas.io.telemetry.record import Log
 from torchvision_dddas.types import Telemetry
 
 MAGIC = b"\xa3\x95\x80\x80"
-"""The beginning of the message that describes descriptions, the first one of a binary log."""
+"""The first bytes of a binary log: the message that describes descriptions."""
 IN_TEXT = re.compile(r"^FMT, ?\d+, ?\d+, ?\w+, ?\w+", re.MULTILINE)
-"""A description in a log as text."""
+"""A description in a text log."""
 _HEAD, _FMT = MAGIC[:2], MAGIC[2]
-# The letters of a format that NumPy calls otherwise, and how many units of a letter make one.
+# Format letters with another name in NumPy, and the number of units of a letter in one.
 _TYPES = {"M": "b", "g": "e", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "n": "S4", "N": "S16"}
 _TYPES |= dict.fromkeys("aZ", "S64") | {letter: letter for letter in "bBhHiIfdqQ"}
 _PER_UNIT = dict.fromkeys("cCeE", 1e2) | {"L": 1e7}
-# UTC is behind GPS time by 14 s, and by one more since each of these weeks.
+# UTC is 14 s behind GPS time, and one second more since each of these weeks.
 _WEEK_S, _GPS_EPOCH_S, _LEAP_WEEKS = 604_800, 315_964_800, (1512, 1695, 1851, 1930)
 
 
-@np.errstate(invalid="ignore", over="ignore")  # where a log is damaged a number may be any bits
+@np.errstate(invalid="ignore", over="ignore")  # a damaged log may hold any bits
 def read_dataflash(path: Path, text: str | None, clock_offset_s: float) -> Telemetry:
-    """Positions, heights and attitudes of an ArduPilot log; times since the first. text: of a log that is text.
+    """Read positions, heights and attitudes of an ArduPilot log; times count from the first. text: of a text log.
 
-    Raises InputError if it has none.
+    Raise InputError if it has none.
     """
     log = Log(path, "ArduPilot DataFlash log", "byte" if text is None else "line", bridge_s=1.0)
     topics: Topics = {}
@@ -45,14 +45,14 @@ def read_dataflash(path: Path, text: str | None, clock_offset_s: float) -> Telem
 
 
 def _clock(receiver: Topic) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds since 1970 in UTC, 0 without a fix, and the autopilot's times."""
+    """Return seconds since 1970 in UTC, 0 without a fix, and the autopilot's times."""
     week, week_ms = (column(receiver, a if a in receiver else b) for a, b in (("GWk", "Week"), ("GMS", "TimeMS")))
     utc_s = _GPS_EPOCH_S + week * _WEEK_S + week_ms / 1e3 - 14 - np.searchsorted(_LEAP_WEEKS, week, side="right")
     return np.where((column(receiver, "Status") >= 2) & (week > 0), utc_s, 0), receiver["time_s"]
 
 
 def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
-    """Yield the messages that are read, by name. A message is whole if another one, or nothing, follows."""
+    """Yield the messages to read, by name. A message is whole if another message, or the end, follows."""
     formats: dict[int, tuple[str, int, str, list[str]]] = {_FMT: ("FMT", 89, "", [])}
     places: dict[int, list[int]] = {}
     place = lost = first = 0
@@ -70,7 +70,7 @@ def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
             places.setdefault(content[place + 2], []).append(place)
         place = end
     if lost:
-        log.note(f"byte {first}: {lost} bytes are no whole messages and left out")
+        log.note(f"byte {first}: {lost} bytes are not whole messages and are left out")
     for number, where in places.items():
         name, size, letters, fields = formats[number]
         row = np.dtype([(f"{i}", "<" + _TYPES.get(letter, "S1")) for i, letter in enumerate(letters)])
@@ -82,7 +82,7 @@ def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
 
 
 def _written(log: Log, text: str) -> Iterator[tuple[str, Topic]]:
-    """Yield the messages of a log as text that are read, by name. Its numbers are in the units of their columns."""
+    """Yield the messages to read of a text log, by name. Its numbers are in the units of their columns."""
     columns: dict[str, tuple[str, ...]] = {}
     rows: dict[tuple[str, tuple[str, ...]], list[list[float]]] = {}  # by name and columns, which damage may change
     bad: list[int] = []
@@ -98,7 +98,7 @@ def _written(log: Log, text: str) -> Iterator[tuple[str, Topic]]:
             except ValueError:
                 bad.append(number)
     if bad:
-        log.note(f"line {bad[0]}: {len(bad)} messages are cut off or garbled and left out")
-    # Of several kinds of columns the one with most rows comes last, and stays.
+        log.note(f"line {bad[0]}: {len(bad)} messages are cut off or garbled and are left out")
+    # If a message has several sets of columns, the set with most rows comes last, and is kept.
     for (name, names), found in sorted(rows.items(), key=lambda item: len(item[1])):
         yield name, dict(zip((*names, "where"), np.array(found).T, strict=True))

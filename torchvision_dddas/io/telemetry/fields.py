@@ -46,9 +46,11 @@ FIELDS = (
     Field("above_sea_m", *_HEIGHT, "the sea", "gpsaltitude gpsalt galt"),
     Field("above_ellipsoid_m", *_HEIGHT, "the ellipsoid WGS 84", ""),
     Field("geoid_m", "length", -120, 100, "the ellipsoid, up to the sea",
-          "undulation geoidundulation geoidheight geoidseparation geoidsep"),
+          "undulation geoidundulation geoidheight geoidseparation geoidsep geoidalseparation geoid"),
     Field("bare_height_m", *_HEIGHT, "not said: the take-off point is assumed", "height"),
     Field("bare_altitude_m", *_HEIGHT, "not said: the sea is assumed", "altitude alt gpsheight ele"),
+    Field("accuracy_m", "length", 1e-3, 1000, "standard deviation of the place, of east and north together",
+          "horizontalaccuracy hacc gpsaccuracy gpshorizontalaccuracy"),
     Field("speed_m_s", "speed", 0, 300, "the ground",
           "h.s speed groundspeed gndspeed gspd hspeed horizontalspeed velocity horizontalvelocity vel velh spd"),
     Field("heading_rad", "angle", -360, 360, "true north, clockwise, of the camera",
@@ -115,22 +117,22 @@ TABLES = (
     Dialect("UgCS SkyHub", "elapsed date time latitude altitude", "altitude=above_takeoff_m elapsed=time,ms"),
     Dialect("EdgeTX, OpenTX", "date time gps", "hdg=course", "lat-lon"),
     Dialect("ulog2csv, receiver before PX4 1.14", "timestamp timeutcusec lat lon",
-            "timestamp=time,us alt=above_sea_m,mm altellipsoid=above_ellipsoid_m,mm heading="),
+            "timestamp=time,us alt=above_sea_m,mm altellipsoid=above_ellipsoid_m,mm eph=accuracy_m heading="),
     Dialect("ulog2csv", "timestamp timestampsample|timestamp altellipsoid|timestamp deltaalt|timestamp timeutcusec",
             "timestamp=time,us timestampsample= alt=above_sea_m z=above_takeoff_m,-m heading=vehicle_heading_rad,rad"),
     Dialect("mavlogdump, MNT", "timeus desyawe", "pitch=pitch_rad roll=roll_rad yawe=heading_rad"),
     Dialect("mavlogdump, with a place", "timeus lat lng", "alt=above_sea_m status=fix relalt=above_takeoff_m"),
     Dialect("mavlogdump, without a place", "timeus", "alt=above_takeoff_m"),
     Dialect("MAVLink GPS_RAW_INT", "timeusec fixtype lat lon alt eph|gpsrawint.|gps2raw.", "alt=above_sea_m,mm "
-            "altellipsoid=above_ellipsoid_m,mm vel=speed_m_s,cm/s cog=course"),
+            "altellipsoid=above_ellipsoid_m,mm vel=speed_m_s,cm/s cog=course hacc=accuracy_m,mm"),
     Dialect("MAVLink MOUNT_ORIENTATION", "timebootms roll pitch yaw yawabsolute|mountorientation.", "roll=roll_rad "
             "pitch=pitch_rad yaw= yawabsolute=heading_rad"),
     Dialect("u-blox NAV-PVT", "itow lon lat height hmsl", "itow=time,ms lon=longitude_deg,e7 lat=latitude_deg,e7 "
-            "height=above_ellipsoid_m,mm hmsl=above_sea_m,mm gspeed=speed_m_s,mm/s headmot=course"),
+            "height=above_ellipsoid_m,mm hmsl=above_sea_m,mm gspeed=speed_m_s,mm/s headmot=course hacc=accuracy_m,mm"),
     Dialect("mavlogdump of a .tlog", "timebootms lat lon alt relativealt|globalpositionint.", "alt=above_sea_m,mm "
             "relativealt=above_takeoff_m,mm hdg=vehicle_heading_rad,cdeg vfrhud.alt=above_sea_m "
             "attitude.yaw=vehicle_heading_rad,rad"),
-    # GPS_altitude is in metres or in tenths of them, as the firmware has it.
+    # GPS_altitude is ignored: its unit is the metre or the decimetre, depending on the firmware.
     Dialect("blackbox_decode (Betaflight, INAV)", "gpscoord[0]|loopiteration",
             "navpos[2]=above_takeoff_m,cm gpsaltitude="),
     Dialect("Parrot", "productgpslatitude", "anglepsi=vehicle_heading_rad,rad"),
@@ -168,7 +170,8 @@ ZEROS = {
     "wgs84 hae",
 }
 _ZERO_OF = {word: quantity for quantity, words in ZEROS.items() for word in words.split()}
-_ALONE = {"agl", "amsl", "msl", "asl", "hae", "ato", "abovesealevel", "abovesea", "aboveground"}
+_ALONE = {"agl", "amsl", "msl", "asl", "hae", "ato", "abovesealevel", "abovesea", "aboveground", "abovetakeoff"}
+_ALONE |= {"aboveellipsoid", "ellipsoidal", "abovegeoid"}
 _FILL = "gps|gnss|rtk|drone|uav|aircraft|vehicle|point"
 _IN_HEIGHT = re.compile(rf"({'|'.join(_ZERO_OF)})|(altitude|alt|height|elevation|elev|ele|hgt|h)|{_FILL}")
 _NOTHING = re.compile(f"(?:{_FILL})*")
@@ -233,12 +236,12 @@ class Names:
 
     def _find(self, name: str, words: list[str]) -> Known | None:
         rest = _plain("".join(word for word in words if word in _ZERO_OF or word not in _ANY_UNIT))
-        for key in dict.fromkeys((name + rest, name)):  # altitude (m AMSL) is altitudeamsl
+        for key in dict.fromkeys((name + rest, name)):  # "altitude (m AMSL)" is known as altitudeamsl
             if (known := self._named(key)) is not None:
                 with_unit = next((found for word in words if (found := known.in_unit(word))), None)
                 # A unit that is not known may be any. The letter h means the height only with a unit.
                 if key == name and known.field.kind == "length" and not _NOTHING.fullmatch(rest):
-                    continue  # the zero point of this height is not known
+                    continue  # the column does not say from where this height is measured
                 if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
                     return with_unit or known
         return None

@@ -203,7 +203,7 @@ def _length(content: bytes, place: int) -> tuple[int, int]:
 
 
 class _Sums:
-    """Sums of the bytes at even and at odd places up to each place, modulo 2^16, for checksums of any part."""
+    """Running sums of the bytes at even and at odd places, modulo 2^16. They give the checksum of any part at once."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
@@ -347,7 +347,7 @@ def _packets(log: Log, content: bytes, size: int, first: int) -> Iterator[tuple[
     while place + _PACKET <= len(content):
         if content[place : place + 1] != _SYNC:
             damaged.append(place)
-            # The next byte that begins a packet and that another one follows.
+            # Search for the next sync byte that has another sync byte one packet later.
             while (place := content.find(_SYNC, place + 1)) >= 0 and content[place + size : place + size + 1] not in (
                 b"",
                 _SYNC,

@@ -1,4 +1,4 @@
-"""One record of a flight from the samples of any log: checked, and resampled at common times."""
+"""Make one record of a flight from the samples of any log: check them, and resample them at common times."""
 
 import math
 import time
@@ -14,33 +14,36 @@ from torchvision_dddas.geometry import DEGREE_M
 from torchvision_dddas.io.telemetry.fields import HEIGHTS, POSSIBLE
 from torchvision_dddas.types import COLUMNS_OF_TELEMETRY, Telemetry
 
-KINDS = "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, ArduPilot .bin or .log, MPEG-TS with MISB ST 0601, or NMEA 0183"
+KINDS = (
+    "a CSV, DJI .SRT, MAVLink .tlog, PX4 .ulg, ArduPilot .bin or .log, MPEG-TS with MISB ST 0601, NMEA 0183, or a JPEG "
+    "or TIFF"
+)
 
 OWN = "table"
-"""The kind of own tables, which may lack a place."""
+"""The kind of this package's own tables, which may lack a place."""
 
-# No log is older, and none of the future. A GPS receiver whose count of weeks has rolled over is 1024 weeks early.
+# Older logs and logs from the future are rejected. A GPS receiver after a week rollover is 1024 weeks early.
 _FIRST_CLOCK_S, _DAY_S = 1_230_768_000.0, 86_400.0  # 2009-01-01
-# A barometer's zero drifts by metres in a flight; an altitude below this has another origin than the ground.
+# A barometer's zero drifts by metres in a flight; an altitude below this has another zero than the ground.
 _DEEP_M = -5.0
-# Samples this near are of the same time: between them a split would have the time of one of them.
+# Samples this close have the same time: a split between them would coincide with one of them.
 _SAME_S = 1e-6
-# A vehicle does not go further between two samples, unless they are of two flights.
+# A larger distance between two samples separates two flights.
 JUMP_M, SPLIT_S, _STRAY = 200.0, 1e-3, 2
-# Two heights that differ by less everywhere are the same.
+# Two heights are the same if they differ by less than this throughout.
 _ALIKE_M = 0.5
-# A pause of this many median sample intervals, and of this many seconds, is a gap: nothing is known within it.
+# A pause of this many median sample intervals, and of this many seconds, is a gap with unknown values.
 _GAP_SHARE, _GAP_S = 10.0, 5.0
-# A log with nothing but these is refused.
-_NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad"}
+# A log that has only these quantities is refused.
+_NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad", "position_sigma_m"}
 # Angles that turn all the way round, and the lower end of their range.
 _TURNING = {"heading_rad": 0.0, "roll_rad": -np.pi, "vehicle_heading_rad": 0.0}
 _FULL = {"longitude_deg": 360.0} | dict.fromkeys(_TURNING, 2 * np.pi)
-# Half the time span over which a line is fitted to the places: lowest and highest.
+# Half the time span over which a line is fitted to the places: smallest and largest value.
 _LEAST_S, _MOST_S = 1.0, 10.0
-# Places are rounded: the span is long enough for a step of the last digit to change the speed by no more than this.
+# Places are rounded: the span is so long that a step of the last digit changes the speed by at most this.
 _STEP_M_S = 0.5
-# A receiver's places drift by this even where more digits are written.
+# A receiver's places drift by this even if more digits are written.
 _WANDER_M = 0.1
 
 
@@ -48,14 +51,14 @@ _WANDER_M = 0.1
 class Log:
     """The samples of a log. path: of the file. kind: in words, for messages. where: unit of places in the file.
 
-    bridge_s: longest pause of a quantity that is still interpolated; 0 where a missing value means unknown.
-    jitter_s: how far time may run back; more is another recording, or damage. is_nominal: as in Telemetry.
-    height_zero: what altitude_m counts from, as in Telemetry. splits: times at which another flight begins.
-    latest_utc_s: the latest that time 0 can be, in seconds since 1970, where the dates do not tell their zone.
+    bridge_s: longest pause of a quantity that is interpolated; 0 if a missing value means unknown.
+    jitter_s: how far time may run back; a larger step is another recording, or damage. is_nominal: as in Telemetry.
+    height_zero: zero of altitude_m, as in Telemetry. splits: times at which another flight begins.
+    latest_utc_s: latest possible time 0, in seconds since 1970, if the zone of the dates is unknown.
     start_local_s: as in Telemetry.
-    samples: column of the record, or another quantity of `fields` -> rows (N, 3) of time, value (NaN where unknown) and
-    place in the file. Positions are longitude_deg and latitude_deg, or east_m and north_m. moments: the same, with any
-    value, of each row of a log whose rows hold all quantities, also of empty rows.
+    samples: column of the record, or another quantity of `fields` -> rows (N, 3) of time, value (NaN if unknown) and
+    place in the file. Positions are longitude_deg and latitude_deg, or east_m and north_m. moments: rows (N, 3) with
+    any value, one for each row of a log whose rows hold all quantities, including empty rows.
     """
 
     path: Path
@@ -77,51 +80,51 @@ class Log:
         self.samples.setdefault(quantity, []).append((time_s, value, where))
 
     def add_all(self, times: np.ndarray, where: np.ndarray, values: dict[str, np.ndarray], known: bool = False) -> None:
-        """Set all samples of some quantities, each argument (N,). known: whether to leave out unknown values."""
+        """Set all samples of some quantities; arguments are (N,). known: leave out unknown values."""
         for quantity, column in values.items():
             rows = np.column_stack([times, column, where]).astype(float)
             self.samples[quantity] = rows[~np.isnan(rows[:, 1])] if known else rows
 
     def note(self, text: str) -> None:
-        """Note what the user should know, once. It may hold text of the file."""
+        """Add a note for the user, once. It may contain text of the file."""
         text = printable(" ".join(text.split()))
         if text not in self.notes:
             self.notes.append(text)
 
     def latitude_first(self, pairs: np.ndarray, told: str, asked: str, what: str) -> bool:
-        """Whether of two coordinates, (N, 2), the first is the latitude. told, asked: by the dialect and by the user.
+        """Return whether the latitude is the first of two coordinates, (N, 2). told, asked: by dialect and by user.
 
-        what: that holds them, in words. Raises InputError where nothing tells the order.
+        what: the field that holds them, in words. Raise InputError if the order is unknown.
         """
         is_beyond = (np.abs(pairs) > 90).any(axis=0)
         if asked == "auto" and is_beyond[0] != is_beyond[1]:
             return bool(is_beyond[1])
         order = told if asked == "auto" else asked
         if not order:
-            raise self.refuse(f"{what} may be lat-lon or lon-lat; wanted aerial.order=lat-lon or aerial.order=lon-lat")
+            raise self.refuse(f"{what} may be lat-lon or lon-lat; set aerial.order=lat-lon or aerial.order=lon-lat")
         if asked == "auto":
-            self.note(f"{what} is taken as {order}, as this dialect has it; aerial.order may tell another order")
+            self.note(f"{what} is read as {order}, as usual in this dialect; aerial.order sets another order")
         return order == "lat-lon"
 
     def refuse(self, text: str, where: float | None = None) -> InputError:
-        """The error to raise, with the file and the place."""
+        """Return the InputError to raise, with the file and the place."""
         place = f", {self.where} {where:.0f}" if where is not None else ""
         return InputError(f"telemetry {self.path}{place}: {text}")
 
 
 def is_clock(utc_s: Any) -> Any:
-    """Whether seconds since 1970, a number or an array, can be the time of a log."""
+    """Return whether seconds since 1970, a number or an array, can be the time of a log."""
     return (utc_s >= _FIRST_CLOCK_S) & (utc_s <= max(time.time(), _FIRST_CLOCK_S) + _DAY_S)
 
 
 def build_record(
     log: Log, clock_offset_s: float = 0.0, start_utc_s: float = float("nan"), from_first: bool = False
 ) -> Telemetry:
-    """The record of a log: a row for each time of any sample, every column linear between its own samples.
+    """Return the record of a log: a row for each time of any sample, every column linear between its own samples.
 
     start_utc_s: seconds since 1970 at the log's own time 0. from_first: whether times count from the first sample.
-    Raises InputError where neither altitude, place nor attitude is known, where a place is off the globe, and where
-    time runs back.
+    Raise InputError if neither altitude, place nor attitude is known, if a place is off the globe, or if time runs
+    back.
     """
     samples = {name: _sort(log, np.array(rows, float).reshape(-1, 3)) for name, rows in log.samples.items()}
     moments = _sort(log, np.array(log.moments, float).reshape(-1, 3))
@@ -132,6 +135,10 @@ def build_record(
     _check_globe(log, samples)
     samples = {name: rows for name, rows in samples.items() if np.isfinite(rows[:, 1]).any()}
     _settle_heights(log, samples)
+    if (accuracy := samples.pop("accuracy_m", None)) is not None:
+        samples["position_sigma_m"] = accuracy * [1, math.sqrt(0.5), 1]
+        middle_m = np.nanmedian(samples["position_sigma_m"][:, 1])
+        log.note(f"the log states the error of its places: a sigma of {middle_m:.2g} m east and north, the median")
     _split_flights(log, samples)
     if not set(samples) - _NOT_ALONE:
         raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
@@ -154,7 +161,7 @@ def build_record(
     clock_s = start_utc_s + start
     if np.isfinite(clock_s) and not is_clock(clock_s):
         date = np.datetime64(int(np.clip(clock_s, -1e11, 1e11)), "s")
-        log.note(f"the log's clock says {date}, which cannot be: the time of day is unknown")
+        log.note(f"the log's clock says {date}, which cannot be right: the time of day is unknown")
         clock_s = np.nan
     columns = {"altitude_m": unknown, "speed_m_s": unknown, **columns, "place": place}
     known: dict[str, Any] = {name: columns[name] for name in COLUMNS_OF_TELEMETRY if name in columns}
@@ -173,7 +180,7 @@ def build_record(
 
 
 def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
-    """The times, and one more within each gap, where nothing is known."""
+    """Return the times, with one more within each gap, where values are unknown."""
     if len(times) < 6:
         return times
     steps = np.diff(times)
@@ -188,10 +195,10 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
 
 
 def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | None) -> np.ndarray:
-    """One quantity at all times: linear between two samples that are near each other, else NaN.
+    """Return one quantity at all times: linear between neighbouring samples, otherwise NaN.
 
-    A quantity that is sampled more rarely than others is interpolated; one with a long pause is unknown in it. Outside
-    its span a column holds for bridge_s.
+    A quantity that is sampled less often than others is interpolated, but not over a long pause. Outside its span a
+    column keeps its value for bridge_s.
     """
     known, values = rows[:, 0], rows[:, 1]
     if np.array_equal(known, times):
@@ -217,7 +224,7 @@ def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | 
 
 
 def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
-    """Sorted by time; of samples at the same time the last. Single damaged times are left out."""
+    """Sort by time, keep the last of samples at the same time, and leave out single damaged times."""
     rows = rows[np.isfinite(rows[:, 0])]
     rows = rows[~_stray(rows[:, 0], log.jitter_s)]
     is_back = np.diff(rows[:, 0]) < -log.jitter_s
@@ -231,7 +238,7 @@ def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
 
 
 def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
-    """Which times are out of order while their neighbours are in order: single damaged ones, not another recording."""
+    """Return which times are out of order between ordered neighbours: damaged times, not another recording."""
     stray = np.zeros(len(times), bool)
     if len(times) < 3 or not np.isfinite(jitter_s):
         return stray
@@ -239,13 +246,13 @@ def _stray(times: np.ndarray, jitter_s: float) -> np.ndarray:
     stray[1:-1] = (before <= after) & ((middle < before - jitter_s) | (middle > after + jitter_s))
     stray[0] = times[0] > times[1] + jitter_s and times[1] <= times[2]
     stray[-1] = times[-1] < times[-2] - jitter_s and times[-3] <= times[-2]
-    # A day without a sample, then one: its time is damaged.
+    # A last sample after a day without samples has a damaged time.
     stray[-1] |= times[-1] > times[-2] + 86_400
     return stray
 
 
 def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Set impossible values to NaN, but for places, see `_check_globe`."""
+    """Set impossible values to NaN, except for places, which `_check_globe` checks."""
     for name, rows in samples.items():
         low, high = (-np.inf, np.inf) if "itude_deg" in name else POSSIBLE.get(name, (-np.inf, np.inf))
         wrong = np.isinf(rows[:, 1]) | (rows[:, 1] < low) | (rows[:, 1] > high)
@@ -253,12 +260,14 @@ def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
             _, value, where = rows[wrong.argmax()]
             value = math.degrees(value) if name.endswith("_rad") else value
             title = name.replace("_rad", "_deg")
-            log.note(f"{log.where} {where:.0f}: {title} is {value:g}, which cannot be; {wrong.sum()} left out")
+            instead = ", aerial.position_sigma_m counts there" if name == "accuracy_m" else ""
+            what = f"{title} is {value:g}, which cannot be; {wrong.sum()} left out{instead}"
+            log.note(f"{log.where} {where:.0f}: {what}")
             rows[wrong, 1] = np.nan
 
 
 def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Raises InputError for degrees that are none; longitude and latitude 0 stand for no fix."""
+    """Raise InputError for degrees out of range; longitude and latitude 0 mean no fix."""
     for name, most in (("latitude_deg", 90.0), ("longitude_deg", 180.0)):
         rows = samples.get(name, np.zeros((0, 3)))
         wrong = np.abs(rows[:, 1]) > most
@@ -275,7 +284,7 @@ def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
 
 
 def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Make altitude_m and above_sea_m of the heights that a log holds; note what is assumed of them."""
+    """Make altitude_m and above_sea_m from the heights in a log; note assumptions about their zero."""
     unsaid = "the file does not say where the {} is zero; above the {} is assumed"
     takeoff, ground, height, bare, geoid = (samples.pop(name, None) for name in HEIGHTS)
     if takeoff is None and ground is None and height is not None:
@@ -306,7 +315,7 @@ def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
 
 
 def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Split the log where its place jumps: nothing is known between two flights, nor of one or two places astray."""
+    """Split the log where its place jumps: nothing is known between flights; one or two stray places are dropped."""
     for pair, scale in ((("longitude_deg", "latitude_deg"), DEGREE_M), (("east_m", "north_m"), 1.0)):
         east, north = (samples.get(name, np.zeros((0, 3))) for name in pair)
         known = np.flatnonzero(np.isfinite(east[:, 1] + north[:, 1])) if len(east) == len(north) else np.zeros(0, int)
@@ -332,13 +341,13 @@ def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
 
 
 def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Note where there is no place or no altitude, or one below the ground."""
+    """Note a missing place or altitude, or an altitude below the ground."""
     if not {"latitude_deg", "east_m"} & set(samples) and log.kind != OWN:
         log.note("the log holds no place")
     if "altitude_m" not in samples:
         log.note("the log holds no altitude above ground")
         if "above_ellipsoid_m" in samples and "above_sea_m" not in samples:
-            log.note("its heights count from the ellipsoid: without the geoid they tell none above sea or ground")
+            log.note("its heights count from the ellipsoid: alone they give no height above ground")
         return
     deep = samples["altitude_m"][:, 1] < _DEEP_M
     if deep.any():
@@ -365,21 +374,21 @@ def _note_silence(log: Log, samples: dict[str, np.ndarray]) -> None:
 
 
 def _longest_silence_s(known: np.ndarray, bridge_s: float) -> float:
-    """The longest pause between samples over which a quantity is interpolated."""
+    """Return the longest pause between samples over which a quantity is interpolated."""
     return max(1.5 * float(np.median(np.diff(known))), bridge_s) if len(known) > 1 else bridge_s
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Speed over ground from places, where a log does not have it.
+# Speed over ground from places, if a log does not have it.
 
 
 def _speed_from_places(
     time_s: np.ndarray, place: np.ndarray, geographic: bool, splits: Sequence[float]
 ) -> tuple[np.ndarray, float]:
-    """Speed as the slope of a line fitted to the places around each time, m/s, and the time span of the fit, s.
+    """Return the slope of a line fitted to the places around each time, m/s, and the time span of the fit, s.
 
-    time_s: (N,) rising. place: (N, 2) degrees or metres, NaN where unknown: there the speed is NaN, and where
-    the places span too short a time. splits: times over which no line is fitted.
+    time_s: (N,) rising. place: (N, 2) degrees or metres, NaN if unknown. The speed is NaN at unknown places, and if the
+    places span too short a time. splits: times over which no line is fitted.
     """
     known = np.isfinite(place).all(axis=1)
     speed = np.full(len(time_s), np.nan)
@@ -406,7 +415,7 @@ def _speed_from_places(
 
 
 def _step_m(place: np.ndarray, geographic: bool) -> float:
-    """The step of the last written digit of the places, m."""
+    """Return the step of the last written digit of the places, m."""
     metres, least = (DEGREE_M, _WANDER_M) if geographic else (1.0, 0.0)
     for digits in range(8):
         shifted = place * 10.0**digits

@@ -30,7 +30,8 @@ _KNOWN = {field.quantity: Known(field, math.pi / 180 if field.kind == "angle" el
 # Columns of own tables; their pitch is counted down.
 _OWN = {"altitude_m": "above_ground_m", "heading_deg": "heading_rad", "pitch_deg": "pitch_rad", "roll_deg": "roll_rad"}
 _OWN |= {"hfov_deg": "hfov_rad", "vehicle_heading_deg": "vehicle_heading_rad"}
-_OWN |= {name: name for name in ("speed_m_s", *_PLACE, *PLACES[1], "above_sea_m")}
+_OWN |= {name: name for name in ("speed_m_s", *_PLACE, *PLACES[1], "above_sea_m", "above_takeoff_m")}
+_OWN |= {"above_ellipsoid_m": "above_ellipsoid_m", "accuracy_m": "accuracy_m"}
 SCHEMA = Schema(
     "telemetry",
     Column("time_s", "g", -1e10, 1e10, wanted="seconds since the clip's first frame"),
@@ -53,7 +54,12 @@ _GROUPED = re.compile(r"[-+]?\d{1,3},\d{3}")
 
 
 def read_telemetry_table(
-    path: Path, clock_offset_s: float, clip: Path | None, zone: tzinfo | None = None, order: str = "auto"
+    path: Path,
+    clock_offset_s: float,
+    clip: Path | None,
+    zone: tzinfo | None = None,
+    order: str = "auto",
+    rate_hz: float | None = None,
 ) -> Telemetry:
     """Read an own table, whose columns are all in SCHEMA, or that of another program; arguments as `read_telemetry`.
 
@@ -71,7 +77,7 @@ def read_telemetry_table(
     # A comma at the end of the lines, or the numbers of the rows that pandas writes.
     if {name for name in header if name not in ("", "Unnamed: 0")} <= set(SCHEMA.names):
         return _read_own(path, text, clock_offset_s)
-    return _Table(path, text).read(clock_offset_s, clip, zone, order)
+    return _Table(path, text).read(clock_offset_s, clip, zone, order, rate_hz)
 
 
 def _bare(title: str) -> str:
@@ -92,7 +98,8 @@ def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
     if len(pairs) > 1:
         raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind, leave the other out")
     # The camera's file may say the height.
-    wanted = pairs[0] if pairs else () if "above_sea_m" in text.header else ("altitude_m",)
+    has_height = any(name.startswith("above_") for name in text.header)
+    wanted = pairs[0] if pairs else () if has_height else ("altitude_m",)
     table = read_table(path, SCHEMA, ("time_s", *wanted), is_ragged=True, text=text)
     table.require_rows()
     time_s = table["time_s"]
@@ -186,7 +193,9 @@ class _Table:
             span = f"'{title}' is {finite.min():g} to {finite.max():g}, which may be radians: degrees are assumed"
             self.log.note(f"{span}; wanted a name with the unit, as gimbal_yaw_rad or latitude_rad")
 
-    def read(self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str) -> Telemetry:
+    def read(
+        self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str, rate_hz: float | None
+    ) -> Telemetry:
         """The record of the table."""
         log = self.log
         if not self.columns:
@@ -199,7 +208,10 @@ class _Table:
         if "time_s" in self.header and len(others := set(self.header) - set(SCHEMA.names)) < len(self.header) - 1:
             log.note(f"no own table has the columns {', '.join(sorted(others)[:_LISTED])}: read as another program's")
         values = self._quantities(order)
-        time_s, start_utc_s = self._times(values, zone) if "time" in self.columns else (self._frames(clip), math.nan)
+        if "time" in self.columns:
+            time_s, start_utc_s = self._times(values, zone)
+        else:
+            time_s, start_utc_s = self._frames(clip, rate_hz), math.nan
         where, is_known = np.array(self.lines, float), np.isfinite(time_s)
         if not is_known.all():
             (place, _), *_ = self.columns.get("time") or self.columns["frame"]
@@ -297,13 +309,16 @@ class _Table:
         self.used -= {place for place, _ in columns if self.header[place] not in titles}
         return time_s, start_utc_s
 
-    def _frames(self, clip: Path | None) -> np.ndarray:
+    def _frames(self, clip: Path | None, rate_hz: float | None) -> np.ndarray:
         """The same from the numbers of a clip's frames, which count from 0 or from 1."""
-        if clip is None:
-            raise InputError(f"telemetry {self.log.path} has frames and no times; give its clip, or a column time_s")
+        if clip is None and rate_hz is None:
+            raise InputError(
+                f"telemetry {self.log.path} has frames and no times; give its clip, --rate, or a column time_s"
+            )
         if (count := self.numbers("frame")) is None:
             return np.full(len(self.rows), np.nan)
-        return (count - min(float(count[np.isfinite(count)][0]), 1.0)) / open_source(clip).rate_hz
+        rate_hz = rate_hz or open_source(str(clip)).rate_hz
+        return (count - min(float(count[np.isfinite(count)][0]), 1.0)) / rate_hz
 
     def _note_film(self, time_s: np.ndarray) -> None:
         """Note when the camera begins to record."""

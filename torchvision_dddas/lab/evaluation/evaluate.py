@@ -43,20 +43,31 @@ def evaluate(
     MOTChallenge text), or folders of clips by name. Measures come in registry.GROUPS. Raises InputError where
     the two do not fit together.
     """
-    if interval < 1:
-        raise InputError(f"interval must be at least 1 frame, got {interval}")
     notes: list[str] = []
-    clips = {}
-    for name, (true_place, found_place) in _pairs(truth, result, notes).items():
-        clips[name] = score_clip(
-            load_truth(true_place, first_frame), load_result(found_place), notes, interval, ignoring
-        )
+    clips = score_files(truth, result, notes, first_frame, interval, ignoring)
     scored = {name: {"frames": clip.frames, **figures(clip.counts)} for name, clip in clips.items()}
     report = {"clips": scored, "notes": notes}
     if len(clips) > 1:
         report["pooled"] = figures(pooled([clip.counts for clip in clips.values()]))
         report["mean"] = mean(list(scored.values()))
     return report
+
+
+def score_files(
+    truth: Path,
+    result: Path,
+    notes: list[str],
+    first_frame: int | None = None,
+    interval: int = 1,
+    ignoring: Ignoring = "dropped",
+) -> "dict[str, ClipScore]":
+    """Score the clips of a result by name; the arguments are those of `evaluate`, which raises the same errors."""
+    if interval < 1:
+        raise InputError(f"interval must be at least 1 frame, got {interval}")
+    return {
+        name: score_clip(load_truth(true_place, first_frame), load_result(found_place), notes, interval, ignoring)
+        for name, (true_place, found_place) in _pairs(truth, result, notes).items()
+    }
 
 
 def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path, Path]]:
@@ -128,7 +139,13 @@ class Result:
 def load_result(place: Path) -> Result:
     """Read a result folder, or a file of MOTChallenge text. Raises InputError if it is none."""
     if place.is_file():
-        rows = read_rows(place, "result")
+        try:
+            rows = read_rows(place, "result")
+        except InputError as error:
+            if place.suffix.lower() not in (".csv", ".json", ".xml", ".parquet"):
+                raise
+            convert = f"dddas convert {place.name} {place.stem}.txt"
+            raise InputError(f"{error}. A result is MOTChallenge text: make it with {convert}") from None
         if not rows.named:
             return Result(place, 0, rows.table.boxes_by_frame(), False, "complete")
         check_identities(rows.table, rows.line, place)

@@ -10,6 +10,7 @@ from torchvision_dddas import geometry
 from torchvision_dddas.config import load_config
 from torchvision_dddas.control import Mission, StartedSource
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.geo import Zones
 from torchvision_dddas.io.output import NOTICED, RunRecord, clip_facts
 from torchvision_dddas.lab.evaluation.metrics.crowds import CrowdScore, CrowdScorer
 from torchvision_dddas.lab.simulation import (
@@ -20,8 +21,6 @@ from torchvision_dddas.lab.simulation import (
     scenario_settings,
 )
 from torchvision_dddas.pipeline import Pipeline, assemble_mission, map_site
-
-CONFIG = "patrol"  # the shipped configuration of a simulated run, unless another is given
 
 
 def run_scenario(
@@ -34,9 +33,11 @@ def run_scenario(
     backend: str = "auto",
     save: Sequence[str] = (),
     progress: Callable[[str, int | None], AbstractContextManager[Callable[[], None]]] | None = None,
+    zones: Zones | None = None,
 ) -> tuple[RunRecord, CrowdScore]:
     """Fly a scenario and write everything under a folder; returns the record of the run and its score.
 
+    zones: whose events are written too.
     overrides: of the settings; scene: of the scenario. progress: given a name and the number of frames, a context with
     a function that is called for each frame. Raises InputError for bad input.
     """
@@ -47,9 +48,9 @@ def run_scenario(
                 f"scenario {scenario} is located by nothing, so that nothing can be steered; add "
                 "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
             )
-        own = scenario_settings(chosen)
+        own = scenario_settings(chosen, config)
         own.setdefault("landmarks.common_sigma_m", chosen.gps.common_m)
-        settings = load_config(config or CONFIG, overrides, own)
+        settings = load_config(config, overrides, base=own)
         with name_scenario_in_errors(scenario):
             simulated = SimulatorSource(chosen, Path(scenario).stem)
         source: Any = StartedSource(simulated)
@@ -65,13 +66,16 @@ def run_scenario(
             "origin_deg": locator.site.origin_deg,
             "settings": mission.settings.model_dump(),
         }
-        record = output.begin(facts, simulated.rate_hz, simulated.size, map_site(locator, None))
+        record = output.begin(
+            facts, simulated.rate_hz, simulated.size, map_site(locator, None), zones.zones if zones else ()
+        )
         output.record_truth(partial(geometry.lonlat, origin_deg=simulated.origin_deg))
         scorer = CrowdScorer(partial(geometry.east_north, origin_deg=simulated.origin_deg))
         try:
             with (progress or _no_progress)(simulated.name, simulated.count) as tick:
                 done = 0
-                for result in Pipeline.from_assembly(ready)(source):
+                results = Pipeline.from_assembly(ready)(source)
+                for result in results if zones is None else zones.mark(results):
                     for truth in simulated.truths():
                         scorer.feed(truth)
                         output.add_truth(truth)
@@ -85,6 +89,7 @@ def run_scenario(
                     done = result.tracked.number
         finally:
             _log_notices(output, mission)
+            record.notes += zones.notes if zones else []
             record.problems += [str(problem) for problem in simulated.problems]
             for problem in simulated.problems:
                 output.story.event(problem.frame, str(problem), kind="problem")

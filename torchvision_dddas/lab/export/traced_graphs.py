@@ -16,7 +16,7 @@ from torchvision_dddas.chain import Window
 from torchvision_dddas.config import Settings
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.export.graph_files import Check, ExportedGraph, open_session, trace_graph
-from torchvision_dddas.nn import GRAPH_EFFORT, MotionSegmenter, PlaneHomography, Registration
+from torchvision_dddas.nn import GRAPH_EFFORT, FrameRegistration, MotionSegmenter, PlaneHomography
 
 
 class RawPlaneHomography(nn.Module):
@@ -53,11 +53,11 @@ class WarpDifference(nn.Module):
 
 
 class Step(nn.Module):
-    """`nn.Registration` without branches, and `WarpDifference`."""
+    """`nn.FrameRegistration` without branches, and `WarpDifference`."""
 
     def __init__(self, size: tuple[int, int], settings: Settings) -> None:
         super().__init__()
-        self.register = Registration(settings.registration, GRAPH_EFFORT)
+        self.register = FrameRegistration(settings.registration, effort=GRAPH_EFFORT)
         self.compare = WarpDifference(settings)
         cell = settings.registration.cell_side(*size)
         self.count = (size[0] // cell) * (size[1] // cell)
@@ -71,11 +71,13 @@ class Step(nn.Module):
         Where nothing agrees: the identity, with 0 inliers.
         """
         levels, pairs = reference[None, None].float(), len(neighbours)
-        points, valid = (found.expand(pairs, *found.shape[1:]) for found in self.register.keypoints(levels, False))
+        points, valid = (
+            found.expand(pairs, *found.shape[1:]) for found in self.register.keypoints(levels, halved=False)
+        )
         earlier = [level.expand(pairs, -1, -1, -1) for level in self.register.pyramid(levels)]
         later = self.register.pyramid(neighbours[:, None].float())
         drawn = samples.expand(pairs, -1, -1)
-        motion = self.register.match(points, valid, earlier, later, drawn, tolerance_px)
+        motion = self.register.match(points, valid, earlier, later, samples=drawn, ransac_px=tolerance_px)
         difference, mask = self.compare(reference, neighbours, motion.later_from_earlier, threshold)
         return motion.later_from_earlier, motion.inliers.sum(1), motion.tracked.sum(1), difference, mask
 

@@ -7,13 +7,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from torchvision_dddas.lab.simulation.aerial_ground import Terrain
+from torchvision_dddas.lab.simulation.aerial_ground import PixelPlaces, Terrain
+from torchvision_dddas.lab.simulation.aerial_looks import WARM_LEVELS, cool_ground, draw_own_shadow, draw_water
 from torchvision_dddas.lab.simulation.agents import Moment
 from torchvision_dddas.lab.simulation.body_shapes import Wardrobe, limb_capsules, vehicle_faces
 from torchvision_dddas.lab.simulation.cameras import LEAST_PX, Shutter, motion_blur, streak_kernel
 from torchvision_dddas.lab.simulation.ground_backdrop import HAZE
 from torchvision_dddas.lab.simulation.ground_objects import BITS
-from torchvision_dddas.lab.simulation.scenario import Scenario
+from torchvision_dddas.lab.simulation.scenario import CameraParameters, Scenario
 from torchvision_dddas.lab.simulation.sensors import Sensor
 from torchvision_dddas.lab.simulation.world import SHADE_BGR, World, equal_runs, shadow_above_ground
 from torchvision_dddas.types import Camera
@@ -46,7 +47,8 @@ class AerialCamera:
         self._world, self._exposure_s = world, parameters.exposure_s
         self._shutter = Shutter(self.camera, parameters.readout_s, parameters.vibration_px, scenario.seed)
         self._terrain = Terrain(world, self._shutter)
-        self._painter = _Painter(world, self._shutter, parameters.exposure_s, scenario.seed)
+        self._painter = _Painter(world, self._shutter, parameters, scenario.seed)
+        self._scenario = scenario
         self._sensor = Sensor(parameters, size, scenario.seed)
 
     def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -56,7 +58,7 @@ class AerialCamera:
         with ThreadPoolExecutor(1) as other:
             drawing = other.submit(self._painter.draw, moment)
             places = self._terrain.places(moment)
-            picture = self._terrain.picture(places)
+            picture = self._ground(places, moment)
             drawn = drawing.result()
         targets, bodies = self._painter.paint(moment, drawn, picture, places.rise_m)
         if places.haze is not None:
@@ -71,6 +73,19 @@ class AerialCamera:
             way = self._shutter.ways(moment, np.c_[place, self._world.up_m(place)], self._exposure_s)
             picture = motion_blur(picture, way.reshape(3, 3, 2).astype(np.float32))
         return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies
+
+    def _ground(self, places: PixelPlaces, moment: Moment) -> np.ndarray:
+        """(H, W, 3) uint8, the ground and what stands on it, without what moves there."""
+        picture, scenario = self._terrain.picture(places), self._scenario
+        if scenario.world.shore_m:
+            draw_water(picture, places, scenario.world.shore_m, moment.time_s)
+        if scenario.camera.thermal:
+            return cool_ground(picture)
+        if scenario.uav.size_m:
+            place = moment.pose.place_m
+            high = float(place[2] - self._world.up_m(place[None, :2])[0])
+            draw_own_shadow(picture, places, place, high, self._world.to_sun, scenario.uav.size_m)
+        return picture
 
 
 class _Outlines(NamedTuple):
@@ -106,8 +121,9 @@ _Drawn = tuple[list[_Sheet], list[_Sheet], dict[int, np.ndarray]]
 class _Painter:
     """Paints people and vehicles with their shadows into a picture, and labels their pixels."""
 
-    def __init__(self, world: World, shutter: Shutter, exposure_s: float, seed: int) -> None:
-        self._world, self._shutter, self._exposure_s = world, shutter, exposure_s
+    def __init__(self, world: World, shutter: Shutter, parameters: CameraParameters, seed: int) -> None:
+        self._world, self._shutter, self._exposure_s = world, shutter, parameters.exposure_s
+        self._is_thermal = parameters.thermal
         self._shapes = _Shapes(world, shutter, seed)
         step = max(-(-max(world.surface.shape) // _SHADE_CELLS), 1)
         cells = tuple(-(-n // step) for n in world.surface.shape[::-1])
@@ -132,11 +148,13 @@ class _Painter:
         solids, shade_body, shade_px = self._shapes.outlines(moment, rows, float(scale.max()), shaded)
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
-        kept = in_sun[shade_body]
+        kept = in_sun[shade_body] & (not self._is_thermal)
         # Each body has a canvas of its own, enlarged: the smaller the body the more so.
         low, high = _boxes(solids.body, solids.points_px, shape)
         steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
         code = np.clip(1 + solids.up_m * _CODES, 1, 255)
+        if self._is_thermal:
+            solids = solids._replace(colour=np.array([[WARM_LEVELS[str(bodies.kind[k])]] * 3 for k in solids.body]))
         colours = np.c_[np.clip(solids.colour, 0, 255), code].tolist()
         sheets = _fill(solids.body, solids.points_px, low, high, steps, colours)
         shades = _draw_shades(shade_body[kept], shade_px[kept], bodies.target, shape)

@@ -1,7 +1,7 @@
 """All that moves in a simulated world, step by step, and what the vehicles report of it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -123,6 +123,7 @@ class Agents:
         time, team = self.time_s, self._team
         faults = active_faults(self._scenario.fault, time)
         pose, velocity, turn = self._aircraft.pose()
+        pose = replace(pose, place_m=pose.place_m + np.array([faults.cut_m, 0.0, 0.0]))
         # The UAV's place is the last.
         places = np.concatenate([team.place, pose.place_m[None, :2]])
         errors = np.concatenate([self._gps.error_m + self._jumped(faults), self._telemetry_errors[None, 4:]])

@@ -12,6 +12,7 @@ _TINTS = {
     "building": np.array([[196, 200, 204], [92, 104, 150], [140, 150, 158], [124, 156, 184]], float),
 }
 _TRIES = 20
+_POLE_M = 0.25  # thickness of a pole
 
 
 @dataclass(frozen=True)
@@ -35,27 +36,29 @@ class StandingObjects:
 
 
 def scatter_objects(
-    counts: tuple[int, int, int],
+    counts: tuple[int, int, int, int],
     side_m: float,
     wished: np.ndarray,
     built: np.ndarray,
     clear: tuple[np.ndarray, float],
     rng: np.random.Generator,
 ) -> StandingObjects:
-    """So many bushes, trees and buildings on free places.
+    """So many bushes, trees, buildings and poles on free places; a pole is a thin, high building.
 
     wished, built: (h, w) pictures of the world, row 0 the north edge: how well plants and buildings stand there, from
     0 to 1. clear: places (N, 2) and how near to them nothing stands. Nothing overlaps a building. What finds no place
     is left out.
     """
-    kind = np.repeat(["building", "tree", "bush"], counts[::-1])
+    kind = np.repeat(["building", "building", "tree", "bush"], [counts[2], counts[3], counts[1], counts[0]])
     total, half = len(kind), np.zeros((len(kind), 2))
     is_building = kind == "building"
-    half[is_building] = rng.uniform((3.5, 2.5), (7.5, 4.5), (counts[2], 2))
+    half[: counts[2]] = rng.uniform((3.5, 2.5), (7.5, 4.5), (counts[2], 2))
+    half[counts[2] : counts[2] + counts[3]] = _POLE_M / 2
     half[kind == "tree"] = rng.uniform(1.6, 3.4, (counts[1], 1))
     half[kind == "bush"] = np.clip(rng.lognormal(-0.35, 0.4, (counts[0], 1)), 0.3, 1.8)
     radius = np.where(is_building, np.hypot(*half.T), half[:, 0])
     height = np.where(is_building, rng.uniform(2.8, 4.5, total), radius * rng.uniform(1.0, 1.5, total))
+    height[counts[2] : counts[2] + counts[3]] *= 1.8
     heading = rng.uniform(0, np.pi, total)
     tries = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (total, _TRIES, 3))
     places, good = side_m * tries[..., :2], np.empty((total, _TRIES), bool)
@@ -67,7 +70,7 @@ def scatter_objects(
     for place in clear[0]:
         good &= np.hypot(*(places - place).transpose(2, 0, 1)) >= clear[1] + radius[:, None]
     # Buildings come first, and whatever comes later keeps off them.
-    for k in range(counts[2]):
+    for k in range(counts[2] + counts[3]):
         if good[k].any():
             off = np.hypot(*(places - places[k, np.argmax(good[k])]).transpose(2, 0, 1))
             good[k + 1 :] &= off[k + 1 :] > radius[k] + radius[k + 1 :, None] + 0.5

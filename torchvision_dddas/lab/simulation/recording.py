@@ -15,6 +15,7 @@ import numpy as np
 from torchvision_dddas import geometry
 from torchvision_dddas.config import Settings, format_toml, with_parameters
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
+from torchvision_dddas.io.camera_files import DISTORTION
 from torchvision_dddas.io.colour_files import format_colours
 from torchvision_dddas.io.output import RUN_JSON, Part, PartOf, RunRecord, RunRecorder
 from torchvision_dddas.io.overlay_video import OverlayVideo
@@ -80,9 +81,7 @@ def record_scenario(
 
 def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Recorded]:
     """The frames of a run that nobody steers. has_ground: whether ground vehicles take pictures, all at once."""
-    scenario = simulator.scenario
-    apart_s = with_parameters(Settings(), scenario_settings(scenario)).steering.picture_s
-    apart = max(1, round(apart_s * scenario.clip.rate_hz))
+    apart = _pictures_apart(simulator.scenario)
     shown = np.zeros((*simulator.camera.size_px[::-1], 3), np.uint8)
     for k in range(count):
         begun = time.perf_counter()
@@ -97,6 +96,12 @@ def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Record
             seconds["ground"] = time.perf_counter() - begun
         shown = shown if shot.frame is None else shot.frame.image
         yield _Recorded(shot, shown, tuple(picture for picture in pictures if picture is not None), seconds)
+
+
+def _pictures_apart(scenario: Scenario) -> int:
+    """Frames from one picture of a ground vehicle to its next."""
+    apart_s = with_parameters(Settings(), scenario_settings(scenario)).steering.picture_s
+    return max(1, round(apart_s * scenario.clip.rate_hz))
 
 
 def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
@@ -140,7 +145,7 @@ class _RecordingOutput(RunRecorder[_Recorded]):
 
     files: ClassVar[tuple[str, ...]] = (
         *("clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif", "scenario.toml"),
-        *("ground/*/camera.toml", "ground/*/poses.csv", *TruthOutput.files, RUN_JSON),
+        *("ground/*/camera.toml", "ground/*/platform.toml", "ground/*/poses.csv", *TruthOutput.files, RUN_JSON),
     )
     numbered: ClassVar[tuple[str, ...]] = ("frames", "ground/*", "truth/masks")
     saved: ClassVar[tuple[str, ...]] = RECORDED
@@ -164,7 +169,7 @@ class _RecordingOutput(RunRecorder[_Recorded]):
             "truth": PartOf(truth, lambda item: item.shot.truth),
             "frames": _Frames(folder / "frames"),
             "video": OverlayVideo(folder, rate_hz, lambda item: item.shown, "clip.mp4"),
-            "ground": _Ground(folder / "ground", simulator.names),
+            "ground": _Ground(folder / "ground", simulator.names, rate_hz / _pictures_apart(scenario)),
         }
         record = self.start(facts, parts)
         record.counts = {"events": [], "dropped": 0}
@@ -226,9 +231,10 @@ class _Frames(Part[_Recorded]):
 
 
 class _Ground:
-    """ground/ugv1/000001.jpg and so on, poses.csv and camera.toml beside them."""
+    """ground/ugv1/000001.jpg and so on, poses.csv, camera.toml and platform.toml beside them."""
 
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
+    def __init__(self, folder: Path, names: Sequence[str], rate_hz: float) -> None:
+        self._rate_hz = rate_hz
         self._folder, self._count = folder, dict.fromkeys(names, 0)
         self._poses: dict[str, TextFiles] = {}
 
@@ -238,6 +244,8 @@ class _Ground:
             if name not in self._poses:
                 folder.mkdir(parents=True, exist_ok=True)
                 write_whole(folder / "camera.toml", _camera_toml(camera, is_standing=True).encode())
+                keys = {"name": name, "clip": ".", "camera": "camera.toml", "poses": "poses.csv"}
+                write_whole(folder / "platform.toml", format_toml(keys | {"rate_hz": self._rate_hz}).encode())
                 self._poses[name] = TextFiles({folder / "poses.csv": ",".join(_POSES) + "\n"})
             number = self._count[name] = self._count[name] + 1
             write_whole(folder / f"{number:06d}.jpg", _encode_jpeg(picture.image))
@@ -316,8 +324,7 @@ def _camera_toml(camera: Camera, is_standing: bool = False) -> str:
         "focal_px": float(camera.focal_px[0]),
         "focal_v_px": float(camera.focal_px[1]),
         "centre_px": [float(value) for value in camera.centre_px],
-        "k1": camera.k1,
-        "k2": camera.k2,
+        **dict(zip(DISTORTION, camera.distortion, strict=True)),
     }
     if is_standing:
         keys |= {

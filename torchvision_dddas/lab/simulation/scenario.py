@@ -54,6 +54,10 @@ class WorldParameters(Group):
     bushes_per_ha: float = parameter(40.0, "bushes on a hectare", "1/ha", 0, 2000)
     trees_per_ha: float = parameter(3.0, "trees on a hectare", "1/ha", 0, 500)
     buildings: int = parameter(2, "buildings in the world", "buildings", 0, 200)
+    poles: int = parameter(0, "lamp posts and other poles in the world", "poles", 0, 500)
+    shore_m: float = parameter(
+        0.0, "water, seen from the air: how far south of the middle its edge lies; 0: no water", "m", -2000, 2000
+    )
     sun_azimuth_deg: float = parameter(140.0, "direction of the sun, clockwise from north", "deg", 0, 360)
     sun_height_deg: float = parameter(50.0, "elevation of the sun", "deg", 5, 90)
 
@@ -135,6 +139,7 @@ class AircraftParameters(Group):
     heading_deg: float = parameter(0.0, "heading of the picture's upper edge at first", "deg", -360, 360)
     start_m: Place = parameter((0.0, 0.0), "ground that is in the middle of the picture at first", "m")
     way_m: tuple[Place, ...] = parameter((), "places that it looks at, one after the other, and back again", "m")
+    size_m: float = parameter(0.0, "size of the UAV, whose shadow falls on the ground; 0: no shadow", "m", 0, 20)
     speed_m_s: float = parameter(2.0, "speed along its way", "m/s", 0, 40)
     maximum_m_s: float = parameter(10.0, "fastest that it flies when it is steered", "m/s", 0.1, 60)
     wind_m_s: float = parameter(1.0, "standard deviation of the gusts that push it about", "m/s", 0, 30)
@@ -151,6 +156,7 @@ class CameraParameters(Group):
     width_px: int = parameter(640, "width of the picture", "px", 64, 3840)
     height_px: int = parameter(480, "height of the picture", "px", 64, 2160)
     hfov_deg: float = parameter(60.0, "width of the field of view", "deg", 5, 120)
+    thermal: bool = parameter(False, "a thermal camera: people bright, the ground and buildings dull, no shadows")
     exposure_s: float = parameter(0.002, "time of exposure: what moves is blurred along its way", "s", 0, 0.5)
     readout_s: float = parameter(0.015, "rolling shutter: how much later the last row is read", "s", 0, 0.5)
     vibration_px: float = parameter(
@@ -167,12 +173,12 @@ class Fault(Group):
     """Something that goes wrong for a while."""
 
     what: Literal[
-        "ugv_lost", "gps_dropout", "gps_jump", "frozen", "dropped", "gust", "landmark_hidden", "telemetry_silent"
+        "ugv_lost", "gps_dropout", "gps_jump", "frozen", "dropped", "gust", "cut", "landmark_hidden", "telemetry_silent"
     ] = parameter(
         "gps_dropout",
         "a vehicle stops and is silent; its receiver is silent; its places are off by `size` metres; the camera "
-        "repeats a picture; pictures are missing; the UAV is pushed with `size` m/s; a marker is covered; the "
-        "UAV says nothing of itself",
+        "repeats a picture; pictures are missing; the UAV is pushed with `size` m/s; the film goes on `size` metres "
+        "further east; a marker is covered; the UAV says nothing of itself",
     )
     time_s: float = parameter(10.0, "when it begins", "s", 0, 86400)
     seconds: float = parameter(5.0, "how long it lasts", "s", 0, 86400)
@@ -226,9 +232,24 @@ def scenario_parameters() -> list[Parameter]:
     return rows
 
 
-def scenario_settings(scenario: Scenario) -> dict[str, object]:
-    """The parameters of the system that a scenario sets: `{"group.parameter": value}`."""
-    return {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
+TEAM: dict[str, object] = {
+    "aerial.shadows": True,  # the simulator's sun is known
+    "landmarks.length_m": 2.5,
+    "people.scale_step": 1.1,  # as many people are found from the ground in half the time
+    "crowds.join_m": 3.0,
+    "steering.sampling": True,
+    "gates.tiny_px": 1000.0,  # a crowd is one target at any height
+}
+"""Parameters that belong to a simulated team which watches crowds."""
+
+
+def scenario_settings(scenario: Scenario, config: str | None = None) -> dict[str, object]:
+    """The parameters of the system that a scenario sets: `{"group.parameter": value}`.
+
+    config: the configuration that is chosen. TEAM holds for the default and for `patrol`, which add nothing to it.
+    """
+    own = {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
+    return TEAM | own if config in (None, "patrol") else own
 
 
 def scenario_toml(scenario: Scenario) -> str:
@@ -238,9 +259,10 @@ def scenario_toml(scenario: Scenario) -> str:
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """A shipped scenario by its name, or a TOML file; changed by `group.parameter=value`, `crowd.1.people=20`.
+    """Load a shipped scenario by its name, or a scenario from a TOML file.
 
-    seed: in place of its own. Files that it names are looked for beside it, then from where the program was started.
+    overrides: changes such as `uav.altitude_m=80` or `crowd.1.people=20`. seed: replaces the scenario's own seed. Files
+    that the scenario names are searched for in its folder first, then in the working directory.
     Raises InputError with one line: no such scenario (with those there are), no TOML, an unknown parameter (with the
     nearest), a value out of its range, and what `check_scenario` says.
     """

@@ -124,6 +124,7 @@ _EVENTS = {
     "frozen": ("the UAV's camera repeats a picture", "the UAV's camera sees again"),
     "dropped": ("pictures of the UAV are missing", "the UAV's pictures come again"),
     "gust": ("a gust pushes the UAV with {size:g} m/s", "the gust is over"),
+    "cut": ("the film goes on elsewhere", "the film goes back"),
     "landmark_hidden": ("the marker of {who} is covered", "the marker of {who} is seen again"),
     "telemetry_silent": ("the UAV says nothing of itself", "the UAV reports again"),
 }
@@ -134,7 +135,8 @@ _EARLY_S = 1e-9  # times of frames are rounded; a fault begins at the frame of i
 class ActiveFaults:
     """The faults at a moment; vehicles by their rows, from 0.
 
-    jumped: metres, by vehicle. gusts: (row of the fault, seconds since it began, size). picture: "", frozen or dropped.
+    jumped: metres, by vehicle. gusts: (row of the fault, seconds since it began, size). cut_m: how far
+    east the film is taken up. picture: "", frozen or dropped.
     """
 
     lost: frozenset[int]
@@ -142,6 +144,7 @@ class ActiveFaults:
     covered: frozenset[int]
     jumped: dict[int, float]
     gusts: tuple[tuple[int, float, float], ...]
+    cut_m: float
     picture: str
     is_mute: bool
 
@@ -164,6 +167,7 @@ def active_faults(faults: tuple[Fault, ...], time_s: float) -> ActiveFaults:
         frozenset(vehicles("landmark_hidden")),
         vehicles("gps_jump"),
         tuple((row, time_s - fault.time_s, fault.size) for row, fault in now if fault.what == "gust"),
+        sum(fault.size for _, fault in now if fault.what == "cut"),
         next((what for what in ("dropped", "frozen") if what in kinds), ""),
         "telemetry_silent" in kinds,
     )

@@ -71,7 +71,10 @@ class Simulator:
         check_scenario(scenario)
         self.scenario = scenario
         clear = _start_places_m(scenario), _CLEAR_M
-        self.world: World = build_world(scenario.world, scenario.seed, elevation, photo, clear)
+        # Heat has no shadows: light from straight above casts none.
+        light = {"sun_height_deg": 90.0} if scenario.camera.thermal else {}
+        ground = scenario.world.model_copy(update=light)
+        self.world: World = build_world(ground, scenario.seed, elevation, photo, clear)
         _check_flight(scenario.uav, self.world)
         self._aerial = AerialCamera(self.world, scenario)
         self._ground = GroundCamera(self.world, scenario)
@@ -317,8 +320,8 @@ def open_simulator(scenario: Scenario) -> Simulator:
     world = scenario.world
     ends = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]) * world.side_m / 2
     try:
-        elevation = read_elevation(world.elevation, ends, world.origin_deg, 10.0) if world.elevation else None
-        photo = read_ortho(world.photo, ends, world.origin_deg, 0.0) if world.photo else None
+        elevation = read_elevation(world.elevation, ends, world.origin_deg, margin_m=10.0) if world.elevation else None
+        photo = read_ortho(world.photo, ends, world.origin_deg, margin_m=0.0) if world.photo else None
     except InputError as error:
         # The reader knows of landmarks alone.
         raise InputError(str(error).replace("the landmarks lie", "the world lies")) from None

@@ -230,7 +230,7 @@ def _noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, widt
 
 
 def _noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
-    """Rows [first, last) of an endless picture that is 0 but for a share of its pixels, which are in (0.3, 1]."""
+    """Rows [first, last) of an endless picture. A share of its pixels lies in (0.3, 1], the others are 0."""
     first = rows[0] // _BLOCK
     drawn = np.zeros((((rows[1] - 1) // _BLOCK + 1 - first) * _BLOCK, columns), np.float32)
     for block in range(first, first + len(drawn) // _BLOCK):

@@ -21,6 +21,7 @@ _COARSEST_M = 2.0  # step of the grid of heights
 _MOST_STEPS = 1000  # along a side of it
 _HILLS_M = (60.0, 200.0)  # wavelengths of the synthetic relief
 _EMPTY_SHARE = 1e-3  # a white or black area of less of the photo, inside it, is a thing in it and no hole
+_DRY_M = 3.0  # from the water's edge to what stands
 _BETWEEN = 32  # shares in which two levels of a texture are mixed
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
@@ -85,7 +86,12 @@ def build_world(
     wished = (0.12 + 0.5 * ground["grass"] ** 2 + 0.8 * banks) * np.clip((road - 2.5) / 1.5, 0, 1) * (wash > 0.8 * half)
     built = np.clip((road - 9) / 2, 0, 1) * (wash > half + 8)
     hectares = (side_m / 100) ** 2
-    counts = round(parameters.bushes_per_ha * hectares), round(parameters.trees_per_ha * hectares), parameters.buildings
+    if parameters.shore_m:
+        north, east = (np.linspace(1, -1, n) * side_m / 2 for n in wished.shape)
+        dry = north[:, None] > shore_north_m(-east, parameters.shore_m) + _DRY_M
+        wished, built = wished * dry, built * dry
+    plants = round(parameters.bushes_per_ha * hectares), round(parameters.trees_per_ha * hectares)
+    counts = *plants, parameters.buildings, parameters.poles
     clear = (np.zeros((0, 2)), 0.0) if keep_clear is None else keep_clear
     things = scatter_objects(counts, side_m, np.clip(wished, 0, 1), built, clear, np.random.default_rng([seed, 20]))
     crowns = Crowns(things, side_m, seed)
@@ -112,6 +118,11 @@ def build_world(
             lit = image[k] * (1 - shade * np.clip(1 - SHADE_BGR[k] / slopes, 0, 1))
             albedo[rows[0] : rows[1], :, k] = np.clip(np.round(lit), 0, 255)
     return World(side_m, texel, albedo, surface, texel * factor, relief, things, to_sun)
+
+
+def shore_north_m(east_m: np.ndarray, shore_m: float) -> np.ndarray:
+    """How far north the water reaches at each place; shore_m: distance of its edge south of the middle, on average."""
+    return np.asarray(-shore_m + 3 * np.sin(east_m / 14) + 1.2 * np.sin(east_m / 4.3 + 1))
 
 
 def _on_texels(field: np.ndarray, cells: int) -> np.ndarray:

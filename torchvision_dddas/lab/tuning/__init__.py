@@ -1,6 +1,5 @@
 """Tuning of parameters by gradient: examples of what is true, losses on them, descent, and what it was worth."""
 
-from torchvision_dddas.lab.tuning.colours import fit_colours
 from torchvision_dddas.lab.tuning.descent import Plan, Step, descend
 from torchvision_dddas.lab.tuning.family import Family, prepare
 from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters
@@ -21,7 +20,6 @@ __all__ = [
     "Tuned",
     "Tuner",
     "descend",
-    "fit_colours",
     "judge",
     "prepare",
 ]

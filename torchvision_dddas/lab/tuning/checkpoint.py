@@ -1,4 +1,4 @@
-"""The state of a descent on disk, with what it depends on, so that only the same descent is resumed."""
+"""The state of a descent on disk, with the facts it depends on, so that only the same descent is resumed."""
 
 import io
 from collections.abc import Mapping
@@ -14,20 +14,20 @@ FORMAT = 4
 
 
 def write_checkpoint(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write a state. asked: what the descent depends on, by name. Raises InputError where the disk refuses."""
+    """Write a state. asked: facts that the descent depends on, by name. Raise InputError if the disk refuses."""
     content = io.BytesIO()
     torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
     save_file(place, content.getvalue())
 
 
 def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """The state. Raises InputError for a file that is no checkpoint, or that of a descent with other facts."""
+    """Read the state. Raise InputError for a file that is no checkpoint, or one of a descent with other facts."""
     try:
         found = _load(place)
         written, state, form = dict(found["asked"]), dict(found["state"]), found["format"]
     except OSError as error:
         raise InputError(f"{place} cannot be read: {error.strerror}") from None
-    except Exception:  # for bytes that are no checkpoint torch's reader raises nearly anything
+    except Exception:  # torch's reader may raise any error for bytes that are no checkpoint
         raise InputError(f"{place} is no checkpoint, or is damaged; begin again without --resume") from None
     if form != FORMAT:
         raise InputError(f"{place} is a checkpoint of another version; begin again without --resume")
@@ -37,7 +37,7 @@ def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
                 text if len(text) <= 80 else f"{text[:79]}…" for text in (str(written.get(name)), str(value))
             )
             raise InputError(
-                f"{place} is of a descent with other {name.replace('_', ' ')}, {held} and not {wanted}; ask for the "
+                f"{place} is of a descent with other {name.replace('_', ' ')}, {held} instead of {wanted}; give the "
                 "same, or begin again without --resume"
             )
     return state
@@ -46,7 +46,7 @@ def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
 def set_aside(place: Path, aside: Path) -> int:
     """Keep an unfinished checkpoint that a new descent would overwrite; return its steps, 0 if none was kept.
 
-    One of more steps that lies at `aside` already is left there. Raises InputError where the disk refuses.
+    A checkpoint with more steps that is already at `aside` stays there. Raise InputError if the disk refuses.
     """
     steps = _unfinished_steps(place)
     if steps == 0 or steps < _unfinished_steps(aside):
@@ -62,7 +62,7 @@ def _unfinished_steps(place: Path) -> int:
     try:
         state = _load(place)["state"]
         return 0 if state["ended"] or state["failed"] else int(state["history"][-1]["step"])
-    except Exception:  # what cannot be read cannot be resumed
+    except Exception:  # an unreadable file cannot be resumed
         return 0
 
 

@@ -19,13 +19,13 @@ from torchvision_dddas.lab.tuning.family import Example, Family
 from torchvision_dddas.lab.tuning.parameters import TUNABLE, Parameters
 
 FINAL_RATE = 0.1
-"""The rate at the last step, as a share of the first."""
+"""Learning rate at the last step, as a share of the first."""
 
 SIZES_FIXED = 0.5
-"""After this share of the steps sizes are whole numbers and only the other parameters move, if there are such."""
+"""After this share of the steps, sizes are fixed to whole numbers and only other parameters move, if there are any."""
 
 GAIN = 1e-5
-"""A loss that is less by no more than this is rounding, and no reason to move a parameter."""
+"""A smaller reduction of the loss is rounding, and does not justify a change of a parameter."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Plan:
     """How to descend. rate: of Adam, in units of which one is about a factor e of a parameter.
 
     look_every: steps between two measurements of the watched examples. patience: measurements without a gain that end
-    the descent. watched: share of each clip's examples, its last, that is held back for this. most_watched: of all
-    clips together. most_s: no step begins after this many seconds. pull: weight of half the squared distance from the
-    start in the loss, in the rate's units; it keeps parameters in place that few examples determine weakly.
-    Raises InputError for a value out of its range.
+    the descent. watched: share of each clip's examples, the last ones, that is held back for this. most_watched: limit
+    for all clips together. most_s: no step begins after this many seconds. pull: weight of half the squared distance
+    from the start in the loss, in the rate's units; it keeps parameters in place that the examples hardly determine.
+    Raise InputError for a value out of its range.
     """
 
     steps: int = 100
@@ -66,7 +66,7 @@ class Plan:
 class Step:
     """The parameters after a step, where step 0 is the start, and the losses.
 
-    loss: of the step's batch, NaN at step 0. watched: mean of the watched examples at the final softness; None where
+    loss: of the step's batch, NaN at step 0. watched: mean loss of the watched examples at the final softness; None if
     they were not measured.
     """
 
@@ -79,10 +79,10 @@ class Step:
 
 @dataclass
 class Descended:
-    """The result of a descent. parameters: in their best state, which is that after step `best`. ended: why.
+    """The result of a descent. parameters: in their best state, after step `best`. ended: reason for the end.
 
     failed: in one line, which clip, frame and parameter gave a value that is not finite; empty otherwise. idle:
-    parameters without any effect on the loss. taken: steps in `seconds`, without those of a resumed checkpoint.
+    parameters without any effect on the loss. taken: number of steps in `seconds`, without those of a checkpoint.
     """
 
     parameters: Parameters
@@ -109,11 +109,11 @@ def descend(
     place: Path | None = None,
     resume: bool = False,
 ) -> Descended:
-    """Move parameters to where the family's loss is least. They are changed in place and end in their best state.
+    """Minimize the family's loss. The parameters are changed in place and end in their best state.
 
-    tell: called with each step, those of a resumed checkpoint included. place: file of a checkpoint, written at every
-    measurement. resume: go on from it if it exists. Raises InputError where there are no examples, where no parameter
-    has an effect on the loss, where the loss is not finite at the start, and for a checkpoint of another descent.
+    tell: called with each step, including those of a resumed checkpoint. place: file of a checkpoint, written at every
+    measurement. resume: continue from it if it exists. Raise InputError if there are no examples, if no parameter has
+    an effect on the loss, if the loss is not finite at the start, and for a checkpoint of another descent.
     """
     plan = plan or Plan()
     if not examples:
@@ -151,7 +151,7 @@ def descend(
 
 
 class _Run:
-    """A descent under way.
+    """A descent in progress.
 
     moved: parameters that had a gradient. best, least, best_step: the best state, its watched loss and its step. since:
     measurements without a gain.
@@ -169,7 +169,7 @@ class _Run:
         self.least, self.best_step, self.since = math.inf, 0, 0
         self.history: list[Step] = []
         self.ended = self.failed = ""
-        # What the descent depends on, which a checkpoint must agree with.
+        # Facts that determine the descent, which a checkpoint must match.
         used = "\n".join(f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched))
         self._facts = {
             "family": family.name,
@@ -190,7 +190,7 @@ class _Run:
         return self._record(0, self._softness(1), math.nan, measure=True)
 
     def step(self) -> Step | None:
-        """One step; None where it failed."""
+        """Take one step; return None if it failed."""
         plan, number = self._plan, self.history[-1].step + 1
         softness = self._softness(number)
         clips = [example.clip for example in self._learned]
@@ -206,7 +206,7 @@ class _Run:
         if not bool(torch.isfinite(loss)):
             self._fail(number, batch, values, softness)
             return None
-        # The examples of one batch may depend on no parameter; all together must.
+        # The loss of one batch may depend on no parameter, but that of all examples must.
         if not wrong.requires_grad and not self.moved:
             parts = self._parts(self._learned)
             if not any(self._family.loss(values, part, softness).requires_grad for part in parts):
@@ -229,7 +229,7 @@ class _Run:
         return None if self.failed else step
 
     def stop(self, reason: str) -> None:
-        """End here, with a measurement of the last state."""
+        """End the descent, with a measurement of the last state."""
         last = self.history[-1]
         if last.watched is None:
             self.history.pop()
@@ -237,7 +237,7 @@ class _Run:
         self.ended = self.ended or reason
 
     def load(self, place: Path) -> None:
-        """Take up a checkpoint. Raises InputError for one of another descent."""
+        """Continue from a checkpoint. Raise InputError for one of another descent."""
         state = read_checkpoint(place, self._facts)
         self._parameters.load_state_dict(state["knobs"])
         self._adam.load_state_dict(state["adam"])
@@ -246,7 +246,7 @@ class _Run:
             setattr(self, name, state[name])
 
     def save(self, place: Path | None) -> None:
-        """Write a checkpoint. Raises InputError where the disk refuses."""
+        """Write a checkpoint. Raise InputError if the disk refuses."""
         if place is not None:
             state = {
                 "knobs": self._parameters.state_dict(),
@@ -257,12 +257,12 @@ class _Run:
             write_checkpoint(place, self._facts, state | {name: getattr(self, name) for name in self._SAVED})
 
     def _record(self, number: int, softness: float, loss: float, measure: bool) -> Step:
-        """Note the parameters as they are now; measure: and the loss of the watched examples."""
+        """Record the current parameters, and if `measure` is set the loss of the watched examples."""
         watched = None
         with torch.no_grad():
             values = {name: float(value) for name, value in self._parameters.values().items()}
             if measure:
-                # Rounded as the settings are: a blend of two sizes may do well where either alone does badly.
+                # Round as the settings do: a blend of two sizes may be good although each of them is bad.
                 settled = self._parameters.settled()
                 watched = self._watched_mean(settled)
         if watched is not None and not math.isfinite(watched):
@@ -280,7 +280,7 @@ class _Run:
         return step
 
     def _watched_mean(self, values: Mapping[str, Tensor]) -> float:
-        """The pull, and the mean loss of the watched examples at the final softness, each clip with the same weight."""
+        """Return the pull plus the mean loss of the watched examples at the final softness, clips equally weighted."""
         shares = iter(clip_shares([example.clip for example in self._watched]))
         losses = (self._family.loss(values, part, self._hardest).tolist() for part in self._parts(self._watched))
         # Each part is summed exactly, so that the result does not depend on the order within it.
@@ -303,7 +303,7 @@ class _Run:
         self.failed = f"{self._explain(batch, values, softness) or 'the pull is not finite'}, at step {number}"
 
     def _explain(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
-        """Name the first example whose loss or gradient is not finite, and the parameter; empty where all are finite.
+        """Return the first example with a loss or gradient that is not finite, and the parameter; empty if none is.
 
         A parameter is named if its earlier value alone makes the loss finite, or if its gradient is not finite.
         """
@@ -343,11 +343,11 @@ class _Run:
 
 
 def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
-    """The examples to learn from, and those to watch: the last ones of each clip.
+    """Return the examples to learn from, and those to watch: the last ones of each clip.
 
-    Of a clip of three or more at least one is learned from and one watched. most: to watch; of more, some evenly among
-    them. Neighbouring frames are alike, so that one piece in time says more than single frames. Where no clip has
-    three, or watched is 0, all are learned from and watched.
+    A clip with three or more examples has at least one of each kind. most: largest number to watch, chosen evenly.
+    Neighbouring frames are similar, so a contiguous part is a better test than single frames. If no clip has three
+    examples, or watched is 0, all examples are learned from and watched.
     """
     clips: dict[str, list[Example]] = {}
     for example in examples:
@@ -364,10 +364,10 @@ def split_examples(examples: Sequence[Example], watched: float, most: int) -> tu
 
 
 def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
-    """The places of the examples that a step takes, from step 0; clips: the clip of each example.
+    """Return the indices of the examples of a step, counted from 0. clips: the clip of each example.
 
-    All examples come in a random order, those of clips with fewer several times, so that every clip has the same
-    weight; then all in another order. The result depends on the arguments alone, so that a descent can be resumed.
+    All examples come in a random order, those of clips with fewer examples several times, so that every clip has the
+    same weight; then all in a new order. The result depends only on the arguments, so that a descent can be resumed.
     """
     batch = min(batch, len(clips))
     of_clip: dict[str, list[int]] = {}
@@ -376,7 +376,7 @@ def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[i
     most = max(len(places) for places in of_clip.values())
 
     def draw_order(turn: int) -> list[int]:
-        """One turn: as many examples of each clip as the largest has."""
+        """Return one round: as many examples of each clip as the largest clip has."""
         generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
         drawn: list[int] = []
         for places in of_clip.values():
@@ -391,6 +391,6 @@ def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[i
 
 
 def clip_shares(clips: Sequence[str]) -> list[float]:
-    """The weight of each example in a mean in which every clip has the same weight; clips: the clip of each."""
+    """Return the weight of each example in a mean with equal weights for all clips. clips: the clip of each example."""
     count = Counter(clips)
     return [1 / (len(count) * count[clip]) for clip in clips]

@@ -1,4 +1,4 @@
-"""What can be tuned: the base class of all families of parameters, and the preparation of a study for one of them."""
+"""Families of tunable parameters: their base class, and the preparation of a study for one of them."""
 
 import glob
 from abc import ABC, abstractmethod
@@ -24,16 +24,15 @@ Tick = Callable[[], object]
 FAMILIES = {
     "motion": "motion.MotionFamily",
     "tracking": "tracking.TrackingFamily",
-    "location": "location.LocationFamily",
 }
 """Family -> its module and class in this package; a module is loaded when its family is used."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled piece of a clip. clip, frame: named in messages. content: what the loss takes, on the CPU.
+    """One labelled piece of a clip. clip, frame: named in messages. content: the input of the loss, on the CPU.
 
-    settings: those it was prepared with, for what is not tuned; the same for all examples of a descent.
+    settings: those of its preparation, for parameters that are not tuned; the same for all examples of a descent.
     """
 
     clip: str
@@ -43,11 +42,11 @@ class Example:
 
 
 class Family(ABC):
-    """A stage of the pipeline whose parameters can be tuned: examples of what is true, and a loss on them.
+    """A stage of the pipeline whose parameters can be tuned: labelled examples, and a loss on them.
 
-    name: a key of FAMILIES. task: of a study, whose clips are used. measure: judged before and after, such as
+    name: a key of FAMILIES. task: of a study, whose clips are used. measure: compared before and after, such as
     motion.pixels.f. softness: of the loss at the first and at the last step. interval: frames between examples. empty:
-    why a clip may give no example; a clip without any is an error where this is set.
+    why a clip may give no example; if it is set, a clip without any is an error.
     """
 
     name: str
@@ -59,23 +58,23 @@ class Family(ABC):
 
     @abstractmethod
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterable[tuple[int, Any]]:
-        """Frame number and content of each example of a clip, in the order of its frames.
+        """Yield frame number and content of each example of a clip, in the order of its frames.
 
-        Raises InputError where the clip lacks the truth that the loss needs.
+        Raise InputError if the clip lacks the truth that the loss needs.
         """
 
     def check(self, names: Sequence[str], settings: Settings) -> None:  # noqa: B027
-        """Raises InputError, with what to set, where a parameter has no effect under these settings."""
+        """Raise InputError, with what to set, if a parameter has no effect under these settings."""
 
     def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:  # noqa: B027
-        """Raises InputError, before anything is computed, for clips that cannot be used."""
+        """Raise InputError, before anything is computed, for clips that cannot be used."""
 
     def at(self, interval_frames: int, task: Task) -> Self:
-        """The family for a study's interval and for the task of the measure."""
+        """Return the family for a study's interval and for the task of the measure."""
         return self
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """The examples of all clips. tick is called once an example. Raises InputError for a clip without any."""
+        """Return the examples of all clips. tick: called once an example. Raise InputError for a clip without any."""
         self.check_clips(clips, settings)
         found: list[Example] = []
         for clip in clips:
@@ -89,17 +88,17 @@ class Family(ABC):
 
     @abstractmethod
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """(B,) how wrong each example is, with a gradient in the parameters, on their device.
+        """Return (B,) the loss of each example, with a gradient in the parameters, on their device.
 
-        parameters: the tuned values by name, in the units of the settings; all others are as the examples were prepared
-        with. The result depends on nothing else.
+        parameters: the tuned values by name, in the units of the settings; all others are as in the preparation of the
+        examples. The result depends on nothing else.
         """
 
 
 def load_family(name: str) -> Family:
-    """The family of a name. Raises InputError where there is none."""
+    """Return the family of a name. Raise InputError for an unknown name."""
     if name not in FAMILIES:
-        raise InputError(f"'{name}' is no family of parameters that can be tuned; wanted one of {', '.join(FAMILIES)}")
+        raise InputError(f"'{name}' is no family of parameters that can be tuned; give one of {', '.join(FAMILIES)}")
     module, kind = FAMILIES[name].split(".")
     found: Family = getattr(import_module(f"{__package__}.{module}"), kind)()
     return found
@@ -107,9 +106,9 @@ def load_family(name: str) -> Family:
 
 @dataclass
 class Prepared:
-    """A study that is ready for tuning. spec: the study with the family's task alone. tuned, held: names of clips.
+    """A study that is ready for tuning. spec: the study with only the family's task. tuned, held: names of clips.
 
-    clips: those tuned on. goal: the measure that is judged before and after.
+    clips: those used for tuning. goal: the measure that is compared before and after.
     """
 
     spec: Spec
@@ -134,10 +133,10 @@ def prepare(
 ) -> Prepared:
     """Read a study's clips and prepare the examples of those that are not held out.
 
-    names: of parameters, as `expand_names` takes them. holdout, clips: patterns of clips' names. measure: in place of
-    the family's. tick: called once an example. Raises InputError for a parameter that cannot be tuned or has
-    no effect under the settings, parameters of several families, clips without the needed truth, and
-    as `plan_study` does.
+    names: of parameters, as for `expand_names`. holdout, clips: patterns of clips' names. measure: overrides the
+    family's. tick: called once an example. Raise InputError for a parameter that cannot be tuned or has no effect
+    under the settings, parameters of several families, clips without the needed truth, and as `plan_study`
+    does.
     """
     settings = load_config(spec.config, spec.overrides)
     by_family: dict[str, list[str]] = {}

@@ -56,7 +56,7 @@ def overlap_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"
 class LabelledFrames:
     """A batch of labelled frames of one size. truth: where something moves. known: where the truth is known.
 
-    removed, added: what the hard steps after the hulls (persistence, outlines, shadows, small and weak targets) took
+    removed, added: what the hard steps after the hulls (tracklets, outlines, shadows, small targets) took
     from the mask and added to it, at the settings that the frames were prepared with. removed also holds what they take
     from a mask with a lower threshold.
     """
@@ -137,9 +137,9 @@ class MotionFamily(Family):
 def soft_masks(frames: LabelledFrames, settings: Settings, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
     """The masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
     motion = MotionSegmenter(settings, tuned=())
-    core = motion.segment(frames.differences, values, softness)
+    core = motion.segment(frames.differences, values=values, softness=softness)
     reach = _REACH * softness * settings.difference.threshold
-    mask = motion.outlined(core, label_regions(core, settings.morphology.hull, reach), values, softness)
+    mask = motion.outlined(core, label_regions(core, settings.morphology.hull, reach), values=values, softness=softness)
     return torch.where(frames.added, 1.0, torch.where(frames.removed, 0.0, mask))
 
 
@@ -225,7 +225,7 @@ def record_frames(
     Raises InputError as `dddas detect` does.
     """
     source, engine = open_clip(clip), _RecordingEngine(settings, wanted)
-    loop = MotionDetector(settings, engine, source.rate_hz)
+    loop = MotionDetector(settings, backend=engine, rate_hz=source.rate_hz)
 
     def scenes() -> Iterator[Scene]:
         for frame in source:

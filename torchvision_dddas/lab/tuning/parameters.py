@@ -1,4 +1,4 @@
-"""Which parameters gradients can move, and the transforms that keep them in their ranges."""
+"""Parameters that gradients can move, and the transforms that keep them in their ranges."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 
-# A value at the end of its range has no gradient; it starts this share of the range away from it.
+# A value at the end of its range has no gradient, so it starts at this share of the range from the end.
 _EDGE = 1e-3
 
 
@@ -21,8 +21,8 @@ _EDGE = 1e-3
 class Tunable:
     """One parameter that gradients can move between the limits of its field in `Settings`.
 
-    log: steps are factors, not amounts, of the value plus offset, so that 0 can be reached. rounding: of the final
-    value; during descent the parameter is continuous.
+    log: steps are factors of the value plus offset, instead of amounts; the offset makes 0 reachable. rounding: of the
+    final value; during descent the parameter is continuous.
     """
 
     name: str
@@ -35,19 +35,19 @@ class Tunable:
     rounding: Literal["none", "whole", "odd"] = "none"
 
     def value(self, free: Tensor) -> Tensor:
-        """The value for an unconstrained number; mid-range, one free unit is about a factor e (or an amount of 1)."""
+        """Return the value for an unconstrained number; mid-range, one unit is about a factor e, or an amount of 1."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         scaled = low + (high - low) * torch.sigmoid(free * (4.0 / (high - low)))
         return scaled.exp() - self.offset if self.log else scaled
 
     def free(self, value: float) -> float:
-        """The unconstrained number for a value; a value at the end of the range is moved in by a thousandth of it."""
+        """Return the unconstrained number for a value; a value at an end of the range is moved in by a thousandth."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         share = min(max((self._scaled(value) - low) / (high - low), _EDGE), 1.0 - _EDGE)
         return math.log(share / (1.0 - share)) * (high - low) / 4.0
 
     def rounded(self, value: float) -> float | int:
-        """The value as the settings take it: whole, odd, or with four digits, within the range."""
+        """Return the value in the form of the settings: whole, odd, or with four digits, within the range."""
         value = min(max(value, self.low), self.high)
         if self.rounding == "none":
             return min(max(float(f"{value:.4g}"), self.low), self.high)
@@ -57,7 +57,7 @@ class Tunable:
 
     @property
     def range(self) -> str:
-        """Such as `0.1 to 255` or `1 to 31, odd`."""
+        """The range, such as `0.1 to 255` or `1 to 31, odd`."""
         return f"{self.low:g} to {self.high:g}" + (", odd" if self.rounding == "odd" else "")
 
     def _scaled(self, value: float) -> float:
@@ -77,8 +77,8 @@ def _from_settings(family: str, group: str, names: str, **options: object) -> di
     return found
 
 
-# Not tunable: switches and choices; scores that decide which detections there are; numbers of points, levels or frames,
-# which change the graph; and what counts single blobs (persistence), as a mask's pixels give no gradient for it.
+# Not tunable: switches and choices; scores that select the detections; numbers of points, levels or frames, which
+# change the graph; and parameters that count single blobs (tracklets), because a mask's pixels give them no gradient.
 TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "noise_levels threshold"),
     **_from_settings("motion", "difference", "gradient_share", offset=0.02),
@@ -90,27 +90,20 @@ TUNABLE: dict[str, Tunable] = {
     **_from_settings("tracking", "track", "crossing", offset=0.01),
     **_from_settings("tracking", "track", "rest_price appearance_weight", offset=0.1),
     **_from_settings("tracking", "track", "hiding appearance_offset", log=False),
-    **_from_settings("location", "ground", "body_height_sigma_m height_sigma feet_sigma", offset=1e-3),
-    **_from_settings("location", "landmarks", "pixel_sigma"),
-    **_from_settings("location", "landmarks", "sigma_m common_sigma_m", offset=0.01),
-    **_from_settings("location", "aerial", "focal_sigma focal_guess_sigma altitude_sigma", offset=1e-3),
-    **_from_settings("location", "aerial", "tilt_sigma_deg tilt_guess_sigma_deg heading_sigma_deg", offset=0.01),
-    **_from_settings("location", "aerial", "altitude_sigma_m position_sigma_m target_sigma_px", offset=0.01),
-    **_from_settings("location", "aerial", "own_sigma", offset=1e-3),
 }
 
 
 def expand_names(names: Iterable[str]) -> list[str]:
-    """The names of tunable parameters, each once, in the order given; `difference.*` stands for all of a group.
+    """Return the names of tunable parameters, each once, in the order given; `difference.*` means all of a group.
 
-    Raises InputError, with all tunable parameters and their ranges, for an unknown name.
+    Raise InputError, with all tunable parameters and their ranges, for an unknown name.
     """
     found: dict[str, None] = {}
     for name in names:
         fitting = [known for known in TUNABLE if fnmatchcase(known, name)]
         if not fitting:
             known = ", ".join(f"{tunable.name} ({tunable.range})" for tunable in TUNABLE.values())
-            raise InputError(f"'{name}' is no parameter that can be tuned by gradient; wanted of: {known}")
+            raise InputError(f"'{name}' is no parameter that can be tuned by gradient; give some of: {known}")
         found |= dict.fromkeys(fitting)
     if not found:
         raise InputError("no parameter to tune; name some, such as difference.threshold")
@@ -121,19 +114,19 @@ class Parameters(nn.Module):
     """The tuned parameters as torch parameters without bounds; all others stay as the settings have them."""
 
     def __init__(self, settings: Settings, names: Iterable[str]) -> None:
-        """names: as `expand_names` takes them. Raises InputError for one that cannot be tuned."""
+        """names: as for `expand_names`. Raise InputError for a parameter that cannot be tuned."""
         super().__init__()
         self.base, self.names = settings, expand_names(names)
         self._starts = [TUNABLE[name].free(value_of(settings, name)) for name in self.names]
-        # In double precision, for geometry; a number without axes leaves a picture's own precision alone.
+        # Use double precision: a tensor without axes does not change a picture's own precision.
         self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in self._starts])
         sizes = {name for name in self.names if TUNABLE[name].rounding != "none"}
         self._sizes = sizes if len(sizes) < len(self.names) else set()
 
     def values(self, whole: bool = False) -> dict[str, Tensor]:
-        """Each parameter's value: a float64 tensor without axes, with its gradient.
+        """Return each parameter's value: a float64 tensor without axes, with its gradient.
 
-        whole: sizes are rounded and without a gradient, unless all parameters are sizes.
+        whole: sizes are rounded and have no gradient, unless all parameters are sizes.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
         if whole and self._sizes:
@@ -141,20 +134,20 @@ class Parameters(nn.Module):
         return found
 
     def moved(self, whole: bool = False) -> Tensor:
-        """The sum of squares of the unconstrained steps from the start, with its gradient. whole: as in `values`."""
+        """Return the sum of squares of the unconstrained steps from the start, with gradient. whole: as in `values`."""
         held = self._sizes if whole else set()
         ends = [free.detach() if name in held else free for name, free in zip(self.names, self.free, strict=True)]
         return torch.stack([(end - start) ** 2 for end, start in zip(ends, self._starts, strict=True)]).sum()
 
     def settled(self) -> dict[str, Tensor]:
-        """The values as the settings round them, without a gradient; otherwise as `values`."""
+        """Return the values rounded as in the settings, without a gradient; otherwise as `values`."""
         settings = self.settings()
         return {
             name: free.new_tensor(value_of(settings, name)) for name, free in zip(self.names, self.free, strict=True)
         }
 
     def settings(self) -> Settings:
-        """The settings with these values rounded; parameters that have not moved keep their exact values."""
+        """Return the settings with these values rounded; parameters that have not moved keep their exact values."""
         moved = {
             name: TUNABLE[name].rounded(float(value.detach()))
             for (name, value), free, start in zip(self.values().items(), self.free, self._starts, strict=True)
@@ -164,7 +157,7 @@ class Parameters(nn.Module):
 
 
 def value_of(settings: Settings, name: str) -> float:
-    """The value of a parameter as a float; name: group.parameter."""
+    """Return the value of a parameter as a float; name: group.parameter."""
     group, key = name.split(".")
     return float(getattr(getattr(settings, group), key))
 
@@ -173,6 +166,6 @@ _Group = TypeVar("_Group", bound=BaseModel)
 
 
 def with_tensors(group: _Group, prefix: str, values: Mapping[str, Tensor]) -> _Group:
-    """A group of parameters in which those named `prefix.key` are tensors; nothing is checked."""
+    """Return a group in which the parameters named `prefix.key` are tensors; nothing is checked."""
     mine = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{prefix}.")}
     return type(group).model_construct(**{**dict(group), **mine})

@@ -16,7 +16,7 @@ SIDES = {"tuned": "Clips tuned on", "held_out": "Clips held out"}
 
 
 def tuning_report(run: Mapping[str, Any]) -> str:
-    """The HTML. run: the content of run.json of `dddas tune`, NaN as None."""
+    """Return the HTML. run: the content of run.json of `dddas tune`, NaN as None."""
     parameters, verdict = run["knobs"], run.get("verdict")
     _, group, name = verdict["measure"].split(".", 2) if verdict else ("", "", "f")
     return render_page(
@@ -33,7 +33,7 @@ def tuning_report(run: Mapping[str, Any]) -> str:
 
 
 def _side(anchor: str, heading: str, side: Mapping[str, Any] | None, group: str, name: str) -> dict[str, Any]:
-    """The card and the section of one set of clips."""
+    """Return the card and the section of one set of clips."""
     if side is None:
         return {"anchor": anchor, "heading": heading, "gain": None}
     clips, changes = side["clips"], side["changes"] or {}
@@ -52,7 +52,7 @@ def _side(anchor: str, heading: str, side: Mapping[str, Any] | None, group: str,
 
 
 def _gain(side: Mapping[str, Any], entry: Mapping[str, Any] | None, digits: int) -> dict[str, Any]:
-    """The texts of a card. entry: the goal in the comparison."""
+    """Return the texts of a card. entry: the goal in the comparison."""
 
     def signed(value: float) -> str:
         text = format_number(value, digits)
@@ -88,7 +88,7 @@ def _charts(run: Mapping[str, Any]) -> list[Markup]:
         Line("batch", steps, _column(history, "loss"), 6, faint=True),
         Line("watched", _column(watched, "step"), _column(watched, "watched"), 1),
     ]
-    ring = Dots("kept", _column(kept, "step"), _column(kept, "watched"), 2, sign="ring")
+    ring = Dots("kept", _column(kept, "step"), _column(kept, "watched"), 2, is_ring=True)
     charts = [chart("Loss", across, Axis("loss"), losses, [ring])]
     for name, parameter in run["knobs"].items() if history else ():
         values, mark = np.array([step["knobs"][name] for step in history], float), steps == run["best"]
@@ -97,10 +97,10 @@ def _charts(run: Mapping[str, Any]) -> list[Markup]:
             Line("value", steps, values, 1),
         ]
         axis, middle, spread = Axis(parameter["unit"].strip("-") or "value"), float(values.mean()), np.ptp(values)
-        if spread < 0.04 * abs(middle):  # a parameter that hardly moves must not look as if it did
+        if spread < 0.04 * abs(middle):  # avoid exaggerating the movement of a nearly constant parameter
             reach = max(0.55 * float(spread), 0.02 * abs(middle), 1e-6)
             axis = Axis(axis.name, middle - reach, middle + reach)
-        charts.append(chart(name, across, axis, lines, [Dots("kept", steps[mark], values[mark], 2, sign="ring")]))
+        charts.append(chart(name, across, axis, lines, [Dots("kept", steps[mark], values[mark], 2, is_ring=True)]))
     if len({step["softness"] for step in history}) > 1:
         charts.append(chart("Softness", across, Axis("softness"), [Line("", steps, _column(history, "softness"), 3)]))
     return [Markup(svg) for svg in charts]

@@ -29,9 +29,9 @@ from torchvision_dddas.tracking.appearance import (
     visible_shares,
 )
 from torchvision_dddas.tracking.kalman import transform_boxes
-from torchvision_dddas.tracking.scene import Scene, SceneState
+from torchvision_dddas.tracking.scene import SceneState, SceneStatistics
 from torchvision_dddas.tracking.score_tracker import is_remembered
-from torchvision_dddas.tracking.scores import Look, association_scores, is_near_border, newborn_scores
+from torchvision_dddas.tracking.scores import BoxLook, association_scores, is_near_border, newborn_scores
 from torchvision_dddas.tracking.smoother import FILLED
 from torchvision_dddas.types import DetectionTable
 
@@ -60,7 +60,7 @@ class TrackingFamily(Family):
     missed: float = 0.0
 
     def at(self, interval_frames: int, task: Task) -> "TrackingFamily":
-        """With the boxes that the task tracks: true ones for association, detections for tracking."""
+        """Return this family for a task. Association tracks the true boxes, tracking tracks detections."""
         if task != "tracking":
             return replace(self, interval=interval_frames)
         measure = self.measure.replace("association", task)
@@ -144,7 +144,7 @@ _LEARNED = ("time", "step", "density", "missing", "turnover")
 def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval: int) -> Iterator[dict[str, Any]]:
     """The boxes of each frame, and what the tracker knows of the scene by then if it has followed all targets."""
     size = open_clip(clip).size if clip.pictures else boxes.size
-    scene, camera = Scene(size), CameraMotion(load_engine("onboard", settings))
+    scene, camera = SceneStatistics(size), CameraMotion(load_engine("onboard", settings))
     before: tuple[float, np.ndarray] | None = None
     seen: dict[int, float] = {}  # when each target that has a track was last seen
     for number, identity, box_px, image in boxed_frames(clip, boxes.table, interval):
@@ -254,12 +254,12 @@ def link_nll(
     if not scores:
         return true_sum
     possible = _drop_empty_rows(_drop_empty_rows(torch.stack(scores, 1)).transpose(-1, -2))
-    return (log_partition(possible, softness, _ROUNDS).sum(1) - true_sum) / boxes.clamp(min=1)
+    return (log_partition(possible, softness, rounds=_ROUNDS).sum(1) - true_sum) / boxes.clamp(min=1)
 
 
 def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: TrackParameters) -> Any:
     """(B, N, N) scores of tracks and boxes, without appearance."""
-    look = Look.of(tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters)
+    look = BoxLook.of(tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters)
     at_rest: Any = torch.zeros_like(tracks.state[None, ..., :2])
     scores: Any = newborn_scores(look, parameters, at_rest), association_scores(look, parameters)
     return torch.where((tracks.hits == 1)[..., None], *scores)

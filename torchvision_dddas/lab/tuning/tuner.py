@@ -1,4 +1,4 @@
-"""A whole tuning run on a study: examples, descent, figures before and after, and the files that record it."""
+"""A whole tuning run on a study: examples, descent, measures before and after, and the files that record them."""
 
 import json
 import time
@@ -31,10 +31,10 @@ FILES = (CHECKPOINT, OLD, TUNED, REPORT, RUN)
 
 @dataclass(frozen=True)
 class Display:
-    """What to call while a run is under way; by default nothing is shown.
+    """Callbacks during a run; by default nothing is shown.
 
-    message: with a line of text. step: with every step. progress: with a name and a count, or None where the count is
-    unknown; gives a function to call after each item. study: as `judge` takes it.
+    message: called with a line of text. step: called with every step. progress: called with a name and a count (None if
+    unknown), returns a function to call after each item. study: as for `judge`.
     """
 
     message: Callable[[str], object] = lambda line: None
@@ -49,7 +49,7 @@ class Display:
 class Tuned:
     """The result of a run. before, after: values of the tuned parameters.
 
-    failed: why the run stopped early, in one line; empty where it did not.
+    failed: why the run stopped early, in one line; empty if it did not.
     """
 
     descended: Descended
@@ -60,9 +60,9 @@ class Tuned:
 
 
 class Tuner:
-    """Tunes parameters on the clips of a study and writes FILES into a folder.
+    """Tune parameters on the clips of a study and write FILES into a folder.
 
-    tuned.toml holds the settings for --config, report.html and run.json what happened, checkpoint.pt the descent.
+    tuned.toml holds the settings for --config, report.html and run.json the results, checkpoint.pt the descent.
     """
 
     def __init__(
@@ -76,9 +76,9 @@ class Tuner:
         cache: Path | None = None,
         display: Display | None = None,
     ) -> None:
-        """resume: go on from the folder's checkpoint where there is one. device: of the descent.
+        """resume: continue from the folder's checkpoint if there is one. device: of the descent.
 
-        jobs, cache: as `judge` takes them.
+        jobs, cache: as for `judge`.
         """
         self._folder, self._plan, self._resume, self._device = folder, plan or Plan(), resume, device
         self._jobs, self._cache = jobs, cache
@@ -95,10 +95,10 @@ class Tuner:
         clips: Sequence[str] = (),
         measure: str | None = None,
     ) -> Tuned:
-        """Prepare, descend, measure before and after, and record it. The arguments are those of `prepare`.
+        """Prepare, descend, measure before and after, and record the results. Arguments are those of `prepare`.
 
-        Raises InputError as `prepare`, `descend` and `judge` do, and where the folder cannot be written. A loss that is
-        not finite is no error here: `Tuned.failed` says so, and the last good state is measured and written.
+        Raise InputError as `prepare`, `descend` and `judge` do, and if the folder cannot be written. A loss that is not
+        finite is not an error here: `Tuned.failed` reports it, and the last good state is measured and written.
         """
         with claimed(self._folder):
             try:
@@ -146,7 +146,7 @@ class Tuner:
         return Tuned(found, verdict, before, after, f"{found.failed}; {last_good}" if found.failed else "")
 
     def _begin_record(self, ready: Prepared) -> None:
-        """Called with the first step, so that a refused run leaves the files of an earlier one alone."""
+        """Begin the record at the first step, so that a refused run leaves the files of an earlier run unchanged."""
         if not self._resume:
             place, aside = self._folder / CHECKPOINT, self._folder / OLD
             if steps := set_aside(place, aside):
@@ -163,7 +163,7 @@ class Tuner:
         after: Mapping[str, Any],
         verdict: Verdict,
     ) -> dict[str, Any]:
-        """The content of run.json and of the report."""
+        """Return the content of run.json and of the report."""
         spec = ready.spec
         meaning = {parameter.name: parameter.meaning for parameter in all_parameters()}
         return {
@@ -207,6 +207,6 @@ class Tuner:
 
 
 def _values(ready: Prepared) -> dict[str, Any]:
-    """The parameters as settings have them."""
+    """Return the parameters in the form of the settings."""
     settings = ready.parameters.settings()
     return {name: getattr(getattr(settings, name.split(".")[0]), name.split(".")[1]) for name in ready.parameters.names}

@@ -1,4 +1,4 @@
-"""What tuning was worth: the study before and after, hard operations, on the clips tuned on and on those held out."""
+"""The effect of tuning: the study before and after, with hard operations, on tuned and on held-out clips."""
 
 import glob
 import math
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.lab.evaluation.studies.comparison import compare_studies, verdict
 from torchvision_dddas.lab.evaluation.studies.jobs import Event, Workers
 from torchvision_dddas.lab.evaluation.studies.records import Case, ScoredCase, ScoredStudy, Spec
@@ -18,16 +19,16 @@ from torchvision_dddas.lab.evaluation.studies.sweep import format_value, toml_va
 TIMES = "before", "after"
 
 Shown = Callable[[], AbstractContextManager[tuple[Callable[[Plan], object], Callable[[Event], object]]]]
-"""How far a study is: what to call as it begins, and for each of its events."""
+"""Shows the progress of a study: functions to call at its beginning and for each of its events."""
 
 
 @dataclass(frozen=True)
 class Side:
     """One set of clips. pooled, mean: the goal before and after, over all counts and over the clips' values.
 
-    says: of the pooled goal, the one question that was asked: better or worse beyond noise, or not. changes: every
-    measure and clip, as `compare_studies` has it, corrected for all of them; None where nothing can be compared.
-    frame_ms: what a frame took before and after, where it was computed. notes: clips without a result, and why.
+    says: the answer for the pooled goal, the one question asked: better or worse beyond noise, or neither. changes:
+    every measure and clip, as from `compare_studies`, corrected for all of them; None if nothing can be compared.
+    frame_ms: time a frame before and after, if it was computed. notes: clips without a result, and why.
     """
 
     clips: tuple[str, ...]
@@ -39,21 +40,21 @@ class Side:
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """The dictionary that run.json holds."""
+        """Return the dictionary that run.json holds."""
         pairs = {name: dict(zip(TIMES, getattr(self, name), strict=True)) for name in ("pooled", "mean", "frame_ms")}
         return vars(self) | pairs
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What tuning was worth on the clips tuned on, and on those held out; None where none were."""
+    """The effect of tuning on the clips tuned on, and on those held out; None without held-out clips."""
 
     goal: Goal
     tuned: Side
     held: Side | None
 
     def lines(self) -> list[str]:
-        """What tuning was worth, a line for each set of clips."""
+        """Return the effect of tuning, a line for each set of clips."""
         lines = []
         for name, side in {"Tuned on": self.tuned, "Held out": self.held}.items():
             if side is not None:
@@ -64,7 +65,7 @@ class Verdict:
         return lines
 
     def as_json(self) -> dict[str, Any]:
-        """The dictionary that run.json holds."""
+        """Return the dictionary that run.json holds."""
         sides = {"tuned": self.tuned.as_json(), "held_out": None if self.held is None else self.held.as_json()}
         return {"measure": self.goal.name, "better": "less" if self.goal.minimize else "more", **sides}
 
@@ -80,23 +81,28 @@ def judge(
     cache: Path | None = None,
     shown: Shown = lambda: nullcontext((lambda planned: None, lambda event: None)),
 ) -> Verdict:
-    """Run a study as it is and with other values of some parameters. tuned, held: names of clips.
+    """Run a study as it is and with other values of some parameters; once if no value changed. tuned, held: clips.
 
-    spec, base, cache: as `run_study` takes them; jobs: as `Workers`. Raises InputError as they do, and where no clip
-    can have the goal's measure.
+    spec, base, cache: as for `run_study`; jobs: as for `Workers`. Raise InputError as they do, and if no clip can
+    have the goal's measure.
     """
+    settings = load_config(spec.config, spec.overrides)
+    is_changed = with_parameters(settings, parameters) != settings
     changed = tuple(f"{name}={toml_value(value)}" for name, value in parameters.items())
     names, cases = [glob.escape(name) for name in (*tuned, *held)], []
     with Workers(jobs) as workers:
-        for more in ((), changed):
+        for more in ((), changed)[: 1 + is_changed]:
             one = replace(spec, tasks=(goal.task,), overrides=(*spec.overrides, *more))
             with shown() as (begun, tell):
                 cases.append(run_study(one, base, workers, cache, names, tell, begun).cases)
+    cases = cases if is_changed else 2 * cases
     sides = [
         _compare(goal, [[case for case in found if case.clip.name in clips] for found in cases], tuple(clips))
         for clips in (tuned, held)
         if clips
     ]
+    if not is_changed:
+        sides = [replace(side, says="no change", frame_ms=(side.frame_ms[0], math.nan)) for side in sides]
     return Verdict(goal, sides[0], sides[1] if len(sides) > 1 else None)
 
 

@@ -191,24 +191,15 @@ def sdd(home: Path, name: str) -> None:
     video(home / "videos" / scene / number / "video.mov", 3)
 
 
-# The camera looks ahead: its right is the unit's -y, its down -z, its ahead x; it sits 1 m ahead of the unit.
-CALIBRATION = (
-    "P2: " + " ".join(["0"] * 12) + "\nR_rect 1 0 0 0 1 0 0 0 1\n"
-    "Tr_velo_cam 0 -1 0 0 0 0 -1 0 1 0 0 0\nTr_imu_velo 1 0 0 -1 0 1 0 0 0 0 1 0\n"
-)
-
-
 def kitti_label(
     frame: int, identity: int, kind: str = "Car", truncated: int = 0, occluded: int = 0, x: int = 10
 ) -> str:
     return f"{frame} {identity} {kind} {truncated} {occluded} -1 {x} 5 {x + 4} 10 1.5 1.6 3.7 -2 1.6 20 0.1\n"
 
 
-def kitti(home: Path, name: str, labels: str = "", oxts: str = "0 8.4 110 0 0 0\n" * 2) -> None:
+def kitti(home: Path, name: str, labels: str = "") -> None:
     numbered(home / "training/image_02" / name, 2, first=0)
     text(home / "training/label_02" / f"{name}.txt", labels or kitti_label(0, 0) + kitti_label(1, 0))
-    text(home / "training/calib" / f"{name}.txt", CALIBRATION)
-    text(home / "training/oxts" / f"{name}.txt", oxts)
 
 
 INRIA_BOX = (

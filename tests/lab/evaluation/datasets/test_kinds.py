@@ -1,6 +1,5 @@
 """What is particular to each kind of data set: where its files may lie, what counts, and in which coordinates."""
 
-from math import cos, pi, radians
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ from tests.lab.evaluation.datasets.layouts import CAR, MAN, clip, complaint, def
 from tests.lab.evaluation.studies.scored_clips import found_of
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.inria import read_annotation
-from torchvision_dddas.lab.evaluation.datasets.kitti import EARTH_RADIUS_M
 from torchvision_dddas.lab.evaluation.datasets.labelled_masks import read_definition
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.metrics import pixels
@@ -391,22 +389,6 @@ def test_of_kitti_other_classes_and_what_is_cut_off_or_unknown_neither_count_nor
     assert tracks_of(found).identity.tolist() == [0, 4] and ignored_of(found) == [1, 2, 3]
     assert tracks_of(found).box_px[0].tolist() == [10, 5, 4, 5]
     assert counting(found, [1, 1, 2], (21, 1, 4, 4), (10, 5, 4, 5), (21, 1, 4, 4)) == [False, True, True]
-
-
-def test_places_of_kitti_turn_and_move_with_the_car(tmp_path: Path) -> None:
-    """20 m ahead of the camera, 2 m to its left: first the car looks east, then north from 100 m farther north."""
-    degree = 2 * pi * EARTH_RADIUS_M / 360
-    layouts.kitti(tmp_path, "0000", oxts=f"0 8.4 110 0 0 0\n{100 / degree:.12f} 8.4 110 0 0 {pi / 2}\n")
-    positions = truth_of(clip("kitti", tmp_path)).positions
-    assert positions.east_north_m == pytest.approx(np.array([[21.0, 2.0], [-2.0, 121.0]]), abs=1e-3)
-    east = 10.0 / (EARTH_RADIUS_M * cos(radians(49)) * pi / 180)
-    layouts.kitti(tmp_path, "0000", oxts=f"49 8 110 0 0 0\n49 {8 + east:.12f} 110 0 0 0\n")
-    positions = truth_of(clip("kitti", tmp_path)).positions
-    assert np.diff(positions.east_north_m, axis=0) == pytest.approx(np.array([[10.0, 0.0]]), abs=1e-3)
-    (tmp_path / "training/calib/0000.txt").unlink()
-    found = read("kitti", tmp_path)
-    assert truth_of(found.clips[0]).positions is None and found.missing == ()
-    assert found.notes[0].startswith("0000: no places in metres, which need ")
 
 
 def test_of_inria_pictures_of_one_size_are_a_clip(tmp_path: Path) -> None:

@@ -11,7 +11,12 @@ from tests.pages import Page
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.metrics import bootstrap
 from torchvision_dddas.lab.evaluation.studies.cache import SCORES, read_scores, write_scores
-from torchvision_dddas.lab.evaluation.studies.comparison import compare_studies, comparison_report, verdict
+from torchvision_dddas.lab.evaluation.studies.comparison import (
+    compare_methods,
+    compare_studies,
+    comparison_report,
+    verdict,
+)
 from torchvision_dddas.lab.evaluation.studies.records import ScoredCase, ScoredStudy
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 
@@ -56,12 +61,22 @@ def test_a_loss_everywhere_is_worse_beyond_noise_and_other_noise_is_not(missing)
     assert mota["over_clips"]["p"] == pytest.approx(2 / 2**8)
     assert mota["over_clips"]["p"] < mota["over_clips"]["p_holm"] < 0.05
     assert mota["over_clips"]["interval"][0] < mota["change"] < mota["over_clips"]["interval"][1] < 0
+    assert mota["effect_size"] < -2 and mota["clips_needed"] == 8  # fewer give no p below 0.05 for four measures
     assert len(found["clips"]) == 8
     turned = [ScoredStudy(study.name, study.cases[::-1]) for study in (one, two)]
     assert json.dumps(found) == json.dumps(of_tracks(*turned))
     pooled = of_tracks(one, missing("three", 0.06))["pooled"]["tracks"]
     assert {entry["says"] for entry in pooled.values()} <= {"within noise", "the same"}
     assert pooled["mota"]["over_clips"]["enough"]
+
+
+def test_p_is_corrected_for_the_tests_of_all_methods(missing):
+    studies = [missing(name, share, range(6)) for name, share in {"one": 0.05, "two": 0.3, "three": 0.1}.items()]
+    pair = of_tracks(*studies[:2])["pooled"]["tracks"]["hota"]
+    first, second = (one["tasks"]["tracking"]["pooled"]["tracks"]["hota"] for one in compare_methods(studies))
+    assert first["over_clips"]["p"] == pair["over_clips"]["p"] and second["first"] == first["first"]
+    assert first["over_clips"]["p_holm"] > pair["over_clips"]["p_holm"]
+    assert first["clips_needed"] > pair["clips_needed"]
 
 
 def test_few_clips_allow_no_verdict_or_one_on_themselves(missing):
@@ -148,10 +163,11 @@ def test_the_page_begins_with_what_changed_by_how_much_and_whether_that_is_beyon
     assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 not, 1 the same" in page.shown()
     assert "only in the first" in page.shown() and "untouched" in page.shown()
     assert not {"i", "b>"} & set(page.found)
-    # The interval over clips stands before that over frames, and p is the corrected one.
+    # The interval over clips stands before that over frames, and the raw p before the corrected one.
     assert "0.010 to 0.200" in text and "0.050 to 0.150" not in text
     values = page.values("td", "data-v")
-    assert "0.4" in values and "0.2" not in values[:6]
+    assert values[values.index("better on these clips") + 1 :][:4] == ["0.2", "0.4", "0.01", "0.02"]
+    assert "raw p, clips" in text and "corrected p, clips" in text
     # The largest loss stands first in the plot.
     rows = [text.index(f">{name}</text>") for name in ("down", "quiet", "up &lt;i&gt;")]
     assert rows == sorted(rows)

@@ -13,6 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import pytest
 
@@ -193,12 +194,20 @@ def test_a_dead_worker_costs_its_clip_s_time_and_the_third_one_the_clip(by_name,
 
 
 def stopped_after(line: str, words: list[str], by: signal.Signals) -> int:
-    """Run a command and stop it once a line of stderr holds some words; its exit code. Its workers end with it."""
+    """Run a command and stop it once a line of stderr holds some words and it has workers; its exit code.
+
+    Its workers end with it.
+    """
     psutil = pytest.importorskip("psutil")
     with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as run:
         assert run.stderr is not None
         assert any(line in text for text in run.stderr)
-        workers = [child for child in psutil.Process(run.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+        # Clips that are kept are counted before a worker starts.
+        workers, until = list[Any](), time.monotonic() + 60
+        while not workers and time.monotonic() < until and run.poll() is None:
+            children = psutil.Process(run.pid).children()
+            workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+            time.sleep(0.05)
         assert workers
         run.send_signal(by)
         run.wait(60)
@@ -290,7 +299,8 @@ def test_a_signal_to_a_study_with_workers_is_one_line(tmp_path, at_start) -> Non
 @pytest.mark.slow
 def test_a_study_killed_interrupted_and_resumed_gives_the_same_bytes_as_one_process(tmp_path) -> None:
     pytest.importorskip("distributed")
-    study, whole, out = world.three(tmp_path / "clips"), tmp_path / "whole", tmp_path / "out"
+    # The clip with tracks takes so long that it is under way when the two others are done.
+    study, whole, out = world.three(tmp_path / "clips", tracked=45), tmp_path / "whole", tmp_path / "out"
     program = [sys.executable, "-c", "from torchvision_dddas.cli import main; main()"]
 
     def command(out: Path, cache: str, count: int) -> list[str]:

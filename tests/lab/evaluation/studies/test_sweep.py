@@ -125,3 +125,15 @@ def test_the_best_is_written_so_that_it_is_read_as_the_same_settings(tmp_path) -
     assert load_config(tmp_path / "best.toml") == wanted
     words = [f"{name}={sweep.toml_value(value)}" for name, value in parameters.items()]
     assert load_config("fast", words) == with_parameters(load_config("fast"), parameters)
+
+
+def test_parameters_that_mean_something_else_or_have_no_effect_are_named() -> None:
+    fast = load_config("fast")
+    axes = parse_grid(["difference.threshold=10,20", "refine.share=0.5", "morphology.erode_px=1"], fast)
+    units, effect = sweep.parameter_notes(axes, fast)
+    assert "difference.threshold is in grey levels with difference.kind = to_reference" in units
+    assert effect == "refine.share has no effect: refine.on is false"
+    assert sweep.parameter_notes(axes, NOW) == []
+    mixed = parse_grid(["difference.peak=1", "difference.kind=normalized,to_next", "refine.on=true"], NOW)
+    (units,) = sweep.parameter_notes(mixed, NOW)
+    assert "with difference.kind = to_next, and" in units

@@ -63,10 +63,10 @@ def study(folder: Path, text: str = "") -> Path:
     return path
 
 
-def three(folder: Path) -> Path:
-    """A study of a clip with masks, one with tracks, and one of a table alone; the file."""
+def three(folder: Path, tracked: int = 10) -> Path:
+    """A study of a clip with masks, one with tracks in so many pictures, and one of a table alone; the file."""
     filmed(folder, "masks", 1)
-    followed(folder, "tracks", 2)
+    followed(folder, "tracks", 2, tracked)
     followed(folder, "table", 3, pictures=False)
     return study(folder)
 

@@ -8,7 +8,6 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.metrics.matching import lie_within
 from torchvision_dddas.lab.evaluation.metrics.text_rows import LAST
 from torchvision_dddas.lab.evaluation.metrics.truth import (
-    Positions,
     TrackTable,
     Truth,
     check_identities,
@@ -39,7 +38,6 @@ def truth_of(
     counts: np.ndarray,
     length: int,
     regions: TrackTable | None = None,
-    positions: Positions | None = None,
 ) -> Truth:
     """The truth, with boxes of every frame up to the clip's length, or the last labelled one where it is 0.
 
@@ -69,7 +67,6 @@ def truth_of(
         kept,
         None if counts.all() else table.at(~counts),
         length,
-        positions=positions if positions is not None and len(positions.frame) else None,
         ignoring="removed",
         regions=regions,
     )

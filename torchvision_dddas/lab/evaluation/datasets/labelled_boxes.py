@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from torchvision_dddas.errors import InputError
+from torchvision_dddas.io.foreign_boxes import VISDRONE
 from torchvision_dddas.lab.evaluation.datasets import files
 from torchvision_dddas.lab.evaluation.datasets.annotations import boxes_of_corners, table_of, truth_of
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
@@ -29,10 +30,7 @@ class VisDrone(Reader):
     kind = "visdrone"
     layout = "VisDrone-MOT: sequences/ and annotations/ of a split, or a folder of splits"
     terms = "academic research only"
-    categories = (
-        *("pedestrian", "people", "bicycle", "car", "van"),
-        *("truck", "tricycle", "awning-tricycle", "bus", "motor"),
-    )
+    categories = VISDRONE
     defaults: ClassVar = {"classes": list(categories)}
     words: ClassVar = {"classes": ("VisDrone", categories)}
 

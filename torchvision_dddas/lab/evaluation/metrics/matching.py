@@ -100,7 +100,7 @@ def counted(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
 
 
 def lie_within(box_px: np.ndarray, region_px: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether more than half of the area of each box (N, 4) lies in one of the regions (M, 4)."""
+    """Return (N,) bool, whether one of the regions (M, 4) covers more than half of the area of each box (N, 4)."""
     if not len(region_px) or not len(box_px):
         return np.zeros(len(box_px), bool)
     inside, _ = areas(box_px[:, None], region_px[None])

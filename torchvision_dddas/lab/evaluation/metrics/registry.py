@@ -178,7 +178,7 @@ GROUPS: Mapping[str, Group] = {
 HEADLINES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "motion": (("pixels", "f"), ("boxes", "f1"), ("target", "hit"), ("still", "false_blobs_per_frame")),
     "tracking": (("tracks", "hota"), ("target_track", "same_identity")),
-    "association": (("tracks", "ar_3"), ("tracks", "idf1")),
+    "association": (("tracks", "hota"), ("tracks", "idf1")),
     "people": ((RANKED, "ap"), ("boxes", "f1")),
     "location": ((METRES, "median_m"), ("location", "located")),
 }

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.images import decode_image
+from torchvision_dddas.io.images import read_mask as read_mask
 from torchvision_dddas.io.tables import LAST_FRAME, check_crowding
 from torchvision_dddas.lab.evaluation.metrics.text_rows import FARTHEST, read_columns, read_text
-from torchvision_dddas.memory import MASK
 
 UNNAMED = 1 << 24
 """The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
@@ -144,20 +142,6 @@ def load_truth(place: Path, first_frame: int | None = None) -> Truth:
             raise InputError(f"{numbers[early[0]]} is numbered below the first frame, {first}: see --first-frame")
         return Truth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
     return _load_boxes(found)
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
-    try:
-        image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK)
-    except OSError:
-        image = None
-    if image is None:
-        raise InputError(f"{path} is no picture that can be read")
-    if image.ndim == 2:
-        return image.astype(np.int32)
-    blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
-    return blue + 256 * green + 65536 * red
 
 
 def labels_of(truth: Truth, frame: int) -> np.ndarray:

@@ -1,5 +1,5 @@
 """report.html of a study: measures, charts, the frames that went worst, costs."""
 
-from torchvision_dddas.lab.evaluation.report.study import study_report
+from torchvision_dddas.lab.evaluation.report.study import study_report, study_tables
 
-__all__ = ["study_report"]
+__all__ = ["study_report", "study_tables"]

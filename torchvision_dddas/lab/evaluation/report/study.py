@@ -12,6 +12,7 @@ from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.io.report import (
     Cell,
     Column,
+    Table,
     format_count,
     format_number,
     number_cell,
@@ -21,7 +22,7 @@ from torchvision_dddas.io.report import (
 )
 from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS, HEADLINES, describe, title_of_group
-from torchvision_dddas.lab.evaluation.report.task_charts import course_charts, error_clouds, maps, ranked_charts
+from torchvision_dddas.lab.evaluation.report.task_charts import error_clouds, maps, ranked_charts
 from torchvision_dddas.lab.evaluation.report.worst_frames import draw_pictures, find_worst_frames
 from torchvision_dddas.lab.evaluation.studies.records import TASKS, Case, Results, Task
 from torchvision_dddas.lab.evaluation.studies.summary import sum_costs
@@ -63,8 +64,6 @@ def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict
     clips: Mapping[str, Groups] = metrics.get("clips", {})
     groups = [group for group in GROUPS if any(group in clip for clip in clips.values())]
     worst, n_other_faults = find_worst_frames(cases)
-    rank = {id(one.case): k for k, one in reversed(list(enumerate(worst)))}
-    courses = course_charts(sorted(cases, key=lambda case: rank.get(id(case), len(worst))))
     titles = {group: title_of_group(group) for group in groups}
     return {
         "id": task,
@@ -74,17 +73,17 @@ def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict
         "cost": _format_cost(cases),
         "n_left_out": sum(case.cause != "" for case in cases),
         "plots": [*(plot for group in groups for plot in _measure_plot(metrics, group)), *ranked_charts(cases)],
-        "tables": [(title[:1].upper() + title[1:], _measure_table(metrics, group)) for group, title in titles.items()],
+        "tables": [
+            (title[:1].upper() + title[1:], _measure_table(metrics, group).markup) for group, title in titles.items()
+        ],
         "worst": draw_pictures(worst),
         "n_other_faults": n_other_faults,
-        "courses": courses,
-        "n_courses_left_out": len(clips) - len(courses),
         "maps": [*maps(cases), *error_clouds(cases)],
         "notes": _unique(f"{case.clip.name}: {note}" for case in cases if case.scored for note in case.scored.notes),
     }
 
 
-def _figure(groups: Groups, group: str, measure: str, name: str = "") -> Interval:
+def figure_of(groups: Groups, group: str, measure: str, name: str = "") -> Interval:
     """A measure with its interval, NaN where unknown. name: what it is of."""
     low, high = groups.get("intervals", {}).get(group, {}).get(measure) or (None, None)
     value, low, high = (
@@ -95,7 +94,7 @@ def _figure(groups: Groups, group: str, measure: str, name: str = "") -> Interva
 
 def _known_figures(metrics: Mapping[str, Any], group: str, measure: str) -> list[Interval]:
     """The figures of all clips that have the measure."""
-    figures = [_figure(clip, group, measure, name) for name, clip in metrics["clips"].items()]
+    figures = [figure_of(clip, group, measure, name) for name, clip in metrics["clips"].items()]
     return [figure for figure in figures if math.isfinite(figure.value)]
 
 
@@ -104,7 +103,17 @@ def _shown(metrics: Mapping[str, Any], group: str) -> list[str]:
     return [name for name in GROUPS[group].shown if _known_figures(metrics, group, name)]
 
 
-def _measure_table(metrics: Mapping[str, Any], group: str) -> Markup:
+def study_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
+    """The tables of measures by TASK-GROUP. metrics: as `study_report` takes them."""
+    return {
+        f"{task}-{group}": _measure_table(mine, group)
+        for task, mine in metrics["tasks"].items()
+        for group in GROUPS
+        if any(group in clip for clip in mine["clips"].values())
+    }
+
+
+def _measure_table(metrics: Mapping[str, Any], group: str) -> Table:
     """A row a clip, and below them what belongs to all; each figure with its interval."""
     names = _shown(metrics, group)
     known = [describe(name) for name in names]
@@ -112,14 +121,14 @@ def _measure_table(metrics: Mapping[str, Any], group: str) -> Markup:
     columns += [Column(metric.title, metric.meaning) for metric in known]
 
     def cells(groups: Groups) -> list[Cell]:
-        figures = [_figure(groups, group, name) for name in names]
+        figures = [figure_of(groups, group, name) for name in names]
         return [number_cell(f.value, m.digits, (f.low, f.high)) for f, m in zip(figures, known, strict=True)]
 
     clips = {name: groups for name, groups in metrics["clips"].items() if group in groups}
     rows = [[text_cell(name), number_cell(groups["frames"]), *cells(groups)] for name, groups in clips.items()]
     whole = {"pooled": metrics["pooled"], "mean over clips": metrics["mean"]} if len(rows) > 1 else {}
     foot = [[text_cell(title), Cell(""), *cells(groups)] for title, groups in whole.items() if group in groups]
-    return table(f"{title_of_group(group)}, clip by clip", columns, rows, foot)
+    return Table(f"{title_of_group(group)}, clip by clip", columns, rows, foot)
 
 
 def _measure_plot(metrics: Mapping[str, Any], group: str) -> list[tuple[Markup, str]]:
@@ -129,7 +138,7 @@ def _measure_plot(metrics: Mapping[str, Any], group: str) -> list[tuple[Markup, 
         return []
     known, rows = describe(names[0]), _known_figures(metrics, group, names[0])
     rows.sort(key=lambda row: -row.value if known.better < 0 else row.value)
-    whole = _figure(metrics["pooled"], group, names[0], "pooled") if len(rows) > 1 else None
+    whole = figure_of(metrics["pooled"], group, names[0], "pooled") if len(rows) > 1 else None
     title, span = f"{known.title}, {title_of_group(group)}", (0.0, 1.0 if known.is_share else 0.0)
     more = max(len(rows) - MOST_ROWS, 0)
     note = f"the worst {len(metrics['clips']) - more}; {more} better ones are in the table" if more else ""
@@ -148,7 +157,7 @@ def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> 
     if not named:
         return None
     group, name = named[0]
-    known, figures, whole = describe(name), _known_figures(metrics, group, name), _figure(pooled, group, name)
+    known, figures, whole = describe(name), _known_figures(metrics, group, name), figure_of(pooled, group, name)
     clips = f"one clip: {figures[0].name if figures else 'none'}"
     if len(figures) > 1:
         worst = (max if known.better < 0 else min)(figures, key=lambda figure: figure.value)

@@ -1,7 +1,6 @@
-"""The charts of a task: ranked curves, course over the frames, maps, errors on the ground."""
+"""The charts of a task: ranked curves, maps, errors on the ground."""
 
 from collections.abc import Sequence
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +12,9 @@ from torchvision_dddas.lab.evaluation.studies.records import Case, Scored
 from torchvision_dddas.lab.evaluation.studies.summary import rank
 
 MOST_CLIPS = 6
-"""Clips whose accuracy over the frames is drawn."""
+"""Clips with a map."""
 MOST_FAINT = 40
 """Curves of single clips behind that of all."""
-_BINS = 80
 _LEAST, _MOST = 0.01, 10.0
 """False positives an image from which and up to which misses are drawn."""
 _MOST_TARGETS = 60
@@ -92,46 +90,6 @@ def ranked_charts(cases: Sequence[Case]) -> list[Markup]:
     ]
 
 
-def course_charts(cases: Sequence[Case]) -> list[Markup]:
-    """The accuracy over the frames of each of the first MOST_CLIPS clips that have it."""
-    scored = ((case.clip.name, case.scored) for case in cases if case.scored is not None)
-    charts = (_metres_chart(name, one) or _course(name, one) for name, one in scored)
-    return list(islice(filter(None, charts), MOST_CLIPS))
-
-
-def _course(name: str, scored: Scored) -> Markup | None:
-    """F or F1 in bins of frames; crosses where identities change."""
-    counts = tally(scored)
-    if counts is None or len(scored.frames) < 2:
-        return None
-    size = max(1, -(-len(scored.frames) // _BINS))
-    starts = np.arange(0, len(scored.frames), size)
-    right, wrong = (np.add.reduceat(x, starts) for x in (counts.right, counts.false + counts.missed))
-    whole = 2 * right + wrong
-    share = np.divide(2 * right, whole, out=np.full(len(starts), np.nan), where=whole > 0)
-    at = np.add.reduceat(scored.frames.astype(float), starts) / np.diff(np.r_[starts, len(scored.frames)])
-    changed = scored.frames[counts.switched > 0]
-    words = [f"frame {frame}" for frame in changed.tolist()]
-    dots = [Dots("change of identity", changed.astype(float), np.zeros(len(changed)), 2, words, "cross")]
-    line = Line(counts.measure, at, share, 1)
-    return chart(name, Axis("frame"), Axis(counts.measure, 0, 1), [line], dots if len(changed) else [])
-
-
-def _metres_chart(name: str, scored: Scored) -> Markup | None:
-    """The errors on the ground in bins of frames; None without any."""
-    if "error_m" not in scored.samples or not np.isfinite(scored.samples["error_m"]).any():
-        return None
-    known = np.isfinite(scored.samples["error_m"])
-    frame, error = scored.samples["frame"][known], scored.samples["error_m"][known]
-    numbers = np.unique(frame)
-    bins = np.array_split(numbers, min(_BINS, len(numbers)))
-    errors = [error[(frame >= part[0]) & (frame <= part[-1])] for part in bins]
-    at, middle = np.array([part.mean() for part in bins]), np.array([np.median(mine) for mine in errors])
-    high = np.array([np.percentile(mine, 95) for mine in errors])
-    lines = [Line("95 % of the targets", at, high, 6, dashed=True), Line("median", at, middle, 1)]
-    return chart(name, Axis("frame"), Axis("error, m", 0), lines)
-
-
 def maps(cases: Sequence[Case]) -> list[Markup]:
     """A map a clip with places, of the first MOST_CLIPS: true ways, and those that were found for the same targets."""
     drawn: list[Markup] = []
@@ -178,5 +136,5 @@ def error_clouds(cases: Sequence[Case]) -> list[Markup]:
     kept = off[np.unique(np.linspace(0, len(off) - 1, _MOST_ERRORS).astype(int))]
     reach = float(np.percentile(np.abs(kept), 99)) * 1.1 or 1.0
     across, up = Axis("error to the east, m", -reach, reach), Axis("error to the north, m", -reach, reach)
-    none = [Dots("no error", np.zeros(1), np.zeros(1), 2, sign="ring")]
+    none = [Dots("no error", np.zeros(1), np.zeros(1), 2, is_ring=True)]
     return [chart("Errors", across, up, dots=[Dots("found", kept[:, 0], kept[:, 1], 1), *none], equal=True)]

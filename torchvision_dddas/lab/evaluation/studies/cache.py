@@ -209,7 +209,8 @@ def read_scores(folder: Path) -> ScoredStudy:
         study = unpack(path.read_bytes())
     except FileNotFoundError:
         raise InputError(
-            f"{folder} holds no study: no {SCORES}; wanted a folder that dddas evaluate --dataset wrote"
+            f"{folder} holds no study: no {SCORES}; wanted a folder that dddas evaluate --dataset wrote, or "
+            "that of a method of dddas evaluate --names"
         ) from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None

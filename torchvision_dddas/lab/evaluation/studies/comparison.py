@@ -8,21 +8,26 @@ import numpy as np
 from markupsafe import Markup
 
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.io.report import Cell, Column, format_number, number_cell, render_page, table, text_cell
+from torchvision_dddas.io.report import Cell, Column, Table, format_number, number_cell, render_page, text_cell
 from torchvision_dddas.io.report.charts import MOST_ROWS, Interval, interval_chart
 from torchvision_dddas.lab.evaluation.metrics import bootstrap
 from torchvision_dddas.lab.evaluation.metrics.bootstrap import FEWEST, Effect, Stratum
+from torchvision_dddas.lab.evaluation.metrics.effect_size import count_needed, paired_effect_size
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS, describe, is_lower_better, title_of_group
-from torchvision_dddas.lab.evaluation.studies.records import Scored, ScoredStudy
+from torchvision_dddas.lab.evaluation.studies.records import TASKS, Scored, ScoredStudy
 from torchvision_dddas.lab.evaluation.studies.summary import Estimate, flat, measures, over_clips, over_frames
 
 LEVEL = 0.05
 
 MEANING = (
-    "Better and worse are beyond noise: p below 0.05 after Holm's correction for all tests of this table. "
+    "Better and worse are beyond noise: corrected p below 0.05, by Holm's method for all tests of one kind of a task. "
     "“On these clips”: significant over blocks of their frames, which holds for these clips alone. "
     "“Within noise”: no change is shown, nor that there is none. "
-    "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures."
+    "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures. "
+    "Effect size: the mean of the clips' changes over their standard deviation (Cohen's d_z). Clips needed: so many "
+    "show an effect of this size in 4 of 5 studies (power 0.8), by a paired t test at 0.05 divided by the number of "
+    "tests. "
+    "The effect of few clips is itself uncertain, and so is this number."
 )
 
 WAYS = ("over_clips", "over_frames")
@@ -39,9 +44,21 @@ def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
     {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames,
     {"interval", "p", "p_holm", "enough"} or None, hold for other clips like these, and for other frames of the same
     clips. p_holm is corrected for all tests of a task's pooled figures, or of all its clips. Not enough: so few clips
-    or blocks of frames could not make it small, whatever changed. Raises InputError where no task has a clip in
-    both.
+    or blocks of frames could not make it small, whatever changed. Pooled entries have "effect_size" and "clips_needed"
+    too, see `effect_size`. Raises InputError where no task has a clip in both.
     """
+    return compare_methods((first, second))[0]
+
+
+def compare_methods(studies: Sequence[ScoredStudy]) -> list[dict[str, Any]]:
+    """Compare each study with the first, as `compare_studies` does; p_holm covers the tests of all of them."""
+    found = [_compare(studies[0], other) for other in studies[1:]]
+    for task in TASKS:
+        _correct([one["tasks"][task] for one in found if task in one["tasks"]])
+    return found
+
+
+def _compare(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
     by_key = [{(case.task, case.clip): case.scored for case in study.cases} for study in (first, second)]
     both = sorted(by_key[0].keys() & by_key[1].keys())
     notes = [
@@ -89,8 +106,17 @@ def _compare_task(pairs: Pairs) -> dict[str, Any]:
     clips = {clip: _changes([pair], 1, {}) for clip, pair in pairs.items() if clip not in same}
     every = [scored for side in zip(*pairs.values(), strict=True) for scored in side]
     pooled = _changes(list(pairs.values()), None, {"over_clips": over_clips(every) if len(pairs) >= FEWEST else {}})
-    of_clips = [entry for clip in clips.values() for _, _, entry in entries_of(clip)]
-    of_pooled = [entry for _, _, entry in entries_of(pooled)]
+    by_clip = [[measures([scored]) for scored in pair] for pair in pairs.values()]
+    for group, name, entry in entries_of(pooled):
+        ends = [[side.get(group, {}).get(name, math.nan) for side in sides] for sides in by_clip]
+        entry["effect_size"] = paired_effect_size(np.array(ends))
+    return {"same": same, "pooled": pooled, "clips": clips}
+
+
+def _correct(tasks: Sequence[Mapping[str, Any]]) -> None:
+    """Add the corrected p values and the verdicts. tasks: the changes of one task, from one or several comparisons."""
+    of_clips = [entry for task in tasks for clip in task["clips"].values() for _, _, entry in entries_of(clip)]
+    of_pooled = [entry for task in tasks for _, _, entry in entries_of(task["pooled"])]
     for entries, way in ((of_clips, "over_frames"), (of_pooled, "over_clips"), (of_pooled, "over_frames")):
         # Holm's correction covers all p-values of one kind of test.
         effects = [entry[way] for entry in entries if entry[way] is not None]
@@ -98,10 +124,15 @@ def _compare_task(pairs: Pairs) -> dict[str, Any]:
         for i, one in enumerate(effects):
             one["p_holm"] = adjusted[str(i)]
             one["enough"] = one.pop("least") * len(effects) < LEVEL
-    for groups in (pooled, *clips.values()):
-        for _, name, entry in entries_of(groups):
-            entry["says"] = verdict(entry, name)
-    return {"same": same, "pooled": pooled, "clips": clips}
+    n_tests = max(1, len(of_pooled))
+    for entry in of_pooled:
+        count = count_needed(entry["effect_size"], LEVEL / n_tests)
+        # The exchange test of n clips gives no p below 2 / 2**n.
+        entry["clips_needed"] = count and max(count, math.floor(1 + math.log2(n_tests / LEVEL)) + 1)
+    for task in tasks:
+        for groups in (task["pooled"], *task["clips"].values()):
+            for _, name, entry in entries_of(groups):
+                entry["says"] = verdict(entry, name)
 
 
 def _changes(
@@ -198,7 +229,12 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
         if pooled := entries_of(changes["pooled"]):
             group, name, entry = pooled[0]
             before, after = (number_cell(entry[end], describe(name).digits).text for end in ("first", "second"))
-            card |= {"change": _signed(entry, name), "metric": _title(group, name), "before": before, "after": after}
+            card |= {
+                "change": signed_change(entry, name),
+                "metric": measure_title(group, name),
+                "before": before,
+                "after": after,
+            }
             card["verdict"] = entry["says"]
         tasks.append(card)
     return render_page(
@@ -218,24 +254,39 @@ def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], firs
 
     anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
-    pooled = [_cells(group, name, entry, WAYS) for group, name, entry in entries_of(changes["pooled"])]
+    columns = [Column("clip", text=True), *_columns(first, second, {WAYS[1]: ""})]
     by_clip = [
         [text_cell(clip), *_cells(group, name, entry, WAYS[1:])]
         for clip, groups in changes["clips"].items()
         for group, name, entry in entries_of(groups)
     ]
-    columns = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
-    says = Column("verdict", text=True)
     section = render_page(
         "comparison_section.html",
         id=anchor,
         title=title,
         charts=_charts(changes["clips"]),
-        pooled=table("all clips together", [*columns, Column("p, clips"), Column("p, frames"), says], pooled),
-        by_clip=by_clip and table("clip by clip", [Column("clip", text=True), *columns, Column("p"), says], by_clip),
+        pooled=pooled_changes(changes, first, second).markup,
+        by_clip=by_clip and Table("clip by clip", columns, by_clip).markup,
         same=changes["same"],
     )
     return Markup(section)
+
+
+def pooled_changes(changes: Mapping[str, Any], first: str, second: str) -> Table:
+    """Return the table of the changes over all clips. The arguments are those of `comparison_section`."""
+    columns = _columns(first, second, {WAYS[0]: ", clips", WAYS[1]: ", frames"})
+    columns += [Column("effect size", "Cohen's d_z"), Column("clips needed", "for a power of 0.8")]
+    rows = []
+    for group, name, entry in entries_of(changes["pooled"]):
+        needed = [number_cell(entry.get("effect_size"), 2), number_cell(entry.get("clips_needed"))]
+        rows.append([*_cells(group, name, entry, WAYS), *needed])
+    return Table("all clips together", columns, rows)
+
+
+def _columns(first: str, second: str, ways: Mapping[str, str]) -> list[Column]:
+    tests = [Column(f"{p}{over}") for over in ways.values() for p in ("raw p", "corrected p")]
+    ends = [Column("measure", text=True), Column(first), Column(second), Column("change", "with its 95 % interval")]
+    return [*ends, Column("verdict", text=True), *tests]
 
 
 def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
@@ -249,7 +300,9 @@ def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
         name = next(iter(changed.values()))[0]
         rows.sort(key=lambda row: row.value * (-1 if describe(name).better < 0 else 1))
         reach = max(abs(v) for row in rows for v in (row.value, row.low, row.high) if math.isfinite(v)) or 1.0
-        svg = interval_chart(f"Change of {_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach))
+        svg = interval_chart(
+            f"Change of {measure_title(group, name)}", rows, Interval("no change", 0.0), (-reach, reach)
+        )
         charts.append((svg, f"{len(rows) - MOST_ROWS} more in the table" if len(rows) > MOST_ROWS else ""))
     return charts
 
@@ -258,9 +311,9 @@ def _cells(group: str, name: str, entry: Mapping[str, Any], ways: Sequence[str])
     digits = describe(name).digits
     small = number_cell(entry["change"], digits, _change(entry)[1:]).small
     cells = [number_cell(entry["first"], digits), number_cell(entry["second"], digits)]
-    cells.append(Cell(_signed(entry, name), entry["change"], small))
-    cells += [number_cell(None if (effect := entry.get(way)) is None else effect["p_holm"]) for way in ways]
-    return [text_cell(_title(group, name)), *cells, text_cell(str(entry["says"]))]
+    cells += [Cell(signed_change(entry, name), entry["change"], small), text_cell(str(entry["says"]))]
+    cells += [number_cell((entry.get(way) or {}).get(p)) for way in ways for p in ("p", "p_holm")]
+    return [text_cell(measure_title(group, name)), *cells]
 
 
 def entries_of(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
@@ -275,11 +328,13 @@ def _change(entry: Mapping[str, Any]) -> tuple[float, float, float]:
     return math.nan if entry["change"] is None else float(entry["change"]), low, high
 
 
-def _signed(entry: Mapping[str, Any], name: str) -> str:
+def signed_change(entry: Mapping[str, Any], name: str) -> str:
+    """The change of a measure with its sign and its decimals."""
     change = entry["change"]
     text = format_number(math.nan if change is None else change, describe(name).digits)
     return f"+{text}" if change and change > 0 else text
 
 
-def _title(group: str, name: str) -> str:
+def measure_title(group: str, name: str) -> str:
+    """The measure and its group in words."""
     return f"{describe(name).title}, {title_of_group(group)}"

@@ -22,10 +22,12 @@ from torchvision_dddas.errors import InputError, readable
 from torchvision_dddas.io.atomic_files import cannot_write, claimed, write_whole
 from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.io.output import finite, versions
+from torchvision_dddas.io.report.figure_files import save_figures
+from torchvision_dddas.io.report.table_files import save_tables
 from torchvision_dddas.lab.evaluation.datasets import kinds
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
-from torchvision_dddas.lab.evaluation.report import study_report
+from torchvision_dddas.lab.evaluation.report import study_report, study_tables
 from torchvision_dddas.lab.evaluation.studies.cache import SCORES, Cache, cache_folder, code_digest, write_scores
 from torchvision_dddas.lab.evaluation.studies.jobs import (
     Done,
@@ -61,7 +63,7 @@ def read_spec(path: Path) -> Spec:
     if unknown := [key for key in content if key not in _KEYS]:
         raise InputError(f"{where} has no key '{unknown[0]}'; wanted {', '.join(_KEYS)}")
     name = _text(content, "name", where, path.stem)
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise InputError(f"{where}: name must consist of letters, digits, blanks, and . + - _, got {name!r}")
     tasks = _text(content, "tasks", where, [])
     if unknown := [task for task in tasks if task not in TASKS]:
@@ -84,6 +86,11 @@ def read_spec(path: Path) -> Spec:
         backend,
         interval,
     )
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can name a study and its folder."""
+    return _NAME.fullmatch(text) is not None
 
 
 def _source(table: Mapping[str, Any], where: str) -> Source:
@@ -290,13 +297,11 @@ def write_study(
     with claimed(folder):
         try:
             results = run_study(spec, base, workers, place, clips, count, begin)
-            measures = summarize(results)
-            _write_json(folder / "metrics.json", measures)
-            write_csv(folder / "metrics.csv", measures)
-            write_parquet(folder, measures, results)
-            scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
-            write_scores(folder, spec.name, scored)
-            write_whole(folder / "report.html", readable(study_report(finite(measures), results)).encode())
+            measures = write_measures(folder, results)
+            page = readable(study_report(finite(measures), results))
+            write_whole(folder / "report.html", page.encode())
+            save_figures(folder / "figures", page)
+            save_tables(folder / "tables", study_tables(finite(measures)))
             study = {name: value for name, value in vars(spec).items() if name not in ("sources", "overrides")}
             record = {
                 "state": "complete",
@@ -322,6 +327,18 @@ def write_study(
                 raise cannot_write(folder / "run.json", error) from error
             raise
     return results, measures
+
+
+def write_measures(folder: Path, results: Results) -> dict[str, Any]:
+    """Write the measures of a study and its counts for comparisons, and return the measures. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    measures = summarize(results)
+    _write_json(folder / "metrics.json", measures)
+    write_csv(folder / "metrics.csv", measures)
+    write_parquet(folder, measures, results)
+    scored = [ScoredCase(c.task, c.clip.name, c.scored) for c in results.cases if c.scored is not None]
+    write_scores(folder, results.spec.name, scored)
+    return measures
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[Any, ...]]:

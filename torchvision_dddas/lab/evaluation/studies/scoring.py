@@ -12,12 +12,13 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.ground_tables import read_landmarks
 from torchvision_dddas.io.images import decode_image
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
-from torchvision_dddas.lab.evaluation.evaluate import Result, score_clip
+from torchvision_dddas.lab.evaluation.evaluate import ClipScore, Result, score_clip
 from torchvision_dddas.lab.evaluation.metrics import boxes, metres
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
 from torchvision_dddas.lab.evaluation.metrics.matching import WITHIN, counted
 from torchvision_dddas.lab.evaluation.metrics.metres import GroundLocations
 from torchvision_dddas.lab.evaluation.metrics.pixels import Still
+from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 from torchvision_dddas.lab.evaluation.metrics.truth import Positions, TrackTable, Truth
 from torchvision_dddas.lab.evaluation.studies.records import Found, Scored, Task, round_as_written
 
@@ -64,19 +65,38 @@ def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
     )
     notes: list[str] = []
     scored = score_clip(truth, result, notes, interval if is_tracked else 1)
-    # Tracks are scored on frames without any box too: they count nothing, which is a result.
-    whole = 1 + interval * np.arange(scored.frames) if is_tracked else np.zeros(0, np.int64)
-    frames = np.unique(np.concatenate([whole, *(columns["frame"] for columns in scored.each.values())]))
-    per_frame: dict[str, dict[str, np.ndarray]] = {}
-    for group, columns in scored.each.items():
-        per_frame[group] = {name: np.where(np.isin(frames, whole), 0.0, np.nan) for name in columns if name != "frame"}
-        for name, values in per_frame[group].items():
-            values[np.searchsorted(frames, columns["frame"])] = columns[name]
+    frames, per_frame = _spread(scored, interval if is_tracked else 0)
     ranked = {}
     if "boxes" in scored.counts:
         rows = np.isin(found.frame, scored.each["boxes"]["frame"])
         ranked["boxes"] = _ranked(clip.truth, found.frame[rows], box_px[rows], found.score[rows], counts[rows])
-    return Scored(frames.astype(np.int64), scored.counts, per_frame, ranked, {}, tuple(notes))
+    return Scored(frames, scored.counts, per_frame, ranked, {}, tuple(notes))
+
+
+def by_task(clip: ClipScore, interval: int = 1) -> dict[Task, Scored]:
+    """The counts of a clip that was scored from files, by the task that they belong to: motion or tracking."""
+    found: dict[Task, Scored] = {}
+    steps: dict[Task, int] = {"motion": 0, "tracking": interval}
+    for task, step in steps.items():
+        if mine := [group for group in clip.counts if task in GROUPS[group].tasks]:
+            frames, per_frame = _spread(replace(clip, each={group: clip.each[group] for group in mine}), step)
+            found[task] = Scored(frames, {group: clip.counts[group] for group in mine}, per_frame)
+    return found
+
+
+def _spread(clip: ClipScore, interval: int) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
+    """The scored frames (F,) and the counts of each (F,), by group and name. interval: of tracks; 0 for boxes, masks.
+
+    Tracks are scored on frames without any box too: such frames count nothing, which is a result.
+    """
+    whole = 1 + interval * np.arange(clip.frames) if interval else np.zeros(0, np.int64)
+    frames = np.unique(np.concatenate([whole, *(columns["frame"] for columns in clip.each.values())])).astype(np.int64)
+    per_frame: dict[str, dict[str, np.ndarray]] = {}
+    for group, columns in clip.each.items():
+        per_frame[group] = {name: np.where(np.isin(frames, whole), 0.0, np.nan) for name in columns if name != "frame"}
+        for name, values in per_frame[group].items():
+            values[np.searchsorted(frames, columns["frame"])] = columns[name]
+    return frames, per_frame
 
 
 @dataclass(frozen=True)
@@ -228,7 +248,7 @@ def _team_error(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames, and the error that the landmarks' reports share in each; none where it cannot be known."""
     if clip.landmarks is not None and fleet is not None:
-        table = read_landmarks(clip.landmarks, clip.rate_hz)
+        table = read_landmarks(clip.landmarks, rate_hz=clip.rate_hz)
         if table.geographic == (origin is not None):
             kept = ~table.planned & np.isfinite(table.place).all(axis=1) & (table.frame == np.round(table.frame))
             reported = table.place[kept] if origin is None else geometry.east_north(table.place[kept], origin)

@@ -1,10 +1,8 @@
 """The stages that process one clip, each as its own command does: motion, tracking, association, people, location."""
 
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,9 @@ from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.studies.records import Found, Task, round_as_written
+from torchvision_dddas.memory import peak_memory_mb, reset_peak_memory
 from torchvision_dddas.people import detect_in_clip, load_scorer
-from torchvision_dddas.pipeline import AerialInput, Assembly, Pipeline, assemble_files, read_locator
+from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
 from torchvision_dddas.tracking import track_clip, track_scenes, track_table
 from torchvision_dddas.types import (
     Detections,
@@ -45,7 +44,6 @@ _MOTION = (
     "difference",
     "morphology",
     "refine",
-    "persistence",
     "tracklets",
     "small",
     "history",
@@ -96,8 +94,7 @@ def find(
 
     Raises InputError if the clip's files are unusable.
     """
-    with suppress(OSError):  # where the system allows, the peak memory counts from now on
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    reset_peak_memory()
     start, run = time.perf_counter(), _Run(clip, narrow_settings(settings, task), backend, interval, before, on_frame)
     STAGES[task](run)
     run.seconds["other"] = time.perf_counter() - start - sum(run.seconds.values())
@@ -109,7 +106,7 @@ def find(
         steps=run.steps,
         more=more,
         seconds=dict(run.seconds),
-        peak_mb=_peak_memory_mb(),
+        peak_mb=peak_memory_mb(),
         notes=tuple(run.notes),
     )
 
@@ -312,39 +309,17 @@ def _find_locations(run: _Run) -> None:
         _locate_table(run)
 
 
-def aerial_input(clip: Clip) -> AerialInput:
+def _aerial_input(clip: Clip) -> AerialInput:
     """The files that locating from the air takes."""
     assert clip.landmarks is not None
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
-def open_pipeline(
-    clip: Clip, settings: Settings, backend: str = "auto", interval: int = 1
-) -> tuple[Source, Assembly, Pipeline]:
-    """The pictures of a clip with landmarks, and what `dddas run` does with them."""
-    source = open_clip(clip)
-    ready = assemble_files(aerial_input(clip), clip.telemetry, settings, source, backend, str(clip.pictures[0]))
-    return source, ready, Pipeline.from_assembly(ready, interval, pictures=False)
-
-
-def open_table(
-    clip: Clip, settings: Settings, backend: str = "auto"
-) -> tuple[DetectionTable, geo.AerialLocator, list[str]]:
-    """The detections of a clip with landmarks and without pictures, what locates them, and notes."""
-    if clip.given is None:
-        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
-    table = read_detections(clip.given)
-    span = (table.first, table.last)
-    locator, notes = read_locator(
-        aerial_input(clip), settings, None, clip.rate_hz, backend, span, "table", None, extent=table.extent
-    )
-    geo.check_table(table, locator)
-    return table, locator, notes
-
-
 def _locate_clip(run: _Run) -> None:
-    source, ready, pipeline = open_pipeline(run.clip, run.settings, run.backend, run.interval)
-    for result in pipeline(source):
+    clip, source = run.clip, open_clip(run.clip)
+    aerial = _aerial_input(clip)
+    ready = assemble_files(aerial, clip.telemetry, run.settings, source, run.backend, str(clip.pictures[0]))
+    for result in Pipeline.from_assembly(ready, interval=run.interval, pictures=False)(source):
         tracks, located = result.tracked.tracks, result.locations
         seen = tracks.row >= 0
         columns = {"box_px": round_as_written(tracks.box_px[seen]), "identity": tracks.identity[seen]}
@@ -356,7 +331,15 @@ def _locate_clip(run: _Run) -> None:
 
 
 def _locate_table(run: _Run) -> None:
-    table, locator, notes = open_table(run.clip, run.settings, run.backend)
+    clip = run.clip
+    if clip.given is None:
+        raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
+    table = read_detections(clip.given)
+    aerial, span = _aerial_input(clip), (table.first, table.last)
+    locator, notes = read_locator(
+        aerial, run.settings, None, clip.rate_hz, run.backend, span, "table", None, extent=table.extent
+    )
+    geo.check_table(table, locator)
     for located in locator.locate_table(table):
         places = _place_columns(len(located.box_px), located.row, located.positions, located.relative_m2)
         score = table.score[table.rows(located.frame)]
@@ -369,7 +352,7 @@ def _locate_from_ground(run: _Run) -> None:
     if clip.given is None or clip.camera is None:
         raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
     table = read_detections(clip.given)
-    locator = GroundLocator(read_camera(clip.camera), run.settings, rate_hz=clip.rate_hz)
+    locator = GroundLocator(read_camera(clip.camera), settings=run.settings, rate_hz=clip.rate_hz)
     for located in locator.locate_tables([table]):
         rows = np.flatnonzero(located.sightings.by != "bearing")
         places = _place_columns(len(located.box_px), rows, located.positions)
@@ -401,16 +384,3 @@ STAGES: Mapping[Task, Callable[[_Run], None]] = {
     "people": _find_people,
     "location": _find_locations,
 }
-
-
-def _peak_memory_mb() -> float:
-    """The process's peak in units of 2**20 bytes, since its start on some systems; NaN where it is not reported."""
-    with suppress(OSError, ValueError, StopIteration):
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-        return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024
-    try:
-        import resource
-    except ImportError:
-        return float("nan")
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 2**20 if sys.platform == "darwin" else peak / 1024

@@ -20,6 +20,7 @@ from typing import Any
 from torchvision_dddas.config import Settings, all_parameters, changes, format_toml, nearest, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
+from torchvision_dddas.lab.evaluation.report.sweep import save_sweep
 from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
 from torchvision_dddas.lab.evaluation.studies.jobs import Event, Workers
 from torchvision_dddas.lab.evaluation.studies.records import Spec
@@ -78,6 +79,24 @@ def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
         found = _RANGE.fullmatch(values)
         axes.append(_range(parameter, found, text, settings) if found else _choice(parameter, values, text, settings))
     return axes
+
+
+def parameter_notes(axes: Sequence[Axis], settings: Settings) -> list[str]:
+    """What parameters mean with these settings, where that differs from the default; and those without effect."""
+    tried = {axis.parameter: axis for axis in axes}
+    kinds = tried["difference.kind"].values if "difference.kind" in tried else (settings.difference.kind,)
+    others = ", ".join(str(kind) for kind in kinds if kind != "normalized")
+    notes = [
+        f"{parameter} is in grey levels with difference.kind = {others}, and in units of noise with normalized, the "
+        "default: a value of one cannot be used with the other"
+        for parameter in ("difference.threshold", "difference.peak")
+        if parameter in tried and others
+    ]
+    for parameter in tried:
+        group = parameter.split(".")[0]
+        if getattr(getattr(settings, group), "on", True) is False and f"{group}.on" not in tried:
+            notes.append(f"{parameter} has no effect: {group}.on is false")
+    return notes
 
 
 def count_points(axes: Sequence[Axis]) -> int:
@@ -303,9 +322,10 @@ def split_clips(
 
 @dataclass
 class SweepRecord:
-    """What a sweep has found so far: sweep.json after every trial, best.toml at the end.
+    """What a sweep has found so far: sweep.json after every trial, best.toml and the report at the end.
 
-    tuned, held: names of clips. on_held: the measure on those held out, with the settings as they were and the best.
+    tuned, held: names of clips. notes: of `parameter_notes`.
+    on_held: the measure on those held out, with the settings as they were and the best.
     """
 
     folder: Path
@@ -317,6 +337,7 @@ class SweepRecord:
     trials: list[Trial] = field(default_factory=list)
     best: Trial | None = None
     on_held: tuple[Measured, Measured] | None = None
+    notes: Sequence[str] = ()
 
     def add(self, trial: Trial) -> None:
         """Record a trial. Raises InputError if it cannot be written."""
@@ -334,6 +355,7 @@ class SweepRecord:
         self._write_json()
         text = settings_toml(with_parameters(self.settings, best.parameters), about)
         save_file(self.folder / "best.toml", text.encode())
+        save_sweep(self)
 
     @property
     def heading(self) -> str:
@@ -371,6 +393,7 @@ class SweepRecord:
             ],
             "best": None if self.best is None else self.best.number,
             "on_held_out": held,
+            "notes": self.notes,
         }
         save_file(self.folder / "sweep.json", (json.dumps(content, indent=2) + "\n").encode())
 

@@ -1,0 +1,18 @@
+"""How fast the package is on this machine: detection chains, operations, and a plain OpenCV chain beside them."""
+
+from torchvision_dddas.lab.benchmark.chains import CHAINS, STAGES, ChainFigures, draw_frame, measure_chains
+from torchvision_dddas.lab.benchmark.machine import describe_machine, format_table, machine_words
+from torchvision_dddas.lab.benchmark.report import format_chains, format_operations
+
+__all__ = [
+    "CHAINS",
+    "STAGES",
+    "ChainFigures",
+    "describe_machine",
+    "draw_frame",
+    "format_chains",
+    "format_operations",
+    "format_table",
+    "machine_words",
+    "measure_chains",
+]
