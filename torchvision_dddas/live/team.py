@@ -98,6 +98,7 @@ class LiveTeam:
         self._changed, self._ended = threading.Condition(), threading.Event()
         self._looks: dict[str, deque[PlatformLook]] = {name: deque(maxlen=_KEPT) for name in self._healths}
         self._notes: list[str] | None = None
+        self._is_fusing = False
         self._refused, self._now_s = False, -math.inf  # by the disk; time of the newest main result
         self._inbox, self._fused = deque[PlatformLook](), deque[FusedTargets]()
         self._left_out, self._facts = Counter[str](), self._team.facts
@@ -129,6 +130,8 @@ class LiveTeam:
             while len(self._inbox) > _MOST and not self._waits:
                 self._left_out[self._inbox.popleft().name] += 1
             self._changed.notify_all()
+            if self._waits:  # wait for the fusion, so that each run writes the same lines
+                self._changed.wait_for(lambda: not self._inbox and not self._is_fusing)
         confirmed = self._team.confirm([look for look in due if now_s - look.time_s < _FRESH_S], located)
         result = replace(result, confirmed=confirmed)
         return replace(result, fused=self._write(result))
@@ -245,7 +248,7 @@ class LiveTeam:
             with self._changed:
                 self._changed.wait_for(lambda: self._inbox or self._ended.is_set())
                 look = self._inbox.popleft() if self._inbox else None
-                is_last = look is None
+                is_last, self._is_fusing = look is None, True
                 self._changed.notify_all()
             try:
                 known = self._team.fusion.flush() if look is None else self._team.fuse(look)
@@ -253,6 +256,9 @@ class LiveTeam:
                 self._facts = self._facts if self._inbox else self._team.facts
             except Exception as error:
                 self._run.event("platform", f"{look.name if look else UAV}: not fused, {type(error).__name__}: {error}")
+            with self._changed:
+                self._is_fusing = False
+                self._changed.notify_all()
             self._rest()
 
     def _write(self, result: FrameResult | None) -> FusedTargets | None:
