@@ -17,14 +17,12 @@ test: lint quick
 quick: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
-# The quick tests of the rooms that call on dependencies most, with the oldest release of each that pyproject.toml admits.
-OLDEST := chain detection functional geometry io nn people
+# The quick tests with the oldest release of each dependency that pyproject.toml admits.
 oldest:
 	test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check uv
 	VIRTUAL_ENV=.venv-oldest .venv-oldest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EXTRAS)]'
-	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu" \
-		$(OLDEST:%=tests/%)
+	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
 # What a change needs, with each Python from 3.11 to 3.13 that is installed; those of pyenv are not on the path.
 OTHERS ?= 3.11 3.12 3.13

@@ -86,6 +86,7 @@ def test_mistakes_are_told_in_one_line(run, uav, other, says):
     assert says in bad(run("--aerial", folder / "uav2.toml"))
 
 
+@pytest.mark.slow
 def test_a_uav_that_is_elsewhere_in_time_or_space_is_noted(run, uav, tmp_path):
     far = uav("far", {"set": ["aerial.heading_offset_deg=0"]})
     log = (far / "log.csv").read_text().replace("32.2", "32.3")

@@ -32,6 +32,7 @@ def coded_again(image, quality):
     return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS.keys())
 @pytest.mark.parametrize("config", [None, "fast", "half", "paper"])
 def test_repeats_cost_nothing_in_any_configuration(film, config, pattern):
@@ -113,6 +114,7 @@ def test_a_frame_of_another_size_is_refused_in_one_line(film, config, size):
     assert len(detector.flush()) > 0  # what was taken before is not lost
 
 
+@pytest.mark.slow
 def test_scenes_do_not_depend_on_the_batch_where_pictures_repeat(film):
     images = [film[k] for k in stored(len(film), [2, 1])]
     one, eight = (detect(images, load_config(), batch) for batch in (1, 8))

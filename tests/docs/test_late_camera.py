@@ -57,6 +57,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+@pytest.mark.slow
 def test_a_board_waits_for_its_camera_and_is_well_once_pictures_come(tmp_path: Path) -> None:
     page = (ROOT / "docs/onboard.md").read_text(encoding="utf-8")
     (block,) = [b for b in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) if "rtsp://CAMERA" in b]

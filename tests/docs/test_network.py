@@ -20,6 +20,7 @@ def network() -> dict:
     return runpy.run_path(str(ROOT / "docs" / "network.py"))
 
 
+@pytest.mark.slow
 def test_it_learns_from_simulated_scenes_and_is_scored_on_another(network, capsys) -> None:
     network["main"](**SMALL, size_px=(96, 72))
     told = capsys.readouterr().out

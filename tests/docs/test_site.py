@@ -105,6 +105,7 @@ def texts_of_code() -> Iterator[str]:
                 yield node.value
 
 
+@pytest.mark.slow
 def test_the_messages_on_the_page_on_trouble_are_those_of_the_code() -> None:
     page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
     messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)

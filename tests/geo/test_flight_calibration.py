@@ -50,6 +50,7 @@ def test_offset_and_standard_deviations_are_found(offset_deg):
     assert not any("heading" in name for name in found.settings(AerialParameters(), ["heading"]))
 
 
+@pytest.mark.slow
 def test_a_wrong_point_is_left_out_and_changes_little():
     seen, right = looks(), estimate(looks())
     seen[7].marks.east_north_m[1] += [15.0, -10.0]
@@ -68,6 +69,7 @@ def turned_looks(angles_deg, pitches):
     return seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_deg", [1.0, -1.0])
 def test_a_camera_that_looks_lower_than_its_log_gets_an_offset_of_the_pitch(offset_deg):
     found = estimate(turned_looks([-offset_deg, 0.0], (40.0, 60.0, 90.0)))
@@ -78,6 +80,7 @@ def test_a_camera_that_looks_lower_than_its_log_gets_an_offset_of_the_pitch(offs
     assert not any("pitch" in name for name in found.settings(AerialParameters(), ["tilt"]))
 
 
+@pytest.mark.slow
 def test_an_offset_without_a_parameter_counts_in_the_standard_deviation():
     found = estimate(turned_looks([0.0, -1.0], (40.0, 60.0)))
     assert np.degrees(found.offset[2]) == pytest.approx(1.0, abs=0.15)
@@ -90,6 +93,7 @@ def test_pictures_in_quick_succession_tell_little():
     assert few.offset_sigma[0] > 1.5 * estimate(looks(10)).offset_sigma[0]
 
 
+@pytest.mark.slow
 def test_too_few_pictures_and_a_log_of_another_flight_are_refused():
     with pytest.raises(InputError, match=r"at least 6 pictures with points are needed.*got 5"):
         estimate(looks(5))

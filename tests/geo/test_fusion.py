@@ -81,6 +81,7 @@ def test_what_comes_later_than_the_delay_is_left_out_and_counted():
     assert fusion.update(ground(walk(1.0)), "ugv1", time_s=1.0) == [] and fusion.late == 1
 
 
+@pytest.mark.slow
 def test_ellipses_and_speeds_hold_the_truth_as_often_as_they_say():
     squares = []
     for seed in range(12):
@@ -91,6 +92,7 @@ def test_ellipses_and_speeds_hold_the_truth_as_often_as_they_say():
     assert 1.5 < np.mean(squares) < 6.0  # four numbers
 
 
+@pytest.mark.slow
 def test_together_the_error_is_less_than_of_the_platforms_alone():
     alone, both = list[float](), list[float]()
     for seed in range(12):

@@ -25,6 +25,7 @@ def share_inside(too_small, n, seeds=range(40)):
     return np.mean(inside), causes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("too_small", [3.0, 10.0])
 @pytest.mark.parametrize("n", [4, 8])
 def test_ellipses_hold_the_truth_where_landmarks_state_errors_too_small(too_small, n):

@@ -261,6 +261,7 @@ def test_frames_without_two_neighbours_show_nothing(clip) -> None:
     assert found.mask.shape == (1, 2, 1, 120, 160) and not found.mask.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asks", [False, True])
 @pytest.mark.parametrize("softness", [0.0, 0.2])
 @pytest.mark.parametrize("kind", KINDS)

@@ -41,6 +41,7 @@ def test_views_share_identities_without_known_pairs(opposite):
     assert len(frames) == len(opposite[1]) and counts[:, 0].sum() <= 0.02 * both and counts[:, 1].sum() > 0.9 * both
 
 
+@pytest.mark.slow
 def test_the_map_takes_feet_to_feet(opposite):
     frame, (a, b) = share(opposite[1])[-1], opposite[1][-1]
     _, i, j = np.intersect1d(a.identity, b.identity - 100, return_indices=True)
@@ -48,6 +49,7 @@ def test_the_map_takes_feet_to_feet(opposite):
     assert np.median(off) < 0.5 * np.median(b.box_px[:, 2]) and frame.maps[0, 1].quality > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [2, 3])
 def test_a_view_of_a_lower_rate_is_registered_and_shares_all_it_shows(opposite, every):
     none = Tracks(0, np.zeros(0, np.int64), np.zeros((0, 4)))
@@ -62,6 +64,7 @@ def test_a_view_has_an_identity_once(opposite):
     assert all(len(set(ids.tolist())) == len(ids) for frame in share(opposite[1]) for ids in frame.shared)
 
 
+@pytest.mark.slow
 def test_views_without_overlap_share_nothing():
     pairs = [
         (boxes(one, camera(0), 1, k + 1), boxes(other, camera(90), 101, k + 1))
@@ -71,6 +74,7 @@ def test_views_without_overlap_share_nothing():
         assert frame.maps[0, 1].b_from_a is None and not np.intersect1d(*frame.shared).size
 
 
+@pytest.mark.slow
 def test_a_lost_registration_is_found_again():
     places, jump = walk(150), 60
     views = []

@@ -130,6 +130,7 @@ def found(tracks):
     return {frame: list(zip(*columns, strict=True)) for frame, columns in rows.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("interval", "mode", "score", "memory", "hits"),
     [(1, "default", 1.0, 1, 1), (4, "default", 0.97, 9, 3), (1, "default", 0.97, 20, 6), (4, "paper", 1.0, 9, 3)],

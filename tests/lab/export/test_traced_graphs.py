@@ -44,6 +44,7 @@ def made(fast: Settings) -> ExportedGraph:
     return found
 
 
+@pytest.mark.slow
 def test_the_graph_computes_what_torch_does_on_pictures_it_was_not_traced_with(made, fast):
     """Whole grey levels: three pixels in thousands may differ by rounding."""
     graph, session = traced.build_module("warp_difference", fast, SIZE), open_session(made.content)
@@ -91,6 +92,7 @@ def test_only_standard_operations_are_used_and_inputs_have_names_of_our_own(made
     assert tuple(value.name for value in model.graph.output) == traced.SEGMENTATION["warp_difference"][1]
 
 
+@pytest.mark.slow
 def test_the_file_is_the_same_each_time_and_holds_nothing_of_the_machine(made, fast):
     (again,) = traced.export_segmentation("warp_difference", fast, SIZE).values()
     assert again.content == made.content

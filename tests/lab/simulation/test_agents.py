@@ -334,6 +334,7 @@ def test_a_gust_pushes_the_uav_at_about_its_own_speed():
         assert max(found) == fastest
 
 
+@pytest.mark.slow
 def test_nobody_is_run_over():
     across = (CrowdPlan(people=12, start_m=(0.0, -20.0), heading_deg=0.0), CrowdPlan(people=8, behaviour="stand"))
     agents = Agents(busy(crowd=across, car=(CarPlan(start_m=(-60.0, 0.0), speed_m_s=8.0),)), world_of())

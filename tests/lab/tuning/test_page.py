@@ -20,6 +20,7 @@ def code_of(heading: str) -> str:
     return code
 
 
+@pytest.mark.slow
 def test_the_ten_lines_of_the_text_run_as_they_are(tmp_path, monkeypatch, capsys) -> None:
     code = code_of("As a library")
     assert len([line for line in code.splitlines() if line]) <= 10

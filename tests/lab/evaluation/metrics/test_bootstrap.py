@@ -28,6 +28,7 @@ def coverage(series, block=None):
     return held / len(series)
 
 
+@pytest.mark.slow
 def test_intervals_of_correlated_frames_hold_the_truth_as_often_as_they_say():
     series = chain(np.random.default_rng(1), 300, 0.8, worlds=100)
     assert 0.88 <= coverage(series) <= 0.99

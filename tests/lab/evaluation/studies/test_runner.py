@@ -75,6 +75,7 @@ def study(tmp_path):
     return read_spec(world.three(tmp_path / "clips"))
 
 
+@pytest.mark.slow
 def test_a_repeated_study_starts_no_worker_and_gives_the_same_bytes(study, tmp_path, monkeypatch) -> None:
     pytest.importorskip("distributed")
     left = tmp_path / "cache/ab/.abc.0123456789abcdef.part.npz"  # by a worker that was killed
