@@ -131,10 +131,13 @@ def stopped(after: int) -> Bowl:
 
 def test_an_interrupted_run_resumes_to_the_same_end(one, clips, tmp_path) -> None:
     first = one("--resume", bowl=stopped(9))
-    assert f"there is no checkpoint at {tmp_path / 'checkpoint.pt'}: it begins anew" in first.output.splitlines()
+    assert (
+        f"there is no checkpoint at {tmp_path / 'checkpoint.pt'}: the descent starts from the settings"
+        in first.output.splitlines()
+    )
     assert first.exit_code == 130 and record(tmp_path)["state"] == "interrupted"
     again = one("--resume")
-    assert again.exit_code == 0 and "begins anew" not in again.output
+    assert again.exit_code == 0 and "there is no checkpoint" not in again.output
     assert tune(clips, tmp_path / "whole", "--clips", "one").exit_code == 0
     assert record(tmp_path)["history"] == record(tmp_path / "whole")["history"]
 
@@ -144,7 +147,7 @@ def test_an_unfinished_descent_is_kept_beside_the_new_one(one, tmp_path) -> None
     assert one(bowl=stopped(8)).exit_code == 130
     begun = now.read_bytes()
     again = one("--rate", "0.1", bowl=stopped(2))  # not as far as the first step's look
-    assert again.exit_code == 130 and "unfinished descent, of 5 steps; kept as checkpoint.old.pt" in again.output
+    assert again.exit_code == 130 and "unfinished descent of 5 steps, now kept as checkpoint.old.pt" in again.output
     assert old.read_bytes() == begun != now.read_bytes()
     assert one().exit_code == 0
     assert old.read_bytes() == begun, "one of fewer steps took the place of the one of more"

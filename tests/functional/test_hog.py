@@ -151,7 +151,7 @@ def test_gradients_stay_finite_where_the_picture_is_flat_black_or_straight(shape
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"cell": 6}, "block of 16 px is no multiple of a cell of 6 px"),
+        ({"cell": 6}, "block of 16 px is not a multiple of a cell of 6 px"),
         ({"window": (60, 128)}, "do not fill a window width of 60 px"),
         ({"window": (64, 8)}, "do not fill a window height of 8 px; wanted 16"),
     ],

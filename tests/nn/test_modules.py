@@ -100,7 +100,7 @@ def test_a_plane_homography_leaves_out_what_has_no_weight():
             lambda: HistogramAffinity().affinity(
                 torch.ones(4, 2, 5), torch.ones(4, 2).bool(), torch.zeros(1, 4, dtype=torch.int64)
             ),
-            r"windows must be \(W, 2\) or \(W, 3\) places of frames, got \(1, 4\)",
+            r"windows must be \(W, 2\) or \(W, 3\) indices of frames, got \(1, 4\)",
         ),
         (
             lambda: F.ransac(NONE, NONE, torch.ones(1, 0).bool(), torch.zeros(1, 3, 4).long()),

@@ -2,15 +2,15 @@
 
     >>> import torchvision_dddas.functional as F
 
-Images are (B, C, H, W) floats, in [0, 1] unless an argument is called levels (0 .. 255); points are (B, N, 2), (u, v)
-in pixels from the centre of the top left one; matrices are named by direction (reference_from_frame). float32, or
-float64 for gradient checks; any device; every shape is fixed by the shapes of the inputs, and what is missing is marked
-by a validity mask. What Kornia has too is named as there and takes the same first arguments; what only ours has is
-given by name, what only Kornia's has is refused. What is Kornia's own is passed on.
+Images are (B, C, H, W) floats in [0, 1], or 0 .. 255 if an argument is called levels. Points are (B, N, 2), (u, v) in
+pixels from the centre of the top left pixel. The name of a matrix states its direction (reference_from_frame). Tensors
+are float32, or float64 for gradient checks, on any device. The shapes of the inputs fix all shapes; a validity mask
+marks missing entries. Functions that Kornia has too keep its name and first arguments. Our further arguments must be
+named, and Kornia's further arguments are refused. Functions that only Kornia has are passed on unchanged.
 
-Each function has one form, chosen on a CPU. `python eval/speed.py operations` times it beside Kornia's and OpenCV's. On
-a GPU the choice was not measured. Engines, modules, tuning and export call these functions and nothing beside them, so
-that another choice there is a switch inside the function that it concerns.
+The table in `chain.implementations` states which implementation of an operation runs on which device, and why.
+`dddas settings --backends` prints the table. `python eval/speed.py operations` compares the times with Kornia's and
+OpenCV's. Engines, modules, tuning and export call only these functions.
 """
 
 from kornia.geometry import oneway_transfer_error, transform_points

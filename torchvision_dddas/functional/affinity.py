@@ -1,8 +1,8 @@
-"""How alike the targets of two or three frames are: the generalised Jaccard coefficient (appendix C, eq. 1, 4, 5).
+"""How alike targets of two or three frames are: the generalised Jaccard coefficient (appendix C, eq. 1, 4, 5).
 
-Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), histograms
-(D = 768). Frames with fewer targets are padded; an affinity with a padded target is 0, and so is that of two vectors of
-zeros, which resemble nothing. `tracking.source_tracker` is the twin for one window without torch.
+Features are non-negative vectors, (B, N, D): box centres in pixels from the picture's corner (D = 2), or histograms (D
+= 768). Frames with fewer targets are padded. The affinity of a padded target is 0, and so is the affinity of two
+vectors of zeros. `tracking.source_tracker` computes the same for one window without torch.
 """
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 def pair_affinity(
     a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"], a_valid: Bool[Tensor, "B N"], b_valid: Bool[Tensor, "B M"]
 ) -> Float[Tensor, "B N M"]:
-    """S = Σ min / Σ max in [0, 1].
+    """Return S = Σ min / Σ max of each pair, in [0, 1].
 
     >>> a, b = torch.tensor([[[1.0, 3.0]]]), torch.tensor([[[2.0, 2.0]]])
     >>> there = torch.ones(1, 1, dtype=torch.bool)
@@ -31,7 +31,9 @@ def triplet_affinity(
     b_valid: Bool[Tensor, "B M"],
     c_valid: Bool[Tensor, "B L"],
 ) -> Float[Tensor, "B N M L"]:
-    """The numerators of (a, b) and (b, c) added, over their denominators added: eq. 4 and 5, newest frame first.
+    """Return the sum of the numerators of (a, b) and (b, c) over the sum of their denominators.
+
+    Source: appendix C, eq. 4 and 5, newest frame first.
 
     >>> a, b, c = (torch.tensor([[[1.0, 3.0]]]) for _ in range(3))
     >>> there = torch.ones(1, 1, dtype=torch.bool)
@@ -47,12 +49,13 @@ def triplet_affinity(
 def _sums(
     a: Float[Tensor, "B N D"], b: Float[Tensor, "B M D"]
 ) -> tuple[Float[Tensor, "B N M"], Float[Tensor, "B N M"]]:
-    """Numerator Σ min(a, b) and denominator Σ max(a, b) of each pair.
+    """Return numerator Σ min(a, b) and denominator Σ max(a, b) of each pair.
 
-    min + max = a + b and max - min = |a - b|: so both follow from one distance, and no (B, N, M, D) is held.
+    Because min + max = a + b and max - min = |a - b|, both follow from one distance, and no (B, N, M, D) tensor is
+    needed.
     """
     total = a.sum(-1)[..., :, None] + b.sum(-1)[..., None, :]
-    # ONNX has no L1 distance of all pairs: an exported graph does hold (B, N, M, D).
+    # ONNX has no L1 distance of all pairs, so an exported graph does hold a (B, N, M, D) tensor.
     exported = torch.compiler.is_compiling()
     apart = (a[..., :, None, :] - b[..., None, :, :]).abs().sum(-1) if exported else torch.cdist(a, b, p=1.0)
     return ((total - apart) / 2).clamp(min=0), (total + apart) / 2
@@ -60,6 +63,6 @@ def _sums(
 
 def _divide(smaller: Tensor, larger: Tensor, valid: Tensor) -> Tensor:
     there = valid & (larger > 0)
-    # The inner `where` keeps 0 / 0 out of the gradient.
+    # The inner `where` prevents 0 / 0 in the gradient.
     share = smaller / torch.where(there, larger, torch.ones_like(larger))
     return torch.where(there, share, torch.zeros_like(share))

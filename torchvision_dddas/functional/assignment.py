@@ -1,10 +1,10 @@
-"""Soft one-to-one assignment of two frames' targets: odds of all assignments at once, and their likelihood.
+"""Soft one-to-one assignment of the targets of two frames: the likelihood of all assignments together.
 
-An assignment pairs targets of a frame with targets of another; who stays alone scores 0, the dummy that is used any
-number of times. Its probability is exp(sum of its scores / softness) over that of all assignments: the partition
-function. Exactly that is a permanent, beyond reach; what stands here is Bethe's approximation, whose fixed point is
-found by passing messages between rows and columns (Williams and Lau, 2014: it always converges; Vontobel, 2013: it is
-the least of a convex function).
+An assignment pairs targets of one frame with targets of the other. A target without a partner takes the dummy, which
+scores 0 and may be used any number of times. The probability of an assignment is exp(sum of its scores / softness)
+divided by the sum over all assignments, the partition function. The exact partition function is a permanent, which is
+too costly. This module computes Bethe's approximation. Its fixed point is found by messages between rows and columns
+(Williams and Lau, 2014: they always converge; Vontobel, 2013: it is the minimum of a convex function).
 """
 
 import torch
@@ -12,23 +12,23 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-_CLOSE = 1e-6  # change of any share that ends the rounds
+_CLOSE = 1e-6  # the rounds end when no share changes by more than this
 
 
 def log_partition(score: Float[Tensor, "*B N M"], softness: float, *, rounds: int = 50) -> Float[Tensor, "*B"]:
-    """Bethe's softness · log Σ exp(sum of scores / softness), over all assignments.
+    """Return Bethe's approximation of softness · log Σ exp(sum of scores / softness), over all assignments.
 
-    score: -inf forbids a pair. softness: above 0, in the unit of the scores; as it vanishes the result becomes the
-    score of the best assignment. rounds: of messages, at most. The gradient in the scores is the share of each pair in
-    all assignments: at the fixed point messages have no slope, so that they need none. Never above the exact sum
-    (Gurvits), and equal to it where one frame has a single target.
+    score: -inf forbids a pair. softness: above 0, in the unit of the scores; as it vanishes, the result becomes the
+    score of the best assignment. rounds: largest number of rounds of messages. The gradient in the scores is the share
+    of each pair in all assignments. The messages need no gradient, because the result has no slope in them at the fixed
+    point. The result is never above the exact value (Gurvits), and equals it if one frame has a single target.
 
     >>> F.log_partition(torch.tensor([[[3.0, 0.0], [0.0, 2.0]]]), 0.01).round(decimals=2)
     tensor([5.])
     """
     scaled = score / softness
     with torch.no_grad():
-        # Logarithms of the messages from columns to their pairs: how free a column is, would the pair not be.
+        # Logarithms of the messages from columns to pairs: how free a column is without the pair.
         from_column, share = torch.zeros_like(scaled), torch.zeros_like(scaled)
         for _ in range(rounds if scaled.numel() else 0):
             from_row = scaled - _log_sum_of_others(scaled + from_column, -1)
@@ -37,7 +37,7 @@ def log_partition(score: Float[Tensor, "*B N M"], softness: float, *, rounds: in
             if (share - before).abs().amax() < _CLOSE:
                 break
         from_row = scaled - _log_sum_of_others(scaled + from_column, -1)
-        # Of the columns and the pairs; the rows have the slope.
+        # Only the rows carry the gradient; columns and pairs are constants.
         columns = _log_one_more(from_row, -2).sum(-1)
         pairs = functional.softplus(from_row + from_column).sum((-1, -2))
     rows = _log_one_more(scaled + from_column, -1).sum(-1)
@@ -45,20 +45,20 @@ def log_partition(score: Float[Tensor, "*B N M"], softness: float, *, rounds: in
 
 
 def _log_one_more(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "*B K"]:
-    """log(1 + Σ exp) over an axis, 1 being for who stays alone."""
+    """Return log(1 + Σ exp) over an axis. The 1 stands for the target without a partner."""
     alone = torch.zeros_like(x.sum(axis, keepdim=True))
     return torch.logsumexp(torch.cat([x, alone], axis), axis)
 
 
 def _log_sum_of_others(x: Float[Tensor, "*B N M"], axis: int) -> Float[Tensor, "*B N M"]:
-    """log(1 + Σ of exp over the others of the axis), for each."""
+    """For each entry, return log(1 + Σ exp) over the other entries of the axis."""
     if not x.numel():
         return x
     most, at = x.max(axis, keepdim=True)
-    # Relative to the largest, or to the dummy's 0 where that is more.
+    # Subtract the largest term, or the dummy's 0 if that is larger, so that exp does not overflow.
     top = most.clamp(min=0)
     terms, alone = torch.exp(x - top), torch.exp(-top)
     others = (terms.sum(axis, keepdim=True) + alone - terms).log() + top
-    # The largest is summed around, not subtracted: what is left may be smaller than what is lost in the difference.
+    # For the largest entry, sum the others directly: subtraction from the total would lose the digits of a small rest.
     rest = x.scatter(axis, at, -torch.inf)
     return others.scatter(axis, at, torch.logaddexp(rest.logsumexp(axis, keepdim=True), torch.zeros_like(most)))

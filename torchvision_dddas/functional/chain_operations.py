@@ -1,9 +1,9 @@
-"""The operations of the detection chain on batches of tensors; with softness, the same steps have gradients.
+"""The operations of the detection chain on batches of tensors. With softness above 0, the same steps have gradients.
 
-Without softness all is computed in bytes, as on OpenCV. Registration, warps and exposure are hard and pass no gradient.
-Whole grey levels are rounded straight through. Thresholds and extrema commute, so the margin over the threshold goes
-through the morphology, whose extrema stay hard, and the threshold is softened last: the outline lies where the hard one
-does, whatever the softness.
+Without softness everything is computed in bytes, as in OpenCV. Registration, warps and exposure are hard and pass no
+gradient. Whole grey levels are rounded straight through. Thresholds and extrema commute, so the morphology is applied
+to the margin over the threshold, with hard extrema, and the threshold is softened last. The outline therefore lies
+where the hard outline lies, for any softness.
 """
 
 import torch
@@ -35,14 +35,14 @@ from torchvision_dddas.functional.warp import seen_by_both, seen_columns, warp_p
 LEVEL = 255
 """White, in grey levels."""
 
-_EXPOSURE_LEAST = 100  # the exposure is not judged by fewer pixels
+_EXPOSURE_LEAST = 100  # the exposure is not fitted to fewer pixels
 
 Light = tuple[Tensor, Tensor]
 Columns = tuple[Tensor, Tensor]
 
 
 class TensorOperations(Operations[Tensor, Tensor, Columns]):
-    """Implements `Operations` for a batch: views are (B, 1, H, W) floats of whole levels, pictures are bytes.
+    """Implement `Operations` for a batch: views are (B, 1, H, W) floats of whole levels, pictures are bytes.
 
     >>> operations = F.TensorOperations(softness=0.1)
     >>> operations.grey(torch.tensor([[[[17.0, 18.0]]]])).dtype, operations.is_hard
@@ -50,14 +50,14 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
     """
 
     def __init__(self, softness: float = 0.0, *, whole: bool = True, dtype: torch.dtype = torch.float32) -> None:
-        """softness: above 0, evidence is made of floats of `dtype`, which have gradients.
+        """softness: if above 0, evidence consists of floats of `dtype`, which have gradients.
 
         whole: round where OpenCV does.
         """
         self.whole, self.is_hard, self.dtype = whole, softness == 0.0 and whole, dtype
 
     def grey(self, view: Tensor) -> Tensor:
-        """See `Operations`, as of every other method."""
+        """See `Operations`, also for all other methods."""
         return to_bytes(view)
 
     def texture(self, view: Tensor) -> Tensor:
@@ -98,7 +98,7 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
         if all_true((gain * levels + offset).round() == levels):
             return warped
         darkened = (gain * LEVEL + offset).round() < WHITE
-        # A clipped pixel only says that the place was at least so bright.
+        # The true brightness of a clipped pixel is unknown; it is only at least as high.
         cut = None if all_true(~darkened) else (warped >= WHITE) & darkened
         through = to_bytes(warped.to(gain.dtype).mul_(gain).add_(offset).round_().clamp_(0.0, float(LEVEL)))
         return through if cut is None else torch.where(cut, torch.maximum(through, to_bytes(reference)), through)
@@ -179,7 +179,7 @@ class TensorOperations(Operations[Tensor, Tensor, Columns]):
 
 
 def close_masks(mask: Tensor, side: int) -> Tensor:
-    """The mask closed with an ellipse; of bytes on a CPU only around where any of the pictures is set at all.
+    """Return the mask closed with an ellipse. Bytes on a CPU are closed only around pixels that a picture sets.
 
     >>> mask = torch.zeros(1, 1, 9, 9)
     >>> mask[..., 3:6, [2, 3, 5, 6]] = 1
@@ -194,7 +194,7 @@ def close_masks(mask: Tensor, side: int) -> Tensor:
         places = mask.amax((0, 1, dim)).nonzero()
         if not len(places):
             return mask
-        # A pixel's closing depends on what lies less than 2 x side away.
+        # The closing of a pixel depends only on pixels less than 2 x side away.
         spans.append(slice(max(int(places[0]) - 2 * side, 0), int(places[-1]) + 2 * side + 1))
     out = torch.zeros_like(mask)
     out[..., spans[0], spans[1]] = closing(mask[..., spans[0], spans[1]], kernel)

@@ -1,4 +1,4 @@
-"""Colours: HSV, which pixels are of a colour (appendix A, IV-A), and histograms of boxes (appendix C, eq. 3)."""
+"""Colours: HSV, the pixels within a colour's range (appendix A, IV-A), and histograms of boxes (appendix C, eq. 3)."""
 
 import math
 
@@ -9,15 +9,16 @@ from torch import Tensor
 
 from torchvision_dddas.functional.soft import step
 
-TURN = 180.0  # of the hue
-FULL = 255.0  # saturation, value
-BINS = 256  # of a channel's histogram
+TURN = 180.0  # one turn of the hue
+FULL = 255.0  # largest saturation and value
+BINS = 256  # in the histogram of a channel
 
 
 def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
-    """Hue 0 to 180, saturation and value 0 to 255, of blue, green, red in [0, 1]; grey has hue 0 and saturation 0.
+    """Convert blue, green, red in [0, 1] to hue, 0 to 180, saturation and value, 0 to 255.
 
-    OpenCV's for 8-bit pictures, before it rounds; by Kornia's rgb_to_hsv.
+    Hue and saturation of grey are 0. The values are OpenCV's for 8-bit pictures before rounding, by Kornia's
+    rgb_to_hsv.
 
     >>> F.bgr_to_hsv(torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1)).flatten()
     tensor([120.0000, 255.0000, 255.0000])
@@ -29,10 +30,11 @@ def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
 def within_ranges(
     hsv: Float[Tensor, "B 3 H W"], low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"], *, softness: float = 0.0
 ) -> Float[Tensor, "B K H W"]:
-    """How much each pixel belongs to each range of colours: 0 or 1 where softness, in the units of hsv, is 0.
+    """Return how far each pixel belongs to each range of colours: 0 or 1 with softness 0. softness: in units of hsv.
 
-    A range whose lowest hue is above its highest goes over 0. The bounds are whole 8-bit levels, and what rounds to
-    one of them is inside: it is judged by how far the worst of the three numbers is from half a level beyond.
+    A range whose lowest hue is above its highest hue wraps around 0. The bounds are whole 8-bit levels. A number that
+    rounds to a bound is inside: each range extends half a level beyond its bounds, and the number that is nearest to
+    leaving it, or furthest outside, decides.
 
     >>> red = F.bgr_to_hsv(torch.tensor([0, 0, 1.0]).reshape(1, 3, 1, 1))
     >>> F.within_ranges(red, torch.tensor([[170.0, 80, 80]]), torch.tensor([[10.0, 255, 255]])).flatten()
@@ -40,7 +42,7 @@ def within_ranges(
     """
     hue, saturation, value = hsv.unbind(1)
     middle, half = (low + high) / 2, (high - low) / 2
-    # On a circle what goes over 0 is a range as any other, half a turn from the middle of its bounds.
+    # On a circle, a range that wraps around 0 is like any other. Its middle is half a turn from the mean of its bounds.
     over_zero = (half[:, 0] < 0).to(low.dtype) * (TURN / 2)
     middle_hue, half_hue = torch.remainder(middle[:, 0] + over_zero, TURN), half[:, 0] + over_zero
     found = []
@@ -63,17 +65,17 @@ def rgb_histogram(
     normalize: bool = True,
     largest: tuple[int, int] | None = None,
 ) -> tuple[Float[Tensor, "B N 768"], Bool[Tensor, "B N"]]:
-    """256 bins each of red, green and blue for every box, and which boxes are valid and not empty inside the picture.
+    """Return 3 x 256 bins (red, green, blue) of each box, and which boxes are valid and have pixels in the picture.
 
-    Kornia's image_histogram2d is the triangular kernel of softness 1, of whole pictures of one size; it compares every
-    pixel with every bin, in 80 to 300 times the time (`python eval/speed.py operations`).
+    Kornia's image_histogram2d has a triangular kernel, as softness 1 has, but takes whole pictures of one size. It
+    compares every pixel with every bin, which takes 80 to 300 times as long (`python eval/speed.py operations`).
     image: red, green, blue in [0, 1]. box_px: x, y of the top left pixel, width, height; edges are rounded to whole
-    pixels and cut at the picture. Missing boxes have zeros; gradients reach the image where softness is above 0.
-    softness: at 0 each pixel counts in the nearest level, exactly so for 8-bit pictures; at 1 it is shared between the
-    two nearest levels by distance; between, the ramp from one level to the next is that share of a level wide.
-    normalize: each channel adds up to 1; False leaves the counts, and a box of 100 pixels 300 in all.
-    largest: (height, width) in pixels that no box exceeds: then only so much is read for each of them, and a larger box
-    does not count as valid. None: the whole picture, N times.
+    pixels and cut at the picture. Missing boxes have zeros. Gradients reach the image if softness is above 0.
+    softness: at 0 each pixel counts in the nearest level, which is exact for 8-bit pictures. At 1 it is shared between
+    the two nearest levels by distance. In between, softness is the width of the ramp from one level to the next.
+    normalize: let each channel add up to 1; False returns counts, 300 in all for a box of 100 pixels.
+    largest: (height, width) in pixels that no box exceeds. Only so many pixels are then read for each box, and a larger
+    box is not valid. None: the whole picture is read for each box.
 
     >>> box_px, valid = torch.tensor([[[1.0, 1, 4, 4]]]), torch.ones(1, 1, dtype=torch.bool)
     >>> histogram, there = F.rgb_histogram(torch.zeros(1, 3, 8, 8), box_px, valid)
@@ -87,7 +89,7 @@ def rgb_histogram(
     low, high = low.clamp(min=0).minimum(edge), high.clamp(min=0).minimum(edge)
     side = high - low
     valid = valid & (side > 0).all(-1) & (side[..., 0] <= columns) & (side[..., 1] <= rows)
-    # NaN boxes fail the comparisons above; their indices must still be numbers.
+    # NaN boxes fail the comparisons above, but their indices must still be numbers.
     left, top = torch.where(valid[..., None], low, torch.zeros_like(low)).long().unbind(-1)
     wide, tall = torch.where(valid[..., None], side, torch.zeros_like(side)).long().unbind(-1)
 
@@ -97,7 +99,7 @@ def rgb_histogram(
     inside = (down < tall[..., None])[..., :, None] & (across < wide[..., None])[..., None, :]
     place = (v[..., :, None] * width + u[..., None, :]).flatten(1)
     pixels = image.flatten(2).gather(2, place[:, None].expand(-1, 3, -1))
-    # Every pixel counts in the level, or the two levels, that it is nearest to, of its box's histogram.
+    # In the histogram of its box, every pixel counts in the level, or in the two levels, nearest to it.
     level = pixels.clamp(0, 1) * (BINS - 1)
     weight = inside.flatten(1)[:, None].to(pixels.dtype).expand_as(level)
     batch, boxes = valid.shape

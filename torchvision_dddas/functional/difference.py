@@ -1,4 +1,4 @@
-"""What changed between registered frames, apart from the light (appendix B, step S4)."""
+"""The differences of registered frames, after their exposures are matched (appendix B, step S4)."""
 
 import numpy as np
 import torch
@@ -17,12 +17,12 @@ def fit_exposure(
     *,
     floor: float = 3 / 255,
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
-    """Gain and offset such that gain * warped + offset has the reference's light: trimmed least squares.
+    """Fit gain and offset by trimmed least squares, so that gain * warped + offset has the reference's exposure.
 
-    Starts from the median difference, so that a jump of light does not pass for movers. Each round keeps the pixels
-    whose error is at most max(floor, 3.7 x the median error) and fits them again, until the fit is settled to floor/30,
-    a tenth of a grey level. Without inside pixels, or on a frame of one single grey, the gain stays 1 (and the offset
-    is the difference of the means).
+    The fit starts from the median difference, so that a jump of the exposure is not taken for moving targets. Each
+    round fits the pixels whose error is at most max(floor, 3.7 x the median error), until the fit changes by less than
+    floor/30, a tenth of a grey level. Without inside pixels, or on a frame of a single grey, the gain stays 1. In the
+    second case the offset is the difference of the means.
 
     >>> warped = torch.rand(1, 1, 32, 32)
     >>> gain, offset = F.fit_exposure(1.2 * warped + 0.1, warped, torch.ones(1, 1, 32, 32, dtype=torch.bool))
@@ -55,16 +55,16 @@ def fit_exposure(
 
 
 def absolute_difference(a: UInt8[Tensor, "*any"], b: UInt8[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
-    """|a - b| of unsigned bytes."""
+    """Return |a - b| of unsigned bytes."""
     return torch.maximum(a, b).sub_(torch.minimum(a, b))
 
 
 def match_exposure(
     earlier: Float[Tensor, "B 1 H W"], later: Float[Tensor, "B 1 H W"]
 ) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, "B 1 H W"]]:
-    """Both pictures, whole grey levels, the darker one in the other's exposure where the two differ clearly.
+    """Return both pictures in whole grey levels, the darker one in the other's exposure if they differ clearly.
 
-    The twin of `detection.engine.match_exposure`, batched.
+    This is the batched form of `chain.exposure.match_exposure`.
 
     >>> picture = (torch.rand(1, 1, 64, 64) * 100).round()
     >>> earlier, later = F.match_exposure(picture, 2 * picture)
@@ -84,9 +84,9 @@ def match_exposure(
 
 
 def level_quantiles(levels: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 33"]:
-    """The grey levels below which 2 to 98 % of a picture lie, float64; the pixels of a level are spread over it.
+    """Return the grey levels below which 2 to 98 % of a picture lie, float64. Pixels of a level are spread over it.
 
-    From every 3rd pixel of every 5th row, both odd, as `detection.engine.exposure_between` explains.
+    Use every 3rd pixel of every 5th row; `chain.exposure.measure_level_shares` says why both are odd.
     """
     sample = levels[..., ::5, ::3].flatten(1).round().long().clamp(0, 255)
     counts = torch.zeros(len(levels), 257, dtype=torch.float64, device=levels.device)
@@ -101,9 +101,10 @@ def level_quantiles(levels: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 33"]:
 def fit_quantiles(
     wanted: Float[Tensor, "B 33"], given: Float[Tensor, "B 33"]
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
-    """Gain and offset that take the levels `given` to the levels `wanted` at the same shares of a picture.
+    """Fit gain and offset that convert the quantiles `given` to the quantiles `wanted`.
 
-    1 and 0 where they hardly differ, or not as exposures do: the twin of `detection.engine.fit_exposure`, batched.
+    Return 1 and 0 if they are nearly equal, or if gain and offset do not explain the difference. This is the batched
+    form of `chain.exposure.fit_exposure`.
     """
     one = torch.ones_like(wanted[:, 0])
     kept = (torch.minimum(wanted, given) > 3.0) & (torch.maximum(wanted, given) < 252.0)
@@ -129,8 +130,8 @@ def fit_quantiles(
 
 
 def _middle(values: Float[Tensor, "B N"], kept: Bool[Tensor, "B N"]) -> Float[Tensor, "B"]:
-    """The median of the values that are kept, the mean of two in the middle; 0 where there are none."""
-    # By topk of a fixed number: the sort of torch 2.6 is in no graph.
+    """Return the median of the kept values, with the mean of the middle two; 0 if no value is kept."""
+    # Use topk of a fixed number, because torch 2.6 cannot export its sort.
     size, count = int(values.shape[1]), kept.sum(1, keepdim=True)
     ordered = values.masked_fill(~kept, torch.inf).topk(size, dim=1, largest=False).values
     pair = ordered.gather(1, torch.cat([(count - 1).clamp(min=0) // 2, count // 2], 1).clamp(max=values.shape[1] - 1))
@@ -144,9 +145,10 @@ def regional_medians(
     least: float,
     most: Float[Tensor, "B"],
 ) -> Float[Tensor, "B 1 R C"]:
-    """Lower medians of regions of `side` pixels, between `least` and `most`, outliers among the regions smoothed away.
+    """Return lower medians of regions of `side` pixels, clipped to `least` and `most`.
 
-    A region in which less than a tenth of the mask is set has `least`.
+    A region in which at most a tenth of the mask is set has the value `least`. A median filter removes outliers among
+    the regions.
     """
     down, across = (-length % side for length in values.shape[-2:])
     cells = functional.pad(values.masked_fill(~mask, torch.inf), (0, across, 0, down), value=torch.inf)
@@ -160,26 +162,26 @@ def regional_medians(
 
 
 def _count_at_most(rising: Float[Tensor, "B N"], values: Float[Tensor, "B M"]) -> Int64[Tensor, "B M"]:
-    """How many numbers of each rising row are at most each value."""
-    if is_traced():  # a graph has no search
+    """Count the numbers of each rising row that are at most each value."""
+    if is_traced():  # an exported graph has no search
         return (rising[:, None] <= values[..., None]).sum(-1)
     return torch.searchsorted(rising, values.contiguous(), right=True)
 
 
 def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B 1"]:
-    """Lower median of the values under the mask; 0 where there are none.
+    """Return the lower median of the values under the mask; 0 if the mask is empty.
 
     >>> F.masked_median(torch.tensor([[1.0, 5, 9]]), torch.tensor([[True, True, False]]))
     tensor([[1.]])
     """
     if may_branch(values) and not values.requires_grad:
-        # The same in a fifth of the time that torch takes.
+        # NumPy takes a fifth of torch's time.
         rows = zip(values.numpy(), mask.numpy(), strict=True)
         seen = [row[kept] for row, kept in rows]
         found = [np.partition(row, (len(row) - 1) // 2)[(len(row) - 1) // 2] if len(row) else 0.0 for row in seen]
         return torch.tensor(found, dtype=values.dtype)[:, None]
     if not torch.compiler.is_compiling():
-        # Several times faster than sorting, but a graph cannot hold it.
+        # This is several times faster than sorting, but cannot be exported.
         return values.masked_fill(~mask, torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(0.0)
     middle = (mask.sum(1, keepdim=True) - 1) // 2
     ordered = values.masked_fill(~mask, torch.inf).sort(1).values
@@ -189,24 +191,24 @@ def masked_median(values: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Fl
 def noise_weight(
     texture: Float[Tensor, "B 1 H W"], noise_levels: float | Tensor, gradient_share: float | Tensor
 ) -> Float[Tensor, "B 1 H W"]:
-    """One over the noise expected of a pixel, in grey levels: that of a flat region, and a share of the gradient.
+    """Return 1 over the expected noise of a pixel in grey levels, from the noise of flat regions and the gradient.
 
-    texture: 4 x grey levels a pixel, as `mean_gradient` gives it.
+    texture: in 4 x grey levels a pixel, as `mean_gradient` returns it.
 
     >>> 1 / F.noise_weight(torch.full((1, 1, 1, 1), 40.0), 4.0, 0.12)
     tensor([[[[4.1761]]]])
     """
-    # In place where that keeps the gradient of the parameters.
+    # Compute in place where this does not break the gradients of the parameters.
     return (texture.square() * (gradient_share / 4) ** 2).add_(noise_levels**2).rsqrt_()
 
 
 def noise_units(
     z: UInt8[Tensor, "B 1 H W"], textured: Bool[Tensor, "B 1 H W"], scale: float, least: int = 500
 ) -> Float[Tensor, "B"]:
-    """The median of z / scale over textured pixels where that is above 1, else 1; 1 too where they are too few."""
+    """Return the median of z / scale over textured pixels, at least 1; 1 if at most `least` pixels are textured."""
     level, seen = z.flatten(1), textured.flatten(1)
     total = seen.sum(1, dtype=torch.int32)
-    # The upper one of the two in the middle is above the scale; only then can their mean be.
+    # The mean of the middle two can only be above the scale if the upper one is.
     is_high = (total > least) & ((seen & is_above(level, int(scale))).sum(1, dtype=torch.int32) >= total - total // 2)
     units = torch.ones_like(total, dtype=torch.float64)
     if all_true(~is_high):
@@ -214,6 +216,6 @@ def noise_units(
     counts = torch.zeros(len(level), 257, dtype=torch.int64, device=z.device)
     counts.scatter_add_(1, torch.where(seen, level.long(), 256), torch.ones_like(level, dtype=torch.int64))
     ranks = torch.stack([(total - 1).clamp(min=0) // 2, total // 2], 1)
-    # The mean of the two in the middle, as NumPy takes it.
+    # Take the mean of the middle two, as NumPy does.
     median = _count_at_most(counts.cumsum(1), ranks).double().mean(1)
     return torch.where(is_high, (median / scale).clamp(min=1.0), units)

@@ -1,9 +1,9 @@
-"""Gaussian smoothing (appendix B, step S5), gradients, box sums, and what pictures are outside their edges.
+"""Gaussian smoothing (appendix B, step S5), gradients, box sums, and the continuation of pictures beyond their edges.
 
-Kornia's `sobel` and `box_blur` take 5 to 10 times the time of `mean_gradient` on a CPU (`python eval/speed.py
-operations`). Its Gaussian is fastest on whole batches: in strips of rows it takes 2 to 8 times as long.
+On a CPU, Kornia's `sobel` and `box_blur` take 5 to 10 times as long as `mean_gradient` (`python eval/speed.py
+operations`). Kornia's Gaussian is fastest on whole batches; in strips of rows it takes 2 to 8 times as long.
 
-Outside its edges a picture is mirrored, the edge pixel not repeated: Kornia's border `reflect`, OpenCV's 101.
+Pictures are mirrored beyond their edges without repeating the edge pixel: Kornia's border `reflect`, OpenCV's 101.
 """
 
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from torchvision_dddas.chain import uses_kornia
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.functional.soft import is_traced
 
-# The sigmas whose weights are nearest to the binomial ones that OpenCV takes for small kernels.
+# With these sigmas the weights are nearest to the binomial weights that OpenCV uses for small kernels.
 _SIGMAS = {3: 0.8493, 5: 1.0647, 7: 1.4474, 9: 1.7054}
-# Pixels in work at once on a CPU: temporaries then stay in its cache, and their memory is used again.
+# Number of pixels that are processed at once on a CPU, so that temporaries stay in the cache and are reused.
 _STRIP_PIXELS = 100_000
 
 
@@ -30,11 +30,12 @@ def gaussian_blur2d(
     sigma: tuple[float, float] | Tensor | None = None,
     border_type: str = "reflect",
 ) -> Shaped[Tensor, "B C H W"]:
-    """`kornia.filters.gaussian_blur2d`; without a sigma it is that of cv2.GaussianBlur, and bytes stay bytes.
+    """Smooth as `kornia.filters.gaussian_blur2d` does; without a sigma as cv2.GaussianBlur. Bytes stay bytes.
 
-    Halves are rounded up. Pictures may be of any size. OpenCV's weights for kernels up to 9 differ by up to 0.006.
+    Halves are rounded up. Pictures may have any size. For kernels up to 9 the weights differ from OpenCV's by up to
+    0.006.
 
-    Raises InputError for an even size, and another border than `reflect` without a sigma.
+    Raise InputError for an even size, and for another border than `reflect` without a sigma.
 
     >>> F.gaussian_blur2d(torch.ones(1, 1, 8, 8), 5)[0, 0, 4, 4]
     tensor(1.)
@@ -46,7 +47,7 @@ def gaussian_blur2d(
     if any(side < 1 or side % 2 == 0 for side in sides):
         raise InputError(f"kernel_size must be odd and at least 1, got {kernel_size}")
     if border_type != "reflect":
-        raise InputError(f"border_type must be reflect where no sigma is given, got {border_type}; give a sigma")
+        raise InputError(f"border_type must be reflect without a sigma, got {border_type}; give a sigma")
     if sides == (1, 1):
         return input
     sigma = (_SIGMAS.get(sides[0], 0.15 * sides[0] + 0.35), _SIGMAS.get(sides[1], 0.15 * sides[1] + 0.35))
@@ -55,7 +56,7 @@ def gaussian_blur2d(
     down, across = sides[0] // 2, sides[1] // 2
     if down < levels.shape[-2] and across < levels.shape[-1]:
         blurred = filters.gaussian_blur2d(levels, sides, sigma, border_type)
-    else:  # Kornia mirrors once only
+    else:  # Kornia mirrors only once
         padded = pad_reflect(levels, across, across, down, down)
         around = filters.gaussian_blur2d(padded, sides, sigma, "constant")
         blurred = around[..., down : down + levels.shape[-2], across : across + levels.shape[-1]]
@@ -63,7 +64,7 @@ def gaussian_blur2d(
 
 
 def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B C H W"]:
-    """Sum over block x block pixels, mirrored at the edges, anchored where OpenCV's box filter is.
+    """Return the sum over block x block pixels, mirrored at the edges, anchored as in OpenCV's box filter.
 
     >>> F.box_sum(torch.ones(1, 1, 4, 4), 3)[0, 0, 1]
     tensor([9., 9., 9., 9.])
@@ -80,10 +81,10 @@ def box_sum(values: Shaped[Tensor, "B C H W"], block: int) -> Shaped[Tensor, "B 
 
 
 def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], *, block: int = 5) -> Shaped[Tensor, "B 1 H W"]:
-    """Mean gradient magnitude over block x block pixels, 4 x grey levels a pixel, for pictures in whole grey levels.
+    """Return the mean gradient magnitude over block x block pixels, in 4 x grey levels a pixel, of whole grey levels.
 
-    Half of `kornia.filters.sobel` without normalisation, through `box_blur`; rounded to whole numbers and cut off at
-    255 before and after the mean, as OpenCV's 8-bit pictures are. Kornia's `sobel` repeats the edge pixel: the rim
+    It is half of `kornia.filters.sobel` without normalisation, then `box_blur`. As in OpenCV's 8-bit pictures, values
+    are rounded and clipped at 255 before and after the mean. Kornia's `sobel` repeats the edge pixel, so the rim
     differs. No gradient passes.
 
     >>> slope = torch.arange(8.0).expand(1, 1, 8, 8)
@@ -103,24 +104,24 @@ def mean_gradient(levels: Shaped[Tensor, "B 1 H W"], *, block: int = 5) -> Shape
 
 
 def to_bytes(levels: Float[Tensor, "*any"]) -> UInt8[Tensor, "*any"]:
-    """Numbers in [0, 256), cut down to whole ones."""
-    # By way of 16 bits in a third of the time.
+    """Truncate numbers in [0, 256) to bytes."""
+    # Conversion by way of 16 bits takes a third of the time.
     return levels.to(torch.int16).to(torch.uint8)
 
 
 def is_above(levels: UInt8[Tensor, "*any"], limit: int) -> Bool[Tensor, "*any"]:
-    """Where levels are above the limit, in a sixth of the time that torch takes to compare bytes."""
+    """Return where levels are above the limit, in a sixth of the time that torch takes to compare bytes."""
     if is_traced() or not 0 <= limit < 255:
-        # Torch would cut a whole number down to a byte: 300 to 44.
+        # Torch would wrap a whole number to a byte: 300 to 44.
         return levels > float(limit)
     return levels.clamp(limit, limit + 1).sub_(limit).view(torch.bool)
 
 
 def in_strips(work: Callable[[Tensor], Tensor], picture: Tensor, reach: int) -> Tensor:
-    """work(picture), where a pixel of the result depends on `reach` rows on either side at most.
+    """Return work(picture), if a pixel of the result depends on at most `reach` rows on either side.
 
-    On a CPU in strips of rows: several times as fast on large pictures. At once on other devices, for graphs, and where
-    the picture takes gradients.
+    On a CPU, work in strips of rows, which is several times as fast on large pictures. On other devices, in graphs, and
+    if the picture takes gradients, work on the whole picture.
     """
     height = picture.shape[-2]
     step = strip_rows(picture, height, picture.numel() // max(height, 1))
@@ -135,7 +136,7 @@ def in_strips(work: Callable[[Tensor], Tensor], picture: Tensor, reach: int) -> 
 
 
 def strip_rows(like: Tensor, height: int, row: int) -> int:
-    """How many of `height` rows of `row` numbers are worked on at once; see `in_strips`."""
+    """Return how many of `height` rows of `row` numbers are processed at once; see `in_strips`."""
     if like.device.type != "cpu" or (like.requires_grad and torch.is_grad_enabled()) or is_traced():
         return height
     return max(_STRIP_PIXELS // max(row, 1), 8)
@@ -144,7 +145,7 @@ def strip_rows(like: Tensor, height: int, row: int) -> int:
 def pad_reflect(
     image: Shaped[Tensor, "B C H W"], left: int, right: int, top: int, bottom: int
 ) -> Shaped[Tensor, "B C h w"]:
-    """As `torch.nn.functional.pad` in mode `reflect`; where a side is smaller than the border the mirror repeats.
+    """Pad as `torch.nn.functional.pad` in mode `reflect`. If a side is smaller than the border, the mirror repeats.
 
     >>> F.pad_reflect(torch.arange(3.0).reshape(1, 1, 1, 3), 2, 2, 0, 0).flatten()
     tensor([2., 1., 0., 1., 2., 1., 0.])
@@ -158,7 +159,7 @@ def pad_reflect(
 
 
 def reflect_index(index: Int64[Tensor, "*any"], size: int) -> Int64[Tensor, "*any"]:
-    """The pixel inside 0 .. size - 1 that an index outside mirrors.
+    """Return the pixel within 0 .. size - 1 to which an index outside is mirrored.
 
     >>> F.reflect_index(torch.tensor([-2, -1, 0, 3, 4]), 3)
     tensor([2, 1, 0, 1, 0])

@@ -1,8 +1,9 @@
-"""Pyramidal Lucas-Kanade: where points of one frame are in another (appendix B, step S2).
+"""Pyramidal Lucas-Kanade: find points of one frame in another (appendix B, step S2).
 
-Agrees with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker; sampling patches with `grid_sample` in every
-iteration costs 17-20x OpenCV's time on a CPU, the correlation table per point that is used here 7-9x, 4-5x when sparse
-and predicted: what an iteration needs at a fractional displacement is a bilinear mix of sums at whole ones, made once.
+The results agree with cv2.calcOpticalFlowPyrLK. Kornia has no sparse tracker. Sampling patches by `grid_sample` in
+every iteration takes 17-20 times OpenCV's time on a CPU. Here each point has a table of correlations at whole
+displacements, computed once, and an iteration interpolates bilinearly in it. This takes 7-9 times OpenCV's time, and
+4-5 times for few points with predicted places.
 """
 
 import math
@@ -17,7 +18,7 @@ from torchvision_dddas.functional.soft import all_true, is_traced
 
 Pyramid = list[Tensor]
 
-# Half the side of the table that is tried first on a CPU: most points stay in it, and it has a quarter of the places.
+# Half the side of the table that a CPU tries first. Most points stay in it, and it has a quarter of the entries.
 _SMALL_REACH = 1
 _POINTS_AT_ONCE = 500
 
@@ -26,10 +27,10 @@ def build_pyramid(
     input: Float[Tensor, "B C H W"],  # noqa: A002 (Kornia's name)
     max_level: int,
 ) -> Pyramid:
-    """`max_level` pictures, full size first, each half the one before: cv2.buildOpticalFlowPyramid (5-tap binomial).
+    """Return `max_level` pictures from full size, each half the previous: cv2.buildOpticalFlowPyramid (5-tap binomial).
 
-    kornia.geometry.build_pyramid smooths alike, at the same border (`reflect`), then interpolates between pixels; here
-    every other pixel is taken, and odd sides are rounded up. Kornia's takes 5 to 11 times as long on a CPU
+    kornia.geometry.build_pyramid smooths alike, at the same border (`reflect`), but then interpolates between pixels.
+    This function takes every other pixel and rounds odd sides up. Kornia's takes 5 to 11 times as long on a CPU
     (`python eval/speed.py operations`).
 
     >>> [tuple(level.shape) for level in F.build_pyramid(torch.rand(1, 1, 48, 64), 3)]
@@ -54,11 +55,12 @@ def lucas_kanade(
     reach_px: int = 4,
     rounds: int = 1,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """The points' places in the second frame, and which were found.
+    """Return the points' places in the second frame, and which were found.
 
-    guess: predicted places (default: they stay). Tables reach reach_px around a level's starting place and are made
-    again up to `rounds` times where a point left them; with a good guess a reach of 2 does. Not found: too little
-    texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit), gone from the table, or outside the frame.
+    guess: predicted places; by default the points' own. Tables reach reach_px around the start of a level. If a point
+    leaves its table, a new table is made, up to `rounds` tables in all. With a good guess a reach of 2 suffices. A
+    point is not found if it has too little texture (smaller eigenvalue per pixel below min_eigen, in OpenCV's unit),
+    leaves its table, or lies outside the frame.
 
     >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7)
     >>> start = torch.tensor([[[30.0, 30.0]]])
@@ -96,9 +98,9 @@ def forward_backward(
     limit_px: float = 1.0,
     **settings: float,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """As `lucas_kanade`, with its settings; found only where tracking back returns to within limit_px of the start.
+    """Track as `lucas_kanade`; a point is found only if tracking back ends within limit_px of its start.
 
-    The backward guess uses the predicted displacement, not the known start: otherwise the check would always pass.
+    The backward guess uses the predicted displacement, not the known start. Otherwise the check would always pass.
 
     >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7)
     >>> start = torch.tensor([[[30.0, 30.0]]])
@@ -113,10 +115,10 @@ def forward_backward(
 
 
 class _FromPatch:
-    """What a level needs of the first frame around each point: gradients times the inverse structure tensor.
+    """The data of a level's first frame around each point: gradients times the inverse structure tensor.
 
-    gradients: (B, N, 2, window^2), such that their product with a grey patch is the displacement that it implies.
-    target: (B, N, 2), what the first frame's own patch implies. textured: whether the tensor can be inverted.
+    gradients: (B, N, 2, window^2); their product with a grey patch is the displacement that the patch implies. target:
+    (B, N, 2), the displacement of the first frame's own patch. textured: whether the tensor can be inverted.
     """
 
     def __init__(self, image: Tensor, points: Tensor, window: int, min_eigen: float) -> None:
@@ -133,14 +135,14 @@ class _FromPatch:
         window = self.window
         corner = points - (window - 1) / 2
         base = corner.detach().floor()
-        # One pixel more on every side for the gradient, one more to the right and below for the interpolation.
+        # Read one more pixel on every side for the gradient, and one more to the right and below for the interpolation.
         grey = _gather(image, base.long() - 1, frame, window + 3)
         inside = _inside(image, base.long(), window + 1)
         across = grey[..., 2:] - grey[..., :-2]
         down = grey[..., 2:, :] - grey[..., :-2, :]
         along_u = torch.add((across[..., :-2, :] + across[..., 2:, :]) * 3.0, across[..., 1:-1, :], alpha=10.0)
         along_v = torch.add((down[..., :-2] + down[..., 2:]) * 3.0, down[..., 1:-1], alpha=10.0)
-        # Like OpenCV: grey is mirrored outside the picture, gradients are zero there.
+        # Like OpenCV, mirror grey levels outside the picture, and set gradients to zero there.
         slopes = torch.stack([along_u, along_v], 2) * (inside / 32.0)[:, :, None]
         planes = torch.cat([slopes, grey[..., 1:-1, 1:-1][:, :, None]], 2)
         part = (corner - base)[..., None, None, None, :]
@@ -157,7 +159,7 @@ class _FromPatch:
         return inverse @ gradients, (inverse @ products[..., 2:])[..., 0], textured
 
     def select(self, chosen: Tensor) -> "_FromPatch":
-        """Those of the chosen points alone, in a batch of one."""
+        """Return the data of the chosen points, as a batch of one."""
         part = copy(self)
         part.gradients, part.target = self.gradients[chosen][None], self.target[chosen][None]
         return part
@@ -166,10 +168,10 @@ class _FromPatch:
 def _descend(
     patch: _FromPatch, image: Tensor, start: Tensor, active: Tensor, iterations: int, epsilon_px: float, reach: int
 ) -> tuple[Tensor, Tensor]:
-    """Newton steps of the active points from `start` inside one table: places, and whether each stayed within it.
+    """Take Newton steps of the active points from `start` in one table; return places, and whether each stayed in it.
 
-    On a CPU a small table does for most; those that leave it start again in one of the full reach. The result is the
-    same.
+    On a CPU, a small table suffices for most points. Points that leave it start again in a table of the full reach. The
+    result is the same.
     """
     frame = torch.arange(len(image), device=image.device)[:, None].expand(active.shape)
     if image.device.type != "cpu" or is_traced():
@@ -196,14 +198,14 @@ def _step_in_table(
     epsilon_px: float,
     reach: int,
 ) -> tuple[Tensor, Tensor]:
-    """As `_descend`, all in a table of one reach. frame: whose picture of the batch each point is searched in."""
+    """Do the work of `_descend` in tables of one reach. frame: index of the picture in which each point is searched."""
     corner = start - (patch.window - 1) / 2
     base = corner.detach().floor()
     span = 2 * reach + 2
     whole = base.long() - reach
     parts = _parts(image, start.shape)
     table = torch.cat([_table(patch.gradients[:, p], image, whole[:, p], frame[:, p], span) for p in parts], 1)
-    # Places are kept relative to the table's origin, where a table index is a whole displacement.
+    # Keep places relative to the table's origin, so that a table index is a whole displacement.
     origin = base - reach
     place = corner - origin
     corners = torch.tensor([0, 1, span, span + 1], device=place.device)
@@ -218,12 +220,12 @@ def _step_in_table(
         seen = (weights[..., None, :] * table.gather(3, index[..., None, :].expand(-1, -1, 2, -1))).sum(-1)
         step = patch.target - seen
         length = step.detach()
-        # At rest, or swinging between two places: then OpenCV stops half-way.
+        # A point ends at rest. If it swings between two places, it ends half-way, as in OpenCV.
         rest = length.square().sum(-1) <= epsilon_px**2
         swing = ((length + last).abs().amax(-1) < 0.01) & ~rest
         last = length
         share = active * (1.0 - 0.5 * swing)
-        # Beyond the table mixing would extrapolate: a point waits at the edge, and the next table is centred there.
+        # Do not extrapolate: a point beyond the table waits at its edge, and the next table is centred there.
         place = (place + share[..., None] * step).clamp(0, span - 1)
         active = active & ~(rest | swing)
         if all_true(~active):
@@ -233,20 +235,20 @@ def _step_in_table(
 
 
 def _table(gradients: Tensor, image: Tensor, corner: Tensor, frame: Tensor, span: int) -> Float[Tensor, "B N 2 T"]:
-    """The displacement that the second frame's patch implies at each of span x span whole displacements."""
+    """Return the displacement that the second frame's patch implies at each of span x span whole displacements."""
     area = gradients.shape[-1]
     window = math.isqrt(area)
     grey = _gather(image, corner, frame, window + span - 1)
     batch, count, side = grey.shape[:3]
-    # Columns unfolded, rows not: rows of one displacement lie together in memory, so each is one strided product.
-    # Dimension 3 and not -1: torch's older ONNX exporter gets a negative one wrong.
+    # Unfold only the columns. The rows of one displacement then lie together in memory, so that each is one strided
+    # product. Use dimension 3, not -1: torch's older ONNX exporter mishandles a negative one.
     strips = grey.unfold(3, window, 1).transpose(2, 3).reshape(batch * count, span, side * window)
     rows = [gradients.flatten(0, 1) @ strips[..., shift * window : shift * window + area].mT for shift in range(span)]
     return torch.stack(rows, 2).reshape(batch, count, 2, span * span)
 
 
 def _parts(image: Tensor, shape: torch.Size) -> list[slice]:
-    """Of (B, N) points those that are worked on at once: on a CPU few, whose patches stay in its cache."""
+    """Return slices of the (B, N) points to process at once. On a CPU few fit, so that patches stay in the cache."""
     if image.device.type != "cpu" or is_traced():
         return [slice(None)]
     step = max(_POINTS_AT_ONCE // max(shape[0], 1), 1)
@@ -254,7 +256,7 @@ def _parts(image: Tensor, shape: torch.Size) -> list[slice]:
 
 
 def _gather(image: Tensor, corner: Tensor, frame: Tensor, side: int) -> Float[Tensor, "B N side side"]:
-    """Pixels from each whole corner (u, v) of a picture of the batch, mirrored outside."""
+    """Gather the pixels from each whole corner (u, v) of a picture of the batch, mirrored outside."""
     height, width = image.shape[-2:]
     steps = torch.arange(side, device=image.device)
     columns = reflect_index(corner[..., :1] + steps, width)
@@ -264,7 +266,7 @@ def _gather(image: Tensor, corner: Tensor, frame: Tensor, side: int) -> Float[Te
 
 
 def _inside(image: Tensor, corner: Tensor, side: int) -> Float[Tensor, "B N side side"]:
-    """1 where the pixels from each corner lie in the picture, else 0."""
+    """Return 1 where the pixels from each corner lie in the picture, and 0 elsewhere."""
     steps = torch.arange(side, device=image.device)
     columns, rows = corner[..., :1] + steps, corner[..., 1:] + steps
     along_u = ((columns >= 0) & (columns < image.shape[-1])).to(image.dtype)

@@ -1,7 +1,8 @@
-"""Histograms of oriented gradients under a linear SVM, densely: the score of every window of a picture at once.
+"""Dense histograms of oriented gradients under a linear SVM: the scores of all windows of a picture at once.
 
-Written so that scores are OpenCV's `HOGDescriptor` to 1e-4: square-root gamma, its polynomial for the arc tangent,
-circular bins, Gaussian and bilinear weights in a block, L2-Hys with its constants. Sums alone are in another order.
+Scores equal those of OpenCV's `HOGDescriptor` to 1e-4, because all details are OpenCV's: square-root gamma, the
+polynomial for the arc tangent, circular bins, Gaussian and bilinear weights in a block, L2-Hys with its constants. Only
+the order of sums differs.
 Source: N. Dalal and B. Triggs, Histograms of oriented gradients for human detection, CVPR 2005.
 """
 
@@ -18,19 +19,20 @@ from torchvision_dddas.errors import InputError
 ARC = tuple(
     p * 180 / math.pi for p in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-TINY = 2.220446049250313e-16  # what it adds to the divisor
+TINY = 2.220446049250313e-16  # OpenCV adds this to the divisor
 
-# L2-Hys: added to the norm before the clip, for each number of a block, and after it (modules/objdetect, hog.cpp).
+# L2-Hys: added to the norm before the clip, for each number of a block; and added after it (modules/objdetect,
+# hog.cpp).
 SOFT_FIRST, SOFT_SECOND = 0.1, 1e-3
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a descriptor's numbers come from; lengths in pixels.
+    """The layout of a descriptor; lengths in pixels.
 
-    window: (width, height). cell and block are squares. stride: from block to block. bins: over half a turn, or a whole
-    one if signed. clip: of L2-Hys. gamma: whether square roots of the levels are taken.
-    Raises InputError where cells do not fill the block, or blocks the window.
+    window: (width, height). cell and block are squares. stride: from block to block. bins: over half a turn, or over a
+    whole turn if signed. clip: of L2-Hys. gamma: whether to take square roots of the levels.
+    Raise InputError if cells do not fill the block, or blocks do not fill the window.
 
     >>> F.Layout().window, F.Layout(window=(32, 64)).window
     ((64, 128), (32, 64))
@@ -47,7 +49,7 @@ class Layout:
 
     def __post_init__(self) -> None:
         if self.block % self.cell:
-            raise InputError(f"a block of {self.block} px is no multiple of a cell of {self.cell} px")
+            raise InputError(f"a block of {self.block} px is not a multiple of a cell of {self.cell} px")
         for name, length in zip(("width", "height"), self.window, strict=True):
             if length < self.block or (length - self.block) % self.stride:
                 raise InputError(
@@ -57,30 +59,30 @@ class Layout:
 
     @property
     def cells(self) -> int:
-        """Cells along a block's side."""
+        """The number of cells along a block's side."""
         return self.block // self.cell
 
     @property
     def blocks(self) -> tuple[int, int]:
-        """Blocks of a window, (across, down)."""
+        """The numbers of blocks of a window, (across, down)."""
         width, height = ((length - self.block) // self.stride + 1 for length in self.window)
         return width, height
 
     @property
     def features(self) -> int:
-        """Numbers of a descriptor."""
+        """The number of values of a descriptor."""
         return self.blocks[0] * self.blocks[1] * self.cells**2 * self.bins
 
 
 def gradient(bordered: Tensor, gamma: bool = True) -> tuple[Tensor, Tensor]:
-    """(B, 1, H, W) differences of neighbours across and down, of the channel where they are largest.
+    """Return differences of neighbours across and down, (B, 1, H, W) each, of the channel with the largest gradient.
 
-    bordered: (B, C, H + 2, W + 2) levels 0 .. 255 with a border of one pixel, reflected (101) at the picture's edge.
-    Of equal channels the first wins, as in OpenCV's BGR order.
+    bordered: (B, C, H + 2, W + 2) levels 0 .. 255 with a border of one pixel, reflected (101) at the picture's edge. Of
+    equal channels the first counts, as in OpenCV's BGR order.
     """
     levels = bordered
     if gamma:
-        # The root's slope at black is infinite, and would turn the gradient of all black pixels into NaN.
+        # The slope of the root is infinite at black, and would turn the gradient of all black pixels into NaN.
         levels = (bordered.clamp(min=1e-30) if bordered.requires_grad else bordered).sqrt()
     across = levels[..., 1:-1, 2:] - levels[..., 1:-1, :-2]
     down = levels[..., 2:, 1:-1] - levels[..., :-2, 1:-1]
@@ -95,9 +97,9 @@ def gradient(bordered: Tensor, gamma: bool = True) -> tuple[Tensor, Tensor]:
 
 
 def angle(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
-    """Direction in bins, from -0.5 to bins - 0.5: 0 is the centre of the first bin.
+    """Return the direction in bins, from -0.5 to bins - 0.5; 0 is the centre of the first bin.
 
-    By OpenCV's polynomial, up to 0.01 degrees off the true angle, and so are the trained weights.
+    OpenCV's polynomial is up to 0.01 degrees off the true angle. The trained weights fit the polynomial.
     """
     x, y = dx.abs(), dy.abs()
     ratio = torch.minimum(x, y) / (torch.maximum(x, y) + TINY).clamp(min=TINY)
@@ -113,14 +115,14 @@ def angle(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
 
 
 def knots(bins: int) -> list[int]:
-    """The whole numbers between which `angle` lies; knot k is the centre of bin k modulo bins."""
+    """Return the whole numbers between which `angle` lies. Knot k is the centre of bin k modulo bins."""
     return list(range(-1, bins + 1))
 
 
 def hats(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
-    """(B, K, H, W): the share of each pixel's magnitude m at each knot k, relu(m - |m (angle - k)|).
+    """Return the share of each pixel's magnitude m at each knot k, relu(m - |m (angle - k)|), (B, K, H, W).
 
-    Knots of the same bin are added after the pooling, where there are 64 times fewer numbers: see `bins_of_knots`.
+    Knots of the same bin are added after the pooling, when there are 64 times fewer numbers: see `bins_of_knots`.
     """
     magnitude = torch.sqrt((dx * dx + dy * dy).clamp(min=1e-30))
     turn = magnitude * angle(dx, dy, layout)
@@ -129,14 +131,15 @@ def hats(dx: Tensor, dy: Tensor, layout: Layout) -> Tensor:
 
 
 def bins_of_knots(bins: int) -> Tensor:
-    """(bins, K) float64: 1 where a knot is the centre of a bin."""
+    """Return (bins, K) float64, 1 where a knot is the centre of a bin."""
     return torch.eye(bins, dtype=torch.float64)[:, [knot % bins for knot in knots(bins)]]
 
 
 def cell_weights(layout: Layout) -> Tensor:
-    """(cells, block) float64: what a pixel of a block's row or column gives to each of its cells.
+    """Return the weight of each row or column of a block's pixels in each of its cells, (cells, block) float64.
 
-    Gaussian with a sigma of a quarter of the block, centred half a pixel off as in OpenCV, times a bilinear hat.
+    The weight is a Gaussian with a sigma of a quarter of the block, centred half a pixel off as in OpenCV, times a
+    bilinear hat.
     """
     place = torch.arange(layout.block, dtype=torch.float64)
     sigma = layout.block / 4
@@ -147,7 +150,7 @@ def cell_weights(layout: Layout) -> Tensor:
 
 
 def _pooled(maps: Tensor, layout: Layout) -> Tensor:
-    """(..., rows, N) -> (..., cells, blocks, N): weighted sums over the rows of each block."""
+    """Return weighted sums over the rows of each block: (..., rows, N) -> (..., cells, blocks, N)."""
     step = math.gcd(layout.block, layout.stride)
     parts, hop = layout.block // step, layout.stride // step
     strips = maps.shape[-2] // step
@@ -160,9 +163,9 @@ def _pooled(maps: Tensor, layout: Layout) -> Tensor:
 
 
 def hog(bordered: Tensor, layout: Layout, *, clip: Tensor | None = None) -> Tensor:
-    """(B, F, ny, nx) normalised histograms of every block, F = bins x cells down x cells across.
+    """Return normalised histograms of every block, (B, F, ny, nx), F = bins x cells down x cells across.
 
-    bordered: as in `gradient`; its inside must hold a block. clip: a number in place of the layout's.
+    bordered: as in `gradient`; its inside must hold a block. clip: replaces the layout's clip.
 
     >>> F.hog(torch.rand(1, 1, 130, 66) * 255, F.Layout()).shape
     torch.Size([1, 36, 15, 7])
@@ -182,9 +185,10 @@ def hog(bordered: Tensor, layout: Layout, *, clip: Tensor | None = None) -> Tens
 
 
 def arrange_weights(weights: Tensor, layout: Layout) -> Tensor:
-    """(down x across x F,) weights of a linear SVM in OpenCV's order, as (down, across, F) for `svm_scores`.
+    """Rearrange a linear SVM's weights from OpenCV's order, (down x across x F,), to (down, across, F).
 
-    OpenCV goes through a window's blocks, and a block's cells, column by column; the bins vary fastest.
+    OpenCV stores the blocks of a window, and the cells of a block, column by column; the bins vary fastest.
+    `svm_scores` takes the result.
 
     >>> F.arrange_weights(torch.zeros(3780), F.Layout()).shape
     torch.Size([15, 7, 36])
@@ -195,9 +199,9 @@ def arrange_weights(weights: Tensor, layout: Layout) -> Tensor:
 
 
 def svm_scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
-    """(B, ny - down + 1, nx - across + 1): the SVM's score of the window that begins at each block.
+    """Return the SVM's score of the window at each block, (B, ny - down + 1, nx - across + 1).
 
-    block_map: (B, F, ny, nx). weights: (down, across, F). bias: a number, added.
+    block_map: (B, F, ny, nx). weights: (down, across, F). bias: a number that is added.
 
     >>> F.svm_scores(torch.ones(1, 2, 4, 3), torch.ones(3, 2, 2), torch.tensor(-1.0))
     tensor([[[11., 11.],
@@ -206,8 +210,8 @@ def svm_scores(block_map: Tensor, weights: Tensor, bias: Tensor) -> Tensor:
     batch, _, ny, nx = block_map.shape
     down, across, _ = weights.shape
     part = torch.matmul(weights.flatten(0, 1), block_map.flatten(2))  # (B, down x across, ny nx)
-    # Sum over a window's blocks: that of part (i, j) lies i rows and j places further on. Parts read as if each were
-    # that much longer than it is stand above one another: a sum over the parts, with no copy for each.
+    # Sum over the blocks of a window. Part (i, j) is read i rows and j columns further on. Padding each part shifts it
+    # by its own offset, so that one sum over the parts needs no copy of each.
     places = ny * nx
     part = (
         torch.nn.functional.pad(part.reshape(batch, down, -1), (0, across)).unflatten(-1, (across, places + 1)).sum(2)

@@ -1,7 +1,7 @@
-"""Good features to track: where both eigenvalues of the structure tensor are large (appendix B, step S1).
+"""Good features to track: points where both eigenvalues of the structure tensor are large (appendix B, step S1).
 
-The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response. Kornia's gradients under its box take
-2 to 7 times as long on a CPU (`python eval/speed.py operations`). The picture is mirrored outside, as by OpenCV;
+The window is OpenCV's box, not the Gaussian of kornia.feature.gftt_response. Kornia's gradients with this box take 2 to
+7 times as long on a CPU (`python eval/speed.py operations`). The picture is mirrored beyond its edges, as in OpenCV;
 Kornia's gradients repeat the edge pixel.
 """
 
@@ -17,7 +17,7 @@ from torchvision_dddas.functional.soft import is_traced
 
 
 def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], *, block: int = 3) -> Float[Tensor, "B 1 H W"]:
-    """Smaller eigenvalue of the structure tensor summed over block x block pixels: cv2.cornerMinEigenVal's values.
+    """Return the smaller eigenvalue of the structure tensor over block x block pixels, as cv2.cornerMinEigenVal does.
 
     >>> picture = torch.zeros(1, 1, 16, 16)
     >>> picture[..., 8:, 8:] = 1
@@ -31,7 +31,7 @@ def corner_min_eigenvalue(gray: Float[Tensor, "B 1 H W"], *, block: int = 3) -> 
 
 
 def _min_eigenvalue_by_kornia(gray: Tensor, block: int) -> Tensor:
-    # Kornia's Sobel filters are an eighth of OpenCV's sums, its box is a mean.
+    # Kornia's Sobel filters return an eighth of OpenCV's sums, and its box a mean.
     du, dv = spatial_gradient(gray, order=1).mul(2.0 / block).unbind(2)
     uu, vv, uv = (box_blur(product, block).mul(block**2) for product in (du * du, dv * dv, du * dv))
     return 0.5 * (uu + vv) - torch.addcmul((0.5 * (uu - vv)).square(), uv, uv).clamp(min=1e-24).sqrt()
@@ -60,10 +60,11 @@ def grid_features(
     block: int = 3,
     least: float = 1e-7,
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
-    """The best pixel of every whole cell_px x cell_px cell, row by row: spread over the frame, and faster.
+    """Return the best pixel of every cell of cell_px x cell_px, row by row, its score, and whether it is valid.
 
-    N is the number of cells that lie in the frame as a whole, which may be none. valid where the cell holds a pixel
-    above quality times the frame's maximum, and above `least`: the rounding that a blank picture shows.
+    Points are spread over the frame, and found faster than in `frame_features`. N is the number of whole cells in the
+    frame, possibly 0. valid: the score is above quality times the frame's maximum, and above `least`, which exceeds the
+    rounding of a blank picture.
 
     >>> points, score, valid = F.grid_features(torch.rand(1, 1, 64, 64), 16)
     >>> points.shape, valid.shape
@@ -91,11 +92,11 @@ def frame_features(
     block: int = 3,
     least: float = 1e-7,
 ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-    """The best `count` corners of the whole frame, best first, and which there are: cv2.goodFeaturesToTrack.
+    """Return the best `count` corners of the whole frame, best first, and which exist: cv2.goodFeaturesToTrack.
 
-    A corner is a local maximum (3 x 3) above quality times the frame's maximum and above `least`, away from the frame's
-    outermost pixels; it is left out nearer than min_distance_px to a better one that is kept. Of very many corners only
-    the best 4 x count are looked at.
+    A corner is a local maximum (3 x 3) above quality times the frame's maximum and above `least`, not in the frame's
+    outermost pixels. A corner is left out if it is nearer than min_distance_px to a better corner that is kept. Only
+    the best 4 x count corners are examined.
 
     >>> points, valid = F.frame_features(F.gaussian_blur2d(torch.rand(1, 1, 64, 64), 7), 20)
     >>> points.shape, bool(valid.all())
@@ -110,9 +111,9 @@ def frame_features(
     value, index = value.topk(min(4 * count, value.shape[1]))
     width = gray.shape[-1]
     points = torch.stack([index % width, index.div(width, rounding_mode="floor")], -1).to(gray.dtype)
-    is_near = (torch.cdist(points, points) < min_distance_px).tril(-1)  # of a better one
+    is_near = (torch.cdist(points, points) < min_distance_px).tril(-1)  # to a better corner
     found = kept = value > 0
-    while True:  # settled from the best on: every round decides at least one corner more
+    while True:  # decide from the best corner on; every round decides at least one more corner
         before, kept = kept, found & ~(is_near & kept[:, None]).any(2)
         if torch.equal(before, kept):
             break

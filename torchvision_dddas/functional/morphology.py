@@ -1,17 +1,15 @@
-"""Erosion and dilation by Kornia's names, bit-exact with OpenCV (appendix B, step S5), hard or soft.
+"""Erosion and dilation with Kornia's names, bit-exact with OpenCV (appendix B, step S5), hard or soft.
 
-Kernels are flat, about their middle.
+Kernels are flat and centred. On a CPU kornia.morphology takes 7 to 34 times as long (`python eval/speed.py operations`)
+and does not take bytes. Here a running maximum doubles its length with each flat shift. Integer and Boolean masks keep
+their type; floats pass gradients.
+Pixels outside the picture have no effect: this is Kornia's border `geodesic`. As in OpenCV the kernel is not mirrored,
+which matters only if it is not symmetric.
 
-On a CPU kornia.morphology takes 7 to 34 times as long (`python eval/speed.py operations`) and does not take bytes;
-here a running maximum doubles its span over flat shifts. Integer and Boolean masks keep their type; floats work too and
-pass gradients.
-Outside the picture nothing decides: this is Kornia's border `geodesic`. As in OpenCV the kernel is not mirrored, which
-differs only where it is not symmetric.
-
-With softness above 0, log-sum-exp takes the place of the extremum: that of N numbers is above their largest by
-softness x ln N at most. Thresholds and extrema commute, so the morphology of a mask is that of the margin by which its
-threshold is passed: soften the threshold last, and the outline is where the hard one is. At softness 0 the gradient of
-float32 pictures goes to the pixel that decides; values within a 500,000th of the picture's span then count as equal.
+With softness above 0, log-sum-exp replaces the extremum. For N numbers it exceeds their maximum by at most softness x
+ln N. Thresholds and extrema commute, so apply the morphology to the margin over a threshold and soften the threshold
+last: the outline then lies where the hard outline lies. At softness 0 the gradient of float32 pictures goes to the
+pixel that decides; values within a 500,000th of the picture's range count as equal.
 """
 
 import math
@@ -29,13 +27,13 @@ from torch.nn import functional
 
 Extremum = Callable[[Tensor, Tensor], Tensor]
 Kernel = Shaped[Tensor, "h w"] | Shaped[np.ndarray, "h w"]
-"""The pixels that count are those where a kernel is not 0. A trace knows no values of tensors: it needs an array."""
+"""The pixels that count are those where a kernel is not 0. A trace cannot read values of tensors and needs an array."""
 Run = tuple[int, int, int]
-"""Of a kernel's row the columns [first, last) that are set."""
+"""A run of set columns [first, last) in a row of the kernel."""
 
-# Outside the picture nothing is set. Not infinite: the gradient of a log-sum-exp of nothing but infinities is none.
+# Pixels outside the picture are not set. Not -inf: the log-sum-exp of infinities alone has no gradient.
 _NOTHING = -1e4
-# Places are numbered within tiles of this side; with them, 32 bits leave so many steps for the value.
+# Pixels are numbered within tiles of this side. The rest of the 32 bits resolves so many steps of the value.
 _TILE = 64
 _STEPS = (1 << 19) - 2
 _SHAPES = {"rectangle": cv2.MORPH_RECT, "ellipse": cv2.MORPH_ELLIPSE}
@@ -43,7 +41,7 @@ _SHAPES = {"rectangle": cv2.MORPH_RECT, "ellipse": cv2.MORPH_ELLIPSE}
 
 @cache
 def kernel_array(shape: Literal["rectangle", "ellipse"], size_px: int | tuple[int, int]) -> Shaped[np.ndarray, "h w"]:
-    """cv2.getStructuringElement, uint8, made once. size_px: (width, height), or one number for both."""
+    """Return cv2.getStructuringElement, uint8, made once. size_px: (width, height), or one number for both."""
     size = (size_px, size_px) if isinstance(size_px, int) else size_px
     return cv2.getStructuringElement(_SHAPES[shape], size)
 
@@ -51,7 +49,7 @@ def kernel_array(shape: Literal["rectangle", "ellipse"], size_px: int | tuple[in
 def structuring_element(
     shape: Literal["rectangle", "ellipse"], size_px: int | tuple[int, int]
 ) -> Shaped[Tensor, "h w"]:
-    """`kernel_array` as a tensor on the CPU.
+    """Return `kernel_array` as a tensor on the CPU.
 
     >>> F.structuring_element("ellipse", 5).int()
     tensor([[0, 0, 1, 0, 0],
@@ -64,10 +62,10 @@ def structuring_element(
 
 
 def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Maximum where the kernel is not 0, around its middle (h // 2, w // 2).
+    """Return the maximum where the kernel is not 0, around its middle (h // 2, w // 2).
 
-    softness: above 0, in the units of the mask, gives softness x log-sum-exp(mask / softness). Values below -1e4 then
-    count as -1e4, as in Kornia.
+    softness: if above 0, in the units of the mask, return softness x log-sum-exp(mask / softness). Values below -1e4
+    then count as -1e4, as in Kornia.
 
     >>> row = torch.tensor([0.0, 0, 1, 0, 0]).reshape(1, 1, 1, 5)
     >>> F.dilation(row, torch.ones(1, 3)).flatten()
@@ -82,7 +80,7 @@ def dilation(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: flo
 
 
 def erosion(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Minimum where the kernel is not 0. softness: as in `dilation`.
+    """Return the minimum where the kernel is not 0. softness: as in `dilation`.
 
     >>> row = torch.tensor([0.0, 1, 1, 1, 0]).reshape(1, 1, 1, 5)
     >>> F.erosion(row, torch.ones(1, 3)).flatten()
@@ -94,7 +92,7 @@ def erosion(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: floa
 
 
 def opening(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Erosion, then dilation: takes away what is smaller than the kernel.
+    """Erode, then dilate. This removes parts that are smaller than the kernel.
 
     >>> row = torch.tensor([0.0, 1, 0, 1, 1, 1]).reshape(1, 1, 1, 6)
     >>> F.opening(row, torch.ones(1, 3)).flatten()
@@ -104,7 +102,7 @@ def opening(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: floa
 
 
 def closing(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: float = 0.0) -> Shaped[Tensor, "B C H W"]:
-    """Dilation, then erosion: fills what is smaller than the kernel.
+    """Dilate, then erode. This fills gaps that are smaller than the kernel.
 
     >>> row = torch.tensor([0.0, 1, 0, 1, 0]).reshape(1, 1, 1, 5)
     >>> F.closing(row, torch.ones(1, 3)).flatten()
@@ -114,7 +112,7 @@ def closing(tensor: Shaped[Tensor, "B C H W"], kernel: Kernel, *, softness: floa
 
 
 def _runs(kernel: Kernel) -> list[Run]:
-    """The kernel as runs (row, first, last) of columns [first, last)."""
+    """Return the kernel as runs (row, first, last) of columns [first, last)."""
     runs = []
     for row, line in enumerate(kernel.tolist()):
         column = 0
@@ -132,7 +130,7 @@ def _margins(kernel: Kernel) -> tuple[int, int, int, int]:
 
 
 def _extremum(mask: Tensor, kernel: Kernel, highest: bool) -> Tensor:
-    """Minimum (highest = True: outside counts as the highest value) or maximum under the kernel."""
+    """Return the maximum under the kernel, or the minimum if `highest` (pixels outside then have the highest value)."""
     height, width = kernel.shape
     better = torch.minimum if highest else torch.maximum
     if mask.dtype == torch.bool:
@@ -144,14 +142,14 @@ def _extremum(mask: Tensor, kernel: Kernel, highest: bool) -> Tensor:
     ends = (-math.inf, math.inf) if is_float else (torch.iinfo(mask.dtype).min, torch.iinfo(mask.dtype).max)
     padded = functional.pad(mask, _margins(kernel), value=ends[highest])
     pitch = padded.shape[-1]
-    # One flat row of memory: a shift by k columns is a shift by k, one by a row a shift by `pitch`. What runs over a
-    # row's end lands in the padding of the next, which is cut away.
+    # The picture is one flat row of memory: a shift by a column is a shift by 1, a shift by a row is a shift by
+    # `pitch`. Shifts beyond the end of a row end in the padding of the next row, which is cut off.
     flat = padded.reshape(-1)
     size = flat.numel() - (height - 1) * pitch - (width - 1)
     if runs == [(row, 0, width) for row in range(height)]:
         result = _running(_running(flat, [width], 1, better)[width], [height], pitch, better)[height]
     else:
-        # One running extremum per distinct run length, shifted into its rows.
+        # Compute one running extremum for each run length, and shift it into the rows of the kernel.
         spans = _running(flat, [last - first for _, first, last in runs], 1, better)
         parts = [spans[last - first].narrow(0, row * pitch + first, size) for row, first, last in runs]
         result = reduce(better, parts)
@@ -160,7 +158,7 @@ def _extremum(mask: Tensor, kernel: Kernel, highest: bool) -> Tensor:
 
 
 def _running(flat: Tensor, lengths: Sequence[int], stride: int, better: Extremum) -> dict[int, Tensor]:
-    """Extrema over so many entries `stride` apart, starting at each; spans double, so a span of 25 takes 5 steps."""
+    """Return extrema over `lengths` entries, `stride` apart, from each entry on. Lengths double: 25 take 5 steps."""
     span, found = 1, {}
     for length in sorted(set(lengths)):
         while 2 * span <= length:
@@ -172,20 +170,20 @@ def _running(flat: Tensor, lengths: Sequence[int], stride: int, better: Extremum
 
 
 def _gather_extremum(x: Tensor, kernel: Kernel, highest: bool) -> Tensor:
-    """As `_extremum`, by finding the pixel that decides, to which the gradient goes.
+    """Return `_extremum` by finding the pixel that decides, so that the gradient goes to this pixel.
 
-    A chain of maxima would keep every step of itself for the gradient: hundreds of pictures for a large ellipse. Here
-    one whole number of 32 bits a pixel goes through the chain, the value in the high bits, the place in the low ones.
+    A chain of maxima would keep each of its steps for the gradient: hundreds of pictures for a large ellipse. Here one
+    32-bit number for each pixel passes the chain, with the value in its high bits and the place in its low bits.
     """
     sign = -1.0 if highest else 1.0
     rows = torch.arange(x.shape[-2], device=x.device, dtype=torch.int32)[:, None]
     columns = torch.arange(x.shape[-1], device=x.device, dtype=torch.int32)
     low, high = (sign * x.detach()).aminmax()
-    # Values as whole numbers whose lowest bits are free for a place within a tile.
+    # Values become whole numbers whose lowest bits are free for a place within a tile.
     value = ((sign * x.detach() - low) / ((high - low).clamp(min=1e-30) / _STEPS)).round_().int() * _TILE**2
     numbered = value | (rows % _TILE * _TILE + columns % _TILE)
     decided = _extremum(numbered, kernel, highest=False)
-    # The kernel is smaller than a tile, so that the place within one identifies the pixel.
+    # The kernel is smaller than a tile, so the place within a tile identifies the pixel.
     row = rows + (decided // _TILE - rows + _TILE // 2) % _TILE - _TILE // 2
     column = columns + (decided - columns + _TILE // 2) % _TILE - _TILE // 2
     place = row * x.shape[-1] + column

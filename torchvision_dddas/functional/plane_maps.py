@@ -1,13 +1,13 @@
 """Homographies and affine maps between two frames: minimal solutions, least squares, RANSAC (appendix B, step S3).
 
-Matrices are (B, 3, 3), act on (u, v, 1) in pixels and have h33 = 1; affine ones (appendix A's registration, the
-baseline of appendix B, Fig. 2 and 4) have the last row 0 0 1. Randomness is an input (which pairs each hypothesis is
-drawn from), so that a run repeats and the graph exports. Points are moved and errors measured by Kornia.
+Matrices are (B, 3, 3), act on (u, v, 1) in pixels and have h33 = 1. Affine maps (appendix A's registration, the
+baseline of appendix B, Fig. 2 and 4) have the last row 0 0 1. Random numbers are an input (the pairs of each
+hypothesis), so that runs repeat and graphs can be exported. Kornia moves the points and measures the errors.
 
-Its find_homography_dlt takes 0.7 to 1.0 of the time of ours (`python eval/speed.py operations`). Ours stays for what it
-does: it solves by elimination, while no ONNX graph holds Kornia's LU, so that the onboard graph is this function; it
-tells which members of a batch it could not solve; and it computes in float64. Kornia's RANSAC takes one pair of frames
-at a time, at batch 8 over five times as long.
+Kornia's find_homography_dlt takes 0.7 to 1.0 of our time (`python eval/speed.py operations`). Ours remains for three
+reasons: it solves by elimination and can be exported to ONNX, unlike Kornia's LU; it reports which members of a batch
+have no solution; it computes in float64. Kornia's RANSAC takes one pair of frames at a time, and over five times as
+long at batch 8.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,12 +24,12 @@ from torchvision_dddas.errors import InputError
 Minimal = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 Fit = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
-# Depth of a point, as a share of the depth of the middle of all, from which on it is on the horizon.
+# A point is on the horizon if its depth is at most this share of the depth of the points' centre.
 HORIZON = 1e-6
 
 
 class PlaneModel(NamedTuple):
-    """A kind of map. size: pairs that fix one. minimal: maps of so many pairs. fit: least squares over more."""
+    """A kind of map. size: number of pairs that fix it. minimal: its maps from `size` pairs. fit: by least squares."""
 
     size: int
     minimal: Minimal
@@ -39,17 +39,17 @@ class PlaneModel(NamedTuple):
 def four_point(
     p: Float[Tensor, "*batch 4 2"], q: Float[Tensor, "*batch 4 2"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
-    """The homographies that take four points p exactly to q, in closed form, by way of a projective basis.
+    """Return the homographies that map four points p exactly to q, in closed form by a projective basis.
 
-    valid is False when three of the points are (nearly) on one line, or when a triple turns over between p and q,
-    which no camera that stays on one side of the plane can do.
+    valid is False if three of the points are nearly on one line, or if the orientation of a triple changes between p
+    and q. A camera that stays on one side of the plane cannot change it.
     """
-    # Around the first point and in units of the sample's own size, so that float32 keeps its digits.
+    # Use coordinates around the first point, in units of the sample's size, so that float32 keeps its digits.
     from_p, p_scale = _local(p)
     from_q, q_scale = _local(q)
     p_dual, p_weight, p_area = _basis(from_p)
     _, q_weight, q_area = _basis(from_q)
-    # Column i of Q times c_i times row i of P's adjugate; c_i = mu_i lambda_j lambda_k avoids every division.
+    # Column i of Q times c_i times row i of P's adjugate. c_i = mu_i lambda_j lambda_k needs no division.
     coefficient = q_weight * p_weight.roll(1, -1) * p_weight.roll(-1, -1)
     columns = functional.pad(from_q[..., :3, :], (0, 1), value=1.0)
     matrix = (columns * coefficient[..., None]).mT @ p_dual
@@ -64,7 +64,7 @@ def four_point(
 def three_point(
     p: Float[Tensor, "*batch 3 2"], q: Float[Tensor, "*batch 3 2"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
-    """The affine maps that take three points p exactly to q; not valid when a triple is (nearly) on one line."""
+    """Return the affine maps that map three points p exactly to q. A triple that is nearly on one line is not valid."""
     p_side = p[..., 1:, :] - p[..., :1, :]
     q_side = q[..., 1:, :] - q[..., :1, :]
     (a, b), (c, d) = p_side[..., 0, :].unbind(-1), p_side[..., 1, :].unbind(-1)
@@ -72,7 +72,7 @@ def three_point(
     q_area = q_side[..., 0, 0] * q_side[..., 1, 1] - q_side[..., 0, 1] * q_side[..., 1, 0]
     valid = (area.abs() > 1e-4 * p_side.square().sum((-2, -1))) & (q_area.abs() > 1e-4 * q_side.square().sum((-2, -1)))
     adjugate = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
-    # Rows are points, so the linear part acts from the right.
+    # Points are rows, so the linear part acts from the right.
     right = adjugate @ q_side / torch.where(valid, area, torch.ones_like(area))[..., None, None]
     shift = q[..., 0, :] - (p[..., :1, :] @ right)[..., 0, :]
     return _or_identity(_with_last_row(torch.cat([right.mT, shift[..., None]], -1)), valid), valid
@@ -81,12 +81,12 @@ def three_point(
 def find_homography(
     points1: Float[Tensor, "B N 2"], points2: Float[Tensor, "B N 2"], weights: Float[Tensor, "B N"] | None = None
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """The homographies from points1 to points2, as in Kornia, and which are valid.
+    """Return the homographies from points1 to points2, as in Kornia, and which are valid.
 
-    Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination.
-    A pair of weight 0 is as if it were not there, whatever it holds; four pairs are met exactly. valid is False with
-    fewer than four pairs of positive weight, when they do not fix eight parameters (collinear), and when one of them
-    would lie on or behind the horizon: so it is with three of four points on one line and noise in their partners.
+    Weighted least squares over N pairs, Hartley-normalised, h33 = 1 in normalised coordinates, by elimination. A pair
+    of weight 0 has no effect, whatever its values. Four pairs are met exactly. valid is False with fewer than four
+    pairs of positive weight, if the pairs do not determine eight parameters (collinear points), and if a pair would lie
+    on or behind the horizon, as happens with three of four points on one line and noise in q.
 
     >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1], [1, 1]]])
     >>> matrix, valid = F.find_homography(p, 2 * p + 3)
@@ -96,7 +96,7 @@ def find_homography(
     weight = torch.ones_like(points1[..., 0]) if weights is None else weights
     used = weight > 0
     p, q = (torch.where(used[..., None], points, torch.zeros_like(points)) for points in (points1, points2))
-    # In float64: the normal equations square the condition, and float32 leaves pixels of error outside the points.
+    # Solve in float64: the normal equations square the condition number, and float32 errs by pixels outside the points.
     wide = _wide(p)
     p_unit, p_mean, p_scale = _hartley(p.to(wide), weight.to(wide))
     q_unit, q_mean, q_scale = _hartley(q.to(wide), weight.to(wide))
@@ -114,7 +114,7 @@ def find_homography(
 def find_affine(
     p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """Weighted least squares over N pairs; valid is False with fewer than three pairs or when they are collinear.
+    """Return least-squares affine maps of N pairs. Fewer than three or collinear pairs give valid = False.
 
     >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1]]])
     >>> matrix, valid = F.find_affine(p, 2 * p + 3, torch.ones(1, 3))
@@ -134,18 +134,18 @@ def find_affine(
 
 HOMOGRAPHY = PlaneModel(4, four_point, find_homography)
 MODELS = {"homography": HOMOGRAPHY, "affine": PlaneModel(3, three_point, find_affine)}
-"""By the names that registration.model takes."""
+"""Models by the names that registration.model takes."""
 
 
 def find_homography_raw(
     p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-    """As the source prints it (appendix A, eq. 8 to 10): A m = k of four pairs, AᵀA m = Aᵀk of more, as they are given.
+    """Solve as the source prints it (appendix A, eq. 8 to 10): A m = k for four pairs, AᵀA m = Aᵀk for more.
 
-    No weights and no normalisation: in degrees cond(A) is about 1e13, that of AᵀA beyond float64, and what comes out
-    of more than four pairs is wrong by decimetres or more even if the pairs are perfect. It is kept to show just that.
-    Therefore a pivot counts as zero only if it is zero: any larger tolerance would refuse degrees altogether. valid is
-    False then, or with fewer than four pairs; that landmarks lie on one line must be seen elsewhere.
+    There are no weights and no normalisation. In degrees cond(A) is about 1e13, and cond(AᵀA) exceeds float64: the
+    result of more than four pairs is wrong by decimetres or more even for perfect pairs. The function shows exactly
+    this. A pivot therefore counts as zero only if it is 0; any tolerance would refuse degrees altogether. valid is
+    False in this case and with fewer than four pairs. Collinear landmarks must be detected elsewhere.
 
     >>> p = torch.tensor([[[0.0, 0], [1, 0], [0, 1], [1, 1]]])
     >>> matrix, valid = F.find_homography_raw(p, 2 * p + 3)
@@ -165,7 +165,7 @@ def draw_samples(
 ) -> Int64[Tensor, "B S size"]:
     """Draw `size` different numbers from 0 .. count - 1 for every hypothesis, on the generator's device.
 
-    Raises InputError if there are fewer than `size` numbers to draw from.
+    Raise InputError if there are fewer than `size` numbers to draw from.
 
     >>> F.draw_samples(torch.Generator().manual_seed(0), 1, 128, 50).shape
     torch.Size([1, 128, 4])
@@ -176,7 +176,7 @@ def draw_samples(
     drawn: list[Tensor] = []
     for k in range(size):
         number = (uniform[..., k] * (count - k)).long().clamp(max=count - k - 1)
-        # Skip over what is taken already, smallest first: the number is a rank among those that are left.
+        # Skip the numbers that are already drawn, smallest first: the new number is a rank among the others.
         for taken in torch.stack(drawn, -1).sort(-1).values.unbind(-1) if drawn else ():
             number = number + (number >= taken)
         drawn.append(number)
@@ -184,7 +184,7 @@ def draw_samples(
 
 
 def invert_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The inverse by cofactors: a graph has no `torch.linalg.inv`. A singular matrix gives what is not finite.
+    """Return the inverse by cofactors: `torch.linalg.inv` cannot be exported. Singular maps give no finite values.
 
     >>> F.invert_map(torch.diag(torch.tensor([2.0, 4.0, 1.0])))
     tensor([[0.5000, 0.0000, 0.0000],
@@ -207,12 +207,13 @@ def ransac(
     tolerance_px: float | Float[Tensor, "B"] = 3.0,
     refits: Sequence[float | Tensor] = (3.0, 2.0, 1.0),
 ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B N"], Bool[Tensor, "B"]]:
-    """later_from_earlier from pairs of which many are wrong, the inliers, and whether it may be believed.
+    """Return later_from_earlier from pairs of which many are wrong, the inliers, and whether it is reliable.
 
-    The best of all hypotheses at once, then least squares on its inliers, ever more strictly (appendix B, step S3).
-    Hypotheses are ranked by their truncated squared error, which ranks those with equally many inliers. samples: from
-    `draw_samples`; numbers are spread over the valid points when some are not. When nothing fits: identity, not valid.
-    Raises InputError without any points.
+    Take the best of all hypotheses, then fit least squares to its inliers with tightening tolerances (appendix B, step
+    S3). Hypotheses are ranked by their truncated squared error, which also ranks hypotheses with equally many inliers.
+    samples: from `draw_samples`; the numbers are spread over the valid points if some are not valid. If no hypothesis
+    fits, return the identity, not reliable.
+    Raise InputError without any points.
 
     >>> p = torch.rand(1, 50, 2) * 100
     >>> q = p + 5
@@ -247,9 +248,9 @@ def refit_map(
     gates_px: Sequence[float | Tensor],
     model: PlaneModel,
 ) -> Float[Tensor, "B 3 3"]:
-    """The guess, fitted again once per gate to the valid pairs that miss it by less.
+    """Return the guess, refitted once per gate to the valid pairs whose error is below the gate.
 
-    A fit counts only if twice the minimal number of points support it.
+    A fit is accepted only if twice the minimal number of points support it.
 
     >>> p = torch.rand(1, 50, 2) * 100
     >>> guess = torch.tensor([[[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]])
@@ -260,8 +261,8 @@ def refit_map(
     matrix = guess
     for gate_px in gates_px:
         support = valid & (oneway_transfer_error(p, q, matrix, squared=False) < gate_px)
-        # Dividing by the denominator of the transfer turns the algebraic residual into pixels. Written out, so that a
-        # batch of one takes the same path as a larger one.
+        # Dividing by the denominator of the transfer turns the algebraic residual into pixels. It is written out, so
+        # that a batch of one takes the same path as a larger batch.
         depth = p[..., 0] * matrix[:, 2, :1] + p[..., 1] * matrix[:, 2, 1:2] + matrix[:, 2, 2:]
         found, solved = model.fit(p, q, support.to(p.dtype) / depth.abs().clamp(min=1e-3).square())
         solved = solved & (support.sum(1) >= 2 * model.size)
@@ -270,7 +271,7 @@ def refit_map(
 
 
 def spread_ranks(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B count"]:
-    """The places of `count` valid entries, evenly spread over all of them; some repeat where there are fewer.
+    """Return the places of `count` valid entries, evenly spread over all of them. With fewer, some repeat.
 
     >>> F.spread_ranks(torch.tensor([[True, False, True, True, False, True]]), 2)
     tensor([[0, 3]])
@@ -281,7 +282,7 @@ def spread_ranks(valid: Bool[Tensor, "B N"], count: int) -> Int64[Tensor, "B cou
 
 
 def normalize_map(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The same mapping with h33 = 1."""
+    """Return the same map with h33 = 1."""
     corner = matrix[..., 2:, 2:]
     tiny = torch.finfo(matrix.dtype).tiny
     return matrix / torch.where(corner.abs() < tiny, torch.full_like(corner, tiny), corner)
@@ -292,9 +293,9 @@ def solve_linear(
 ) -> tuple[Float[Tensor, "*batch n m"], Bool[Tensor, "*batch"]]:
     """Solve matrix @ x = right for every member of the batch; valid is False where the matrix is singular.
 
-    Gaussian elimination with row exchange, the source's own solver (appendix A, IV-B). Written out because
-    `torch.linalg.solve` neither exports nor survives a singular member of a batch. A pivot smaller than `tolerance`
-    times the matrix's largest entry counts as zero (default: 8 n machine epsilons). Invalid members come back as zeros.
+    Gaussian elimination with row exchange, the source's own solver (appendix A, IV-B). `torch.linalg.solve` cannot be
+    exported, and fails on a singular member of a batch. A pivot smaller than `tolerance` times the matrix's largest
+    entry counts as zero (default: 8 n machine epsilons). Invalid members are returned as zeros.
 
     >>> F.solve_linear(torch.tensor([[2.0, 0], [0, 4]]), torch.tensor([[2.0], [2.0]]))
     (tensor([[1.0000],
@@ -315,14 +316,15 @@ def solve_linear(
         usable = pivot.detach().abs() > smallest
         valid = valid & usable
         row = joined[..., k : k + 1, :] / torch.where(usable, pivot, torch.ones_like(pivot))[..., None, None]
-        # Subtracting (pivot - 1) of the scaled row from itself leaves the scaled row: no special case for row k.
+        # Subtracting (pivot - 1) times the scaled row from row k leaves the scaled row, so that row k is no special
+        # case.
         joined = joined - (joined[..., k : k + 1] - (rows == k).to(joined.dtype)[:, None]) * row
     solution = joined[..., n:]
     return torch.where(valid[..., None, None], solution, torch.zeros_like(solution)), valid
 
 
 def _equations(p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]) -> Float[Tensor, "B 2N 9"]:
-    """The linear equations of a homography with h33 = 1; the last column is the right side."""
+    """Return the linear equations of a homography with h33 = 1; the last column is the right side."""
     (x, y), (u, v) = p.unbind(-1), q.unbind(-1)
     one, zero = torch.ones_like(x), torch.zeros_like(x)
     rows_u = torch.stack([x, y, one, zero, zero, zero, -u * x, -u * y, u], -1)
@@ -354,7 +356,7 @@ def _local(points: Float[Tensor, "*batch 4 2"]) -> tuple[Float[Tensor, "*batch 4
 
 
 def _basis(points: Float[Tensor, "*batch 4 2"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Adjugate (rows) of the first three points, the fourth's weights in them, and twice the area of the three."""
+    """Return the adjugate (rows) of the first three points, the fourth's weights in them, and twice their area."""
     a, b, c, d = functional.pad(points, (0, 1), value=1.0).unbind(-2)
     cross = torch.linalg.cross
     dual = torch.stack([cross(b, c), cross(c, a), cross(a, b)], -2)
@@ -362,7 +364,7 @@ def _basis(points: Float[Tensor, "*batch 4 2"]) -> tuple[Tensor, Tensor, Tensor]
 
 
 def _hartley(points: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Points with weighted mean zero and root mean square distance sqrt 2, and the mean and scale that did it."""
+    """Shift and scale points to weighted mean 0 and root mean square distance sqrt 2; return mean and scale too."""
     share = (weight / weight.sum(1, keepdim=True).clamp(min=1e-12))[..., None]
     mean = (points * share).sum(1)
     relative = points - mean[:, None]
@@ -372,7 +374,7 @@ def _hartley(points: Float[Tensor, "B N 2"], weight: Float[Tensor, "B N"]) -> tu
 
 
 def _to_pixels(matrix: Tensor, p_origin: Tensor, p_scale: Tensor, q_origin: Tensor, q_scale: Tensor) -> Tensor:
-    """From local coordinates (x - origin) * scale on either side back to pixels."""
+    """Convert a map of local coordinates (x - origin) * scale on both sides to a map of pixels."""
     into = torch.cat([matrix[..., :2] * p_scale[..., None, None], matrix[..., 2:]], -1)
     last = into[..., 2:] - (into[..., :2] @ p_origin[..., None])
     into = torch.cat([into[..., :2], last], -1)
@@ -381,8 +383,8 @@ def _to_pixels(matrix: Tensor, p_origin: Tensor, p_scale: Tensor, q_origin: Tens
 
 
 def _ranks_to_points(valid: Bool[Tensor, "B N"], samples: Int64[Tensor, "B S size"]) -> Int64[Tensor, "B S size"]:
-    """Spread sample numbers over the valid points alone: number r of N becomes valid point floor(r n / N)."""
-    # Valid points first, in order; unique keys, because a stable sort does not export.
+    """Spread sample numbers over the valid points: number r of N becomes valid point floor(r n / N)."""
+    # Order the valid points first. The keys are unique, because a stable sort cannot be exported.
     place = torch.arange(valid.shape[1], device=valid.device)
     order = torch.where(valid, place, place + valid.shape[1]).sort(1).indices
     available = valid.sum(1).reshape(-1, 1, 1)
@@ -394,10 +396,10 @@ def _ranks_to_points(valid: Bool[Tensor, "B N"], samples: Int64[Tensor, "B S siz
 def _squared_errors(
     matrices: Float[Tensor, "B S 3 3"], p: Float[Tensor, "B N 2"], q: Float[Tensor, "B N 2"]
 ) -> Float[Tensor, "B S N"]:
-    """Squared transfer error of every hypothesis at every point; infinite behind the horizon."""
+    """Return the squared transfer error of every hypothesis at every point; infinite behind the horizon."""
     batch, count = matrices.shape[:2]
     homogeneous = torch.cat([p, torch.ones_like(p[..., :1])], -1)
-    # One product for all hypotheses: broadcasting 3x3 products is several times slower on a CPU.
+    # Use one product for all hypotheses: broadcast 3x3 products are several times slower on a CPU.
     u, v, depth = (matrices.flatten(1, 2) @ homogeneous.mT).reshape(batch, count, 3, -1).unbind(2)
     behind = depth < 1e-6
     inverse = torch.where(behind, torch.ones_like(depth), depth).reciprocal()

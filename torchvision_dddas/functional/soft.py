@@ -1,6 +1,6 @@
-"""Soft stand-ins for hard steps, so that gradients pass: each tends to its hard step as softness vanishes.
+"""Soft forms of hard steps, which pass gradients. Each form tends to its hard step as softness vanishes.
 
-Softness is a Python number, so that tracing keeps one branch; at 0 a function is the hard step itself.
+Softness is a Python number, so that a trace keeps one branch. At 0 each function is the hard step.
 """
 
 import math
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def step(x: Float[Tensor, "*any"], *, softness: float = 0.0) -> Float[Tensor, "*any"]:
-    """1 where x > 0 and 0 elsewhere; with softness above 0, in the unit of x, the sigmoid of x / softness.
+    """Return 1 where x > 0 and 0 elsewhere; with softness above 0, in the unit of x, the sigmoid of x / softness.
 
     >>> F.step(torch.tensor([-1.0, 1.0])), F.step(torch.tensor([0.0, 1.0]), softness=1.0)
     (tensor([0., 1.]), tensor([0.5000, 0.7311]))
@@ -23,7 +23,7 @@ def step(x: Float[Tensor, "*any"], *, softness: float = 0.0) -> Float[Tensor, "*
 
 
 def straight_through(hard: Shaped[Tensor, "*any"], soft: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """The hard value, bit for bit, with the gradient of the soft one (Bengio et al. 2013).
+    """Return the hard value, bit for bit, with the gradient of the soft value (Bengio et al. 2013).
 
     >>> soft = torch.tensor(0.3, requires_grad=True)
     >>> F.straight_through(torch.tensor(1.0), soft).backward()
@@ -35,7 +35,7 @@ def straight_through(hard: Shaped[Tensor, "*any"], soft: Float[Tensor, "*any"]) 
 
 
 def round_straight_through(x: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
-    """The nearest whole numbers, halves to even, with the gradient of x itself.
+    """Return the nearest whole numbers, halves to even, with the gradient of x.
 
     >>> x = torch.tensor(2.6, requires_grad=True)
     >>> F.round_straight_through(x).backward()
@@ -56,10 +56,10 @@ class _StraightThrough(torch.autograd.Function):
 
 
 def blend_sizes(size: float | Tensor, operation: Callable[[int], Tensor], *, lowest: int = 1, pitch: int = 1) -> Tensor:
-    """An operation at a fractional size: its results for the sizes on either side, blended by nearness.
+    """Apply an operation at a fractional size: interpolate its results for the sizes on either side.
 
-    size: one number, or a tensor without axes, to which the gradient goes. lowest, pitch: sizes are lowest, lowest +
-    pitch, ...: 1 and 2 for odd ones.
+    size: a number, or a tensor without axes, which receives the gradient. lowest, pitch: sizes are lowest, lowest +
+    pitch, ...; 1 and 2 for odd sizes.
 
     >>> F.blend_sizes(2.25, lambda size: torch.tensor(float(size)))
     tensor(2.2500)
@@ -88,11 +88,11 @@ def gate_regions(
     *,
     softness: float = 0.0,
 ) -> Float[Tensor, "B R"]:
-    """How far each region passes: the sum of its mask is min_area_px at least, and its highest evidence the peak.
+    """Return how far each region passes: its mask must sum to min_area_px, and its evidence must reach `peak`.
 
     Regions are labelled on the hard mask, which passes no gradient.
-    labels: 0 no region, else 1 to regions; pixels of one label are one region. Softness is a share of either bound, so
-    that large and small numbers soften alike. A label that no pixel has does not pass.
+    labels: 0 for no region, else 1 to `regions`; pixels of one label form one region. Softness is a share of each
+    bound, so that large and small numbers soften alike. A label without pixels does not pass.
 
     >>> mask = torch.ones(1, 1, 1, 4)
     >>> labels = torch.tensor([1, 1, 1, 2]).reshape(1, 1, 1, 4)
@@ -107,24 +107,24 @@ def gate_regions(
     highest = lowest.scatter_reduce(1, place, seen, "amax")[:, 1:]
     there = highest.isfinite()
     highest = torch.where(there, highest, torch.zeros_like(highest))
-    # What equals its bound passes: 1 - step of what is missing.
+    # A value equal to its bound passes: 1 - step of the missing amount.
     large = 1 - step(1 - area[:, 1:] / min_area_px, softness=softness)
     high = 1 - step((peak - highest) / torch.clamp(torch.as_tensor(peak), min=1.0), softness=softness)
     return large * high * there
 
 
 def gates_of_pixels(gate: Float[Tensor, "B R"], labels: Int64[Tensor, "B 1 H W"]) -> Float[Tensor, "B 1 H W"]:
-    """Each pixel's gate; 0 where its label is 0.
+    """Return the gate of each pixel's region; 0 where the label is 0.
 
     >>> F.gates_of_pixels(torch.tensor([[1.0, 0.5]]), torch.tensor([0, 1, 2]).reshape(1, 1, 1, 3)).flatten()
     tensor([0.0000, 1.0000, 0.5000])
     """
-    none = gate.new_zeros(gate.shape[0], 1)  # there may be no region at all
+    none = gate.new_zeros(gate.shape[0], 1)  # there may be no region
     return torch.cat([none, gate], 1).gather(1, labels.reshape(labels.shape[0], -1)).reshape(labels.shape)
 
 
 def may_branch(on: Tensor) -> bool:
-    """Whether Python may branch on a tensor's values: not on a GPU, which the host would wait for, nor in a trace.
+    """Return whether Python may branch on a tensor's values: not in a trace, nor on a GPU, where the host would wait.
 
     >>> F.may_branch(torch.ones(1))
     True
@@ -133,12 +133,12 @@ def may_branch(on: Tensor) -> bool:
 
 
 def all_true(condition: Tensor) -> bool:
-    """Whether to stop early: only where Python may branch; results are the same."""
+    """Return whether to stop early because a condition holds everywhere. False if Python may not branch."""
     return may_branch(condition) and bool(condition.all())
 
 
 def is_traced() -> bool:
-    """Whether a graph is being made: then one way is taken for all data.
+    """Return whether a graph is being traced, in which all data must take the same path.
 
     >>> F.is_traced()
     False

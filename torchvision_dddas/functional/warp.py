@@ -1,8 +1,7 @@
-"""Warping one frame into another (appendix B, step S3), and resizing.
+"""Warp one frame into another (appendix B, step S3), and resize pictures.
 
-Kornia's warp_perspective takes 4 to 6 times as long on a CPU as its `remap` over maps that are made by broadcasting, in
-strips that stay in the cache. Its resize takes 0.3 of the time of the exact one here (`python eval/speed.py
-operations`).
+On a CPU, Kornia's warp_perspective takes 4 to 6 times as long as its `remap` with maps made by broadcasting, in strips
+that stay in the cache. Its resize takes 0.3 of the time of the exact one here (`python eval/speed.py operations`).
 """
 
 from contextlib import suppress
@@ -18,7 +17,7 @@ from torchvision_dddas.functional.filters import strip_rows, to_bytes
 from torchvision_dddas.functional.plane_maps import invert_map
 from torchvision_dddas.functional.soft import is_traced
 
-# Strips of fewer rows are made of too many calls.
+# Strips of fewer rows need too many calls.
 _LEAST_ROWS = 64
 
 
@@ -33,14 +32,14 @@ def warp_perspective(
     subpixels: int = 0,
     whole: bool = False,
 ) -> Shaped[Tensor, "B C h w"]:
-    """`kornia.geometry.warp_perspective`: the picture where M takes its pixels, (u, v) from the first one's centre.
+    """Warp as `kornia.geometry.warp_perspective`: M maps pixels of the picture to pixels of the result.
 
-    dsize: (height, width). Places are as with Kornia's align_corners=True. padding_mode: zeros, or border, whose edge
-    pixels continue outside. inverse_map: M takes
-    pixels of the result to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px,
-    32 as cv2.warpPerspective does; then no gradient reaches M. 0: no rounding.
-    whole: return bytes, halves rounded up; the pictures are grey levels up to 255. Raises InputError for another
-    padding_mode, and for what is no batch of pictures and of as many matrices.
+    Pixels are (u, v) from the centre of the first pixel. dsize: (height, width). Positions are as with Kornia's
+    align_corners=True. padding_mode: zeros, or border to repeat edge pixels outside. inverse_map: M maps the result's
+    pixels to the picture's, as with cv2.WARP_INVERSE_MAP. subpixels: round positions to 1/subpixels px (32 in
+    cv2.warpPerspective), so that no gradient reaches M; 0: do not round.
+    whole: return bytes, halves rounded up; the pictures are grey levels up to 255. Raise InputError for another
+    padding_mode, and unless src is a batch of pictures and M has one matrix for each.
 
     >>> picture = torch.arange(4.0).expand(1, 1, 4, 4)
     >>> right = torch.tensor([[[1.0, 0, 1], [0, 1, 0], [0, 0, 1]]])
@@ -58,15 +57,15 @@ def warp_perspective(
     if not is_traced() and len(M) != len(src):
         raise InputError(f"M has {len(M)} matrices for {len(src)} pictures: M.expand(len(src), -1, -1)")
     if padding_mode not in ("zeros", "border"):
-        raise InputError(f"padding_mode must be zeros or border, got {padding_mode}; Kornia's function has others")
+        raise InputError(f"padding_mode must be zeros or border, got {padding_mode}; Kornia's function takes others")
     rows, columns = dsize
     matrix = M.double() if inverse_map else invert_map(M.double())
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
-    # Row y is the first of these rows plus y times the second; u and v in steps of the rounding.
+    # The position of row y is the first of these rows plus y times the second, in steps of the rounding.
     scale = matrix.new_tensor([max(subpixels, 1), max(subpixels, 1), 1])[:, None]
     start = ((matrix[:, :, 0, None] * u + matrix[:, :, 2:]) * scale).to(src.dtype)[:, :, None]
     slope = (matrix[:, :, 1, None] * scale).to(src.dtype)[:, :, None]
-    # Kornia's normalised places are -1 and 1 at the centres of the first and the last pixel.
+    # Kornia's normalised positions are -1 and 1 at the centres of the first and the last pixel.
     units = [2.0 / (max(subpixels, 1) * max(side - 1, 1e-9)) for side in (src.shape[-1], src.shape[-2])]
     y = torch.arange(rows, dtype=src.dtype, device=src.device)[:, None]
 
@@ -84,13 +83,13 @@ def warp_perspective(
 
 
 def check_batch(name: str, value: object, shape: str, axes: int) -> None:
-    """Raises InputError, with the code that makes one, for what is no tensor with so many axes."""
+    """Raise InputError, with code that converts the value, unless it is a tensor with this number of axes."""
     if isinstance(value, Tensor) and value.dim() == axes:
         return
     code, shown = name, getattr(value, "shape", None)
     if not isinstance(value, Tensor):
         with suppress(ValueError, TypeError):
-            shown = np.shape(np.asarray(value))  # of lists too
+            shown = np.shape(np.asarray(value))  # this also takes lists
         code = f"torch.as_tensor({name})"
         code += ".permute(2, 0, 1) / 255" if axes == 4 and shown is not None and len(shown) == 3 else ""
     got, missing = f"{type(value).__name__} {tuple(shown or ())}", axes - len(shown or ())
@@ -104,10 +103,10 @@ def seen_columns(
     *,
     border_px: int = 0,
 ) -> tuple[Int32[Tensor, "B h"], Int32[Tensor, "B h"]]:
-    """First and last column of every reference row that the frame shows; first > last where it shows none.
+    """Return the first and last column of every reference row that the frame shows; first > last if it shows none.
 
     size, frame_size: (height, width). A strip border_px wide inside the frame's border counts as outside. The nearest
-    frame pixel decides. The frame's outline is convex, so every row sees one run of columns.
+    frame pixel decides. The frame's outline is convex, so every row shows one run of columns.
 
     >>> moved = torch.tensor([[[1.0, 0, 2], [0, 1, 0], [0, 0, 1]]])
     >>> F.seen_columns(moved, (2, 6), (2, 6))
@@ -117,7 +116,7 @@ def seen_columns(
     matrix = frame_from_reference.double()
     along_u, along_v, depth = matrix.unbind(1)
     low, right, bottom = border_px - 0.5, width - border_px - 0.5, height - border_px - 0.5
-    # Each edge, and being in front of the camera, is a half plane a x + b y + c >= 0.
+    # Each edge, and the condition of being in front of the camera, is a half plane a x + b y + c >= 0.
     planes = [along_u - low * depth, right * depth - along_u, along_v - low * depth, bottom * depth - along_v, depth]
     a, b, c = torch.stack(planes, 1).unbind(-1)
     rows = torch.arange(size[0], dtype=torch.float64, device=matrix.device)
@@ -132,7 +131,7 @@ def seen_columns(
 
 
 def columns_between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], width: int) -> Bool[Tensor, "B 1 h w"]:
-    """The columns from first to last of every row, as a mask.
+    """Return a mask of the columns from first to last of every row.
 
     >>> F.columns_between(torch.tensor([[1, 2]]), torch.tensor([[2, 1]]), 4)[0, 0].int()
     tensor([[0, 1, 1, 0],
@@ -141,13 +140,13 @@ def columns_between(first: Int32[Tensor, "B h"], last: Int32[Tensor, "B h"], wid
     columns = torch.arange(width, dtype=first.dtype, device=first.device)
     if is_traced():
         return ((columns >= first[..., None]) & (columns <= last[..., None]))[:, None]
-    # Torch is slow at comparing: row k of these is 1 from column width - k on.
+    # Torch compares slowly. Row k of these steps is 1 from column width - k on.
     steps = torch.cat([torch.zeros_like(columns), torch.ones_like(columns)]).bool().unfold(0, width, 1)
     return (steps[(width - first).long()] & ~steps[(width - 1 - last).long()])[:, None]
 
 
 def seen_by_both(one: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor], width: int) -> Bool[Tensor, "B 1 h w"]:
-    """Where two frames are seen. one, other: as `seen_columns` returns them.
+    """Return the mask of the pixels that two frames show. one, other: as `seen_columns` returns them.
 
     >>> moved = torch.tensor([[[1.0, 0, 2], [0, 1, 0], [0, 0, 1]]])
     >>> one, other = F.seen_columns(torch.eye(3)[None], (4, 6), (4, 6)), F.seen_columns(moved, (4, 6), (4, 6))
@@ -165,23 +164,23 @@ def resize(
     columns: Int64[Tensor, "w"] | None = None,
     rounded: bool = False,
 ) -> Float[Tensor, "B C h w"]:
-    """The pictures in another size, (height, width), as `kornia.geometry.resize` without antialiasing.
+    """Resize pictures to (height, width) as `kornia.geometry.resize` without antialiasing.
 
-    Rounded, as by OpenCV's INTER_LINEAR_EXACT on 8-bit levels, bit for bit. Outside the edge pixel is repeated.
-    The pyramid of a HOG detector is made so: its weights are rounded to 1/256, and plain interpolation moves the scores
-    of a trained detector by up to 0.15.
+    With `rounded` the result equals OpenCV's INTER_LINEAR_EXACT on 8-bit levels, bit for bit. Beyond the edge, the edge
+    pixel is repeated. The pyramid of a HOG detector needs these weights, which are rounded to 1/256: plain
+    interpolation moves the scores of a trained detector by up to 0.15.
 
-    rows, columns: those of the result that are wanted, in any order and number; all by default.
-    rounded: input is levels 0 .. 255, the result whole levels, halves up. Of whole levels every sum is a whole number
-    of 1/65536 below 256, which float32 holds exactly: the result is OpenCV's on every device. Gradients go
-    to the levels, and pass the rounding as if it were not there; not rounded, the result is linear in the levels.
+    rows, columns: the wanted rows and columns of the result, in any order and number; all by default.
+    rounded: input is levels 0 .. 255, the result whole levels, halves up. For whole levels every sum is a multiple of
+    1/65536 below 256, which float32 holds exactly, so that every device gives OpenCV's result. Gradients pass the
+    rounding unchanged. Not rounded, the result is linear in the levels.
 
     >>> F.resize(torch.rand(1, 3, 48, 64), (24, 32)).shape
     torch.Size([1, 3, 24, 32])
     """
     height, width = input.shape[-2:]
     found = _rows(input, *_taps(height, size[0]), rows)
-    # Rows are copied as they lie in memory; columns one by one would take twice the time.
+    # Rows are copied as they lie in memory. Copying columns one by one would take twice the time.
     found = _rows(found.transpose(-1, -2).contiguous(), *_taps(width, size[1]), columns).transpose(-1, -2)
     if not rounded:
         return found.contiguous()
@@ -190,9 +189,9 @@ def resize(
 
 
 def _taps(have: int, wanted: int) -> tuple[Int64[Tensor, "n"], Float64[Tensor, "n"]]:
-    """Of every place of the result the first of its two sources, and the share of the second, a multiple of 1/256.
+    """Return for each place of the result the first of its two sources, and the second's share, a multiple of 1/256.
 
-    Computed as OpenCV does in doubles: 1 / (wanted / have), which is not have / wanted to the last bit.
+    The step is computed as in OpenCV, 1 / (wanted / have), which differs from have / wanted in the last bit.
     """
     at = (torch.arange(wanted, dtype=torch.float64) + 0.5) * (1.0 / (wanted / have)) - 0.5
     left = at.floor()
@@ -202,7 +201,7 @@ def _taps(have: int, wanted: int) -> tuple[Int64[Tensor, "n"], Float64[Tensor, "
 
 
 def _rows(levels: Tensor, first: Tensor, share: Tensor, places: Tensor | None) -> Tensor:
-    """Interpolated rows: all, or those at the places."""
+    """Interpolate rows: all, or those at the given places."""
     first, share = first.to(levels.device), share.to(levels)
     if places is not None:
         first, share = first[places], share[places]

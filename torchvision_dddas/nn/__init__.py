@@ -1,4 +1,4 @@
-"""torch.nn.Modules made of `functional`, for models of one's own, the torch engines, tuning and export."""
+"""Modules of torch.nn built from `functional`, for users' own models, the torch engines, tuning and export."""
 
 from torchvision_dddas.nn.histogram_affinity import HistogramAffinity
 from torchvision_dddas.nn.motion_segmenter import (

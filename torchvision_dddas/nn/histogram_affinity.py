@@ -7,7 +7,7 @@ from torch import Tensor, nn
 import torchvision_dddas.functional as F
 from torchvision_dddas.errors import InputError
 
-# Pixels of boxes that are read at once, at about 100 bytes each, and affinities computed at once.
+# Pixels of boxes that are read at once, at about 100 bytes each, and affinities that are computed at once.
 _PIXELS, _AFFINITIES = 1 << 20, 1 << 21
 
 
@@ -21,7 +21,7 @@ class HistogramAffinity(nn.Module):
     """
 
     def __init__(self, *, normalize: bool = True, softness: float = 0.0) -> None:
-        """normalize: each colour's histogram adds up to 1. softness: see `functional.rgb_histogram`."""
+        """normalize: let the histogram of each colour add up to 1. softness: see `functional.rgb_histogram`."""
         super().__init__()
         self.normalize, self.softness = normalize, softness
 
@@ -32,17 +32,17 @@ class HistogramAffinity(nn.Module):
         valid: Bool[Tensor, "T N"],
         windows: Int64[Tensor, "W K"],
     ) -> Float[Tensor, "W N N *N"]:
-        """(W, N, N) for windows of K = 2 frames, (W, N, N, N) for 3; 0 where a box is missing.
+        """Return affinities, (W, N, N) for windows of K = 2 frames, (W, N, N, N) for 3; 0 if a box is missing.
 
-        clip: RGB in [0, 1]. box_px: x, y, width, height, padded to N a frame; valid: which are there. windows: places
-        of their frames in the clip, newest first.
+        clip: RGB in [0, 1]. box_px: x, y, width, height, padded to N boxes in each frame. valid: which boxes exist.
+        windows: indices of their frames in the clip, newest first.
         """
         return self.affinity(*self.histograms(clip, box_px, valid), windows)
 
     def histograms(
         self, clip: Float[Tensor, "T 3 H W"], box_px: Float[Tensor, "T N 4"], valid: Bool[Tensor, "T N"]
     ) -> tuple[Float[Tensor, "T N 768"], Bool[Tensor, "T N"]]:
-        """3 x 256 bins of every box, and which boxes lie in the picture."""
+        """Return 3 x 256 bins of every box, and which boxes lie in the picture."""
         (frames, boxes), largest = valid.shape, _largest(clip, box_px, valid)
         pixels = largest[0] * largest[1]
         boxes_at_once = max(1, min(boxes, _PIXELS // pixels))
@@ -62,12 +62,12 @@ class HistogramAffinity(nn.Module):
     def affinity(
         self, feature: Float[Tensor, "T N D"], valid: Bool[Tensor, "T N"], windows: Int64[Tensor, "W K"]
     ) -> Float[Tensor, "W N N *N"]:
-        """As `forward`, of any non-negative features of the boxes: histograms, or their centres in pixels.
+        """Return affinities as `forward` does, of any non-negative features, such as the boxes' centres in pixels.
 
-        Raises InputError for windows of other than two or three frames.
+        Raise InputError for windows of other than two or three frames.
         """
         if windows.dim() != 2 or windows.shape[1] not in (2, 3):
-            raise InputError(f"windows must be (W, 2) or (W, 3) places of frames, got {tuple(windows.shape)}")
+            raise InputError(f"windows must be (W, 2) or (W, 3) indices of frames, got {tuple(windows.shape)}")
         count, size = feature.shape[1], windows.shape[1]
         of_frames = F.pair_affinity if size == 2 else F.triplet_affinity
         made = []
@@ -78,7 +78,7 @@ class HistogramAffinity(nn.Module):
 
 
 def _largest(clip: Tensor, box_px: Tensor, valid: Tensor) -> tuple[int, int]:
-    """(height, width) that no box exceeds once its edges are rounded; in a graph, of fixed shapes, the clip's."""
+    """Return (height, width) that no box exceeds after rounding; in a graph, whose shapes are fixed, the clip's."""
     height, width = clip.shape[-2:]
     if torch.compiler.is_compiling() or not box_px.numel():
         return height, width

@@ -1,7 +1,7 @@
-"""Motion segmentation: the detection chain on tensors, as the torch engine, tuning and the exported graphs use it.
+"""Motion segmentation: the detection chain on tensors, for the torch engine, tuning and the exported graphs.
 
 With softness, a share of each threshold, the chain has gradients in its parameters (see `functional.TensorOperations`).
-Regions are labelled hard and gated softly; a hull is the hard one of a region, and counts as far as its region does.
+Regions are labelled hard and gated softly. The hull of a region is hard, and counts as far as its region passes.
 """
 
 from collections import defaultdict
@@ -34,24 +34,24 @@ Values = Mapping[str, float | Tensor]
 TensorChain = DetectionChain[Tensor, Tensor, tuple[Tensor, Tensor]]
 
 TUNED = ("difference.threshold", "difference.noise_levels", "difference.gradient_share")
-"""Parameters that are learned unless others are named."""
+"""Parameters that are learned by default."""
 
 TUNABLE = (
     *TUNED,
     *("difference.blur_px", "difference.peak", "gates.min_area_px"),
     *("morphology.erode_px", "morphology.dilate_px", "morphology.close_px"),
 )
-"""Parameters that can be learned or given with a call; `peak` and `min_area_px` act in `outlined` alone."""
+"""Parameters that can be learned or given in a call. `peak` and `min_area_px` act only in `outlined`."""
 
-_GREY_OF_RGB = tuple(share / 2**15 for share in (9798, 19235, 3735))  # OpenCV's
+_GREY_OF_RGB = tuple(share / 2**15 for share in (9798, 19235, 3735))  # the weights that OpenCV uses
 
 
 class Segmentation(NamedTuple):
-    """What moves in the frames of a batch of clips.
+    """The moving targets in the frames of a batch of clips.
 
-    mask: 0 to 1; all 0 where a frame has no two neighbours. evidence: the largest difference, in noise units or grey
-    levels. later_from_earlier: the background's motion from each frame to the next, float64; inliers: how many
-    keypoints agree with it. margin: above 0 where the mask is above one half; see `Core`.
+    mask: 0 to 1; all 0 if a frame has no two neighbours. evidence: the largest difference, in noise units or grey
+    levels. later_from_earlier: the background's motion from each frame to the next, float64. inliers: number of
+    keypoints that agree with the motion. margin: above 0 where the mask is above one half; see `Core`.
     """
 
     mask: Float[Tensor, "B T 1 H W"]
@@ -65,8 +65,8 @@ class Segmentation(NamedTuple):
 class Differences:
     """A batch of windows, before any tunable parameter acts.
 
-    least: the difference of each near pair, as `difference.kind` has it, grey levels. both: where both neighbours are
-    seen. texture: of the reference, 4 x grey levels a pixel; grey: its grey levels.
+    least: the difference of each near pair, by `difference.kind`, in grey levels. both: where both neighbours are seen.
+    texture: of the reference, in 4 x grey levels a pixel. grey: its grey levels.
 
     >>> least = torch.zeros(1, 2, 64, 64, dtype=torch.uint8)
     >>> least[..., 20:40, 20:40] = 90
@@ -84,10 +84,10 @@ class Differences:
 
 
 class Core(NamedTuple):
-    """Where targets are certain.
+    """The masks of the certain parts of targets.
 
-    mask: 0 to 1. margin: above 0 where the mask is above one half; with softness by how much evidence is above the
-    threshold, cleaned. evidence: the largest over the near pairs. Both in noise units, or grey levels.
+    mask: 0 to 1. margin: above 0 where the mask is above one half; with softness, the cleaned excess of the evidence
+    over the threshold. evidence: the largest over the near pairs. Both are in noise units or grey levels.
 
     >>> maps = torch.zeros(1, 1, 64, 64)
     >>> core = nn.Core(mask=maps, margin=maps - 3.5, evidence=maps)
@@ -104,7 +104,7 @@ class Core(NamedTuple):
 class Regions:
     """Label maps of the connected regions of a hard core: 0 is background, others 1 to `count`.
 
-    near: the regions, and the pixels around them that may join them. filled: their hulls, or themselves.
+    near: the regions, and the pixels around them that may join them. filled: the hulls of the regions, or the regions.
 
     >>> labels = torch.zeros(1, 1, 64, 64, dtype=torch.int64)
     >>> labels[..., 20:40, 20:40] = 1
@@ -121,17 +121,17 @@ class Regions:
 
 
 class MotionSegmenter(nn.Module):
-    """Masks of what moves in clips of a moving camera, up to the cleaned mask.
+    """Masks of moving targets in clips of a moving camera, up to the cleaned mask.
 
     `detection.detect_masks` adds the detector's later steps: hulls, tracklets, outlines, small targets.
 
-    Parameters that are named in `tuned` are nn.Parameters, float64 as the settings' numbers; others are those of the
-    settings, or given with a call. whole: round where the engines do, straight through; False rounds nowhere, for
-    gradient checks.
+    Parameters that are named in `tuned` are nn.Parameters, float64 like the numbers of the settings. All others are
+    those of the settings, or are given in a call. whole: round where the engines do, straight through; False never
+    rounds, for gradient checks.
 
-    Nothing is asked of the host on a GPU, with two exceptions: a size in pixels that is a tensor (blur_px, erode_px,
-    dilate_px, close_px) decides which kernels are built, and is read; and corners of the whole frame
-    (`registration.corners`) are chosen in rounds whose end the host asks for.
+    On a GPU the host waits for the device in only two cases. A size in pixels that is a tensor (blur_px, erode_px,
+    dilate_px, close_px) is read to build kernels. Corners of the whole frame (`registration.corners`) are chosen in
+    rounds, and the host asks whether they have ended.
 
     >>> model = nn.MotionSegmenter(td.load_settings("fast"))
     >>> found = model(torch.rand(1, 3, 1, 64, 64))
@@ -149,7 +149,7 @@ class MotionSegmenter(nn.Module):
     ) -> None:
         """softness: a share of each threshold; 0 is the engine's hard chain. tuned: names of TUNABLE.
 
-        Raises InputError for a negative softness and other names.
+        Raise InputError for a negative softness and for other names.
         """
         super().__init__()
         if softness < 0:
@@ -164,7 +164,7 @@ class MotionSegmenter(nn.Module):
             self.register_parameter(attribute, nn.Parameter(start))
 
     def tuned_settings(self) -> Settings:
-        """The settings with the learned numbers, sizes rounded: the detector that the module is.
+        """Return the settings with the learned numbers, sizes rounded, for a detector that equals this module.
 
         >>> detector = td.MotionDetector(model.tuned_settings(), "torch")
         """
@@ -184,11 +184,11 @@ class MotionSegmenter(nn.Module):
     ) -> Segmentation:
         """Segment every frame of clips of RGB or grey pictures in [0, 1].
 
-        later_from_earlier: px; estimated by default. values: parameters by name, in place of the settings' and the
-        module's own. A frame is compared with the neighbours of `difference.near_frames` on both sides; at the ends of
-        a clip with the two nearest on one side.
+        later_from_earlier: px; estimated by default. values: parameters by name, which replace those of the settings
+        and the module. A frame is compared with the neighbours of `difference.near_frames` on both sides; at the ends
+        of a clip, with the two nearest on one side.
 
-        Raises InputError for clips or motions of another shape or type, and unknown names.
+        Raise InputError for clips or motions of another shape or type, and for unknown names.
         """
         _check_clip(clip, later_from_earlier)
         _check_names(values or ())
@@ -221,9 +221,9 @@ class MotionSegmenter(nn.Module):
         return Segmentation(masks, evidences, later_from_earlier, inliers, margins)
 
     def segment(self, differences: Differences, *, values: Values | None = None, softness: float | None = None) -> Core:
-        """The core of windows of known differences. softness: in place of the module's own.
+        """Return the core of windows of known differences. softness: replaces the module's own.
 
-        Raises InputError for soft masks of a smoothed silhouette.
+        Raise InputError for soft masks of a smoothed silhouette.
         """
         softness, texture = self.softness if softness is None else softness, differences.texture
         chain = self.chain(values, softness=softness, dtype=texture.dtype)
@@ -241,9 +241,9 @@ class MotionSegmenter(nn.Module):
     def chain(
         self, values: Values | None = None, *, softness: float = 0.0, dtype: torch.dtype = torch.float32
     ) -> TensorChain:
-        """The detection chain on tensors, with the module's parameters. values: in place of them.
+        """Return the detection chain on tensors, with the module's parameters. values: replace some of them.
 
-        Raises InputError for soft masks of a smoothed silhouette.
+        Raise InputError for soft masks of a smoothed silhouette.
         """
         is_soft = softness > 0 or not self.whole
         if is_soft:
@@ -256,7 +256,7 @@ class MotionSegmenter(nn.Module):
     def outlined(
         self, core: Core, found: Regions, *, values: Values | None = None, softness: float | None = None
     ) -> Float[Tensor, "B 1 H W"]:
-        """The mask of the regions that pass the gates, their hulls filled. softness: of the gates, a share of each."""
+        """Return the mask of the regions that pass the gates, with filled hulls. softness: a share of each gate."""
         value = self.chain(values).value
         gate = F.gate_regions(
             core.mask,
@@ -268,12 +268,12 @@ class MotionSegmenter(nn.Module):
             softness=self.softness if softness is None else softness,
         )
         drawn = core.mask * F.gates_of_pixels(gate, found.near)
-        # In the hull of a region, a hole or a speck is foreground as far as that region is, whatever its evidence.
+        # In the hull of a region, a hole or a speck is foreground as far as the region is, whatever its own evidence.
         carried = (core.margin <= 0) | (found.filled != found.near)
         return torch.maximum(drawn, F.gates_of_pixels(gate, found.filled) * carried)
 
     def _levels(self, clip: Tensor) -> Float[Tensor, "B T 1 H W"]:
-        """Whole grey levels, rounded as OpenCV rounds them."""
+        """Return whole grey levels, rounded as in OpenCV."""
         levels = (clip.detach() * LEVEL).round_()
         if clip.shape[2] == 3:
             weights = torch.tensor(_GREY_OF_RGB, dtype=clip.dtype, device=clip.device)
@@ -281,7 +281,7 @@ class MotionSegmenter(nn.Module):
         return levels
 
     def _pairs(self, at: int, frames: int) -> list[Pair]:
-        """The pairs of frames that a frame is compared with."""
+        """Return the pairs of frames with which a frame is compared."""
         if self.settings.difference.kind == "between_later":
             return later_pair(at, self.settings.interval.frames, 0, frames - 1)
         if self.settings.difference.kind == "to_next":
@@ -293,7 +293,7 @@ class MotionSegmenter(nn.Module):
     def _differences(
         self, levels: Tensor, later_from_earlier: Tensor, places: list[int], pairs: tuple[Pair, ...]
     ) -> Differences:
-        """The differences of the windows of the places of all clips, clip by clip."""
+        """Return the differences of the windows at the places in all clips, clip by clip."""
         offsets = sorted({offset for pair in pairs for offset in pair})
         reference = levels[:, places].flatten(0, 1)
         neighbours = [levels[:, [place + offset for place in places]].flatten(0, 1) for offset in offsets]
@@ -316,7 +316,7 @@ def _check_clip(clip: Tensor, later_from_earlier: Tensor | None) -> None:
     code = ""
     if clip.dtype not in (torch.float32, torch.float64):
         code = "clip.float()" if clip.is_floating_point() else "clip.float() / 255"
-    elif clip.numel() and F.may_branch(clip):  # what lies on a GPU is not read
+    elif clip.numel() and F.may_branch(clip):  # values on a GPU are not read
         low, high = (float(end) for end in clip.aminmax())
         if not (low >= 0 and high <= 1):
             code = "clip.nan_to_num()" if low != low else "clip / 255" if low >= 0 and high > 2 else "clip.clamp(0, 1)"
@@ -329,7 +329,7 @@ def _check_clip(clip: Tensor, later_from_earlier: Tensor | None) -> None:
 
 
 def differences_of(chain: TensorChain, window: Window[Tensor]) -> Differences:
-    """The part of a batch of windows that depends on no tunable parameter.
+    """Compute the part of a batch of windows that depends on no tunable parameter.
 
     >>> from torchvision_dddas.chain import DetectionChain, Window
     >>> levels = (255 * torch.rand(3, 1, 64, 64)).round()
@@ -345,7 +345,7 @@ def differences_of(chain: TensorChain, window: Window[Tensor]) -> Differences:
 
 
 def check_softness(settings: Settings) -> None:
-    """Raises InputError for a smoothed silhouette, whose outline at one half is no threshold of evidence.
+    """Raise InputError for a smoothed silhouette, whose outline at one half is no threshold of evidence.
 
     >>> nn.check_softness(td.load_settings("source"))
     Traceback (most recent call last):
@@ -360,7 +360,7 @@ def check_softness(settings: Settings) -> None:
 
 
 def chain_motion(later_from_earlier: Float[Tensor, "B S 3 3"], start: int, end: int) -> Float[Tensor, "B 3 3"]:
-    """The motion from frame `start` to frame `end` of each clip, h33 = 1."""
+    """Return the motion from frame `start` to frame `end` of each clip, with h33 = 1."""
     low, high = min(start, end), max(start, end)
     matrix = torch.eye(3, dtype=later_from_earlier.dtype, device=later_from_earlier.device).expand(
         len(later_from_earlier), 3, 3

@@ -19,16 +19,16 @@ class HOGDescriptor(nn.Module):
     """
 
     def __init__(self, layout: F.Layout | None = None) -> None:
-        """layout: of cells, blocks and window; OpenCV's default."""
+        """layout: of cells, blocks and window; by default OpenCV's."""
         super().__init__()
         self.layout = layout or F.Layout()
 
     def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F ny nx"]:
-        """F = bins x cells down x cells across; ny, nx: blocks of the picture, every `layout.stride` pixels."""
+        """Return histograms, F = bins x cells down x cells across; ny, nx: blocks, every `layout.stride` pixels."""
         return F.hog(self.bordered(image), self.layout)
 
     def bordered(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B C H+2 W+2"]:
-        """What `functional.hog` takes: levels 0 to 255 in OpenCV's order of colours, with a mirrored border."""
+        """Return the input of `functional.hog`: levels 0 to 255 in OpenCV's colour order, with a mirrored border."""
         return F.pad_reflect(image.flip(1) * 255, 1, 1, 1, 1)
 
 
@@ -44,7 +44,7 @@ class PersonScorer(nn.Module):
     ) -> None:
         """weights: in OpenCV's order, `layout.features` of them. window_stride_px: from window to window.
 
-        Raises InputError for another number of weights.
+        Raise InputError for another number of weights.
         """
         super().__init__()
         self.descriptor, self.window_stride_px = HOGDescriptor(layout), window_stride_px
@@ -55,14 +55,14 @@ class PersonScorer(nn.Module):
         self.bias = nn.Parameter(torch.tensor(bias, dtype=weights.dtype))
 
     def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B ny nx"]:
-        """RGB or grey pictures in [0, 1]; the first window lies in the top left corner."""
+        """Return the scores of the windows of RGB or grey pictures in [0, 1], from the top left corner on."""
         return self.score(self.descriptor.bordered(image))
 
     def score(self, bordered: Float[Tensor, "B C H+2 W+2"]) -> Float[Tensor, "B ny nx"]:
-        """As `forward`, of bordered levels.
+        """Return scores as `forward` does, of bordered levels.
 
-        Blocks are computed at the common divisor of the strides of windows and blocks, and windows that share blocks
-        are scored together: one phase of the block stride after the other.
+        Blocks are computed at the common divisor of the strides of windows and blocks. Windows that share blocks are
+        scored together, once for each phase of the block stride.
         """
         layout, stride = self.descriptor.layout, self.window_stride_px
         step = math.gcd(stride, layout.stride)

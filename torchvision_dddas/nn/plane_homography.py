@@ -7,7 +7,7 @@ import torchvision_dddas.functional as F
 
 
 class PlaneHomography(nn.Module):
-    """`functional.find_homography`, from ground to image.
+    """A module of `functional.find_homography`, from ground to image.
 
     >>> ground = torch.tensor([[[0.0, 0], [1, 0], [0, 1], [1, 1]]])
     >>> image_from_ground, valid = nn.PlaneHomography()(ground, 100 * ground + 20, torch.ones(1, 4))
@@ -20,5 +20,5 @@ class PlaneHomography(nn.Module):
     def forward(
         self, ground: Float[Tensor, "B n 2"], image: Float[Tensor, "B n 2"], weight: Float[Tensor, "B n"]
     ) -> tuple[Float[Tensor, "B 3 3"], Bool[Tensor, "B"]]:
-        """image_from_ground, and which could be solved. weight: of each landmark's squared error; 0 leaves it out."""
+        """Return image_from_ground, and which were solved. weight: of each landmark's squared error; 0 ignores it."""
         return F.find_homography(ground, image, weight)

@@ -1,8 +1,9 @@
-"""The background's motion between frames (appendix B, steps S1 to S3), batched: the torch engine's and the graph's.
+"""The background's motion between frames (appendix B, steps S1 to S3), batched, for the torch engine and the graph.
 
-A few points, the scouts, search the whole pyramid for the motion; the others start where it takes them, in the full
-resolution alone, which is much faster. Where the scouts do not agree, all points search the whole pyramid. On a GPU and
-in a trace both are done for every pair, and the result chosen there: the host is not asked.
+A few points, the scouts, search the whole pyramid for the motion. The other points start where this motion takes them
+and search only at full resolution, which is much faster. If the scouts do not agree, all points search the whole
+pyramid. On a GPU and in a trace both searches are done for every pair and the device selects the result, so that the
+host need not wait.
 """
 
 from dataclasses import dataclass
@@ -18,19 +19,19 @@ import torchvision_dddas.functional as F
 from torchvision_dddas.config import RegistrationParameters
 
 LEVEL = 255.0
-# A scout shows the motion if this share of them, and so many, agree with it.
+# The scouts show the motion if this share of them, and at least this number, agree with it.
 _AGREEING, _FEWEST = 0.6, 12
 _SCOUT_REACH_PX, _NEAR_REACH_PX = 4, 3
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long is searched.
+    """How thorough the search is.
 
-    scouts: their number. rounds: tables a level that they make at most. scout_steps, near_steps: Lucas-Kanade steps of
-    scouts, and of points that start near their place. scout_refits, refits: gates of the refits, in RANSAC's tolerance;
-    they matter most for accuracy. branches: False takes one way for all data, as a graph must: nothing is tracked back,
-    and RANSAC on all points follows the scouts.
+    scouts: their number. rounds: largest number of tables that a scout makes at a level. scout_steps, near_steps:
+    Lucas-Kanade steps of scouts, and of points that start near their place. scout_refits, refits: gates of the refits,
+    as shares of RANSAC's tolerance; they matter most for accuracy. branches: False takes one path for all data, as a
+    graph must: no point is tracked back, and RANSAC on all points follows the scouts.
     """
 
     scouts: int = 32
@@ -42,15 +43,15 @@ class Effort:
     branches: bool = True
 
 
-# With 64 scouts, or 3 steps, a motion in some dozens is lost; 200 scouts would take three times the nodes' work.
+# With 64 scouts, or 3 steps, one motion in some dozens is lost. 200 scouts would take three times as many operations.
 GRAPH_EFFORT = Effort(96, 1, 6, 6, (1.0,), (1.0, 0.5), branches=False)
 
 
 class Motion(NamedTuple):
-    """What `FrameRegistration` finds.
+    """The result of `FrameRegistration`.
 
-    later_from_earlier: float64. start_px, end_px: keypoints, and where they were found if tracked. inliers: the tracked
-    ones that agree with the matrix; where nothing agrees it is the identity, with none.
+    later_from_earlier: float64. start_px, end_px: keypoints, and the places where they were found if tracked. inliers:
+    the tracked keypoints that agree with the matrix. If none agree, the matrix is the identity, without inliers.
 
     >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 96, 96), 7)
     >>> motion = nn.FrameRegistration()(picture, picture)
@@ -66,7 +67,7 @@ class Motion(NamedTuple):
 
 
 class FrameRegistration(nn.Module):
-    """Corners, pyramidal Lucas-Kanade, RANSAC and refits; nothing here is learned.
+    """Corners, pyramidal Lucas-Kanade, RANSAC and refits. The module learns nothing.
 
     >>> picture = F.gaussian_blur2d(torch.rand(1, 1, 96, 96), 7)
     >>> motion = nn.FrameRegistration()(picture, picture.roll(3, -1))
@@ -80,7 +81,7 @@ class FrameRegistration(nn.Module):
         self.model = F.MODELS[self.settings.model]
 
     def forward(self, earlier: Float[Tensor, "B 1 H W"], later: Float[Tensor, "B 1 H W"]) -> Motion:
-        """The motion from each earlier to its later picture, grey in [0, 1], whose exposures may differ."""
+        """Return the motion from each earlier to its later picture, grey in [0, 1], whose exposures may differ."""
         earlier, later = (picture * LEVEL for picture in (earlier, later))
         points, valid = self.keypoints(earlier)
         matched = F.match_exposure(earlier, later)
@@ -89,7 +90,7 @@ class FrameRegistration(nn.Module):
     def keypoints(
         self, levels: Float[Tensor, "B 1 H W"], *, halved: bool | None = None
     ) -> tuple[Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-        """The best corner of every cell or of the whole frame, and where there is one. levels: grey, 0 .. 255.
+        """Return the best corners of the cells or of the whole frame, and where there is one. levels: grey, 0 .. 255.
 
         halved: search at half the resolution, at a quarter of the cost; by default as the parameter says.
         """
@@ -97,7 +98,7 @@ class FrameRegistration(nn.Module):
         height, width = levels.shape[-2:]
         cell, apart_px = parameters.cell_side(width, height), parameters.min_distance_px
         if (parameters.halved_corners if halved is None else halved) and min(height, width) > 1:
-            # Half a pixel to the left and top of where the corner stands: a search window does not mind.
+            # Points are half a pixel to the left of and above the corners, which does not matter for a search window.
             levels, cell, step = functional.avg_pool2d(levels, 2), max(cell // 2, 1), 2
             apart_px = max(apart_px // 2, 1)
         least = 1e-7 * LEVEL**2
@@ -117,7 +118,7 @@ class FrameRegistration(nn.Module):
         return step * points, valid
 
     def pyramid(self, levels: Float[Tensor, "B 1 H W"]) -> list[Tensor]:
-        """By OpenCV's rule: a level that Lucas-Kanade's window does not fit into is left out."""
+        """Return the pyramid by OpenCV's rule: levels that are smaller than the window of Lucas-Kanade are left out."""
         count, smaller_side = 1, min(levels.shape[-2:])
         while count <= self.settings.levels and smaller_side / 2**count > self.settings.window_px:
             count += 1
@@ -133,10 +134,11 @@ class FrameRegistration(nn.Module):
         samples: Int64[Tensor, "B S size"] | None = None,
         ransac_px: float | Tensor | None = None,
     ) -> Motion:
-        """The motion of the keypoints between two pyramids.
+        """Return the motion of the keypoints between two pyramids.
 
-        samples: numbers of keypoints that the hypotheses are drawn from, by default the same for every pair and call:
-        what one pair gives does not depend on its company. ransac_px: in place of the parameter.
+        samples: numbers of the keypoints from which hypotheses are drawn. By default they are the same for every pair
+        and call, so that the result of a pair does not depend on the rest of its batch. ransac_px: replaces the
+        parameter.
         """
         effort, parameters = self.effort, self.settings
         ransac_px = parameters.ransac_px if ransac_px is None else ransac_px
@@ -172,7 +174,7 @@ class FrameRegistration(nn.Module):
         return Motion(*(torch.stack(column) for column in zip(*(made[place] for place in sorted(made)), strict=True)))
 
     def _search_everywhere(self, frames: "_FramePairs", _: Tensor, ransac_px: float | Tensor) -> Motion:
-        """Lucas-Kanade through the whole pyramid, then RANSAC."""
+        """Search by Lucas-Kanade through the whole pyramid, then RANSAC."""
         search = self._search(self.settings.iterations, _SCOUT_REACH_PX) | {"rounds": 3}
         end, tracked = self._track(frames, None, search)
         refits, count = self.effort.refits, self.settings.hypotheses
@@ -180,10 +182,10 @@ class FrameRegistration(nn.Module):
         return self._judged(matrix, frames.points, end, tracked, ransac_px)
 
     def _search_near(self, frames: "_FramePairs", motion: Tensor, ransac_px: float | Tensor) -> Motion:
-        """Lucas-Kanade in the finest level alone, near where the motion takes the points; refits of that motion."""
+        """Search by Lucas-Kanade only in the finest level, near the places that the motion predicts; then refit."""
         effort, points = self.effort, frames.points
         finest = frames._replace(earlier=frames.earlier[:1], later=frames.later[:1])
-        # Kornia's result has no shape that the exporter knows.
+        # The exporter does not know the shape of Kornia's result.
         guess = F.transform_points(motion.float(), points).reshape([int(side) for side in points.shape])
         end, tracked = self._track(finest, guess, self._search(effort.near_steps, _NEAR_REACH_PX))
         if effort.branches:
@@ -195,7 +197,7 @@ class FrameRegistration(nn.Module):
         return self._judged(matrix, points, end, tracked, ransac_px)
 
     def _track(self, frames: "_FramePairs", guess: Tensor | None, search: dict[str, Any]) -> tuple[Tensor, Tensor]:
-        """Where the points go, and which were found there and, if that is asked for, on the way back."""
+        """Return the points' new places, and which were found there and, if requested, on the way back."""
         given, limit_px = (frames.points, frames.earlier, frames.later, guess), self.settings.forward_backward_px
         if limit_px > 0 and self.effort.branches:
             end, found = F.forward_backward(*given, limit_px=limit_px, **search)
@@ -204,7 +206,7 @@ class FrameRegistration(nn.Module):
         return end, found & frames.valid
 
     def _search(self, most_steps: int, reach_px: int) -> dict[str, Any]:
-        """Settings of the search for points."""
+        """Return the settings of the search for points."""
         parameters = self.settings
         return {
             "window_px": parameters.window_px,
@@ -224,7 +226,7 @@ class FrameRegistration(nn.Module):
         shares: tuple[float, ...],
         hypotheses: int,
     ) -> Tensor:
-        """RANSAC, then least squares on the inliers of a tightening tolerance, `shares` of RANSAC's own."""
+        """Run RANSAC, then least squares on inliers with tolerances that tighten by `shares` of RANSAC's own."""
         model, (batch, count) = self.model, tracked.shape
         if count < model.size:
             return _identities(start)
@@ -243,7 +245,7 @@ class FrameRegistration(nn.Module):
 
 
 class _FramePairs(NamedTuple):
-    """points: keypoints, valid: which are there. earlier, later: pyramids."""
+    """Pairs of frames. points: keypoints. valid: which of them exist. earlier, later: pyramids."""
 
     points: Tensor
     valid: Tensor
@@ -258,8 +260,8 @@ class _FramePairs(NamedTuple):
 
 
 def _drawn(hypotheses: int, count: int, size: int) -> Int64[Tensor, "1 S size"]:
-    """The same numbers of keypoints in every call."""
-    if F.is_traced():  # a graph holds no generator: the numbers are its constants
+    """Return the same numbers of keypoints in every call."""
+    if F.is_traced():  # a graph holds no generator, so the numbers are its constants
         numbers = np.random.default_rng(0).permuted(np.tile(np.arange(count), (hypotheses, 1)), axis=1)
         return torch.tensor(numbers[None, :, :size].tolist())
     return F.draw_samples(torch.Generator().manual_seed(0), 1, hypotheses, count, size=size)

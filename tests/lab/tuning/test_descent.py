@@ -98,7 +98,7 @@ def test_a_checkpoint_of_another_descent_is_refused(tmp_path: Path, change: dict
 def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     place = tmp_path / "checkpoint.pt"
     place.write_bytes(content)
-    with pytest.raises(InputError, match="is no checkpoint, or is damaged"):
+    with pytest.raises(InputError, match="is not a checkpoint, or is damaged"):
         descend(Bowl(), parameters(), pieces(), QUICK, place=place, resume=True)
 
 
@@ -149,7 +149,7 @@ def test_an_impossible_plan_is_refused(wrong: dict) -> None:
 @pytest.mark.parametrize(
     ("examples", "line"),
     [
-        ([], "nothing to tune motion on"),
+        ([], "no clip has an example to tune motion on"),
         (pieces(), "two, frame 8, whatever the parameters, before the first step"),
     ],
 )
@@ -212,7 +212,7 @@ def test_when_its_time_is_over_the_last_state_is_measured(monkeypatch, most_s: f
     monkeypatch.setattr("torchvision_dddas.lab.tuning.descent.time.perf_counter", lambda: float(next(clock)))
     plan = Plan(steps=99, rate=0.1, look_every=50, most_s=most_s)
     found = descend(Bowl(), parameters(), pieces(spread=0.0), plan)
-    assert found.ended == f"{most_s:.0f} s are over" and found.best == found.history[-1].step == last
+    assert found.ended == f"the limit of {most_s:.0f} s was reached" and found.best == found.history[-1].step == last
     watched = [found.history[k].watched for k in (0, -1)]
     assert watched[0] is not None and watched[1] is not None and (last == 0 or watched[1] < watched[0])
 

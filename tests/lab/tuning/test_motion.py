@@ -48,7 +48,7 @@ def test_the_loss_tends_to_that_of_hard_masks(examples: list[Example]) -> None:
 def test_a_clip_without_masks_is_refused_before_any_is_computed(clip: Clip) -> None:
     assert clip.truth is not None
     bare = replace(clip, name="bare", truth=replace(clip.truth, masks={}))
-    with pytest.raises(InputError, match="bare has no masks of what moves; choose clips"):
+    with pytest.raises(InputError, match="bare has no masks of moving targets; choose clips"):
         MotionFamily().examples([clip, bare], SETTINGS, lambda: pytest.fail("a clip was computed before"))
     with pytest.raises(InputError, match=r"difference\.halved"):
         MotionFamily().examples([clip], with_parameters(SETTINGS, {"difference.halved": True}))

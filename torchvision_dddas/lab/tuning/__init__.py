@@ -1,4 +1,4 @@
-"""Tuning of parameters by gradient: examples of what is true, losses on them, descent, and what it was worth."""
+"""Tuning of parameters by gradient: labelled examples, losses on them, the descent, and a test of its effect."""
 
 from torchvision_dddas.lab.tuning.descent import Plan, Step, descend
 from torchvision_dddas.lab.tuning.family import Family, prepare

@@ -14,21 +14,21 @@ FORMAT = 4
 
 
 def write_checkpoint(place: Path, asked: Mapping[str, Any], state: Mapping[str, Any]) -> None:
-    """Write a state. asked: facts that the descent depends on, by name. Raise InputError if the disk refuses."""
+    """Write a checkpoint. asked: facts that the descent depends on, by name. Raise InputError if the disk refuses."""
     content = io.BytesIO()
     torch.save({"format": FORMAT, "asked": dict(asked), "state": dict(state)}, content)
     save_file(place, content.getvalue())
 
 
 def read_checkpoint(place: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
-    """Read the state. Raise InputError for a file that is no checkpoint, or one of a descent with other facts."""
+    """Read the state. Raise InputError if the file is not a checkpoint, or is of a descent with other facts."""
     try:
         found = _load(place)
         written, state, form = dict(found["asked"]), dict(found["state"]), found["format"]
     except OSError as error:
         raise InputError(f"{place} cannot be read: {error.strerror}") from None
-    except Exception:  # torch's reader may raise any error for bytes that are no checkpoint
-        raise InputError(f"{place} is no checkpoint, or is damaged; begin again without --resume") from None
+    except Exception:  # torch's reader may raise any error for bytes that are not a checkpoint
+        raise InputError(f"{place} is not a checkpoint, or is damaged; begin again without --resume") from None
     if form != FORMAT:
         raise InputError(f"{place} is a checkpoint of another version; begin again without --resume")
     for name, value in asked.items():
@@ -67,5 +67,5 @@ def _unfinished_steps(place: Path) -> int:
 
 
 def _load(place: Path) -> Any:
-    # weights_only: a checkpoint is tensors, numbers and texts, and runs no code.
+    # weights_only: a checkpoint holds only tensors, numbers and texts, so that loading it runs no code.
     return torch.load(place, weights_only=True, map_location="cpu")

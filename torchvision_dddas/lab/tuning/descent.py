@@ -30,12 +30,14 @@ GAIN = 1e-5
 
 @dataclass(frozen=True)
 class Plan:
-    """How to descend. rate: of Adam, in units of which one is about a factor e of a parameter.
+    """Settings of a descent. rate: learning rate of Adam; a step of 1 changes most parameters by a factor of about e.
 
-    look_every: steps between two measurements of the watched examples. patience: measurements without a gain that end
-    the descent. watched: share of each clip's examples, the last ones, that is held back for this. most_watched: limit
-    for all clips together. most_s: no step begins after this many seconds. pull: weight of half the squared distance
-    from the start in the loss, in the rate's units; it keeps parameters in place that the examples hardly determine.
+    look_every: steps between two measurements of the watched examples. patience: number of measurements without a gain
+    that end the descent. watched: share of each clip's examples that is held back for these measurements; the last
+    examples are taken. most_watched: limit for all clips together. most_s: no step begins after this many seconds.
+    pull: weight in the loss of half the squared distance from the start, in the unit of the rate; it holds parameters
+    in place that the examples hardly determine.
+
     Raise InputError for a value out of its range.
     """
 
@@ -64,7 +66,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Step:
-    """The parameters after a step, where step 0 is the start, and the losses.
+    """The parameters and losses after a step; step 0 is the start.
 
     loss: of the step's batch, NaN at step 0. watched: mean loss of the watched examples at the final softness; None if
     they were not measured.
@@ -79,10 +81,11 @@ class Step:
 
 @dataclass
 class Descended:
-    """The result of a descent. parameters: in their best state, after step `best`. ended: reason for the end.
+    """The result of a descent. parameters: the best state, after step `best`. ended: the reason for the end.
 
-    failed: in one line, which clip, frame and parameter gave a value that is not finite; empty otherwise. idle:
-    parameters without any effect on the loss. taken: number of steps in `seconds`, without those of a checkpoint.
+    failed: one line that names the clip, frame and parameter that gave a value that is not finite; empty otherwise.
+    idle: parameters without any effect on the loss. taken: number of steps in `seconds`, without the steps of a
+    checkpoint.
     """
 
     parameters: Parameters
@@ -111,13 +114,14 @@ def descend(
 ) -> Descended:
     """Minimize the family's loss. The parameters are changed in place and end in their best state.
 
-    tell: called with each step, including those of a resumed checkpoint. place: file of a checkpoint, written at every
-    measurement. resume: continue from it if it exists. Raise InputError if there are no examples, if no parameter has
-    an effect on the loss, if the loss is not finite at the start, and for a checkpoint of another descent.
+    tell: called with each step, including the steps of a resumed checkpoint. place: file of a checkpoint, written at
+    every measurement. resume: continue from the checkpoint if it exists. Raise InputError if there are no examples, if
+    no parameter has an effect on the loss, if the loss is not finite at the start, and for a checkpoint of another
+    descent.
     """
     plan = plan or Plan()
     if not examples:
-        raise InputError(f"there is nothing to tune {family.name} on; give clips with the truth that it needs")
+        raise InputError(f"no clip has an example to tune {family.name} on; give clips with the truth that it needs")
     run = _Run(family, parameters, examples, plan)
     began = time.perf_counter()
     if resume and place is not None and place.is_file():
@@ -130,7 +134,7 @@ def descend(
         run.save(place)
     while not (run.ended or run.failed):
         if time.perf_counter() - began >= plan.most_s:
-            run.stop(f"{plan.most_s:g} s are over")
+            run.stop(f"the limit of {plan.most_s:g} s was reached")
             break
         taken = run.step()
         if taken is not None:
@@ -154,7 +158,7 @@ class _Run:
     """A descent in progress.
 
     moved: parameters that had a gradient. best, least, best_step: the best state, its watched loss and its step. since:
-    measurements without a gain.
+    number of measurements since the last gain.
     """
 
     _SAVED = ("best", "least", "best_step", "since", "ended", "failed")
@@ -182,7 +186,7 @@ class _Run:
         }
 
     def begin(self) -> Step:
-        """Measure the start."""
+        """Measure the loss at the start."""
         with torch.no_grad():
             values = self._parameters.values()
         if cause := self._explain(self._watched, values, self._hardest):
@@ -206,7 +210,7 @@ class _Run:
         if not bool(torch.isfinite(loss)):
             self._fail(number, batch, values, softness)
             return None
-        # The loss of one batch may depend on no parameter, but that of all examples must.
+        # The loss of one batch may depend on no parameter, but the loss of all examples must depend on some.
         if not wrong.requires_grad and not self.moved:
             parts = self._parts(self._learned)
             if not any(self._family.loss(values, part, softness).requires_grad for part in parts):
@@ -257,12 +261,12 @@ class _Run:
             write_checkpoint(place, self._facts, state | {name: getattr(self, name) for name in self._SAVED})
 
     def _record(self, number: int, softness: float, loss: float, measure: bool) -> Step:
-        """Record the current parameters, and if `measure` is set the loss of the watched examples."""
+        """Record the current parameters and, if `measure` is set, the loss of the watched examples."""
         watched = None
         with torch.no_grad():
             values = {name: float(value) for name, value in self._parameters.values().items()}
             if measure:
-                # Round as the settings do: a blend of two sizes may be good although each of them is bad.
+                # Round as the settings do: a blend of two sizes may be good although both sizes are bad.
                 settled = self._parameters.settled()
                 watched = self._watched_mean(settled)
         if watched is not None and not math.isfinite(watched):
@@ -283,7 +287,7 @@ class _Run:
         """Return the pull plus the mean loss of the watched examples at the final softness, clips equally weighted."""
         shares = iter(clip_shares([example.clip for example in self._watched]))
         losses = (self._family.loss(values, part, self._hardest).tolist() for part in self._parts(self._watched))
-        # Each part is summed exactly, so that the result does not depend on the order within it.
+        # Sum each part exactly, so that the result does not depend on the order of its examples.
         total = sum(math.fsum(loss * next(shares) for loss in part) for part in losses)
         return total + float(self._pull_term())
 
@@ -303,7 +307,7 @@ class _Run:
         self.failed = f"{self._explain(batch, values, softness) or 'the pull is not finite'}, at step {number}"
 
     def _explain(self, batch: Sequence[Example], values: Mapping[str, Tensor], softness: float) -> str:
-        """Return the first example with a loss or gradient that is not finite, and the parameter; empty if none is.
+        """Name the first example with a loss or gradient that is not finite, and the parameter; empty if there is none.
 
         A parameter is named if its earlier value alone makes the loss finite, or if its gradient is not finite.
         """
@@ -343,11 +347,11 @@ class _Run:
 
 
 def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
-    """Return the examples to learn from, and those to watch: the last ones of each clip.
+    """Return the examples to learn from, and the examples to watch: the last ones of each clip.
 
-    A clip with three or more examples has at least one of each kind. most: largest number to watch, chosen evenly.
-    Neighbouring frames are similar, so a contiguous part is a better test than single frames. If no clip has three
-    examples, or watched is 0, all examples are learned from and watched.
+    A clip with three or more examples has at least one example of each kind. most: largest number to watch, chosen
+    evenly. Neighbouring frames are similar, so a contiguous part is a better test than single frames. If no clip has
+    three examples, or watched is 0, all examples serve for both.
     """
     clips: dict[str, list[Example]] = {}
     for example in examples:
@@ -366,8 +370,9 @@ def split_examples(examples: Sequence[Example], watched: float, most: int) -> tu
 def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
     """Return the indices of the examples of a step, counted from 0. clips: the clip of each example.
 
-    All examples come in a random order, those of clips with fewer examples several times, so that every clip has the
-    same weight; then all in a new order. The result depends only on the arguments, so that a descent can be resumed.
+    A round takes all examples in a random order and repeats the examples of shorter clips, so that every clip has the
+    same weight. The next round draws a new order. The result depends only on the arguments, so that a descent can be
+    resumed.
     """
     batch = min(batch, len(clips))
     of_clip: dict[str, list[int]] = {}
@@ -376,7 +381,7 @@ def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[i
     most = max(len(places) for places in of_clip.values())
 
     def draw_order(turn: int) -> list[int]:
-        """Return one round: as many examples of each clip as the largest clip has."""
+        """Return one round: each clip has as many examples as the largest clip."""
         generator = torch.Generator().manual_seed((seed * 1_000_003 + turn) % 2**63)
         drawn: list[int] = []
         for places in of_clip.values():

@@ -1,4 +1,4 @@
-"""The truth of clips as families take it: masks, boxes with identities, owners of detections, padded batches."""
+"""The truth of clips as families need it: masks, boxes with identities, owners of detections, padded batches."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
@@ -19,24 +19,24 @@ from torchvision_dddas.types import DetectionTable, is_sampled
 
 
 def check_masks(clips: Sequence[Clip], still: bool = False) -> None:
-    """Raises InputError for clips without masks. still: clips in which nothing moves need none."""
+    """Raise InputError for clips without masks. still: accept clips without motion, which need no masks."""
     bare = [c.name for c in clips if not (c.truth is not None and c.truth.masks) and not (still and c.still)]
     if bare:
         lack = "have" if len(bare) > 1 else "has"
-        raise InputError(f"{', '.join(bare)} {lack} no masks of what moves; choose clips that have them with --clips")
+        raise InputError(f"{', '.join(bare)} {lack} no masks of moving targets; choose clips with masks by --clips")
 
 
 def labels_at(truth: Truth, frame: int, shape: tuple[int, ...]) -> np.ndarray:
-    """(H, W) as `labels_of`. shape: (H, W, ...) of the frame. Raises InputError where the mask has another size."""
+    """Return (H, W) labels by `labels_of`. shape: (H, W, ...) of the frame. Raise InputError if the sizes differ."""
     labels = labels_of(truth, frame)
     if labels.shape != shape[:2]:
         mask, picture = (f"{width}x{height}" for height, width in (labels.shape, shape[:2]))
-        raise InputError(f"{truth.masks[frame]} is {mask}, the frame itself {picture}")
+        raise InputError(f"{truth.masks[frame]} is {mask}, but the frame is {picture}")
     return labels
 
 
 def true_tracks(clip: Clip, interval: int) -> TrackTable:
-    """The true boxes of frames 1, 1 + interval, ... Raises InputError for a clip without identities."""
+    """Return the true boxes of frames 1, 1 + interval, ... Raise InputError for a clip without identities."""
     if clip.truth is None or clip.truth.tracks is None or not len(clip.truth.tracks.frame):
         raise InputError(f"{clip.name} has no true identities, which tuning the tracker needs; leave it out")
     return clip.truth.tracks.every(interval)
@@ -45,9 +45,10 @@ def true_tracks(clip: Clip, interval: int) -> TrackTable:
 def boxed_frames(
     clip: Clip, table: TrackTable, interval: int
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
-    """Number, identities (n,), boxes (n, 4) and picture of every `interval`-th frame to the last with boxes.
+    """Yield number, identities (n,), boxes (n, 4) and picture of every `interval`-th frame, up to the last with boxes.
 
-    From the first picture; of a clip without pictures, whose pictures are None, from the first frame with boxes.
+    Frames are counted from the first picture. A clip without pictures begins at its first frame with boxes, and its
+    pictures are None.
     """
     if not len(table.frame):
         return
@@ -65,10 +66,11 @@ def boxed_frames(
 
 
 class OwnedBoxes(NamedTuple):
-    """Boxes with their true identities, ordered by frame; each false alarm has an identity of its own below 0.
+    """Boxes with their true identities, ordered by frame. Each false alarm has its own identity below 0.
 
-    score: (N,), 1 for a certain box. begins: (N,) which may begin a track. size: (width, height) that holds nearly all
-    boxes, None where there are too few. own: whether they are moving targets that `dddas detect` found.
+    score: (N,), 1 for a certain box. begins: (N,) whether a box may begin a track. size: (width, height) of an area
+    that holds nearly all boxes; None if there are too few. own: whether the boxes are moving targets that `dddas
+    detect` found.
     """
 
     table: TrackTable
@@ -81,15 +83,15 @@ class OwnedBoxes(NamedTuple):
 def match_owners(found: DetectionTable, truth: Truth, interval: int, parameters: TrackParameters) -> OwnedBoxes:
     """Match the detections of frames 1, 1 + interval, ... with the truth as the measures do, by IoU of 0.5 or more.
 
-    Detections that are too doubtful for the tracker are left out. Targets that the measures ignore own boxes too.
-    Raises InputError if an identity occurs twice in a frame.
+    Detections that are too doubtful for the tracker are left out. Targets that the measures ignore own boxes too. Raise
+    InputError if an identity occurs twice in a frame.
     """
     assert truth.tracks is not None
     parts = [truth.tracks]
     if truth.ignoring == "removed":
         parts += [table for table in (truth.ignored, truth.others) if table is not None]
     frame, identity, true_px = (np.concatenate(column) for column in zip(*parts, strict=True))
-    # The same identity in two tables is two targets.
+    # The same identity in two tables denotes two targets.
     table = np.repeat(np.arange(len(parts)), [len(part.frame) for part in parts])
     _, number = np.unique(np.stack([table, identity]), axis=1, return_inverse=True)
     tracks = TrackTable(frame, number.reshape(-1), true_px.astype(float)).every(interval)
@@ -117,9 +119,10 @@ _Record = TypeVar("_Record")
 def stack_padded(
     kind: type[_Record], rows: Sequence[Mapping[str, np.ndarray]], device: torch.device | str = "cpu", pad: str = "zero"
 ) -> _Record:
-    """A dataclass of tensors whose first axis is the row; shorter arrays are filled up at the end of each axis.
+    """Return a dataclass of tensors whose first axis is the row; shorter arrays are padded at the end of each axis.
 
-    rows: an array for each field of `kind`. pad: zero, or edge to repeat the last number; bools are always False.
+    rows: an array for each field of `kind`. pad: "zero", or "edge" to repeat the last number. Bools are padded with
+    False.
     """
     batch: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]
@@ -132,7 +135,7 @@ def stack_padded(
                     arrays[place] = np.pad(array, wider)
                 elif array.size:
                     arrays[place] = np.pad(array, wider, mode="edge")
-                else:  # nothing to repeat; any value serves, because no target is there
+                else:  # there is nothing to repeat; any value is right, because no target is there
                     arrays[place] = np.pad(array, wider, constant_values=1.0)
         batch[field.name] = torch.as_tensor(np.stack(arrays), device=device)
     return kind(**batch)

@@ -25,14 +25,15 @@ FAMILIES = {
     "motion": "motion.MotionFamily",
     "tracking": "tracking.TrackingFamily",
 }
-"""Family -> its module and class in this package; a module is loaded when its family is used."""
+"""Family -> its module and class in this package. The module is loaded when the family is used."""
 
 
 @dataclass(frozen=True)
 class Example:
-    """One labelled piece of a clip. clip, frame: named in messages. content: the input of the loss, on the CPU.
+    """One labelled piece of a clip. clip, frame: names in messages. content: the input of the loss, on the CPU.
 
-    settings: those of its preparation, for parameters that are not tuned; the same for all examples of a descent.
+    settings: the settings that the example was prepared with, for parameters that are not tuned. All examples of a
+    descent have the same settings.
     """
 
     clip: str
@@ -44,9 +45,9 @@ class Example:
 class Family(ABC):
     """A stage of the pipeline whose parameters can be tuned: labelled examples, and a loss on them.
 
-    name: a key of FAMILIES. task: of a study, whose clips are used. measure: compared before and after, such as
+    name: a key of FAMILIES. task: the study's task, whose clips are used. measure: compared before and after, such as
     motion.pixels.f. softness: of the loss at the first and at the last step. interval: frames between examples. empty:
-    why a clip may give no example; if it is set, a clip without any is an error.
+    reason why a clip may give no example; if it is set, a clip without examples is an error.
     """
 
     name: str
@@ -64,17 +65,17 @@ class Family(ABC):
         """
 
     def check(self, names: Sequence[str], settings: Settings) -> None:  # noqa: B027
-        """Raise InputError, with what to set, if a parameter has no effect under these settings."""
+        """Raise InputError, which says what to set, if a parameter has no effect under these settings."""
 
     def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:  # noqa: B027
-        """Raise InputError, before anything is computed, for clips that cannot be used."""
+        """Raise InputError for clips that cannot be used. It is called before any computation."""
 
     def at(self, interval_frames: int, task: Task) -> Self:
         """Return the family for a study's interval and for the task of the measure."""
         return self
 
     def examples(self, clips: Sequence[Clip], settings: Settings, tick: Tick = lambda: None) -> list[Example]:
-        """Return the examples of all clips. tick: called once an example. Raise InputError for a clip without any."""
+        """Return the examples of all clips. tick: called for each example. Raise InputError for a clip without any."""
         self.check_clips(clips, settings)
         found: list[Example] = []
         for clip in clips:
@@ -88,17 +89,17 @@ class Family(ABC):
 
     @abstractmethod
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """Return (B,) the loss of each example, with a gradient in the parameters, on their device.
+        """Return the loss of each example, (B,), with a gradient in the parameters, on their device.
 
-        parameters: the tuned values by name, in the units of the settings; all others are as in the preparation of the
-        examples. The result depends on nothing else.
+        parameters: the tuned values by name, in the units of the settings. All other parameters are as in the
+        preparation of the examples. The result depends on nothing else.
         """
 
 
 def load_family(name: str) -> Family:
     """Return the family of a name. Raise InputError for an unknown name."""
     if name not in FAMILIES:
-        raise InputError(f"'{name}' is no family of parameters that can be tuned; give one of {', '.join(FAMILIES)}")
+        raise InputError(f"'{name}' is not a family of tunable parameters; give one of {', '.join(FAMILIES)}")
     module, kind = FAMILIES[name].split(".")
     found: Family = getattr(import_module(f"{__package__}.{module}"), kind)()
     return found
@@ -108,7 +109,7 @@ def load_family(name: str) -> Family:
 class Prepared:
     """A study that is ready for tuning. spec: the study with only the family's task. tuned, held: names of clips.
 
-    clips: those used for tuning. goal: the measure that is compared before and after.
+    clips: the clips that are used for tuning. goal: the measure that is compared before and after.
     """
 
     spec: Spec
@@ -131,11 +132,11 @@ def prepare(
     measure: str | None = None,
     tick: Tick = lambda: None,
 ) -> Prepared:
-    """Read a study's clips and prepare the examples of those that are not held out.
+    """Read a study's clips and prepare the examples of the clips that are not held out.
 
-    names: of parameters, as for `expand_names`. holdout, clips: patterns of clips' names. measure: overrides the
-    family's. tick: called once an example. Raise InputError for a parameter that cannot be tuned or has no effect
-    under the settings, parameters of several families, clips without the needed truth, and as `plan_study`
+    names: of parameters, as for `expand_names`. holdout, clips: patterns of clip names. measure: replaces the family's
+    measure. tick: called once for each example. Raise InputError for a parameter that cannot be tuned or has no effect
+    under the settings, for parameters of several families, for clips without the needed truth, and as `plan_study`
     does.
     """
     settings = load_config(spec.config, spec.overrides)
@@ -145,7 +146,7 @@ def prepare(
     if len(by_family) > 1:
         groups = "; ".join(f"{family}: {', '.join(mine)}" for family, mine in by_family.items())
         raise InputError(
-            f"the parameters are of several families, {groups}; tune one of them, then the next with --config "
+            f"the parameters belong to several families, {groups}; tune one family, then the next with --config "
             "tuned.toml"
         )
     family = load_family(*by_family)

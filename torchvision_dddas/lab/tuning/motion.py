@@ -1,4 +1,4 @@
-"""The family of motion segmentation: masks of labelled frames against soft masks."""
+"""The family of motion segmentation: soft masks are compared with the masks of labelled frames."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -30,15 +30,15 @@ from torchvision_dddas.lab.tuning.family import Example, Family
 from torchvision_dddas.nn import Core, Differences, MotionSegmenter, Regions, Values, check_softness, differences_of
 from torchvision_dddas.types import Scene
 
-# Soft masks reach this many softnesses below the threshold, where they are 0.05.
+# A soft mask falls to 0.05 at this many softnesses below the threshold, and ends there.
 _REACH = 3.0
-# Frames of a clip in which nothing moves.
+# Number of frames that are taken from a clip without motion.
 _STILL_FRAMES = 12
-# Share of the threshold at which a second run shows what the hard steps after the hulls do with a freer mask.
+# A second run at this share of the threshold shows how the hard steps after the hulls treat a larger mask.
 _FREER = 0.6
-# This many pixels are right in every frame, so that a frame in which nothing moves and nothing is found is right.
+# Count this many extra pixels as right in every frame. A frame without motion and without targets is then right.
 _SPARE_PX = 1.0
-# Pixels further from any region than this do not join it when the core grows a little.
+# Pixels further than this from every region do not join a region when the core grows a little.
 _FAR_PX = 40.0
 
 Masks = Float[Tensor, "B 1 H W"]
@@ -46,7 +46,7 @@ Labels = Bool[Tensor, "B 1 H W"]
 
 
 def overlap_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"]:
-    """1 - F, with sums of soft masks for counts of pixels (appendix B, eq. 11). known: where the truth is known."""
+    """Return 1 - F, with sums of soft masks for pixel counts (appendix B, eq. 11). known: where the truth is known."""
     seen, axes = mask * known, (1, 2, 3)
     found, true = seen.sum(axes), (truth & known).sum(axes).to(mask.dtype)
     return 1 - (2 * (seen * truth).sum(axes) + _SPARE_PX) / (found + true + _SPARE_PX)
@@ -56,9 +56,9 @@ def overlap_loss(mask: Masks, truth: Labels, known: Labels) -> Float[Tensor, "B"
 class LabelledFrames:
     """A batch of labelled frames of one size. truth: where something moves. known: where the truth is known.
 
-    removed, added: what the hard steps after the hulls (tracklets, outlines, shadows, small targets) took
-    from the mask and added to it, at the settings that the frames were prepared with. removed also holds what they take
-    from a mask with a lower threshold.
+    removed, added: pixels that the hard steps after the hulls (tracklets, outlines, shadows, small targets) removed
+    from the mask and added to it, at the settings that the frames were prepared with. removed also holds the pixels
+    that these steps remove from the mask of a lower threshold.
     """
 
     differences: Differences
@@ -72,9 +72,10 @@ class LabelledFrames:
 class MotionFamily(Family):
     """The family `motion`.
 
-    with_later_steps: keep what the hard steps after the hulls do near the original settings (see `LabelledFrames`);
-    without it tuning works better from a bad start. softness: a share of each threshold; above a tenth, background just
-    below the threshold adds up, and the least loss lies at a higher threshold than with hard masks.
+    with_later_steps: keep the effect of the hard steps after the hulls near the original settings (see
+    `LabelledFrames`). Without it, tuning works better from a bad start. softness: a share of each threshold. Above a
+    tenth, background just below the threshold adds up, and the loss is least at a higher threshold than with hard
+    masks.
     """
 
     with_later_steps: bool = True
@@ -82,17 +83,17 @@ class MotionFamily(Family):
     task: Task = "motion"
     measure: str = "motion.pixels.f"
     softness: tuple[float, float] = (0.1, 0.02)
-    empty = "no labelled frame was compared with its neighbours; nothing to tune on"
+    empty = "no labelled frame was compared with its neighbours, so that there is nothing to tune on"
 
     def check_clips(self, clips: Sequence[Clip], settings: Settings) -> None:
-        """Raises InputError for clips without masks in which something moves, and for halved frames."""
+        """Raise InputError for clips with motion but without masks, and for halved frames."""
         if settings.difference.halved:
             raise InputError("difference.halved = true cannot be tuned by gradient; set it to false")
         check_softness(settings)
         check_masks(clips, still=True)
 
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, LabelledFrames]]:
-        """The frames with masks, and some of a clip in which nothing moves."""
+        """Yield the frames with masks, and some frames of a clip without motion."""
         truth = clip.truth if clip.truth is not None and clip.truth.masks else None
         pitch = max((clip.frames or len(clip.pictures)) // _STILL_FRAMES, 1)
         wanted = set(truth.masks) if truth else set(range(1, _STILL_FRAMES * pitch + 1, pitch))
@@ -103,7 +104,7 @@ class MotionFamily(Family):
         recorded = zip(record_frames(clip, settings, wanted), freer_frames, strict=False)
         for (number, window, mask), (_, _, freer_mask) in recorded:
             labels = labels_at(truth, number, mask.shape) if truth else np.zeros(mask.shape, np.int32)
-            # A frame without a window has no mask, whatever the parameters.
+            # A frame without a window has no mask, for any values of the parameters.
             if window is None or not (labels >= 0).any():
                 continue
             pictures = labels > 0, labels >= 0, mask, mask if freer_mask is None else freer_mask
@@ -114,13 +115,13 @@ class MotionFamily(Family):
                 batch = stack_frames([frame], torch.device("cpu"))
                 with torch.no_grad():
                     hull, freer_hull = (soft_masks(batch, one, {}, 0.0) > 0.5 for one in (settings, freer))
-                # Without the freer run, whatever a lower threshold adds would seem to stay.
+                # Without the run with the larger mask, all pixels that a lower threshold adds would seem to stay.
                 removed = (hull & ~final) | (freer_hull & ~hull & ~freer_final)
                 frame = replace(frame, removed=removed, added=final & ~hull)
             yield number, frame
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """(B,) one loss a frame; frames of one size are computed together. See `Family.loss`."""
+        """Return the loss of each frame, (B,). Frames of one size are computed together. See `Family.loss`."""
         groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for place, example in enumerate(batch):
             groups[example.content.differences.least.shape].append(place)
@@ -135,7 +136,7 @@ class MotionFamily(Family):
 
 
 def soft_masks(frames: LabelledFrames, settings: Settings, values: Values, softness: float) -> Float[Tensor, "B 1 H W"]:
-    """The masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
+    """Return the masks of a batch of frames. softness: a share of each threshold; 0.0 gives hard masks."""
     motion = MotionSegmenter(settings, tuned=())
     core = motion.segment(frames.differences, values=values, softness=softness)
     reach = _REACH * softness * settings.difference.threshold
@@ -144,7 +145,7 @@ def soft_masks(frames: LabelledFrames, settings: Settings, values: Values, softn
 
 
 def stack_frames(frames: Sequence[LabelledFrames], device: torch.device) -> LabelledFrames:
-    """One batch of frames of one size, on a device."""
+    """Stack frames of one size into one batch on a device."""
 
     def stack(parts: Sequence[object], *names: str) -> dict[str, Any]:
         return {name: torch.cat([getattr(part, name) for part in parts]).to(device) for name in names}
@@ -155,10 +156,10 @@ def stack_frames(frames: Sequence[LabelledFrames], device: torch.device) -> Labe
 
 
 def label_regions(core: Core, hull: bool, reach: float = 0.0) -> Regions:
-    """The connected regions (8 neighbours) of each mask of a batch, before any gate.
+    """Label the connected regions (8 neighbours) of each mask of a batch, before any gate.
 
-    hull: fill convex hulls. reach: pixels below the threshold by less than this, in the unit of the margin, belong to
-    the nearest region, or make one of their own where there is none.
+    hull: fill convex hulls. reach: in the unit of the margin; pixels that are below the threshold by less than this
+    belong to the nearest region, or form a region if none is near.
     """
     margins = core.margin.detach()[:, 0].cpu().numpy()
     maps = np.zeros((2, *margins.shape), np.int64)
@@ -171,7 +172,7 @@ def _label_picture(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
     """Write the labels of one picture into near and filled; return the number of regions."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats((margin > 0).astype(np.uint8), ltype=cv2.CV_32S)
     near[:] = parts
-    # Large regions last: a small one within a large hull belongs to it.
+    # Fill large regions last: a small region within a large hull belongs to that hull.
     for label in 1 + np.argsort(stats[1:, cv2.CC_STAT_AREA], kind="stable"):
         x, y, width, height = (int(v) for v in stats[label, :4])
         window = np.s_[y : y + height, x : x + width]
@@ -199,7 +200,7 @@ def _label_picture(margin: np.ndarray, hull: bool, reach: float, near: np.ndarra
 
 
 class _RecordingEngine(OpenCVEngine):
-    """Keeps the windows of wanted frames. number: of the frame that is prepared."""
+    """An engine that keeps the windows of wanted frames. number: of the frame that is being prepared."""
 
     def __init__(self, settings: Settings, wanted: Set[int]) -> None:
         super().__init__(settings)
@@ -220,9 +221,9 @@ class _RecordingEngine(OpenCVEngine):
 def record_frames(
     clip: Clip, settings: Settings, wanted: Set[int]
 ) -> Iterator[tuple[int, Window[OpenCVView] | None, Bool[np.ndarray, "H W"]]]:
-    """The wanted frames of a clip, in order: number, window if it had one, and mask by the hard pipeline.
+    """Yield the wanted frames of a clip, in order: number, window if there is one, and mask by the hard pipeline.
 
-    Raises InputError as `dddas detect` does.
+    Raise InputError as `dddas detect` does.
     """
     source, engine = open_clip(clip), _RecordingEngine(settings, wanted)
     loop = MotionDetector(settings, backend=engine, rate_hz=source.rate_hz)
@@ -241,7 +242,7 @@ def record_frames(
 
 @torch.inference_mode()
 def prepare_differences(window: Window[Any], settings: Settings) -> Differences:
-    """The part of a window that depends on no tunable parameter, on the CPU; a batch of one."""
+    """Compute the part of a window that depends on no tunable parameter, on the CPU, as a batch of one."""
     engine = TorchEngine(settings, "cpu")
     views = [engine.prepare(view.grey) for view in (window.reference, *window.neighbours)]
     batch = engine.batch_of([replace(window, reference=views[0], neighbours=tuple(views[1:]))])

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
 
-# A value at the end of its range has no gradient, so it starts at this share of the range from the end.
+# A value at the end of its range has no gradient, so the start is moved inward by this share of the range.
 _EDGE = 1e-3
 
 
@@ -21,8 +21,8 @@ _EDGE = 1e-3
 class Tunable:
     """One parameter that gradients can move between the limits of its field in `Settings`.
 
-    log: steps are factors of the value plus offset, instead of amounts; the offset makes 0 reachable. rounding: of the
-    final value; during descent the parameter is continuous.
+    log: steps multiply the value plus offset; otherwise they add to the value. The offset makes 0 reachable. rounding:
+    of the final value; during the descent the parameter is continuous.
     """
 
     name: str
@@ -35,19 +35,19 @@ class Tunable:
     rounding: Literal["none", "whole", "odd"] = "none"
 
     def value(self, free: Tensor) -> Tensor:
-        """Return the value for an unconstrained number; mid-range, one unit is about a factor e, or an amount of 1."""
+        """Return the value for a free number. In mid-range, 1 more is a factor of about e, or adds 1 without `log`."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         scaled = low + (high - low) * torch.sigmoid(free * (4.0 / (high - low)))
         return scaled.exp() - self.offset if self.log else scaled
 
     def free(self, value: float) -> float:
-        """Return the unconstrained number for a value; a value at an end of the range is moved in by a thousandth."""
+        """Return the free number for a value. A value at an end of the range is moved inward by a thousandth."""
         low, high = self._scaled(self.low), self._scaled(self.high)
         share = min(max((self._scaled(value) - low) / (high - low), _EDGE), 1.0 - _EDGE)
         return math.log(share / (1.0 - share)) * (high - low) / 4.0
 
     def rounded(self, value: float) -> float | int:
-        """Return the value in the form of the settings: whole, odd, or with four digits, within the range."""
+        """Return the value as the settings hold it: whole, odd, or with four digits, within the range."""
         value = min(max(value, self.low), self.high)
         if self.rounding == "none":
             return min(max(float(f"{value:.4g}"), self.low), self.high)
@@ -78,7 +78,7 @@ def _from_settings(family: str, group: str, names: str, **options: object) -> di
 
 
 # Not tunable: switches and choices; scores that select the detections; numbers of points, levels or frames, which
-# change the graph; and parameters that count single blobs (tracklets), because a mask's pixels give them no gradient.
+# change the graph; and parameters that count blobs (tracklets), because the pixels of a mask give them no gradient.
 TUNABLE: dict[str, Tunable] = {
     **_from_settings("motion", "difference", "noise_levels threshold"),
     **_from_settings("motion", "difference", "gradient_share", offset=0.02),
@@ -94,7 +94,7 @@ TUNABLE: dict[str, Tunable] = {
 
 
 def expand_names(names: Iterable[str]) -> list[str]:
-    """Return the names of tunable parameters, each once, in the order given; `difference.*` means all of a group.
+    """Return the names of tunable parameters, each once, in the given order; `difference.*` means all of a group.
 
     Raise InputError, with all tunable parameters and their ranges, for an unknown name.
     """
@@ -103,7 +103,7 @@ def expand_names(names: Iterable[str]) -> list[str]:
         fitting = [known for known in TUNABLE if fnmatchcase(known, name)]
         if not fitting:
             known = ", ".join(f"{tunable.name} ({tunable.range})" for tunable in TUNABLE.values())
-            raise InputError(f"'{name}' is no parameter that can be tuned by gradient; give some of: {known}")
+            raise InputError(f"'{name}' is not a parameter that can be tuned by gradient; give some of: {known}")
         found |= dict.fromkeys(fitting)
     if not found:
         raise InputError("no parameter to tune; name some, such as difference.threshold")
@@ -111,14 +111,14 @@ def expand_names(names: Iterable[str]) -> list[str]:
 
 
 class Parameters(nn.Module):
-    """The tuned parameters as torch parameters without bounds; all others stay as the settings have them."""
+    """The tuned parameters as unbounded torch parameters. All other parameters keep the values of the settings."""
 
     def __init__(self, settings: Settings, names: Iterable[str]) -> None:
         """names: as for `expand_names`. Raise InputError for a parameter that cannot be tuned."""
         super().__init__()
         self.base, self.names = settings, expand_names(names)
         self._starts = [TUNABLE[name].free(value_of(settings, name)) for name in self.names]
-        # Use double precision: a tensor without axes does not change a picture's own precision.
+        # Use double precision: a tensor without axes does not change the precision of a picture.
         self.free = nn.ParameterList([nn.Parameter(torch.tensor(s, dtype=torch.float64)) for s in self._starts])
         sizes = {name for name in self.names if TUNABLE[name].rounding != "none"}
         self._sizes = sizes if len(sizes) < len(self.names) else set()
@@ -126,7 +126,7 @@ class Parameters(nn.Module):
     def values(self, whole: bool = False) -> dict[str, Tensor]:
         """Return each parameter's value: a float64 tensor without axes, with its gradient.
 
-        whole: sizes are rounded and have no gradient, unless all parameters are sizes.
+        whole: round sizes and give them no gradient, unless all parameters are sizes.
         """
         found = {name: TUNABLE[name].value(free) for name, free in zip(self.names, self.free, strict=True)}
         if whole and self._sizes:
@@ -140,14 +140,14 @@ class Parameters(nn.Module):
         return torch.stack([(end - start) ** 2 for end, start in zip(ends, self._starts, strict=True)]).sum()
 
     def settled(self) -> dict[str, Tensor]:
-        """Return the values rounded as in the settings, without a gradient; otherwise as `values`."""
+        """Return the values, rounded as in the settings and without a gradient; otherwise as `values`."""
         settings = self.settings()
         return {
             name: free.new_tensor(value_of(settings, name)) for name, free in zip(self.names, self.free, strict=True)
         }
 
     def settings(self) -> Settings:
-        """Return the settings with these values rounded; parameters that have not moved keep their exact values."""
+        """Return the settings with these values, rounded. Parameters that have not moved keep their exact values."""
         moved = {
             name: TUNABLE[name].rounded(float(value.detach()))
             for (name, value), free, start in zip(self.values().items(), self.free, self._starts, strict=True)
@@ -166,6 +166,6 @@ _Group = TypeVar("_Group", bound=BaseModel)
 
 
 def with_tensors(group: _Group, prefix: str, values: Mapping[str, Tensor]) -> _Group:
-    """Return a group in which the parameters named `prefix.key` are tensors; nothing is checked."""
+    """Return a group in which the parameters named `prefix.key` are tensors. Nothing is checked."""
     mine = {name.partition(".")[2]: value for name, value in values.items() if name.startswith(f"{prefix}.")}
     return type(group).model_construct(**{**dict(group), **mine})

@@ -1,4 +1,4 @@
-"""report.html of a tuning run: loss and parameters over the steps, and the measures before and after."""
+"""report.html of a tuning run: loss and parameters at each step, and the measures before and after."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ SIDES = {"tuned": "Clips tuned on", "held_out": "Clips held out"}
 
 
 def tuning_report(run: Mapping[str, Any]) -> str:
-    """Return the HTML. run: the content of run.json of `dddas tune`, NaN as None."""
+    """Return the HTML. run: the content of run.json of `dddas tune`, with None for NaN."""
     parameters, verdict = run["knobs"], run.get("verdict")
     _, group, name = verdict["measure"].split(".", 2) if verdict else ("", "", "f")
     return render_page(

@@ -1,4 +1,4 @@
-"""The family of tracking: the negative log-likelihood of the true links by the association scores."""
+"""The family of tracking: the negative log-likelihood of the true links under the association scores."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,14 +36,15 @@ from torchvision_dddas.tracking.smoother import FILLED
 from torchvision_dddas.types import DetectionTable
 
 FRAMES = 25
-"""Frames of a stretch: at an interval of 5 they span the tracker's memory of 125 frames."""
+"""Frames of a stretch: at an interval of 5 they cover the tracker's memory of 125 frames."""
 
 MISSED = 4.0
-"""Margin of a true link by detections. A likelihood alone would rather link nothing than a false alarm and closes the
-gate, but all that follows a broken track counts as another target. Chosen of 0, 2, 4 and 6, not each with all margins
-of wrong links, pulls and sets of parameters, by IDF1 of MOT15 sequences held out."""
+"""Margin of a true link by detections. By likelihood alone, the best gate is so narrow that true links are lost to
+avoid false alarms, and after each broken link the track counts as another target. Chosen from 0, 2, 4 and 6 by IDF1 on
+MOT15 sequences that were held out; not every value was tried with all margins of wrong links, pulls and sets of
+parameters."""
 
-# Rounds of messages a frame; more change the loss by less than a hundredth in a crowd.
+# Rounds of messages for each frame. More rounds change the loss by less than a hundredth in a crowd.
 _ROUNDS = 10
 
 
@@ -56,11 +57,11 @@ class TrackingFamily(Family):
     task: Task = "association"
     measure: str = "association.tracks.idf1"
     softness: tuple[float, float] = (1.0, 1.0)
-    """A likelihood needs softness 1: below it, the loss asks for the best assignment whatever the others are."""
+    """The likelihood needs softness 1. Below it, the loss asks only for the best assignment and ignores all others."""
     missed: float = 0.0
 
     def at(self, interval_frames: int, task: Task) -> "TrackingFamily":
-        """Return this family for a task. Association tracks the true boxes, tracking tracks detections."""
+        """Return this family for a task. Association tracks the true boxes; tracking tracks detections."""
         if task != "tracking":
             return replace(self, interval=interval_frames)
         measure = self.measure.replace("association", task)
@@ -73,7 +74,7 @@ class TrackingFamily(Family):
             raise InputError(f"{mine}; add --set track.mode=default")
 
     def clip_examples(self, clip: Clip, settings: Settings) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-        """Stretches of the clip's true tracks, each a row of `Stretches`; the last may be shorter, with two frames."""
+        """Yield stretches of the clip's true tracks, as rows of `Stretches`. The last may be short, with two frames."""
         frames = list(_tracked_frames(clip, self._boxes(clip, settings), settings, self.interval))
         for start in range(0, len(frames), FRAMES):
             piece = frames[start : start + FRAMES]
@@ -81,7 +82,7 @@ class TrackingFamily(Family):
                 yield piece[0]["frame"], _stack_frames(piece)
 
     def _boxes(self, clip: Clip, settings: Settings) -> OwnedBoxes:
-        """The boxes to track. Raises InputError where detections are wanted and the clip has none."""
+        """Return the boxes to track. Raise InputError if detections are wanted and the clip has none."""
         table = true_tracks(clip, self.interval)
         if self.task == "association":
             certain = np.ones(len(table.frame))
@@ -97,13 +98,13 @@ class TrackingFamily(Family):
         found = match_owners(read_detections(clip.given), clip.truth, self.interval, settings.track)
         if not len(found.score):
             raise InputError(
-                f"{clip.given} has no box that track.doubt = {settings.track.doubt:g} admits on frames 1, "
+                f"{clip.given} has no box that track.doubt = {settings.track.doubt:g} accepts on frames 1, "
                 f"{1 + self.interval}, {1 + 2 * self.interval}, ...; raise track.doubt, or leave {clip.name} out"
             )
         return found
 
     def loss(self, parameters: Mapping[str, Tensor], batch: Sequence[Example], softness: float) -> Tensor:
-        """(B,) nats a link, at softness 1. See `Family.loss`."""
+        """Return the nats per link at softness 1, (B,). See `Family.loss`."""
         track = with_tensors(batch[0].settings.track, "track", parameters)
         device = next(iter(parameters.values())).device
         stretches = stack_padded(Stretches, [example.content for example in batch], device, pad="edge")
@@ -112,13 +113,13 @@ class TrackingFamily(Family):
 
 @dataclass(frozen=True)
 class Stretches:
-    """Stretches of clips, T frames each, in which box n is always target n; float64 and bool.
+    """Stretches of T frames each, in which box n always belongs to target n; float64 and bool.
 
     time, step, density, missing, turnover: as in `SceneState`. size: width and height of the picture. box_px: x, y,
-    width, height, any where no target is there. there: whether a target is seen. certain: with the score 1. begins:
-    with a score that may begin a track. motion: homographies from the frame before. likeness: of tracks (rows) and
-    boxes, NaN where unknown. visible: shares of the boxes. own: whether the boxes are moving targets that `dddas
-    detect` found.
+    width, height; any numbers if the target is absent. there: whether a target is seen. certain: whether its score is
+    1. begins: whether its score allows a new track. motion: homographies from the previous frame. likeness: of tracks
+    (rows) and boxes, NaN if unknown. visible: visible shares of the boxes. own: whether the boxes are moving targets
+    that `dddas detect` found.
     """
 
     time: Float[Tensor, "B T"]
@@ -142,11 +143,11 @@ _LEARNED = ("time", "step", "density", "missing", "turnover")
 
 
 def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval: int) -> Iterator[dict[str, Any]]:
-    """The boxes of each frame, and what the tracker knows of the scene by then if it has followed all targets."""
+    """Yield the boxes of each frame, and the scene statistics of a tracker that has followed all targets until then."""
     size = open_clip(clip).size if clip.pictures else boxes.size
     scene, camera = SceneStatistics(size), CameraMotion(load_engine("onboard", settings))
     before: tuple[float, np.ndarray] | None = None
-    seen: dict[int, float] = {}  # when each target that has a track was last seen
+    seen: dict[int, float] = {}  # time at which each target with a track was last seen
     for number, identity, box_px, image in boxed_frames(clip, boxes.table, interval):
         motion = signature = None
         if image is not None:
@@ -179,7 +180,7 @@ def _tracked_frames(clip: Clip, boxes: OwnedBoxes, settings: Settings, interval:
 
 
 def _stack_frames(frames: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """The fields of `Stretches`."""
+    """Return the fields of `Stretches`."""
     names = np.unique(np.concatenate([frame["identity"] for frame in frames]))
     shape = (len(frames), len(names))
     found = {name: np.zeros(shape, bool) for name in _OF_BOXES} | {"box_px": np.ones((*shape, 4))}
@@ -201,9 +202,9 @@ def _stack_frames(frames: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
 
 @dataclass
 class _Tracks:
-    """The state of all targets. alive: has a track. sure: is no false alarm.
+    """The state of all targets. alive: whether it has a track. sure: whether it is not a false alarm.
 
-    All are tensors, which the tracker's formulas take though they are annotated for arrays.
+    All fields are tensors. The tracker's formulas accept tensors, although they are annotated for arrays.
     """
 
     state: Any
@@ -215,16 +216,16 @@ class _Tracks:
 def link_nll(
     parameters: TrackParameters, stretches: Stretches, interval: int, softness: float, missed: float = 0.0
 ) -> Float[Tensor, "B"]:
-    """(B,) negative log-likelihood of the true links, per box that could be linked; in nats at softness 1.
+    """Return the negative log-likelihood of the true links, (B,), per box that could be linked; in nats at softness 1.
 
     parameters: numbers or tensors. interval: frames between looks. softness: temperature of the assignment, above 0.
-    missed: margin, in the unit of scores: an assignment has to be worse than the true one by it for each true link that
-    it lacks. Links that are that much better already cost almost nothing, so that the doubtful ones count. Source:
-    Gimpel and Smith, 2010 (softmax-margin); softness to 0 makes it the structured hinge.
-    Unlike in the tracker, neighbours do not tell how a target with a single detection moves.
+    missed: margin, in the unit of scores. For each true link that an assignment lacks, its score must be lower than the
+    true one by this margin. Links that already have the margin cost almost nothing, so that the doubtful links count.
+    Source: Gimpel and Smith, 2010 (softmax-margin); as softness vanishes it becomes the structured hinge.
+    Unlike in the tracker, neighbours do not predict the motion of a target with a single detection.
     """
     mine = _with_own(parameters, stretches.own)
-    # The tracker's formulas are annotated for arrays.
+    # The tracker's formulas are annotated for arrays, but accept tensors.
     data: Any = stretches
     has_motion = not bool(torch.equal(data.motion, torch.eye(3).to(data.motion).expand_as(data.motion)))
     has_likeness = not bool(data.likeness.isnan().all())
@@ -258,7 +259,7 @@ def link_nll(
 
 
 def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: TrackParameters) -> Any:
-    """(B, N, N) scores of tracks and boxes, without appearance."""
+    """Return the scores of tracks and boxes, (B, N, N), without appearance."""
     look = BoxLook.of(tracks.state, _looks_since(tracks.state, scene) - 1, box_px, scene, parameters)
     at_rest: Any = torch.zeros_like(tracks.state[None, ..., :2])
     scores: Any = newborn_scores(look, parameters, at_rest), association_scores(look, parameters)
@@ -266,12 +267,12 @@ def _link_scores(tracks: _Tracks, box_px: Any, scene: SceneState, parameters: Tr
 
 
 def _looks_since(state: Any, scene: SceneState) -> Any:
-    """(B, N) looks since the targets were seen."""
+    """Return the number of looks since each target was seen, (B, N)."""
     return (scene.time - state[..., kalman.SEEN].detach()).round()
 
 
 def _drop_empty_rows(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"]:
-    """Without rows in which no pair is possible, as far as every frame has some: most targets are not there."""
+    """Drop rows in which no pair is possible, as far as every frame has some. Most targets are absent from a frame."""
     possible = score.detach().isfinite().any(-1)
     first = possible.to(torch.int8).argsort(-1, descending=True)[..., : max(int(possible.sum(-1).max()), 1)]
     return torch.take_along_dim(score, first[..., None], -2)
@@ -280,7 +281,7 @@ def _drop_empty_rows(score: Float[Tensor, "B T N M"]) -> Float[Tensor, "B T K M"
 def _update_tracks(
     tracks: _Tracks, begun: Any, data: Any, t: int, scene: SceneState, interval: int, parameters: TrackParameters
 ) -> _Tracks:
-    """The tracks after a frame, each with its own box: `ScoreTracker._commit` on the true links."""
+    """Return the tracks after a frame, each linked to its own box: `ScoreTracker._commit` on the true links."""
     box, there, certain = data.box_px[:, t], data.there[:, t], data.certain[:, t]
     linked = there & tracks.alive
     new = there & ~tracks.alive & data.begins[:, t]
@@ -297,7 +298,7 @@ def _update_tracks(
 
 
 def _with_own(parameters: TrackParameters, own: Bool[Tensor, "B"]) -> TrackParameters:
-    """Scatter (B, 1) by whether a stretch's boxes are own targets."""
+    """Return the parameters with scatter as (B, 1), chosen by whether a stretch's boxes are own targets."""
     chosen = {}
     for name in ("scatter", "size_scatter"):
         pair = (getattr(parameters, key) for key in (f"own_{name}", name))

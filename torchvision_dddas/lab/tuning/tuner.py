@@ -34,7 +34,7 @@ class Display:
     """Callbacks during a run; by default nothing is shown.
 
     message: called with a line of text. step: called with every step. progress: called with a name and a count (None if
-    unknown), returns a function to call after each item. study: as for `judge`.
+    unknown); returns a function to call after each item. study: as for `judge`.
     """
 
     message: Callable[[str], object] = lambda line: None
@@ -49,7 +49,7 @@ class Display:
 class Tuned:
     """The result of a run. before, after: values of the tuned parameters.
 
-    failed: why the run stopped early, in one line; empty if it did not.
+    failed: in one line, why the run stopped early; empty if it did not stop early.
     """
 
     descended: Descended
@@ -76,7 +76,7 @@ class Tuner:
         cache: Path | None = None,
         display: Display | None = None,
     ) -> None:
-        """resume: continue from the folder's checkpoint if there is one. device: of the descent.
+        """resume: continue from the folder's checkpoint if there is one. device: where the descent is computed.
 
         jobs, cache: as for `judge`.
         """
@@ -95,10 +95,10 @@ class Tuner:
         clips: Sequence[str] = (),
         measure: str | None = None,
     ) -> Tuned:
-        """Prepare, descend, measure before and after, and record the results. Arguments are those of `prepare`.
+        """Prepare, descend, measure before and after, and record the results. The arguments are those of `prepare`.
 
         Raise InputError as `prepare`, `descend` and `judge` do, and if the folder cannot be written. A loss that is not
-        finite is not an error here: `Tuned.failed` reports it, and the last good state is measured and written.
+        finite raises no error: `Tuned.failed` reports it, and the last good state is measured and written.
         """
         with claimed(self._folder):
             try:
@@ -106,11 +106,11 @@ class Tuner:
                     ready = prepare(study, base, names, holdout, clips, measure, tick)
                 return self._run(ready)
             except BaseException as error:
-                if self._state:  # otherwise the record of an earlier run in this folder is still there
+                if self._state:  # before that, the folder still holds the record of an earlier run
                     with suppress(InputError):
                         self._write_json(RUN, {**self._state, "state": "interrupted"})
                 if is_stop(error) and (self._folder / CHECKPOINT).is_file():
-                    error.add_note(f"the descent is kept in {self._folder / CHECKPOINT}; --resume goes on from there")
+                    error.add_note(f"the descent is kept in {self._folder / CHECKPOINT}; --resume continues from there")
                 raise
 
     def _run(self, ready: Prepared) -> Tuned:
@@ -121,7 +121,7 @@ class Tuner:
         )
         before, place = _values(ready), self._folder / CHECKPOINT
         if self._resume and not place.is_file():
-            self._display.message(f"there is no checkpoint at {place}: it begins anew")
+            self._display.message(f"there is no checkpoint at {place}: the descent starts from the settings")
 
         def tell(step: Step) -> None:
             if not self._state:
@@ -142,7 +142,7 @@ class Tuner:
         record = self._record(ready, found, before, after, verdict)
         self._write(REPORT, tuning_report(finite(record)))
         self._write_json(RUN, record)
-        last_good = f"{self._folder / TUNED} holds the last good state, of step {found.best}"
+        last_good = f"{self._folder / TUNED} holds the last good state, from step {found.best}"
         return Tuned(found, verdict, before, after, f"{found.failed}; {last_good}" if found.failed else "")
 
     def _begin_record(self, ready: Prepared) -> None:
@@ -150,7 +150,7 @@ class Tuner:
         if not self._resume:
             place, aside = self._folder / CHECKPOINT, self._folder / OLD
             if steps := set_aside(place, aside):
-                self._display.message(f"{place} is of an unfinished descent, of {steps} steps; kept as {aside.name}")
+                self._display.message(f"{place} holds an unfinished descent of {steps} steps, now kept as {aside.name}")
         state = {"state": "running", "study": ready.spec.name}
         self._write_json(RUN, state)
         self._state = state

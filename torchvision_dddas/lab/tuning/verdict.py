@@ -19,16 +19,17 @@ from torchvision_dddas.lab.evaluation.studies.sweep import format_value, toml_va
 TIMES = "before", "after"
 
 Shown = Callable[[], AbstractContextManager[tuple[Callable[[Plan], object], Callable[[Event], object]]]]
-"""Shows the progress of a study: functions to call at its beginning and for each of its events."""
+"""Shows the progress of a study: functions to call at its beginning and at each of its events."""
 
 
 @dataclass(frozen=True)
 class Side:
     """One set of clips. pooled, mean: the goal before and after, over all counts and over the clips' values.
 
-    says: the answer for the pooled goal, the one question asked: better or worse beyond noise, or neither. changes:
-    every measure and clip, as from `compare_studies`, corrected for all of them; None if nothing can be compared.
-    frame_ms: time a frame before and after, if it was computed. notes: clips without a result, and why.
+    says: whether the pooled goal is better or worse beyond noise, or neither; no other question is asked. changes:
+    every measure and clip, as from `compare_studies`, corrected for the number of comparisons; None if nothing can be
+    compared. frame_ms: time for a frame before and after, if it was computed. notes: clips without a result, and the
+    reasons.
     """
 
     clips: tuple[str, ...]
@@ -47,14 +48,14 @@ class Side:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The effect of tuning on the clips tuned on, and on those held out; None without held-out clips."""
+    """The effect of tuning on the clips that were tuned on, and on the held-out clips; None without held-out clips."""
 
     goal: Goal
     tuned: Side
     held: Side | None
 
     def lines(self) -> list[str]:
-        """Return the effect of tuning, a line for each set of clips."""
+        """Return the effect of tuning, one line for each set of clips."""
         lines = []
         for name, side in {"Tuned on": self.tuned, "Held out": self.held}.items():
             if side is not None:
@@ -81,10 +82,10 @@ def judge(
     cache: Path | None = None,
     shown: Shown = lambda: nullcontext((lambda planned: None, lambda event: None)),
 ) -> Verdict:
-    """Run a study as it is and with other values of some parameters; once if no value changed. tuned, held: clips.
+    """Run a study with its own and with other values of some parameters; once if no value changed. tuned, held: clips.
 
-    spec, base, cache: as for `run_study`; jobs: as for `Workers`. Raise InputError as they do, and if no clip can
-    have the goal's measure.
+    spec, base, cache: as for `run_study`. jobs: as for `Workers`. Raise InputError as they do, and if no clip can have
+    the goal's measure.
     """
     settings = load_config(spec.config, spec.overrides)
     is_changed = with_parameters(settings, parameters) != settings
@@ -107,14 +108,14 @@ def judge(
 
 
 def _compare(goal: Goal, cases: Sequence[Sequence[Case]], clips: tuple[str, ...]) -> Side:
-    """cases: of these clips, before and after."""
+    """Compare the goal before and after. cases: of these clips, before and after."""
     notes = {
         f"{case.clip.name}, {when}: {case.cause}"
         for when, found in zip(TIMES, cases, strict=True)
         for case in found
         if case.cause
     }
-    # A clip that fails with one of the two settings counts in neither.
+    # Leave out a clip from both sides if it fails with one of the two settings.
     good = set.intersection(*({case.clip.name for case in found if case.scored is not None} for found in cases))
     pairs = [[case for case in found if case.clip.name in good] for found in cases]
     pooled, mean = (
@@ -144,12 +145,12 @@ def _compare(goal: Goal, cases: Sequence[Sequence[Case]], clips: tuple[str, ...]
 
 
 def _say_change(goal: Goal, changes: Mapping[str, Any] | None) -> str:
-    """As `compare_studies` says it, but not corrected for measures that nobody asked about."""
+    """Return the answer of `compare_studies`, but not corrected for measures that nobody asked about."""
     entry = (changes or {"tasks": {}})["tasks"].get(goal.task, {"pooled": {}})["pooled"].get(goal.group, {})
     entry = entry.get(goal.measure)
     return "" if entry is None else verdict(entry, goal.measure, "p")
 
 
 def count_clips(clips: Sequence[str]) -> str:
-    """`1 clip`, `2 clips`."""
+    """Return `1 clip`, `2 clips`, ..."""
     return f"{len(clips)} clip{'s' * (len(clips) != 1)}"
