@@ -101,7 +101,7 @@ def test_telemetry_takes_lists_and_refuses_columns_of_other_lengths_and_times_th
     flight = Telemetry(*lists).at(0.5)
     assert flight is not None and flight.altitude_m == 41.0
     cases: Any = (
-        ({"altitude_m": np.ones(3)}, r"altitude_m of telemetry must have the shape \(2,\), a row a time, got \(3,\)"),
+        ({"altitude_m": np.ones(3)}, r"altitude_m of telemetry must have the shape \(2,\), a row per time, got \(3,\)"),
         ({"place": np.ones((2, 3))}, r"place of telemetry must have the shape \(2, 2\)"),
         ({"time_s": np.array([1.0, 0.0])}, "time_s of telemetry must not decrease"),
     )

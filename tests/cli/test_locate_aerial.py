@@ -215,7 +215,7 @@ SMALL = FLIGHT.camera_toml().replace("1280", "320").replace("720", "180")
         (FLIGHT, {"camera": SMALL}, ("l.csv, line ", "far outside the camera's pictures of 320 x 180 px")),
         (FLIGHT, {"rate": False}, ("--rate",)),
         (METRES, {"telemetry": None, "more": ("--set", "aerial.mode=paper")}, ("needs degrees",)),
-        (FLIGHT, {"table": TRACKS + TRACKS.splitlines()[0] + "\n"}, ("identity 1 is there already",)),
+        (FLIGHT, {"table": TRACKS + TRACKS.splitlines()[0] + "\n"}, ("identity 1 occurs twice",)),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_no_folder(aerial, tmp_path, flight, how, parts):

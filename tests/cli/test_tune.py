@@ -180,7 +180,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
     ("words", "said"),
     [
         ("--parameters difference.absent", "difference.threshold (0.1 to"),
-        ("--parameters registration.keypoints", "is no parameter that can be tuned"),
+        ("--parameters registration.keypoints", "is not a parameter that can be tuned"),
         ("--parameters=", "names no parameter"),
         (f"--parameters {THRESHOLD},track.wander", "several families"),
         ("--steps 0", "steps must be 1 or more, got 0"),

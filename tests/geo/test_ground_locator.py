@@ -54,7 +54,7 @@ def test_one_camera_keeps_the_identities_of_its_table():
 
 def test_an_identity_twice_in_a_frame_is_refused_with_its_line():
     twice = replace(table(camera()), identity=np.array([5, 9, 5, 5, 5, 9]))
-    with pytest.raises(InputError, match=r"line 4: identity 5 is there already in frame 2; wanted each once"):
+    with pytest.raises(InputError, match=r"line 4: identity 5 occurs twice in frame 2; wanted each identity once"):
         found([twice], [camera()])
 
 

@@ -1,4 +1,4 @@
-"""The records that flow through the system: frames in, scenes out. NumPy only, so that every runtime can hold them."""
+"""The records that flow through the system, from frames to scenes and results. They use only NumPy."""
 
 from torchvision_dddas.types.arrays import Bool, Float, Int
 from torchvision_dddas.types.detections import Detections, DetectionTable, are_corners, check_boxes, share_orders

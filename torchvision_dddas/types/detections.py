@@ -19,7 +19,7 @@ class Detections(Boxes):
     area_px: (N,) foreground pixels. heading_rad: (N,) direction of motion relative to the background, image axes
     (0 = right, pi/2 = down). speed_px: (N,) pixels per frame relative to the background. kind: moving, given, person.
     middle_px: (N, 2) u, v of the foreground's centroid. label: (N,) str, the class, empty if unknown. class_id: (N,)
-    int64, its number, -1 if unknown. Other unknown values are NaN. Lists and tensors become arrays. Raises InputError
+    int64, its number, -1 if unknown. Other values are NaN if unknown. Lists and tensors become arrays. Raise InputError
     for other shapes.
 
     >>> found = td.Detections([[40, 60, 20, 20], [80, 60, 10, 20]], [0.9, 0.5], label=["car", "person"])
@@ -36,7 +36,7 @@ class Detections(Boxes):
     speed_px: np.ndarray = field(default_factory=lambda: np.zeros(0))
     kind: str = "moving"
     middle_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
-    # Of objects, because one long word would widen each row of an array of characters.
+    # An array of objects: in an array of characters, one long word would widen each row.
     label: np.ndarray = field(default_factory=lambda: np.zeros(0, object))
     class_id: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
 
@@ -50,15 +50,15 @@ class Detections(Boxes):
 
     @classmethod
     def from_supervision(cls, detections: Any) -> Self:
-        """Detections of another detector, in pixels: of supervision, ultralytics (Results, Boxes), torchvision, ...
+        """Return another detector's detections, in pixels: supervision, ultralytics (Results, Boxes), torchvision, ...
 
-        detections: an object or a mapping that has a name of each line of _FOREIGN, arrays or tensors. Scores that are
-        None count as 1. Classes are those of `data["class_name"]` (N,), else what `names` calls the numbers.
-        Raises InputError where boxes or scores are missing, have other shapes, or are not what `check_boxes` wants.
+        detections: an object or a mapping that has a name of each row of _FOREIGN, with arrays or tensors. Scores that
+        are None count as 1. Classes are those of `data["class_name"]` (N,), or the names that `names` gives to the
+        numbers. Raise InputError if boxes or scores are missing, have other shapes, or are refused by `check_boxes`.
         """
         given, names = detections, getattr(detections, "names", None)
         names = names if isinstance(names, Mapping) else dict(enumerate(names or ()))
-        if hasattr(getattr(given, "boxes", None), "xyxy"):  # ultralytics' Results
+        if hasattr(getattr(given, "boxes", None), "xyxy"):  # Results of ultralytics
             given = given.boxes
         (edges, xyxy), (conf, confidence), (_, number) = (_first_of(given, line) for line in _FOREIGN)
         if not edges or not conf:
@@ -89,7 +89,7 @@ class Detections(Boxes):
             number, words = np.full(count, -1), number
         check_boxes(box_px, score, certain=False)
         if not np.isfinite(number).all():
-            number = np.where(np.isfinite(number), number, -1)  # not known
+            number = np.where(np.isfinite(number), number, -1)  # unknown
         label = np.array(["" if word is None else str(word) for word in words], object)
         if named is None and (number >= 0).any():
             label = np.array([names.get(int(k), str(int(k))) if k >= 0 else "" for k in number], object)
@@ -98,7 +98,7 @@ class Detections(Boxes):
 
 
 def _as_column(name: str, values: Any) -> np.ndarray:
-    """A list or a tensor as the array of this name. Raises InputError for what cannot be that."""
+    """Return a list or a tensor as the array of this name. Raise InputError if it cannot be an array."""
     try:
         array = np.array(_off_device(values), {"label": object, "class_id": np.int64}.get(name, np.float64))
     except (TypeError, ValueError) as error:
@@ -110,13 +110,13 @@ def _as_column(name: str, values: Any) -> np.ndarray:
 
 
 _FOREIGN = (("xyxy", "boxes", "bboxes"), ("confidence", "conf", "scores"), ("class_id", "cls", "labels"))
-"""What supervision, ultralytics, torchvision, transformers and mmdetection call edges, scores and classes."""
+"""Names of edges, scores and classes in supervision, ultralytics, torchvision, transformers and mmdetection."""
 
 
 def _first_of(given: Any, names: Sequence[str]) -> tuple[str, Any]:
-    """The first of the names that an object or mapping has, and its value, off any device; "" and None without one.
+    """Return the first of the names that an object or mapping has, and its value on the CPU; "" and None without one.
 
-    One that is None counts only where all are.
+    A name whose value is None counts only if all values are None.
     """
     held = {name: given[name] for name in names if name in given} if isinstance(given, Mapping) else {}
     held = held or {name: getattr(given, name) for name in names if hasattr(given, name)}
@@ -130,9 +130,9 @@ def _off_device(value: Any) -> Any:
 
 
 def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
-    """Raises InputError for boxes (N, 4) and scores (N,) that no detector of pixels and probabilities gives.
+    """Raise InputError for boxes (N, 4) and scores (N,) that are not plausible pixels and probabilities.
 
-    certain: whether the scores do not count, so that they may have any scale.
+    certain: whether the scores are ignored, so that they may have any scale.
 
     >>> types.check_boxes(np.array([[40.0, 60, 20, 20]]), np.array([90.0]), certain=False)
     Traceback (most recent call last):
@@ -157,7 +157,7 @@ def check_boxes(box_px: np.ndarray, score: np.ndarray, certain: bool) -> None:
 
 
 def share_orders(box: np.ndarray) -> list[str]:
-    """The orders of columns in which boxes (N, 4) lie in a picture with sides of 1; none where they are pixels.
+    """Return the orders of columns in which boxes (N, 4) are shares of a picture; an empty list if they are pixels.
 
     >>> types.share_orders(np.array([[0.1, 0.1, 0.3, 0.5]]))
     ['xyxy', 'xywh']
@@ -168,7 +168,7 @@ def share_orders(box: np.ndarray) -> list[str]:
 
 
 def are_corners(box: np.ndarray, size: tuple[float, float] | None) -> bool:
-    """Whether the last two columns are right and bottom edges: they follow the first two, or sizes would not fit.
+    """Return whether the last two columns are right and bottom edges: they exceed the first two, or sizes do not fit.
 
     >>> types.are_corners(np.array([[600.0, 400, 630, 460]] * 3), size=(640, 480))
     True
@@ -181,7 +181,7 @@ def are_corners(box: np.ndarray, size: tuple[float, float] | None) -> bool:
     return bool(follow or (is_beyond and (last <= 1.01 * np.array(size)).all()))
 
 
-# How many boxes may lie beyond the extent of a table, and from how many rows on the extent is estimated.
+# Number of boxes that may lie beyond the extent of a table, and number of rows from which the extent is estimated.
 _STRAYS, _ENOUGH_ROWS = 3, 30
 
 
@@ -192,10 +192,11 @@ class DetectionTable(Table):
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, else 1.
     line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
     cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
-    own: `dddas detect` wrote it, and all rows are moving. ours: `dddas detect` or `dddas track` wrote it.
+    own: whether `dddas detect` wrote the table, with moving targets only. ours: whether `dddas detect` or `dddas track`
+    wrote it.
     label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
-    kind: (N,) str, what a row is; of `dddas track` detection, bridge (nothing was seen there: a box between two
-    detections) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
+    kind: (N,) str, the kind of a row. `dddas track` writes detection, bridge (a box between two detections, where
+    nothing was seen) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
 
     >>> box_px = np.tile([10.0, 20, 5, 9], (3, 1))
     >>> table = td.DetectionTable("boxes.csv", np.array([1, 1, 2]), box_px, np.ones(3), line=np.array([1, 2, 3]))
@@ -219,7 +220,7 @@ class DetectionTable(Table):
     notes: tuple[str, ...] = ()
 
     def of_kind(self, *kinds: str) -> np.ndarray:
-        """(N,) bool, whether a row is of one of these kinds."""
+        """Return (N,) bool, whether each row is of one of these kinds."""
         return np.zeros(len(self), bool) if self.kind is None else np.isin(self.kind, kinds)
 
     @property
@@ -244,10 +245,10 @@ class DetectionTable(Table):
 
     @cached_property
     def extent(self) -> tuple[float, float] | None:
-        """(width, height) estimated from the boxes; None with too few rows.
+        """The (width, height) estimated from the boxes; None with too few rows.
 
-        The right and bottom edges without the _STRAYS farthest, so that a stray box does not move the picture's border.
-        Rows with a score below 0.5 are ignored.
+        It is the right and bottom edge without the _STRAYS farthest boxes, so that a stray box does not move the
+        picture's border. Rows with a score below 0.5 are ignored.
         """
         likely = self.box_px if self.certain else self.box_px[self.score >= 0.5]
         if len(likely) < _ENOUGH_ROWS:
@@ -256,19 +257,19 @@ class DetectionTable(Table):
         return float(width), float(height)
 
     def classes(self, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
-        """Name and number of the class of each of some rows, as in Detections."""
+        """Return name and number of the class of each of some rows, as in Detections."""
         label = np.full(len(self), "", object) if self.label is None else self.label
         return label[rows], (np.full(len(self), -1) if self.class_id is None else self.class_id)[rows]
 
     def rows(self, frame: int) -> slice:
-        """Where the rows of a frame are."""
+        """Return the slice of the rows of a frame."""
         return slice(*np.searchsorted(self.frame, [frame, frame + 1]))
 
     @cached_property
     def targets(self) -> np.ndarray:
-        """(N,) int64 identity of each row. Rows without identity get numbers above all identities, counted by frame.
+        """Identities of the rows, (N,) int64. Rows without identity get numbers above all identities, counted by frame.
 
-        Raises InputError if a frame has an identity twice.
+        Raise InputError if a frame has an identity twice.
         """
         identity = self.identity if self.identity is not None else np.full(len(self), -1)
         order = np.lexsort((self.line, identity, self.frame))
@@ -277,14 +278,14 @@ class DetectionTable(Table):
         if (twice & (identity[after] > 0)).any():
             row = after[(twice & (identity[after] > 0)).argmax()]
             raise InputError(
-                f"{self.path}, line {self.line[row]}: identity {identity[row]} is there already in frame "
-                f"{self.frame[row]}; wanted each once a frame, or -1 where there are none"
+                f"{self.path}, line {self.line[row]}: identity {identity[row]} occurs twice in frame "
+                f"{self.frame[row]}; wanted each identity once a frame, or -1 for rows without one"
             )
         place = np.arange(len(self)) - np.searchsorted(self.frame, self.frame) + 1
         return np.where(identity > 0, identity, place + max(identity.max(initial=0), 0)).astype(np.int64)
 
     def at(self, frame: int) -> Detections:
-        """The detections of a frame, of kind `given`."""
+        """Return the detections of a frame, of kind `given`."""
         here = self.rows(frame)
         box_px, (label, class_id) = self.box_px[here], self.classes(here)
         area_px = box_px[:, 2] * box_px[:, 3]

@@ -1,4 +1,4 @@
-"""Cameras, poses, landmarks, and places on the ground."""
+"""Cameras, poses, landmarks, and positions on the ground."""
 
 from dataclasses import dataclass, field
 
@@ -19,8 +19,8 @@ class Camera(Record):
     heading_rad: clockwise from true north. pitch_rad: below the horizon. roll_rad: clockwise, seen from behind.
     height_m: above ground, NaN if unknown. focal_sigma: relative. position_sigma_m: east and north each.
     elevation_m: height above the sea of the ground below a camera on it, NaN if unknown.
-    takeoff_above_sea_m: where the aerial vehicle took off, NaN if unknown. given: the fields that are known; None:
-    those that differ from their defaults.
+    takeoff_above_sea_m: height above the sea of the take-off point, NaN if unknown. given: the fields that are known;
+    None: the fields that differ from their defaults.
 
     >>> camera = td.Camera("uav", (640, 480), (600.0, 600.0), (319.5, 239.5), pitch_rad=np.pi / 2)
     >>> camera.knows("pitch_rad"), camera.knows("height_m")
@@ -53,15 +53,15 @@ class Camera(Record):
 
     @property
     def distortion(self) -> tuple[float, float, float, float, float]:
-        """k1, k2, p1, p2, k3, in OpenCV's order; all 0 for a lens without distortion."""
+        """The coefficients k1, k2, p1, p2, k3, in OpenCV's order; all are 0 for a lens without distortion."""
         return self.k1, self.k2, self.p1, self.p2, self.k3
 
     def knows(self, name: str) -> bool:
-        """Whether the value of a field is known, and no default."""
+        """Return whether the value of a field is known rather than a default."""
         if self.given is not None:
             return name in self.given
         value, default = getattr(self, name), type(self).__dataclass_fields__[name].default
-        if isinstance(value, float):  # a heading of 0 that was given is another object than the default
+        if isinstance(value, float):  # a given heading of 0 is another object than the default
             return value == value and value is not default
         return bool(value != default)
 
@@ -84,7 +84,7 @@ class PoseTable(Record):
     """A camera's poses from a CSV, sorted. at: (N,) frames, or seconds if timed.
 
     values: arrays (N,) by column: heading_deg, pitch_deg, longitude_deg and latitude_deg or east_m and north_m; the
-    camera file's values hold for columns that are not there.
+    values of the camera's file replace missing columns.
 
     >>> poses = td.PoseTable("poses.csv", np.array([1, 2]), timed=False, values={"heading_deg": np.array([0.0, 5.0])})
     >>> poses.values["heading_deg"]
@@ -101,7 +101,7 @@ class PoseTable(Record):
 class Sightings(Table):
     """People seen by ground cameras, one row per person and picture, in local metres.
 
-    east_north_m: (N, 2), NaN if the distance is unknown. distance_m: (N,) over ground. bearing_rad: (N,) clockwise
+    east_north_m: (N, 2), NaN if the distance is unknown. distance_m: (N,) over the ground. bearing_rad: (N,) clockwise
     from north. by: (N,) source of the distance: both, height, feet, or bearing (none).
     The error has three parts: own_m2 (N, 2, 2), the covariance of independent errors; body_m (N, 2), the effect of one
     sigma of body height, common to all sightings of a person; camera_m (N, 2, 6), the effect of one sigma of the
@@ -124,7 +124,7 @@ class Sightings(Table):
 
     @property
     def covariance_m2(self) -> np.ndarray:
-        """(N, 2, 2) of all errors together."""
+        """The covariance of all errors together, (N, 2, 2)."""
         camera = self.camera_m @ self.camera_m.swapaxes(1, 2)
         return self.own_m2 + self.body_m[:, :, None] * self.body_m[:, None, :] + camera
 
@@ -136,7 +136,7 @@ class Landmarks(Table):
     frame: (N,) float64 from 1, fractional between two pictures. landmark: (N,) int64, index into names.
     image_px: (N, 2) u, v from the first pixel's centre, or NaN. place: (N, 2) longitude and latitude in degrees if
     geographic, else local metres east and north; NaN in a dropout. sigma_m: (N,) per axis, or NaN.
-    planned: (N,) bool, a planned waypoint instead of a report. line: (N,) int64, in the file.
+    planned: (N,) bool, a planned waypoint instead of a report. line: (N,) int64, the row's line in the file.
     elevation_m, above_ellipsoid_m: (N,) heights of the ground at the place, above the sea and above WGS 84, or NaN.
 
     >>> frame, number, line = np.array([1.0, 1]), np.array([0, 1]), np.array([2, 3])
@@ -166,7 +166,7 @@ class Landmarks(Table):
 
 @dataclass(frozen=True)
 class LandmarkObservations(Table):
-    """The landmarks of one frame, one row each; NaN where unseen or unknown.
+    """The landmarks of one frame, one row each; NaN if unseen or unknown.
 
     landmark: (n,) int64, index into the names. image_px: (n, 2). east_north_m: (n, 2) local metres.
     sigma_m, pixel_sigma: (n,) standard deviations per axis. up_m: (n,) height of the seen point above the local plane.
@@ -223,7 +223,7 @@ class CameraPose(Record):
 
     @property
     def angles_rad(self) -> tuple[float, float, float]:
-        """Heading in [0, 2 pi), pitch and roll as in Camera; straight up or down the roll is 0."""
+        """Heading in [0, 2 pi), pitch and roll as in Camera. If the camera looks straight up or down, the roll is 0."""
         right, down, forward = np.asarray(self.axes, float).T
         level = float(np.hypot(forward[0], forward[1]))
         pitch = float(np.arctan2(-forward[2], level))
@@ -238,14 +238,14 @@ class CameraPose(Record):
 class Fix(Record):
     """The georeference of one frame, with its uncertainty.
 
-    time_s: since the clip's first frame, of the moment that the picture shows; NaN: that of the frame's number.
+    time_s: capture time since the clip's first frame; NaN: the time that follows from the frame's number.
     by: its source: pose, homography, paper, telemetry (no usable landmark), or "" (none: see cause).
     pose, covariance (7, 7): rotation about east, north, up in rad; east, north, up in m; log of the focal length.
     image_from_ground: (3, 3) from local metres to undistorted pixels (paper: distorted), if there is no pose.
     matrix_covariance: (8, 8) of its first eight elements (h33 = 1) in metres from about_m, the landmarks' centre, for
-    numerical precision. landmark: (n,) those seen; state of each: used, reassigned or excluded.
+    numerical precision. landmark: (n,) the landmarks that were seen. state: of each, used, reassigned or excluded.
     chi2, freedom: consistency of the landmarks with the prediction; NaN and 0 without one.
-    changes: what was repaired or excluded, and why. cause: why there is no or only a weak result.
+    changes: what was repaired or excluded, and why. cause: why there is no result, or only a weak one.
 
     >>> td.Fix(5, "", cause="no landmark is seen")
     Fix(frame=5, cause='no landmark is seen')
@@ -268,7 +268,7 @@ class Fix(Record):
 
     @property
     def is_used(self) -> tuple[bool, ...]:
-        """Whether each landmark seen was used."""
+        """Whether each landmark that was seen was also used."""
         return tuple(state in ("used", "reassigned") for state in self.state)
 
 
@@ -339,9 +339,9 @@ class Ortho(Record):
 class GroundLocations(Record):
     """The people of one frame located from ground cameras.
 
-    positions: fused over cameras. members: (P, V) index of each camera's sighting among those located; -1: none.
-    sightings: all, one row per box; vehicle (N,), from 0, is the camera; target, cut, score (N,) and box_px (N, 4) come
-    from its table.
+    positions: fused over cameras. members: (P, V) index of each camera's sighting among the located sightings; -1:
+    none. sightings: all sightings, one row per box; vehicle (N,), from 0, is the camera; target, cut, score (N,) and
+    box_px (N, 4) come from its table.
 
     >>> camera = td.Camera("ugv1", (640, 480), (500.0, 500.0), (319.5, 239.5), height_m=1.2)
     >>> people = td.People(np.array([[310.0, 220, 20, 80]]), np.ones(1), np.ones(1), np.array([False]))
@@ -365,7 +365,7 @@ class GroundLocations(Record):
 class AerialLocations(Record):
     """The targets of one frame located from the air.
 
-    positions: located targets, with absolute covariance. row: (P,) their rows among the frame's targets.
+    positions: located targets, with absolute covariance. row: (P,) row of each position among the frame's targets.
     relative_m2: (P, 2, 2) covariance relative to the landmarks, without the error common to their receivers.
     velocity_m_s: (P, 2) east, north, NaN if unknown. box_px: (N, 4) of all targets. marks: the landmarks as used.
     adjustments, seconds: as in Scene.
@@ -394,12 +394,12 @@ class AerialLocations(Record):
 
 @dataclass(frozen=True)
 class FusedTargets(Table):
-    """The targets that several platforms know together at one moment, one row a target.
+    """The targets that several platforms know together at one moment, one row per target.
 
-    time_s: by the common clock. frame: of the record that was measured then, of the platform `by`. target: (N,) int64.
+    time_s: by the common clock. frame: of the record that platform `by` measured then. target: (N,) int64.
     state: (N, 4) east, north in local metres about origin_deg, and their velocities in m/s. covariance: (N, 4, 4).
-    seen_by: (N,) dict, the platforms that saw it within a second, each with its own number of the target.
-    classes: names, "" for unknown; probability: (N, C) of each.
+    seen_by: (N,) dict, the platforms that saw the target within a second, each with its own number of the target.
+    classes: names, "" for unknown. probability: (N, C) of each class.
 
     >>> state, covariance = np.array([[10.0, 5, 3, 4]]), np.eye(4)[None]
     >>> targets = td.FusedTargets(12.0, 120, "uav", np.array([1]), state, covariance, np.array([{"uav": 7}]))
@@ -420,7 +420,7 @@ class FusedTargets(Table):
 
     @property
     def speed_m_s(self) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) speeds over the ground and their standard deviations, to first order."""
+        """Speeds over the ground and their standard deviations, (N,) each, to first order."""
         velocity, spread = self.state[:, 2:], self.covariance[:, 2:, 2:]
         speed = np.hypot(*velocity.T)
         along = np.where(speed[:, None] > 0, velocity / np.maximum(speed, 1e-9)[:, None], (1.0, 0.0))
@@ -432,9 +432,9 @@ class Confirmation(Record):
     """The UGVs' verdict on the blobs of one frame, one row per blob.
 
     row: (N,) int64 in the blobs' table. kind: human, not_human or unseen, by all observations so far.
-    probability: (N,) of being human. seen_by: vehicles with an observation in this frame. people: (N,) int64, the most
-    people that a vehicle recognized at it in this frame. nearest_m, nearest_sigmas: (N,) to the nearest person, or NaN.
-    best: (N,) highest probability of a person at it, or NaN.
+    probability: (N,) of being human. seen_by: vehicles with an observation in this frame. people: (N,) int64, largest
+    number of people that a vehicle recognized at the blob in this frame. nearest_m, nearest_sigmas: (N,) distance to
+    the nearest person, or NaN. best: (N,) highest probability of a person at the blob, or NaN.
 
     >>> one = np.ones(1)
     >>> seen = td.Confirmation(3, np.array([0]), ("human",), 0.97 * one, (("ugv1",),), np.array([2]), one, one, one)
@@ -455,11 +455,12 @@ class Confirmation(Record):
 
 @dataclass(frozen=True)
 class GroundCrowds(Table):
-    """The crowds of one frame by the people that ground vehicles see, one row a crowd that was looked at.
+    """The crowds of one frame as ground vehicles see them, one row per crowd that was looked at.
 
     target: (N,) int64 as in Positions. east_north_m: (N, 2) the people's centroid, local metres. velocity_m_s: (N, 2)
-    east, north, NaN if unknown. people: (N,) int64, the most that one picture shows. seen_by: (N,) str, the vehicles,
-    separated by semicolons. steers: (N,) bool, the air has lost the crowd, so that this steers.
+    east, north, NaN if unknown. people: (N,) int64, largest number of people in one picture. seen_by: (N,) str, the
+    vehicles, separated by semicolons. steers: (N,) bool, whether this position steers, because the air has lost the
+    crowd.
 
     >>> crowds = td.GroundCrowds(np.array([4]), np.array([[10.0, 20]]), np.array([[1.0, 0]]), people=np.array([6]))
     >>> crowds.people, crowds.steers

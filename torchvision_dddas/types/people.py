@@ -62,7 +62,7 @@ class People(Table):
 
     @property
     def feet_px(self) -> np.ndarray:
-        """(N, 2) u, v of the point between the feet, from the first pixel's centre: the middle of the lower edge."""
+        """The point between the feet, (N, 2) u, v from the first pixel's centre: the middle of the lower edge."""
         return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - 0.5
 
 
@@ -71,7 +71,8 @@ class PeopleFrame(Record):
     """The result of searching one frame for people.
 
     regions_px: (R, 4) the regions searched in addition to the scheduled pyramid levels; None: the whole picture.
-    share: windows scored, relative to a full search. cause: why there is no result. adjustments, seconds: as in Scene.
+    share: number of scored windows, relative to a full search. cause: why there is no result. adjustments, seconds: as
+    in Scene.
 
     >>> types.PeopleFrame(td.Frame(1, 0.0, np.zeros((48, 64), np.uint8)), td.People(), share=0.25)
     PeopleFrame(frame=Frame(...), people=People(0 rows), share=0.25)

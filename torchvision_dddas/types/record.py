@@ -1,21 +1,21 @@
-"""How records print themselves."""
+"""Records, and how they are printed."""
 
 from typing import Any
 
 import numpy as np
 
-_LONGEST = 240  # characters of a record in words
+_LONGEST = 240  # longest text of a record, in characters
 
 
 class Record:
-    """A record that prints itself in one short line: counts and ranges instead of arrays, and no defaults.
+    """A record that is printed in one short line, with counts and ranges instead of arrays, and without defaults.
 
     >>> td.Detections([[40, 60, 20, 20], [80, 60, 10, 20]], [0.9, 0.5], label=["car", "person"])
     Detections(2 rows, box_px: 10 to 80, score: 0.5 to 0.9, label: car, person, class_id: -1)
     """
 
     def __init_subclass__(cls) -> None:
-        # A dataclass makes a repr of its own, unless its class has one by itself.
+        # A dataclass makes its own repr unless its class defines one.
         cls.__repr__ = Record.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
@@ -32,7 +32,7 @@ class Record:
 
 
 def _describe_value(value: Any) -> str:
-    """A field in words: the size of a table, of a long list and of a record in place of its content."""
+    """Return a field in words: sizes of tables, long lists and records replace their content."""
     if isinstance(value, Record):
         return f"{type(value).__name__}({_count(value, 'row') if hasattr(value, '__len__') else '...'})"
     text = f"{value:.6g}" if isinstance(value, float) else repr(value)
@@ -46,7 +46,7 @@ def _count(items: Any, name: str) -> str:
 
 
 def _describe_array(array: np.ndarray, *, is_column: bool) -> str:
-    """The range of numbers, or the different texts of an array, behind its shape unless it is a column of the rows."""
+    """Return the range of numbers, or the different texts, of an array. Its shape comes first unless it is a column."""
     shape = "" if is_column else "x".join(map(str, array.shape)) + " "
     if array.dtype.kind in "iufb":
         known = array[np.isfinite(array)]

@@ -1,4 +1,4 @@
-"""Tables: records of columns of one length, and boxes."""
+"""Tables: records with columns of one length; and boxes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -9,14 +9,14 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.types.record import Record
 
-# What all rows of a table have in common, and a column of tables that are joined.
+# Fields that all rows of a table share. They become columns when tables are joined.
 _COMMON = ("time_s", "frame", "by")
-# What the values of columns mean: tables that differ in it cannot be joined.
+# Fields that give columns their meaning. Tables that differ in them cannot be joined.
 _MEANING = ("names", "classes", "geographic", "origin_deg", "height_zero")
 
 
 class Table(Record):
-    """A record whose arrays have one row an item each: rows can be selected, and tables of one kind joined.
+    """A record whose arrays have one row per item. Rows can be selected, and tables of one kind joined.
 
     >>> boxes = td.Detections([[40, 60, 20, 20], [80, 60, 10, 20]], [0.9, 0.5])
     >>> len(boxes), boxes[0].score, boxes[boxes.score > 0.8].score, [float(row.score[0]) for row in boxes]
@@ -33,16 +33,16 @@ class Table(Record):
         return (self[row] for row in range(len(self)))
 
     def __getitem__(self, rows: int | slice | Sequence[int] | np.ndarray) -> Self:
-        """The selected rows (a number, indices, mask or slice); fields that are not arrays are kept."""
+        """Return the selected rows (a number, indices, mask or slice). Fields that are not arrays are kept."""
         if isinstance(rows, int | np.integer):
             rows = [range(len(self))[rows]]
         return replace(self, **{name: column[rows] for name, column in columns_of(self).items()})  # type: ignore[type-var]
 
     @classmethod
     def concat(cls, tables: Sequence[Self]) -> Self:
-        """All rows in one table; fields that are not arrays come from the first, but frames and times become arrays.
+        """Join tables. Fields that are not arrays come from the first table, but frames and times become arrays.
 
-        Raises InputError without tables, and for tables whose columns or their meaning differ.
+        Raise InputError without tables, and for tables whose columns or their meaning differ.
         """
         if not tables:
             raise InputError(f"{cls.__name__}.concat got no tables; wanted at least one")
@@ -56,7 +56,7 @@ class Table(Record):
         return replace(tables[0], **joined)  # type: ignore[type-var]
 
     def to_columns(self) -> dict[str, np.ndarray]:
-        """Arrays (N,) by column name; wider arrays are split: box_px into x_px, y_px, width_px, height_px.
+        """Return arrays (N,) by column name. Wider arrays are split: box_px into x_px, y_px, width_px, height_px.
 
         The frame is a column, and `label` is called `class`, as in the tables of runs.
         """
@@ -70,7 +70,7 @@ class Table(Record):
         return columns
 
     def to_pandas(self) -> Any:
-        """The columns of to_columns as a pandas DataFrame. Raises InputError where pandas is not installed."""
+        """Return the columns of to_columns as a pandas DataFrame. Raise InputError if pandas is not installed."""
         try:
             import pandas
         except ImportError:
@@ -78,7 +78,7 @@ class Table(Record):
         return pandas.DataFrame(self.to_columns())
 
 
-# Names of the columns of arrays that have several, or another name than a table's column.
+# Names of the columns of arrays with several columns, or with another name than the table's column.
 _SPLIT = {
     "label": ("class",),
     "box_px": ("x_px", "y_px", "width_px", "height_px"),
@@ -109,18 +109,18 @@ class Boxes(Table):
 
     @property
     def xyxy(self) -> np.ndarray:
-        """(N, 4) left, top, right and bottom edge in pixels, as torchvision and supervision have boxes."""
+        """Left, top, right and bottom edges in pixels, (N, 4), as in torchvision and supervision."""
         return np.concatenate([self.box_px[:, :2], self.box_px[:, :2] + self.box_px[:, 2:]], axis=1)
 
     @property
     def foot_px(self) -> np.ndarray:
-        """(N, 2) u, v of the middle of the lower edge, from the first pixel's centre."""
+        """The middle of the lower edge, (N, 2) u, v from the first pixel's centre."""
         return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - (0.5, 1.0)
 
     def to_supervision(self) -> Any:
-        """A supervision.Detections of the boxes, as its annotators draw it; class_id is 0 if no class is known.
+        """Return the boxes as supervision.Detections, which its annotators draw; class_id is 0 if no class is known.
 
-        Raises InputError where supervision is not installed.
+        Raise InputError if supervision is not installed.
         """
         try:
             import supervision
@@ -135,19 +135,19 @@ class Boxes(Table):
 
 
 def columns_of(table: Any) -> dict[str, np.ndarray]:
-    """The columns of a table by name."""
+    """Return the columns of a table by name."""
     values = ((name, getattr(table, name)) for name in table.__dataclass_fields__)  # `fields` takes much longer
     return {name: value for name, value in values if isinstance(value, np.ndarray)}
 
 
 def _common_columns(table: Any) -> dict[str, np.ndarray]:
-    """The values that all rows of a table have in common, as columns."""
+    """Return the values that all rows of a table share, as columns."""
     values = {name: getattr(table, name) for name in _COMMON if name in table.__dataclass_fields__}
     return {name: np.full(len(table), v) for name, v in values.items() if not isinstance(v, np.ndarray)}
 
 
 def complete_table(table: Any, count: int, **unknown: Any) -> None:
-    """Fill the arrays that were not given with what is unknown. Raises InputError for arrays of other lengths."""
+    """Fill arrays that were not given with unknown values. Raise InputError for arrays of other lengths."""
     for name, values in columns_of(table).items():
         if len(values) == 0 < count and name in unknown:
             filled = np.full((count, *values.shape[1:]), unknown[name], values.dtype)

@@ -1,4 +1,4 @@
-"""What a vehicle reports of its flight."""
+"""The reports of a vehicle about its flight."""
 
 import math
 from dataclasses import dataclass, field
@@ -13,22 +13,22 @@ from torchvision_dddas.types.table import Table
 
 @dataclass(frozen=True)
 class Telemetry(Table):
-    """The vehicle's own reports, one row per sample, sorted by time; NaN where unknown. Arrays are (N,).
+    """Reports of a vehicle about its own flight, one row per sample, sorted by time; NaN if unknown. Arrays are (N,).
 
-    time_s: since the clip's first frame. altitude_m: above height_zero: "ground", that below the vehicle, or "takeoff",
-    the point where it took off. above_sea_m: if height_zero is "unknown", the log does not say whether it counts from
-    the sea or from the take-off point. above_ellipsoid_m: above WGS 84. speed_m_s: over ground.
+    time_s: since the clip's first frame. altitude_m: above height_zero: "ground" (below the vehicle) or "takeoff" (the
+    take-off point). above_sea_m: with height_zero "unknown", the log does not say whether it counts from the sea or
+    from the take-off point. above_ellipsoid_m: above WGS 84. speed_m_s: over the ground.
     place: (N, 2) longitude and latitude in degrees if geographic, else local metres east and north.
-    heading_rad, pitch_rad, roll_rad: of the camera, as in Camera; straight down the pitch is pi/2 and the heading that
-    of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of the vehicle's nose.
-    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m, position_sigma_m: standard deviations, the last of east and of
-    north; NaN: those of the group `aerial`.
-    heading_from: what heading_rad was taken from where the log does not say it, in words; empty where it does.
-    is_nominal: hfov_rad follows from a focal length "as for 36 mm": it is that of the longer side of the pictures.
+    heading_rad, pitch_rad, roll_rad: of the camera, as in Camera. If it looks straight down, the pitch is pi/2 and the
+    heading is the direction of the picture's upper edge. hfov_rad: horizontal field of view. vehicle_heading_rad: of
+    the vehicle's nose.
+    heading_sigma_rad, tilt_sigma_rad, altitude_sigma_m, position_sigma_m: standard deviations, the last for east and
+    for north; NaN: the values of the group `aerial`.
+    heading_from: source of heading_rad in words, if the log does not contain the camera's heading; else empty.
+    is_nominal: hfov_rad follows from a 35 mm equivalent focal length, and is measured along the pictures' longer side.
     start_utc_s: seconds since 1970 at time_s = 0, NaN if unknown. start_local_s: the same by a clock of unknown zone.
-    latest_utc_s: the latest that start_utc_s can be where the dates lack a zone. origin: the file.
-    notes: remarks for the user.
-    Raises InputError for columns of other lengths and times that decrease.
+    latest_utc_s: latest possible start_utc_s, if the dates lack a zone. origin: the file. notes: remarks for the user.
+    Raise InputError for columns of other lengths and for decreasing times.
 
     >>> log = td.Telemetry([0.0, 1.0], altitude_m=[40.0, 42.0], speed_m_s=[5.0, 5.0])
     >>> log
@@ -69,26 +69,26 @@ class Telemetry(Table):
             raise InputError("time_s of telemetry must not decrease; sort its rows by time")
         for name in COLUMNS_OF_TELEMETRY:
             given, wanted = np.asarray(getattr(self, name), float), (len(time_s), 2)[: 1 + (name == "place")]
-            if len(given) == 0 < len(time_s):  # a column that was not given is one of unknown values
+            if len(given) == 0 < len(time_s):  # a column that was not given holds unknown values
                 given = np.full(wanted, np.nan)
             if given.shape != wanted:
-                raise InputError(f"{name} of telemetry must have the shape {wanted}, a row a time, got {given.shape}")
+                raise InputError(f"{name} of telemetry must have the shape {wanted}, a row per time, got {given.shape}")
             object.__setattr__(self, name, given)
 
     def focal_px(self, size: tuple[int, int]) -> np.ndarray:
-        """(N,) focal length in pixels by the field of view, NaN where unknown. size: (width, height) of pictures."""
+        """Return focal lengths in pixels from the field of view, (N,), NaN if unknown. size: (width, height)."""
         return (max(size) if self.is_nominal else size[0]) / 2 / np.tan(self.hfov_rad / 2)
 
     @property
     def hold_s(self) -> float:
-        """How long before its first and after its last sample the log still tells a place: half an interval."""
+        """Time for which the log still gives a place before its first and after its last sample: half an interval."""
         return min(0.5 * float(np.median(np.diff(self.time_s))) + 1e-6, 1.0) if len(self) > 1 else 1.0
 
     def at(self, time_s: float, *, tolerance_s: float = 1.0) -> "Flight | None":
-        """The state at a time by linear interpolation, angles and longitudes the short way round.
+        """Return the state at a time by linear interpolation; angles and longitudes turn the short way.
 
-        A field is NaN if it is in either neighbour. Up to tolerance_s outside the span the nearest sample is used;
-        beyond that the result is None. Raises InputError for several times.
+        A field is NaN if it is NaN in either neighbour. Up to tolerance_s before the first and after the last sample,
+        the nearest sample is used; further away the result is None. Raise InputError for several times.
         """
         if np.ndim(time_s):
             got = np.shape(time_s)
@@ -100,7 +100,7 @@ class Telemetry(Table):
         after = min(int(times.searchsorted(time_s)), count - 1)
         end_s = times.item(after)
         before, share = after, 0.0
-        if after > 0 and time_s < end_s:  # else outside the span, or on a sample, which then counts alone
+        if after > 0 and time_s < end_s:  # otherwise the time is outside, or on a sample, which then counts alone
             before = after - 1
             share = (time_s - times.item(before)) / (end_s - times.item(before))
 
@@ -129,7 +129,7 @@ class Telemetry(Table):
         )
 
     def check_overlap(self, last_s: float, *, first_s: float = 0.0, what: str = "clip") -> None:
-        """Raises InputError, with both spans, where no sample lies near a clip or table from first_s to last_s."""
+        """Raise InputError, with both time ranges, if no sample lies near a clip or table from first_s to last_s."""
         if len(self) == 0:
             raise InputError(f"the telemetry has no samples; the {what} lasts from {first_s:.1f} to {last_s:.1f} s")
         from_s, to_s = float(self.time_s[0]), float(self.time_s[-1])
@@ -141,11 +141,11 @@ class Telemetry(Table):
 
 
 _TURN = 2 * math.pi
-_LEAST_SINE = 0.1  # of the angle of a view below the horizon
+_LEAST_SINE = 0.1  # of the angle of the view below the horizon
 
 
 def _wrap(value: float, full: float) -> float:
-    """A value or difference on a circle of circumference `full`, from minus half of it to half."""
+    """Return a value or difference on a circle of circumference `full`, from minus half of it to half."""
     return value if abs(value) <= full / 2 or full == math.inf else (value + full / 2) % full - full / 2
 
 
@@ -192,9 +192,9 @@ class Flight(Record):
 
     @property
     def distance_m(self) -> float:
-        """From the camera to level ground along the optical axis; the altitude where the pitch is not known.
+        """Distance from the camera to level ground along the optical axis; the altitude if the pitch is unknown.
 
-        A view less than about 6 degrees below the horizon counts as one of that many: its ground is too far to tell.
+        A view less than about 6 degrees below the horizon counts as 6 degrees, because its ground is too far to tell.
         """
         if not math.isfinite(self.pitch_rad):
             return self.altitude_m

@@ -1,4 +1,4 @@
-"""Tracks, and the results of a frame."""
+"""Tracks, and the results for a frame."""
 
 import math
 from dataclasses import dataclass, field
@@ -36,13 +36,12 @@ class AppearanceUse(Record):
 class Tracks(Boxes):
     """The targets of one frame with identities, one row per target.
 
-    identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections.
-    row: (N,) int64, its row in the frame's detections; -1 for a box that bridges a gap.
-    link: (N,) in [0, 1], confidence that the box belongs to the identity that it continues, and not to another one that
-    could have taken it. NaN for the first box of a track, for a bridging box, and where unknown.
-    label, class_id: of the detection, as there; of a bridging box those of the identity before. frame: its number, of
-    a table that `concat` joins (N,).
-    appearance: whether it was looked at; None where there was no choice: nothing to link, or no picture.
+    identity: (N,) int64 from 1, unique within a run. box_px, score: as in Detections. row: (N,) int64, the row in the
+    frame's detections; -1 for a box that bridges a gap. link: (N,) in [0, 1], confidence that the box belongs to its
+    identity, and not to another identity that could have taken it. NaN for the first box of a track, for a bridging
+    box, and if unknown. label, class_id: of the detection; a bridging box has those of its identity before the gap.
+    frame: number of the frame; (N,) in a table that `concat` has joined. appearance: whether it was used; None if there
+    was no choice: nothing to link, or no picture.
 
     >>> box_px = np.array([[10.0, 20, 5, 9], [40, 20, 5, 9]])
     >>> tracks = td.Tracks(3, np.array([7, 9]), box_px, np.ones(2), np.array([0, 1]))
@@ -76,8 +75,8 @@ class TrackedFrame(Record):
     """The result of tracking for one frame.
 
     number: 1-based position in the clip. frame: the picture, or None. detections: the tracker's input.
-    tracks: those with an identity, and boxes that bridge gaps.
-    now_from_before: (3, 3) pixel homography from the frame tracked before; None: no motion, or unknown.
+    tracks: detections with an identity, and boxes that bridge gaps.
+    now_from_before: (3, 3) pixel homography from the previous tracked frame; None: no motion, or unknown.
     lines: (N,) int64, lines of the detections in their file; empty for own ones.
     cause: why there is no result. adjustments, seconds, repeats: as in Scene.
 
@@ -109,14 +108,14 @@ class TrackedFrame(Record):
 class FrameResult(Record):
     """The result of the whole pipeline for one frame.
 
-    tracked: its targets, without the landmarks. locations: where they are on the ground; None if nothing locates them.
-    sighted_by: (n,) how each landmark of locations.marks was seen: motion, colour or table.
+    tracked: the frame's targets, without the landmarks. locations: their positions on the ground; None if nothing
+    locates them. sighted_by: (n,) how each landmark of locations.marks was seen: motion, colour or table.
     mark_lonlat_deg: (n, 2) positions of the landmarks; None without a geographic origin.
     confirmed: the UGVs' verdict on each row of locations.positions; None without UGV cameras.
-    crowds: by the people that the UGVs see; None without UGV cameras.
+    crowds: the crowds as the UGVs see them; None without UGV cameras.
     command: the order to the vehicles after this frame; None: no change.
-    events: what targets did at zones, as far as this frame settles it.
-    fused: the targets as all platforms know them at this frame; None without ground platforms.
+    events: events of targets at zones that are certain by this frame.
+    fused: the targets by the data of all platforms at this frame; None without ground platforms.
 
     >>> tracks = td.Tracks(3, np.array([7]), np.array([[10.0, 20, 5, 9]]), np.ones(1), np.zeros(1, int))
     >>> result = td.FrameResult(td.TrackedFrame(3, None, td.Detections(), tracks))
@@ -136,7 +135,7 @@ class FrameResult(Record):
 
     @property
     def frame(self) -> Frame | None:
-        """The frame; None where it could not be read."""
+        """The frame; None if it could not be read."""
         return self.tracked.frame
 
     @property
@@ -146,14 +145,14 @@ class FrameResult(Record):
 
     @property
     def time_s(self) -> float:
-        """The time of the frame by the telemetry's clock where it was located, else by the clip's; NaN if unknown."""
+        """The time of the frame by the telemetry's clock if it was located, else by the clip's; NaN if unknown."""
         if self.locations is not None:
             return self.locations.time_s
         return math.nan if self.frame is None else self.frame.time_s
 
     @property
     def repeats(self) -> int:
-        """As in Scene."""
+        """The earlier frame that this frame repeats, as in Scene."""
         return self.tracked.repeats
 
     @property
@@ -163,5 +162,5 @@ class FrameResult(Record):
 
     @property
     def adjustments(self) -> tuple[Adjustment, ...]:
-        """The changes of parameters at the frame, with their causes."""
+        """The changes of parameters at the frame, with their reasons."""
         return self.tracked.adjustments if self.locations is None else self.locations.adjustments

@@ -1,4 +1,4 @@
-"""What several views share: identities, and the map from one view to another."""
+"""Records of several views: shared identities, and the map from one view to another."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,10 @@ from torchvision_dddas.types.tracks import Tracks
 
 @dataclass(frozen=True)
 class ViewMap(Record):
-    """How two views are registered at a frame.
+    """The registration of two views at a frame.
 
     b_from_a: (3, 3) homography over the ground between pixels, or between metres; None: unknown.
-    quality: the share in [0, 1] of the targets in both views that have a partner, as a mean over the last frames.
+    quality: share in [0, 1] of the targets in both views that have a partner, averaged over the last frames.
 
     >>> td.ViewMap(np.eye(3), quality=0.8)
     ViewMap(b_from_a: 3x3 0 to 1, quality=0.8)
@@ -28,8 +28,8 @@ class ViewMap(Record):
 class SharedFrame(Record):
     """One moment of several views.
 
-    moment: counts the frames that were given, from 1. views: as given, with identities that all views share.
-    own: (N,) of each view, the identities that were given. maps: by the numbers of two views, from 0.
+    moment: number of the frame in the input, from 1. views: the input, with identities that all views share.
+    own: (N,) of each view, the identities in the input. maps: by the numbers of two views, from 0.
 
     >>> one = td.Tracks(3, np.array([1]), np.array([[10.0, 20, 5, 9]]), np.ones(1), np.zeros(1, int))
     >>> frame = td.SharedFrame(3, (one, one), (np.array([7]), np.array([4])), {(0, 1): td.ViewMap(None, 0.0)})
@@ -44,12 +44,12 @@ class SharedFrame(Record):
 
     @property
     def shared(self) -> tuple[np.ndarray, ...]:
-        """(N,) of each view, the shared identities."""
+        """The shared identities of each view, (N,)."""
         return tuple(identities_of(view) for view in self.views)
 
 
 def identities_of(view: Tracks | Positions) -> np.ndarray:
-    """(N,) the identities of tracks, or the targets of positions.
+    """Return the identities of tracks, or the targets of positions, (N,).
 
     >>> types.identities_of(td.Tracks(3, np.array([7]), np.ones((1, 4)), np.ones(1), np.zeros(1, int)))
     array([7])

@@ -1,4 +1,4 @@
-"""Commands to the vehicles, and what is true in a simulated world."""
+"""Commands to the vehicles, and the truth of a simulated world."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ from torchvision_dddas.types.table import Table
 class Order(Record):
     """An order to a ground vehicle: drive to a goal and look at a point.
 
-    goal, look_at: (2,) in the vehicles' own coordinates, longitude and latitude or local metres; look_at None: ahead.
-    picture: whether a picture is requested.
+    goal, look_at: (2,) in the vehicles' own coordinates, longitude and latitude or local metres. look_at: None is
+    ahead. picture: whether a picture is requested.
 
     >>> types.Order("ugv1", goal=np.array([10.0, 20.0]), speed_m_s=2.0, picture=True)
     Order(vehicle='ugv1', goal: 2 10 to 20, speed_m_s=2, picture=True)
@@ -29,10 +29,10 @@ class Order(Record):
 
 @dataclass(frozen=True)
 class Command(Record):
-    """A command to the vehicles; a simulator executes it, a recording ignores it. None: no change.
+    """A command to the vehicles. A simulator executes it, a recording ignores it. None: no change.
 
-    every: process every so many frames. fly_to: (2,) position of the UAV. look_at: (2,) ground point in the picture's
-    centre. Coordinates as in Order.
+    every: interval of the frames to process. fly_to: (2,) position of the UAV. look_at: (2,) ground point in the
+    picture's centre. Coordinates as in Order.
 
     >>> types.Command(every=2, fly_to=np.array([10.0, 20.0]))
     Command(every=2, fly_to: 2 10 to 20)
@@ -47,7 +47,7 @@ class Command(Record):
 
 @dataclass(frozen=True)
 class GroundPicture(Record):
-    """A ground vehicle's picture at a frame of the aerial camera; camera has the reported pose at that moment.
+    """A picture of a ground vehicle at a frame of the aerial camera. camera: with the reported pose at that moment.
 
     >>> camera = td.Camera("ugv1", (640, 480), (500.0, 500.0), (319.5, 239.5))
     >>> types.GroundPicture("ugv1", 12, np.zeros((480, 640, 3), np.uint8), camera)
@@ -93,8 +93,9 @@ class Bodies(Table):
 class Truth(Record):
     """Ground truth of a simulated frame.
 
-    mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all in the world.
-    pose: of the camera at mid-exposure. events: faults, crowds that join or split, in words.
+    mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all bodies in the
+    world.
+    pose: of the camera at mid-exposure. events: in words, faults and crowds that join or split.
 
     >>> none, pair, triple = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
     >>> nobody = types.Bodies(none, none, none, triple, pair, none, none, none, triple, triple, none)

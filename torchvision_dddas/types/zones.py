@@ -1,4 +1,4 @@
-"""Zones of the ground or of the picture, and what targets do at them."""
+"""Zones of the ground or of the picture, and the events of targets at zones."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -12,9 +12,10 @@ from torchvision_dddas.types.record import Record
 class Zone(Record):
     """A named area, or a line that targets cross.
 
-    rings: outlines (N, 2) of an area without the first point again; rings within rings are holes. The pieces of a line.
-    unit: deg (WGS84, longitude and latitude), m (the run's local metres, east and north) or px (u, v of the picture).
-    dwell_s: a target that has been inside for this long dwells.
+    rings: outlines (N, 2) of an area; the first point is not repeated, and rings within rings are holes. For a line,
+    its pieces. unit: deg (WGS84, longitude and latitude), m (the run's local metres, east and north) or px (u, v of the
+    picture).
+    dwell_s: a target that has been inside for this time dwells.
 
     >>> td.Zone("door", (np.array([[0.0, 0], [4, 0], [4, 3]]),), unit="m")
     Zone(name='door', rings=1 item, unit='m')
@@ -33,16 +34,16 @@ def _unknown() -> np.ndarray:
 
 @dataclass(frozen=True)
 class ZoneEvent(Record):
-    """What a target did at a zone, or a crowd with others. Values are NaN, and texts empty, where they are unknown.
+    """An event of a target at a zone, or of a crowd with other crowds. Unknown values are NaN, unknown texts empty.
 
+    kind: enter, leave, present (inside when first seen), dwell, or cross (a line). direction: of a crossing, to_right
+    or to_left of the line as it runs. frame, time_s: of the event. The moment when the target passed the border is
+    interpolated between two frames; `frame` is the later frame. east_north_m, lonlat_deg, image_px: (2,) the target's
+    place at that moment. speed_m_s, or speed_px_s at a zone in pixels. inside_s: time that it has been inside (leave,
+    dwell). is_first: whether the target has not been counted at this zone before.
     others: the crowds that join the target or split off it. The kinds of these events are join, split, gather and
-    scatter; their zone is empty, and frame, time_s and the place tell where the other crowd was last seen (join) or
-    first seen (split) alone.
-    kind: enter, leave, present (inside when it was first seen), dwell, or cross (a line). direction: of a crossing,
-    to_right or to_left of the line as it runs. frame, time_s: of the event: where the target passed the border,
-    interpolated between two frames, of which `frame` is the later one. east_north_m, lonlat_deg, image_px: (2,) its
-    place then. speed_m_s, or speed_px_s at a zone in pixels. inside_s: how long it has been inside (leave, dwell).
-    is_first: whether the target has not been counted at this zone before.
+    scatter. Their zone is empty; frame, time_s and the place state where the other crowd was last (join) or first
+    (split) seen alone.
 
     >>> td.ZoneEvent("enter", "door", target=7, frame=12, time_s=1.2, speed_m_s=1.4).describe()
     'target 7 enters door at 1.4 m/s'
@@ -66,7 +67,7 @@ class ZoneEvent(Record):
     others: tuple[int, ...] = ()
 
     def describe(self) -> str:
-        """The event in words."""
+        """Return the event in words."""
         if self.others:
             ways = {"join": "joined by", "gather": "joined by", "split": "left by", "scatter": "left by"}
             return f"{self.kind}: crowd {self.target} is {ways[self.kind]} {' and '.join(map(str, self.others))}"
@@ -77,7 +78,7 @@ class ZoneEvent(Record):
 
 
 def most_common(classes: Counter[tuple[str, int]]) -> tuple[str, int]:
-    """The label and the number that a target's boxes have most often; "" and -1 where none has any.
+    """Return the most frequent label and number among a target's boxes; "" and -1 if none has any.
 
     >>> from collections import Counter
     >>> types.most_common(Counter({("", -1): 9, ("car", 2): 5, ("bus", 5): 1}))

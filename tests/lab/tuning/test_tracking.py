@@ -65,7 +65,7 @@ def test_what_cannot_be_tuned_is_refused_in_one_line(tmp_path: Path):
     with pytest.raises(InputError, match="walk has no public detections"):
         family.examples([walk()], Settings())
     path.write_text("1,-1,10,10,20,50,0.5\n")
-    with pytest.raises(InputError, match=r"no box that track\.doubt = 0 admits"):
+    with pytest.raises(InputError, match=r"no box that track\.doubt = 0 accepts"):
         family.examples([replace(walk(), given=path)], with_parameters(Settings(), {"track.doubt": 0.0}))
     with pytest.raises(InputError, match=r"no effect under track\.mode=paper; add --set track.mode=default"):
         family.check(["track.wander"], with_parameters(Settings(), {"track.mode": "paper"}))
