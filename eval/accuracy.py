@@ -29,7 +29,7 @@ from torchvision_dddas.lab.benchmark import plain_chain
 from torchvision_dddas.lab.evaluation.metrics import boxes as box_metrics
 from torchvision_dddas.lab.evaluation.metrics import pixels as pixel_metrics
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
-from torchvision_dddas.lab.evaluation.metrics.boxes import Boxes, OneTarget
+from torchvision_dddas.lab.evaluation.metrics.boxes import BoxCounts, OneTarget
 from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.types import Scene
 
@@ -112,7 +112,7 @@ def run_plain(place: Path) -> Iterator[Found]:
 def score(place: Path, run: Chain) -> Figures:
     """The figures of one clip: of masks, of one labelled target, or of a clip where nothing moves."""
     truth = truths.load_truth(place) if truths.find_truth(place) else None
-    pixels, boxes, target, blobs, frames = Pixels(), Boxes(), OneTarget(), 0, 0
+    pixels, boxes, target, blobs, frames = Pixels(), BoxCounts(), OneTarget(), 0, 0
     of_frames = []
     for number, both in enumerate(run(place), 1):
         if both is None:

@@ -14,8 +14,8 @@ from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.lab.evaluation.datasets import motchallenge
 from torchvision_dddas.lab.evaluation.datasets.files import folders_in, images_in, number_of
 from torchvision_dddas.lab.evaluation.datasets.kinds import read
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth
 from torchvision_dddas.lab.evaluation.studies.records import Task
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 from torchvision_dddas.lab.evaluation.studies.stages import find
@@ -90,7 +90,7 @@ def sequences(folder: Path) -> list[Path]:
     return found or sys.exit(f"{folder} holds no sequences with gt/gt.txt; nothing was measured")
 
 
-def truth_of(place: Path) -> Truth:
+def truth_of(place: Path) -> ClipTruth:
     """The truth of a sequence, with its tracks."""
     truth = motchallenge.sequence(place).truth
     assert truth is not None and truth.tracks is not None
@@ -134,7 +134,7 @@ def identified_clips(data: Path, kinds: Iterable[str]) -> list[Clip]:
     found: dict[str, Clip] = {}
     data = data.resolve()  # a relative path would be read as one inside itself
     for kind in kinds:
-        for clip in read(Source(kind, data), data).clips:
+        for clip in read(DatasetSource(kind, data), data).clips:
             if clip.truth is not None and clip.truth.tracks is not None:
                 found.setdefault(clip.name, clip)
     return list(found.values())

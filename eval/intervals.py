@@ -118,7 +118,7 @@ def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float, rate_
 def score_scenes(scenes: Sequence[Scene], truths: Sequence[Truth], is_later: bool) -> dict[str, float]:
     """Measures of masks, and the F1 of boxes at an IoU of 0.5. is_later: masks show the movers of a later frame."""
     found = dict(enumerate((scene.mask, scene.detections.box_px) for scene in scenes))
-    pixels, boxes = pixel_metrics.Pixels(), box_metrics.Boxes()
+    pixels, boxes = pixel_metrics.Pixels(), box_metrics.BoxCounts()
     for at, (mask, box_px) in (move_later(scenes) if is_later else found).items():
         pixels = add_counts(pixels, pixel_metrics.count(mask, truths[at].mask))
         boxes = add_counts(boxes, box_metrics.match(box_px, box_metrics.boxes_of(truths[at].mask)))

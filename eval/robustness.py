@@ -80,7 +80,7 @@ def change_exposure(frames: Sequence[Frame], gain: np.ndarray) -> list[Frame]:
     return [replace(f, image=np.clip(np.round(f.image * g), 0, 255).astype(np.uint8)) for f, g in pairs]
 
 
-def score(frames: Sequence[Frame], truth: truths.Truth, settings: Settings) -> tuple[float, int]:
+def score(frames: Sequence[Frame], truth: truths.ClipTruth, settings: Settings) -> tuple[float, int]:
     """F over the labelled frames, and how many frames were unreliable."""
     pixels, unreliable = Pixels(), 0
     for scene in detect_motion(frames, settings, "onboard"):

@@ -21,7 +21,7 @@ import torch
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.detection import detect_motion
 from torchvision_dddas.lab.evaluation.datasets.kinds import read
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
 from torchvision_dddas.lab.evaluation.metrics import pixels as segmentation
 from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.lab.evaluation.metrics.truth import labels_of
@@ -87,7 +87,7 @@ def measure_default(options: bench.Options) -> tuple[str, Any]:
 def film_clip(place: Path, seed: int, size: tuple[int, int]) -> Clip:
     """A synthetic scene on disk, as a clip of a data set."""
     clips.film_into(place / f"scene-{seed}", seed, FRAMES, size)
-    (clip,) = read(Source("folder", place, (f"scene-{seed}",)), place).clips
+    (clip,) = read(DatasetSource("folder", place, (f"scene-{seed}",)), place).clips
     return clip
 
 

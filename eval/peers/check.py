@@ -21,7 +21,7 @@ from jobs import PYTHON, Table, check_environments, run_peer
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.evaluate import evaluate
 from torchvision_dddas.lab.evaluation.metrics import truth as true_boxes
-from torchvision_dddas.lab.evaluation.studies.records import Found, round_as_written
+from torchvision_dddas.lab.evaluation.studies.records import Findings, round_as_written
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 from torchvision_dddas.lab.evaluation.studies.summary import measures
 
@@ -169,7 +169,7 @@ def studied(folder: Path, result: str, truths: Tables, found: dict[str, Tables],
         known = replace(true_boxes.load_truth(folder / "ours" / name / "gt.txt"), ignoring=ignoring)
         table = thinned_only(found[name][result], interval)
         count = len(table)
-        held = Found(
+        held = Findings(
             table[:, 0].astype(np.int64),
             table[:, 2:6],
             table[:, 6],

@@ -45,7 +45,7 @@ class Sequence:
     """A sequence of DATA. detections: a file with scores in [0, 1], if it has one."""
 
     name: str
-    truth: truth.Truth
+    truth: truth.ClipTruth
     length: int
     detections: Path | None
 

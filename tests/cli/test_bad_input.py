@@ -138,7 +138,7 @@ CASES = [
     ("simulate joining --frames 0", "--frames must be 1 or more, got 0"),
     ("run sim:empty.toml", "empty.toml is empty; wanted tables"),
     ("run sim:joining --scene team.ugvs=3", "team.ugvs must be 4 or more in a clip located by landmarks"),
-    ("run sim:joining --scene clip.located_by=\"'nothing'\"", "scenario joining is located by nothing"),
+    ("run sim:joining --scene clip.located_by=\"'nothing'\"", "scenario joining has clip.located_by = nothing"),
     ("run sim:joining --interval 2", "--interval is of no use with sim:joining"),
     ("run sim:joining --save film", "--save must name some of overlay, cot, map, report, truth"),
     ("run walk walk --live", "2 clips were given; wanted one with --live"),

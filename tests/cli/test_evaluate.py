@@ -84,7 +84,7 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     assert list(found["settings"]) == ["track.memory_frames"] and found["settings"]["track.memory_frames"][1] == 1
     (tmp_path / "other" / SCORES).write_bytes(b"x" * 100)
     assert "is damaged or of another version" in bad(dddas("compare", tmp_path / "out", tmp_path / "other"))
-    assert "holds no study: no scores.bin" in bad(dddas("compare", tmp_path / "out", tmp_path / "clips"))
+    assert "is not a study: it lacks scores.bin" in bad(dddas("compare", tmp_path / "out", tmp_path / "clips"))
 
 
 def test_what_a_study_keeps_is_scored_as_the_study_was(study, dddas, tmp_path) -> None:
@@ -127,11 +127,11 @@ def test_what_clips_that_are_scored_lack_is_a_note_and_not_left_out(own_study, f
     done = own_study(file("study.toml", text))
     assert done.exit_code == 0 and "left out:" not in done.output
     notes = [line for line in done.stdout.splitlines() if line.startswith("note: ")]
-    assert notes[0].startswith("note: bare: no pictures, which belong in ")
+    assert notes[0].startswith("note: bare: no pictures; they belong in ")
     assert any(line.startswith("note: film, motion: ") and "000004.png" in line for line in notes[1:])
     run = record(tmp_path / "out")
     assert run["left_out"] == [] and [f"note: {line}" for line in run["notes"]] == notes
-    assert "no pictures, which belong in" in (tmp_path / "out" / "report.html").read_text()
+    assert "no pictures; they belong in" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_study_that_could_score_nothing_fails_and_says_why(own_study, tmp_path) -> None:

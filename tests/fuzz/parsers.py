@@ -32,7 +32,7 @@ from torchvision_dddas.io.sources import open_source, stream_target
 from torchvision_dddas.io.streams import About, open_stream
 from torchvision_dddas.io.telemetry import read_telemetry
 from torchvision_dddas.lab.evaluation.datasets import kinds
-from torchvision_dddas.lab.evaluation.datasets.record import Source
+from torchvision_dddas.lab.evaluation.datasets.record import DatasetSource
 from torchvision_dddas.lab.evaluation.evaluate import evaluate, load_result
 from torchvision_dddas.lab.evaluation.metrics import truth
 from torchvision_dddas.lab.evaluation.studies.runner import read_spec
@@ -222,7 +222,7 @@ def _stream_word(path: Path) -> None:
 def _dataset(kind: str, path: Path) -> None:
     """What is wrong with a clip is said, and the clip left out; where none is left that counts as a refusal."""
     folder = next(place for place in path.parents if place.name == ROOT)
-    found = kinds.read(Source(kind, folder), folder.parent)
+    found = kinds.read(DatasetSource(kind, folder), folder.parent)
     for line in found.missing:
         assert line.isprintable() and 0 < len(line) <= LONGEST, f"a line that is none: {line[:200]!r}"
     if not found.clips:

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from torchvision_dddas.io.output import RunRecord, RunRecorder
-    from torchvision_dddas.lab.evaluation.studies.jobs import Event
-    from torchvision_dddas.lab.evaluation.studies.runner import Plan
+    from torchvision_dddas.lab.evaluation.studies.jobs import JobEvent
+    from torchvision_dddas.lab.evaluation.studies.runner import StudyPlan
     from torchvision_dddas.types import Source
 
-    Hooks = tuple[Callable[[Plan], None], Callable[[Event], None]]
+    Hooks = tuple[Callable[[StudyPlan], None], Callable[[JobEvent], None]]
 
 EVERY_S = 5.0
 
@@ -79,12 +79,12 @@ def show_progress(quiet: bool) -> "Iterator[Hooks]":
         printed = time.monotonic()
         print_now(text)
 
-    def begin(plan: "Plan") -> None:
+    def begin(plan: "StudyPlan") -> None:
         nonlocal total
         total = len(plan.jobs)
         say(f"{total} clip{'s' * (total != 1)}, {plan.frames} frames to process over all tasks")
 
-    def advance(event: "Event") -> None:
+    def advance(event: "JobEvent") -> None:
         nonlocal done, frames
         frames += event.frames
         if event.note:
@@ -102,7 +102,7 @@ def show_progress(quiet: bool) -> "Iterator[Hooks]":
         with _bar("clips, {task.fields[frames]} frames", "TimeElapsedColumn") as bar:
             task = bar.add_task("study", total=None, frames=0)
 
-            def update(event: "Event") -> None:
+            def update(event: "JobEvent") -> None:
                 nonlocal frames
                 frames += event.frames
                 bar.update(task, advance=event.done is not None, frames=frames, description=event.job.clip.name)

@@ -27,7 +27,7 @@ from torchvision_dddas.cli.progress import EVERY_S, open_console, print_now, pro
 from torchvision_dddas.errors import InputError
 
 if TYPE_CHECKING:
-    from torchvision_dddas.lab.tuning import Step, Tuned
+    from torchvision_dddas.lab.tuning import DescentStep, Tuned
 
 
 @report_errors
@@ -120,7 +120,7 @@ class _StepLines:
     def __init__(self, steps: int) -> None:
         self._steps, self._printed_s, self._least = steps, 0.0, (float("inf"), 0)
 
-    def __call__(self, step: "Step") -> None:
+    def __call__(self, step: "DescentStep") -> None:
         now = time.monotonic()
         if step.watched is None and now - self._printed_s < EVERY_S:
             return

@@ -13,7 +13,15 @@ from torch import Tensor
 from tests.lab.tuning.toys import Bowl, pieces
 from torchvision_dddas.config import Settings, with_parameters
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.lab.tuning.descent import Descended, Plan, Step, clip_shares, descend, draw_batch, split_examples
+from torchvision_dddas.lab.tuning.descent import (
+    Descended,
+    DescentStep,
+    Plan,
+    clip_shares,
+    descend,
+    draw_batch,
+    split_examples,
+)
 from torchvision_dddas.lab.tuning.family import Example
 from torchvision_dddas.lab.tuning.parameters import Parameters
 
@@ -62,7 +70,7 @@ def test_a_descent_that_was_broken_off_resumes_with_the_same_steps(tmp_path: Pat
     class Stopped(Exception):
         pass
 
-    def interrupt(step: Step) -> None:
+    def interrupt(step: DescentStep) -> None:
         if step.step == stop:
             raise Stopped
 
@@ -70,7 +78,7 @@ def test_a_descent_that_was_broken_off_resumes_with_the_same_steps(tmp_path: Pat
     place = tmp_path / "here" / "checkpoint.pt"
     with pytest.raises(Stopped):
         descend(Bowl(), parameters(), pieces(), QUICK, tell=interrupt, place=place)
-    steps = list[Step]()
+    steps = list[DescentStep]()
     resumed = descend(Bowl(), parameters(), pieces(), QUICK, tell=steps.append, place=place, resume=True)
     assert same(whole, resumed) and resumed.best == whole.best and resumed.ended == whole.ended
     assert [step.step for step in steps] == list(range(13))

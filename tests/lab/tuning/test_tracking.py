@@ -13,7 +13,7 @@ from tests.lab.tuning.worlds import seen, walk
 from torchvision_dddas.config import Settings, TrackParameters, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.detection_tables import read_detections
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable
 from torchvision_dddas.lab.tuning.descent import Plan, descend
 from torchvision_dddas.lab.tuning.examples import match_owners
 from torchvision_dddas.lab.tuning.parameters import Parameters
@@ -87,8 +87,8 @@ def table(rows: list[tuple[int, int, list[float]]]) -> TrackTable:
     return TrackTable(np.array(frame), np.array(identity), np.array(box_px))
 
 
-def truth_of(rows: list[tuple[int, int, list[float]]], **more) -> Truth:
-    return Truth("boxes", Path("here"), {}, {}, table(rows), **more)
+def truth_of(rows: list[tuple[int, int, list[float]]], **more) -> ClipTruth:
+    return ClipTruth("boxes", Path("here"), {}, {}, table(rows), **more)
 
 
 def found_of(rows: list[tuple[int, list[float], float]]) -> DetectionTable:

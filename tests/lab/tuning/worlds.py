@@ -7,8 +7,8 @@ import numpy as np
 
 from tests.synthetic_clip import film_into
 from torchvision_dddas.lab.evaluation.datasets.kinds import read
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, Truth
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable
 
 PERSON = np.array([20.0, 50.0])
 
@@ -16,7 +16,7 @@ PERSON = np.array([20.0, 50.0])
 def filmed_clip(place: Path, frames: int) -> Clip:
     """Pictures of 240 x 180 with masks of what moves."""
     film_into(place / "film", 3, frames, (240, 180))
-    (found,) = read(Source("folder", place), place).clips
+    (found,) = read(DatasetSource("folder", place), place).clips
     return found
 
 
@@ -28,7 +28,7 @@ def walk(name: str = "walk", people: int = 4, frames: int = 150, seed: int = 0, 
     identity = np.tile(np.arange(1, people + 1), frames)
     box_px = np.concatenate([place.reshape(-1, 2) - PERSON / 2, np.tile(PERSON, (len(frame), 1))], axis=1)
     table = TrackTable(frame, identity, box_px)
-    truth = Truth("boxes", Path(name), {}, {int(f): box_px[frame == f] for f in np.unique(frame)}, table)
+    truth = ClipTruth("boxes", Path(name), {}, {int(f): box_px[frame == f] for f in np.unique(frame)}, table)
     return Clip(name, Path(name), truth=truth if true else None)
 
 

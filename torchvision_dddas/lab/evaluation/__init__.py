@@ -1,1 +1,1 @@
-"""How good results are: measures, data sets, studies."""
+"""The quality of results: measures, data sets, studies."""

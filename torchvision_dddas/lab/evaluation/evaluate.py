@@ -1,4 +1,4 @@
-"""Results against the truth, for one clip or many: per clip, pooled over the counts, and the mean over clips."""
+"""Compare results with the truth, for one clip or many: each clip, pooled over the counts, and the mean over clips."""
 
 import json
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from torchvision_dddas.lab.evaluation.metrics.pixels import add_counts
 from torchvision_dddas.lab.evaluation.metrics.registry import Counts, figures, mean, pooled
 from torchvision_dddas.lab.evaluation.metrics.tracking import Each, TargetTrack, TrackCounts
 from torchvision_dddas.lab.evaluation.metrics.truth import (
+    ClipTruth,
     Ignoring,
     TrackTable,
-    Truth,
     check_identities,
     find_truth,
     labels_of,
@@ -39,9 +39,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Score results: {"clips": {name: measures}, "pooled": measures, "mean": measures, "notes": [...]}.
 
-    truth and result are one clip's (masks, boxes, tracks; a folder that dddas detect or dddas track wrote, or
-    MOTChallenge text), or folders of clips by name. Measures come in registry.GROUPS. Raises InputError where
-    the two do not fit together.
+    truth and result belong to one clip (masks, boxes, tracks; a folder that dddas detect or dddas track wrote, or
+    MOTChallenge text), or are folders of clips by name. Measures are grouped as in registry.GROUPS. Raise InputError if
+    truth and result do not fit together.
     """
     notes: list[str] = []
     clips = score_files(truth, result, notes, first_frame, interval, ignoring)
@@ -61,7 +61,7 @@ def score_files(
     interval: int = 1,
     ignoring: Ignoring = "dropped",
 ) -> "dict[str, ClipScore]":
-    """Score the clips of a result by name; the arguments are those of `evaluate`, which raises the same errors."""
+    """Score the clips of a result by name. Arguments and errors are those of `evaluate`."""
     if interval < 1:
         raise InputError(f"interval must be at least 1 frame, got {interval}")
     return {
@@ -71,7 +71,7 @@ def score_files(
 
 
 def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path, Path]]:
-    """The clips to score by name: (truth, result)."""
+    """Return the clips to score by name: (truth, result)."""
     for place, what in ((truth, "truth"), (result, "result")):
         if not place.exists():
             raise InputError(f"no {what} at {place}")
@@ -83,7 +83,7 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
     pairs = {n: (truth / n, p) for n, p in places.items() if find_truth(truth / n) is not None}
     if not pairs:
         raise InputError(
-            f"no clip to score: no folder in {truth} that holds masks, boxes or tracks has its like in {result} "
+            f"no clip to score: no folder in {truth} that holds masks, boxes or tracks has a counterpart in {result} "
             f"with a {DETECTIONS} or {TRACKS}"
         )
     notes += [f"{n}: no result, not scored" for n in names if n not in places]
@@ -92,16 +92,16 @@ def _pairs(truth: Path, result: Path, notes: list[str]) -> dict[str, tuple[Path,
 
 
 def _is_result(place: Path) -> bool:
-    """Whether a place looks like a result: a file, or a folder that dddas detect or dddas track wrote."""
+    """Return whether a place looks like a result: a file, or a folder that dddas detect or dddas track wrote."""
     return place.is_file() or any((place / name).is_file() for name in (DETECTIONS, TRACKS))
 
 
 @dataclass(frozen=True)
 class Result:
-    """A result. frames: the last one of the run, 0 where nothing says. state: of the run.
+    """A result. frames: number of the run's last frame, 0 if unknown. state: of the run.
 
-    place: the folder or file. detected: (N, 4) boxes of each frame with targets, None where only tracks were written.
-    tracks: the boxes with identities, None where there are none.
+    place: the folder or file. detected: (N, 4) boxes of each frame with targets; None if only tracks were written.
+    tracks: the boxes with identities; None if there are none.
     """
 
     place: Path
@@ -113,12 +113,12 @@ class Result:
 
     @property
     def name(self) -> str:
-        """What to call it: the folder's name, or the file's without its ending."""
+        """The name in reports: the folder's name, or the file's name without its ending."""
         place = self.place.resolve()
         return place.stem if place.is_file() else place.name
 
     def boxes_at(self, frame: int) -> np.ndarray:
-        """(N, 4) boxes of a frame: the detections, or the tracks' where there are none."""
+        """Return the boxes of a frame, (N, 4): the detections, or the boxes of tracks if there are no detections."""
         if self.detected is not None:
             return self.detected.get(frame, np.zeros((0, 4)))
         return self._tracked.get(frame, np.zeros((0, 4)))
@@ -128,16 +128,16 @@ class Result:
         return {} if self.tracks is None else self.tracks.boxes_by_frame()
 
     def mask_at(self, frame: int) -> np.ndarray:
-        """(H, W) mask of a frame. Raises InputError if it is not there."""
+        """Return the mask of a frame, (H, W). Raise InputError if it is missing."""
         path = self.place / "masks" / f"{frame:06d}.png"
         mask = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK) if path.is_file() else None
         if mask is None:
-            raise InputError(f"{path} is missing or no picture; run dddas detect again with --save masks")
+            raise InputError(f"{path} is missing or not a picture; run dddas detect again with --save masks")
         return mask if mask.ndim == 2 else mask.max(axis=2)
 
 
 def load_result(place: Path) -> Result:
-    """Read a result folder, or a file of MOTChallenge text. Raises InputError if it is none."""
+    """Read a result folder, or a file of MOTChallenge text. Raise InputError if it is neither."""
     if place.is_file():
         try:
             rows = read_rows(place, "result")
@@ -152,7 +152,7 @@ def load_result(place: Path) -> Result:
         return Result(place, 0, None, False, "complete", rows.table)
     if not _is_result(place):
         raise InputError(
-            f"{place} is no result of dddas detect: it holds no {DETECTIONS}; nor of dddas track: no {TRACKS}"
+            f"{place} is not a result of dddas detect or dddas track: it holds neither {DETECTIONS} nor {TRACKS}"
         )
     detected = tracks = None
     if (place / DETECTIONS).is_file():
@@ -164,11 +164,12 @@ def load_result(place: Path) -> Result:
     try:
         record = json.loads((place / "run.json").read_text(encoding="utf-8"))
         written, state, outputs = int(record["frames"]["written"]), str(record["state"]), list(record["outputs"])
-        # dddas track writes every interval-th frame, from wherever its table begins; dddas detect each.
+        # dddas detect writes every frame; dddas track writes every interval-th frame, from the first frame of its
+        # table.
         counted = max(written - 1, 0) * int(record.get("interval_frames", 1)) + min(written, 1)
         frames = int(record.get("last_frame", counted)) if written else 0
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        # Tables of another program: only masks can say how long the clip is, as there is one for each frame.
+        # Tables of other programs do not state the length of the clip. If there are masks, there is one for each frame.
         numbers = [int(p.stem) for p in (place / "masks").glob("*.png") if p.stem.isdecimal()]
         frames, state, outputs = max(numbers, default=0), "complete", ["masks"] if numbers else []
     return Result(place, frames, detected, "masks" in outputs, state, tracks)
@@ -176,7 +177,7 @@ def load_result(place: Path) -> Result:
 
 @dataclass(frozen=True)
 class ClipScore:
-    """A clip's counts by group. frames: how many were scored. each: the counts of single frames, by group."""
+    """The counts of a clip by group. frames: number of scored frames. each: the counts of single frames, by group."""
 
     frames: int
     counts: Counts
@@ -184,19 +185,19 @@ class ClipScore:
 
 
 def score_clip(
-    truth: Truth, result: Result, notes: list[str], interval: int = 1, ignoring: Ignoring = "dropped"
+    truth: ClipTruth, result: Result, notes: list[str], interval: int = 1, ignoring: Ignoring = "dropped"
 ) -> ClipScore:
-    """Count what a clip's truth and result allow; what is left out is added to the notes.
+    """Count everything that a clip's truth and result allow. Notes name what is left out.
 
-    interval: frames 1, 1 + interval, ... alone. ignoring: see matching.pair. Raises InputError where truth and result
-    share no frame, or the result lacks what the truth asks for.
+    interval: score only frames 1, 1 + interval, ... ignoring: see matching.pair. Raise InputError if truth and result
+    share no frame, or if the result lacks data that the truth needs.
     """
     frames: list[int] = []
     of_frames: dict[str, list[Any]] = {}
     has_tracks = truth.tracks is not None and result.tracks is not None
     if truth.kind == "masks":
         if result.tracks is not None:
-            notes.append(f"{result.name}: tracks are not scored, for masks do not tell identities")
+            notes.append(f"{result.name}: tracks are not scored, because masks hold no identities")
         frames = _labelled(truth, result, interval, notes)
         of_frames = _count_masks(truth, result, frames)
     elif truth.kind == "one target":
@@ -226,8 +227,8 @@ def score_clip(
     return ClipScore(scored, counts, each)
 
 
-def _labelled(truth: Truth, result: Result, interval: int, notes: list[str]) -> list[int]:
-    """The labelled frames that the result has."""
+def _labelled(truth: ClipTruth, result: Result, interval: int, notes: list[str]) -> list[int]:
+    """Return the labelled frames that the result has."""
     end = result.frames or truth.frames[-1]
     frames = [f for f in truth.frames if 1 <= f <= end and (f - 1) % interval == 0]
     beyond = [f for f in truth.frames if not 1 <= f <= end]
@@ -244,11 +245,11 @@ def _labelled(truth: Truth, result: Result, interval: int, notes: list[str]) -> 
             "is it the same clip? See --first-frame"
         )
     elif beyond:
-        notes.append(f"{result.name}: truth goes to frame {beyond[-1]}, the result to {end}; the rest is not scored")
+        notes.append(f"{result.name}: truth ends at frame {beyond[-1]}, the result at {end}; the rest is not scored")
     return frames
 
 
-def _count_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
+def _count_masks(truth: ClipTruth, result: Result, frames: list[int]) -> dict[str, list[Any]]:
     if not result.has_masks:
         raise InputError(f"{result.place} has no masks to compare; run dddas detect with --save masks")
     counted: dict[str, list[Any]] = {"pixels": [], "boxes": []} if truth.labels.separate else {"pixels": []}
@@ -266,7 +267,7 @@ def _count_masks(truth: Truth, result: Result, frames: list[int]) -> dict[str, l
 
 
 def _count_tracks(
-    truth: Truth,
+    truth: ClipTruth,
     true: TrackTable,
     result: Result,
     found: TrackTable,
@@ -274,7 +275,7 @@ def _count_tracks(
     interval: int,
     ignoring: Ignoring,
 ) -> tuple[int, str, TrackCounts | TargetTrack, Each]:
-    """Tracks are scored on every frame of the clip, labelled or not: a box where nobody is labelled is false."""
+    """Count tracks on every frame of the clip, labelled or not: a box in a frame without labels is false."""
     labelled = max(truth.frames[-1], truth.length)
     end = labelled if result.state == "complete" else min(labelled, result.frames)
     last = int(found.frame.max(initial=0))
@@ -286,13 +287,13 @@ def _count_tracks(
     if len(true.frame) and not ((true.frame - 1) % interval == 0).any():
         raise InputError(f"{truth.place} has no box{_of(interval)}")
     if last > labelled:
-        notes.append(f"{result.name}: tracks go to frame {last}, the truth to {labelled}; no more counts")
+        notes.append(f"{result.name}: tracks end at frame {last}, the truth at {labelled}; later frames are not scored")
     if end < labelled:
         note = f"{result.name}: the run is {result.state} after frame {end}; later frames are not scored"
         notes += [note] if note not in notes else []
     step = int(np.gcd.reduce(found.frame - 1)) if len(found.frame) else 0
     if step > interval:
-        notes.append(f"{result.name}: the tracks have every {step}th frame alone; --interval {step} scores just those")
+        notes.append(f"{result.name}: the tracks have only every {step}th frame; --interval {step} scores only these")
 
     def cut(table: TrackTable) -> TrackTable:
         return table.at((table.frame <= end) & ((table.frame - 1) % interval == 0))

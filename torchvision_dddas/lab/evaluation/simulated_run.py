@@ -1,4 +1,4 @@
-"""A scenario flown in the closed loop: simulated vehicles, the pipeline that steers them, its files and its score."""
+"""Fly a scenario in the closed loop: simulated vehicles, the pipeline that steers them, the files and the score."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -35,17 +35,17 @@ def run_scenario(
     progress: Callable[[str, int | None], AbstractContextManager[Callable[[], None]]] | None = None,
     zones: Zones | None = None,
 ) -> tuple[RunRecord, CrowdScore]:
-    """Fly a scenario and write everything under a folder; returns the record of the run and its score.
+    """Fly a scenario, write all files into a folder, and return the record of the run and its score.
 
-    zones: whose events are written too.
-    overrides: of the settings; scene: of the scenario. progress: given a name and the number of frames, a context with
-    a function that is called for each frame. Raises InputError for bad input.
+    zones: zones whose events are also written. overrides: of the settings. scene: of the scenario. progress: takes a
+    name and the number of frames, and returns a context with a function to call for each frame. Raise InputError for
+    bad input.
     """
     with SimulatedRunRecorder(folder, save) as output:
         chosen = load_scenario(scenario, scene, seed)
         if chosen.clip.located_by == "nothing":
             raise InputError(
-                f"scenario {scenario} is located by nothing, so that nothing can be steered; add "
+                f"scenario {scenario} has clip.located_by = nothing, so that vehicles cannot be steered; add "
                 "--scene clip.located_by='telemetry', or make files of it with `dddas simulate`"
             )
         own = scenario_settings(chosen, config)
@@ -103,6 +103,6 @@ def _no_progress(name: str, count: int | None) -> AbstractContextManager[Callabl
 
 
 def _log_notices(output: SimulatedRunRecorder, mission: Mission) -> None:
-    """Log what the run itself noticed to go wrong."""
+    """Log problems that the run itself noticed."""
     for notice in mission.notices():
         output.story.event(notice.frame, notice.text, notice.time_s, NOTICED)

@@ -65,7 +65,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Step:
+class DescentStep:
     """The parameters and losses after a step; step 0 is the start.
 
     loss: of the step's batch, NaN at step 0. watched: mean loss of the watched examples at the final softness; None if
@@ -90,7 +90,7 @@ class Descended:
 
     parameters: Parameters
     best: int
-    history: list[Step] = field(default_factory=list)
+    history: list[DescentStep] = field(default_factory=list)
     ended: str = ""
     failed: str = ""
     seconds: float = 0.0
@@ -108,7 +108,7 @@ def descend(
     parameters: Parameters,
     examples: Sequence[Example],
     plan: Plan | None = None,
-    tell: Callable[[Step], object] = lambda step: None,
+    tell: Callable[[DescentStep], object] = lambda step: None,
     place: Path | None = None,
     resume: bool = False,
 ) -> Descended:
@@ -171,7 +171,7 @@ class _Run:
         self.moved: set[str] = set()
         self.best: dict[str, Tensor] = {}
         self.least, self.best_step, self.since = math.inf, 0, 0
-        self.history: list[Step] = []
+        self.history: list[DescentStep] = []
         self.ended = self.failed = ""
         # Facts that determine the descent, which a checkpoint must match.
         used = "\n".join(f"{example.clip} {example.frame}" for example in (*self._learned, *self._watched))
@@ -185,7 +185,7 @@ class _Run:
             "examples": hashlib.sha256(used.encode()).hexdigest()[:16],
         }
 
-    def begin(self) -> Step:
+    def begin(self) -> DescentStep:
         """Measure the loss at the start."""
         with torch.no_grad():
             values = self._parameters.values()
@@ -193,7 +193,7 @@ class _Run:
             raise InputError(f"{cause}, before the first step")
         return self._record(0, self._softness(1), math.nan, measure=True)
 
-    def step(self) -> Step | None:
+    def step(self) -> DescentStep | None:
         """Take one step; return None if it failed."""
         plan, number = self._plan, self.history[-1].step + 1
         softness = self._softness(number)
@@ -245,7 +245,7 @@ class _Run:
         state = read_checkpoint(place, self._facts)
         self._parameters.load_state_dict(state["knobs"])
         self._adam.load_state_dict(state["adam"])
-        self.moved, self.history = set(state["moved"]), [Step(**step) for step in state["history"]]
+        self.moved, self.history = set(state["moved"]), [DescentStep(**step) for step in state["history"]]
         for name in self._SAVED:
             setattr(self, name, state[name])
 
@@ -260,7 +260,7 @@ class _Run:
             }
             write_checkpoint(place, self._facts, state | {name: getattr(self, name) for name in self._SAVED})
 
-    def _record(self, number: int, softness: float, loss: float, measure: bool) -> Step:
+    def _record(self, number: int, softness: float, loss: float, measure: bool) -> DescentStep:
         """Record the current parameters and, if `measure` is set, the loss of the watched examples."""
         watched = None
         with torch.no_grad():
@@ -271,8 +271,8 @@ class _Run:
                 watched = self._watched_mean(settled)
         if watched is not None and not math.isfinite(watched):
             self._fail(number, self._watched, settled, self._hardest)
-            return Step(number, softness, loss, None, values)
-        step = Step(number, softness, loss, watched, values)
+            return DescentStep(number, softness, loss, None, values)
+        step = DescentStep(number, softness, loss, watched, values)
         self.history.append(step)
         if watched is not None and (not self.best or watched < self.least - GAIN):
             self.least, self.best_step, self.since = watched, number, 0

@@ -12,7 +12,7 @@ from torchvision_dddas.config import TrackParameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.metrics.matching import EPSILON, LEAST, pair
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, Truth, labels_of
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable, labels_of
 from torchvision_dddas.lab.evaluation.studies.stages import open_clip
 from torchvision_dddas.tracking.score_tracker import DoubtRule
 from torchvision_dddas.types import DetectionTable, is_sampled
@@ -26,7 +26,7 @@ def check_masks(clips: Sequence[Clip], still: bool = False) -> None:
         raise InputError(f"{', '.join(bare)} {lack} no masks of moving targets; choose clips with masks by --clips")
 
 
-def labels_at(truth: Truth, frame: int, shape: tuple[int, ...]) -> np.ndarray:
+def labels_at(truth: ClipTruth, frame: int, shape: tuple[int, ...]) -> np.ndarray:
     """Return (H, W) labels by `labels_of`. shape: (H, W, ...) of the frame. Raise InputError if the sizes differ."""
     labels = labels_of(truth, frame)
     if labels.shape != shape[:2]:
@@ -80,7 +80,7 @@ class OwnedBoxes(NamedTuple):
     own: bool = False
 
 
-def match_owners(found: DetectionTable, truth: Truth, interval: int, parameters: TrackParameters) -> OwnedBoxes:
+def match_owners(found: DetectionTable, truth: ClipTruth, interval: int, parameters: TrackParameters) -> OwnedBoxes:
     """Match the detections of frames 1, 1 + interval, ... with the truth as the measures do, by IoU of 0.5 or more.
 
     Detections that are too doubtful for the tracker are left out. Targets that the measures ignore own boxes too. Raise

@@ -18,7 +18,7 @@ from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.lab.evaluation.studies.records import Spec
 from torchvision_dddas.lab.evaluation.studies.sweep import settings_toml
 from torchvision_dddas.lab.tuning.checkpoint import set_aside
-from torchvision_dddas.lab.tuning.descent import Descended, Plan, Step, descend
+from torchvision_dddas.lab.tuning.descent import Descended, DescentStep, Plan, descend
 from torchvision_dddas.lab.tuning.family import Prepared, prepare
 from torchvision_dddas.lab.tuning.parameters import TUNABLE
 from torchvision_dddas.lab.tuning.report import tuning_report
@@ -38,7 +38,7 @@ class Display:
     """
 
     message: Callable[[str], object] = lambda line: None
-    step: Callable[[Step], object] = lambda step: None
+    step: Callable[[DescentStep], object] = lambda step: None
     progress: Callable[[str, int | None], AbstractContextManager[Callable[[], object]]] = lambda name, count: (
         nullcontext(lambda: None)
     )
@@ -123,7 +123,7 @@ class Tuner:
         if self._resume and not place.is_file():
             self._display.message(f"there is no checkpoint at {place}: the descent starts from the settings")
 
-        def tell(step: Step) -> None:
+        def tell(step: DescentStep) -> None:
             if not self._state:
                 self._begin_record(ready)
             self._display.step(step)

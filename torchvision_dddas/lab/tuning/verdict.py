@@ -10,15 +10,15 @@ from typing import Any
 
 from torchvision_dddas.config import load_config, with_parameters
 from torchvision_dddas.lab.evaluation.studies.comparison import compare_studies, verdict
-from torchvision_dddas.lab.evaluation.studies.jobs import Event, Workers
+from torchvision_dddas.lab.evaluation.studies.jobs import JobEvent, Workers
 from torchvision_dddas.lab.evaluation.studies.records import Case, ScoredCase, ScoredStudy, Spec
-from torchvision_dddas.lab.evaluation.studies.runner import Plan, run_study
+from torchvision_dddas.lab.evaluation.studies.runner import StudyPlan, run_study
 from torchvision_dddas.lab.evaluation.studies.summary import Goal, goal_value
 from torchvision_dddas.lab.evaluation.studies.sweep import format_value, toml_value
 
 TIMES = "before", "after"
 
-Shown = Callable[[], AbstractContextManager[tuple[Callable[[Plan], object], Callable[[Event], object]]]]
+Shown = Callable[[], AbstractContextManager[tuple[Callable[[StudyPlan], object], Callable[[JobEvent], object]]]]
 """Shows the progress of a study: functions to call at its beginning and at each of its events."""
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.lab.evaluation.datasets import kinds
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Dataset, Source
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, Dataset, DatasetSource
 from torchvision_dddas.lab.simulation.truth import COLUMNS
 
 SIZE = (32, 24)  # of pictures and masks, px
@@ -21,7 +21,7 @@ WHITE, RED = 0xFFFFFF, 0xFF0000
 
 def read(kind: str, folder: Path, clips: Iterable[str] = ("*",), **options: Any) -> Dataset:
     """The data set that a study's file would name so."""
-    return kinds.read(Source(kind, folder, tuple(clips), options), Path())
+    return kinds.read(DatasetSource(kind, folder, tuple(clips), options), Path())
 
 
 def clip(kind: str, folder: Path, **options: Any) -> Clip:

@@ -41,5 +41,5 @@ def test_the_size_is_that_of_the_picture_and_the_head_of_the_file_is_enough(tmp_
 @pytest.mark.parametrize("content", [b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM", b"P6 3 ", b"no picture at all"])
 def test_a_file_that_is_no_picture_is_one_line(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.png is no picture that can be read"):
+    with pytest.raises(InputError, match=r"a\.png is not a readable picture"):
         size_of(tmp_path / "a.png")

@@ -115,7 +115,7 @@ def test_masks_and_boxes_without_identities_need_pictures(tmp_path: Path, name: 
         mask(path, {CAR: 1})
     else:
         text(path, content)
-    assert f"a clip without pictures; put them into {tmp_path / 'cars'}" in complaint("folder", tmp_path)
+    assert f"a clip without pictures; put the pictures into {tmp_path / 'cars'}" in complaint("folder", tmp_path)
 
 
 # -- simulated ---------------------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_without_masks_the_boxes_of_a_simulated_run_are_scored(tmp_path: Path) -
     text(tmp_path / "four/truth/gt.txt", "")
     assert "no target is visible in the pictures" in complaint("simulated", tmp_path)
     (tmp_path / "four/truth").rename(tmp_path / "four/lost")
-    assert "has no truth/; wanted what `dddas simulate --out` writes" in complaint("simulated", tmp_path)
+    assert "has no truth/; wanted the output of `dddas simulate --out`" in complaint("simulated", tmp_path)
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -180,7 +180,7 @@ def test_a_subset_of_davis_is_what_its_list_names(tmp_path: Path, path: str, lin
     assert [c.name for c in read("davis", tmp_path, subset="val", year="2016").clips] == ["dog"]
     assert "it has val" in complaint("davis", tmp_path, subset="test")
     (tmp_path / "Annotations").rename(tmp_path / "elsewhere")
-    expected = f"{tmp_path / 'Annotations/480p'} does not exist; wanted the masks, a folder a clip"
+    expected = f"{tmp_path / 'Annotations/480p'} does not exist; wanted the masks, one folder for each clip"
     assert complaint("davis", tmp_path) == expected
 
 
@@ -228,16 +228,16 @@ def test_sets_and_plain_clips_of_bms_are_read_and_the_second_of_a_name_is_left_o
     layouts.MAKE["folder"](tmp_path, "cars1")
     found = read("bms", tmp_path)
     assert [c.name for c in found.clips] == ["cars1", "cars4"]
-    assert found.missing[0].endswith("of the same name is not")
+    assert found.missing[0].endswith("of the same name is not read")
 
 
 @pytest.mark.parametrize(
     ("content", "line"),
     [
-        (definition([0], 3, {"a.ppm": "a.pgm"}), "is no definition of a clip; wanted two regions or more"),
+        (definition([0], 3, {"a.ppm": "a.pgm"}), "is not a definition of a clip; wanted two regions or more"),
         (definition([0, 9], 3, {}), "names 0 labelled frames, 0 files and 0 pictures; wanted as many of each"),
         (definition([0, 9], 3, {"a.ppm": "a.pgm"}).replace("\n9\n", "\nnine\n"), "wanted a whole number, got 'nine'"),
-        (definition([0, 9], 3, {"a.ppm": "x/.."}), "'x/..' is no name of a file"),
+        (definition([0, 9], 3, {"a.ppm": "x/.."}), "'x/..' is not the name of a file"),
     ],
 )
 def test_a_damaged_definition_is_one_line(tmp_path: Path, content: str, line: str) -> None:
@@ -290,7 +290,7 @@ def test_each_variant_of_uav123_has_its_folders_rate_and_table(tmp_path: Path) -
 def test_a_building_does_not_move(tmp_path: Path) -> None:
     layouts.uav123(tmp_path, "building4")
     line = complaint("uav123", tmp_path)
-    assert line.endswith("its target is a building, which does not move; name it in `still` if nothing else does")
+    assert line.endswith("its target is a building; name the clip in `still` if nothing moves")
     assert clip("uav123", tmp_path, still=["building4"]).still
 
 
@@ -351,7 +351,7 @@ def test_regions_categories_and_attributes_of_uavdt(tmp_path: Path) -> None:
     (line,) = read("uavdt", tmp_path, attributes=["night"]).missing
     assert "M0101: " in line and "does not hold 10 times 0 or 1" in line
     (tmp_path / "M_attr/train/M0101_attr.txt").unlink()
-    assert "M0101: no attributes, which belong in" in read("uavdt", tmp_path, attributes=["night"]).missing[0]
+    assert "M0101: no attributes; they belong in" in read("uavdt", tmp_path, attributes=["night"]).missing[0]
 
 
 def test_stanford_drone_counts_frames_from_one_and_leaves_out_lost_rows(tmp_path: Path) -> None:
@@ -412,7 +412,7 @@ def test_a_crop_shows_one_person_in_its_middle(tmp_path: Path) -> None:
     assert found.name == "crops-96x160"
     assert (height, y, x + width / 2) == (96, 32, 48) and width == pytest.approx(39.36)
     (line, _) = read("inria", tmp_path / "crops", body_height_px=200.0).missing
-    assert "no body of 200 px fits; see body_height_px" in line
+    assert "too low for a body of 200 px; see body_height_px" in line
 
 
 # -- MOTChallenge ------------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from tests.lab.evaluation.datasets.layouts import (
 )
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets import kinds
-from torchvision_dddas.lab.evaluation.datasets.record import Source
+from torchvision_dddas.lab.evaluation.datasets.record import DatasetSource
 
 
 def good(kind: str) -> str:
@@ -84,15 +84,20 @@ HEAD = "name,frame,id,x,y,w,h\ncar,0,7,1,2,8,5\n"
 VIVID, VISDRONE, UAVDT = "bad_truth.csv", "annotations/bad.txt", "UAV-benchmark-MOTD_v1.0/GT/bad_gt_whole.txt"
 SDD, KITTI, INRIA = "annotations/quad/bad/annotations.txt", "training/label_02/bad.txt", "Test/annotations/b.txt"
 BMS = "Trainingset/bad/GroundTruth/"
-SIZES = "wanted masks of the size of the pictures"
+SIZES = "wanted masks of the same size"
 SPOILED: list[tuple[str, str, str | Callable[[Path], None] | None, str]] = [
-    ("folder", "bad/masks/1.png", None, "has no truth; nothing in it can be scored"),
+    ("folder", "bad/masks/1.png", None, "has no truth, so that it cannot be scored"),
     ("folder", "bad/masks/7.png", lambda p: mask(p, {CAR: 1}), "its pictures are 0 to 2; is it the same clip?"),
     ("folder", "bad/masks/1.png", other_size, "1.png is 40×30 pixels, but 0.png 32×24; " + SIZES),
     ("folder", "bad/gt.txt", "", "is empty: wanted one box a line"),
     ("folder", "bad/gt.txt", "1,2\n", "has 2 columns; wanted 4 (x,y,w,h) or MOTChallenge's"),
     ("folder", "bad/gt.txt", "9,1,2,3,4,5,1\n", "labels frame 9, but the clip has 3 frames; is it the same clip?"),
-    ("folder", "bad/boxes_xywh.txt", "1,2,3,4\n", "has 1 lines, but the clip 3 frames; wanted a line a frame"),
+    (
+        "folder",
+        "bad/boxes_xywh.txt",
+        "1,2,3,4\n",
+        "has 1 lines, but the clip has 3 frames; wanted one line for each frame",
+    ),
     ("folder", "bad/boxes_xywh.txt", "1,2,3,2e9\n", "a box is 1,2,3,2e9; wanted numbers from -1e+09 to 1e+09"),
     ("davis", "Annotations/480p/bad/*", None, "holds no masks; wanted the truth of the clip"),
     ("davis", "JPEGImages/480p/bad/*", None, "holds no pictures; wanted the frames of the clip"),
@@ -103,31 +108,36 @@ SPOILED: list[tuple[str, str, str | Callable[[Path], None] | None, str]] = [
         ("cdnet", "PTZ/bad/temporalROI.txt", region, f"says '{region}'; wanted the first and the last frame that count")
         for region in ("3", "five six", "5 3", "-1 4")
     ),
-    ("cdnet", "PTZ/bad/temporalROI.txt", "90 99", "labels none of the frames 90 to 99; wanted masks"),
+    ("cdnet", "PTZ/bad/temporalROI.txt", "90 99", "labels no frame from 90 to 99; wanted masks"),
     ("bms", BMS + "badDef.dat", None, "has no truth; wanted badDef.dat and masks in"),
-    ("bms", "Trainingset/bad/*.jpg", None, "is the truth of a clip without pictures; put them into"),
-    ("bms", BMS + "bad_0004_gt.ppm", None, "bad_0004_gt.ppm does not exist; the definition beside it names it"),
+    ("bms", "Trainingset/bad/*.jpg", None, "is the truth of a clip without pictures; put the pictures into"),
+    ("bms", BMS + "bad_0004_gt.ppm", None, "bad_0004_gt.ppm does not exist, but the definition beside it names it"),
     ("bms", BMS + "bad_0004_gt.ppm", other_size, "is 40×30 pixels, but bad_01.jpg 32×24"),
     ("bms", BMS + "badDef.dat", definition([0, 9], 5, {"x.ppm": "x.pgm"}), "picture x.ppm of frame 0 is not in"),
     ("uav123", "anno/UAV123/bad.txt", "", "is empty"),
-    ("uav123", "anno/UAV123/bad.txt", "a,b,c,d\n", "is no table of boxes"),
-    ("uav123", "anno/UAV123/bad.txt", "1,2,3,4\n", "has 1 lines, but the clip 4 frames; wanted a line a frame"),
-    ("uav123", "data_seq/UAV123/bad/*", None, "or configSeqs.m, which says of what sequence bad is a part"),
+    ("uav123", "anno/UAV123/bad.txt", "a,b,c,d\n", "is not a table of boxes"),
+    (
+        "uav123",
+        "anno/UAV123/bad.txt",
+        "1,2,3,4\n",
+        "has 1 lines, but the clip has 4 frames; wanted one line for each frame",
+    ),
+    ("uav123", "data_seq/UAV123/bad/*", None, "or configSeqs.m, which states the sequence that bad is part of"),
     ("vivid", "bad/*", None, "holds no pictures; wanted frame00000.jpg and so on"),
-    ("vivid", "bad_gt.txt", None, "has no truth of it; wanted bad_truth.csv, bad*.txt or a folder bad_mask"),
+    ("vivid", "bad_gt.txt", None, "has no truth of this clip; wanted bad_truth.csv, bad*.txt or a folder bad_mask"),
     ("vivid", VIVID, HEAD + "car,99,7,1,2,8,5\n", "line 3: there is no picture 99; the clip has 0 to 20"),
     ("vivid", VIVID, HEAD + "car,1,7\n", "line 3: 3 columns; wanted name,frame,identity,x,y,width,height"),
     ("vivid", VIVID, HEAD + "car,1,7,a,2,8,5\n", "line 3: wanted a number from -1e+09 to 1e+09, got 'a'"),
     ("vivid", VIVID, HEAD + "car,0,7,1,2,8,5\n", "lines 2 and 3: identity 7 twice in frame 1"),
-    ("vivid", VIVID, HEAD + "car,1,7.5,1,2,8,5\n", "7.5 is no identity; wanted whole numbers"),
+    ("vivid", VIVID, HEAD + "car,1,7.5,1,2,8,5\n", "7.5 is not an identity; wanted whole numbers"),
     ("vivid", VIVID, "name,frame,id,x,y,w,h\n", "holds no boxes"),
     ("vivid", "bad_gt.txt", "", "is empty; wanted frame,x,y,width,height"),
     ("vivid", "bad_gt.txt", "1,2\n", "has 2 columns; wanted frame,x,y,width,height"),
-    ("vivid", "bad_gt.txt", "0,1,2,8,5\n0,1,2,8,5\n", "line 2: frame 0 is there twice"),
-    ("vivid", "bad_gt.txt", "1,2,8,5\n", "has 1 lines, but the clip 21 frames; wanted a line a frame"),
+    ("vivid", "bad_gt.txt", "0,1,2,8,5\n0,1,2,8,5\n", "line 2: frame 0 occurs twice"),
+    ("vivid", "bad_gt.txt", "1,2,8,5\n", "has 1 lines, but the clip has 21 frames; wanted one for each"),
     ("vivid", "bad_gt.txt", "0,1,2,8,5\n1,2,8,5\n", "line 2: 4 columns; the first line has 5"),
     ("vivid", "bad_gt.txt", "NaN,1,2,8,5\n", "line 1: there is no picture nan"),
-    ("motchallenge", "bad/gt/gt.txt", None, "no truth, which belongs in "),
+    ("motchallenge", "bad/gt/gt.txt", None, "no truth; it belongs in "),
     ("motchallenge", "bad/gt/gt.txt", "1,1,10,20,30\n", "wanted"),
     ("motchallenge", "bad/gt/gt.txt", "\n", "is empty"),
     ("motchallenge", "bad/gt/gt.txt", "1,1,1,2,3,4,1,1,1\n" * 2, "identity 1 twice in frame 1"),
@@ -138,8 +148,8 @@ SPOILED: list[tuple[str, str, str | Callable[[Path], None] | None, str]] = [
     ("motchallenge", "bad/gt/gt.txt", "1,-1,1,2,3,4,1\n", "has no identities; wanted MOTChallenge's"),
     ("motchallenge", "bad/seqinfo.ini", "[Sequence]\nseqLength=4\n", "has 3 frames, but seqinfo.ini says 4"),
     ("motchallenge", "bad/seqinfo.ini", "nothing\n", "does not hold seqLength"),
-    ("motchallenge", "bad/seqinfo.ini", f"[Sequence]\nseqLength=3\nimDir={'9' * 300}\n", "is no folder's name"),
-    ("motchallenge", "bad/img1/000002.png", None, "has 000003.png where frame 2 belongs"),
+    ("motchallenge", "bad/seqinfo.ini", f"[Sequence]\nseqLength=3\nimDir={'9' * 300}\n", "is not a folder's name"),
+    ("motchallenge", "bad/img1/000002.png", None, "has 000003.png in place of frame 2"),
     ("visdrone", VISDRONE, "1,1,2,3,4,5,1\n", "line 1: 7 columns; wanted frame,identity,left"),
     ("visdrone", VISDRONE, "1,1,2,3,4,5,1,12,0,0\n", "line 1: the category is '12'; wanted 0 to 11"),
     ("visdrone", VISDRONE, "3,1,2,3,4,5,1,1,0,0\n", "labels frame 3, but the clip has 2"),
@@ -163,11 +173,11 @@ SPOILED: list[tuple[str, str, str | Callable[[Path], None] | None, str]] = [
     ("kitti", KITTI, kitti_label(0, 0, "Dog"), "the type is 'Dog'; wanted Car"),
     ("kitti", KITTI, kitti_label(5, 0), "labels frame 6, but the clip has 2"),
     ("inria", INRIA, inria_text((34, 24)), "it is 33×24 pixels, but"),
-    ("inria", INRIA, inria_text(announced=2), "announces 2 objects and has the boxes of 1"),
+    ("inria", INRIA, inria_text(announced=2), "announces 2 objects, but has 1 boxes"),
     ("inria", INRIA, inria_text((0, 24)), "says the picture is 0×24 pixels"),
     ("inria", INRIA, "", "does not hold 'Image size'"),
-    ("inria", INRIA, inria_text().replace("(19, 21)", "(5, 21)"), "has a box whose end is before its beginning"),
-    ("inria", "Test/pos/b.png", "no picture", "is no picture that can be read"),
+    ("inria", INRIA, inria_text().replace("(19, 21)", "(5, 21)"), "has a box whose end is before its start"),
+    ("inria", "Test/pos/b.png", "no picture", "is not a readable picture"),
     ("simulated", "bad/truth/*.csv", None, "does not exist; the run was not finished, simulate it again"),
     ("simulated", "bad/frames/*", None, "holds neither frames/ nor clip.mp4; simulate it with --save frames,masks"),
     ("simulated", "bad/frames/000002.jpg", None, "labels frame 2, but the clip has 1 frames; is it the same clip?"),
@@ -178,8 +188,8 @@ SPOILED: list[tuple[str, str, str | Callable[[Path], None] | None, str]] = [
         "lacks kind, visible_px; want",
     ),
     ("simulated", "bad/run.json", '{"state": "interrupted", "clip": {"rate_hz": 1}}', "the run is interrupted"),
-    ("simulated", "bad/run.json", "[]", "run.json does not hold the frames a second"),
-    ("simulated", "bad/run.json", '{"clip": 3, "state": "complete"}', "run.json does not hold the frames a second"),
+    ("simulated", "bad/run.json", "[]", "run.json does not hold the frames per second"),
+    ("simulated", "bad/run.json", '{"clip": 3, "state": "complete"}', "run.json does not hold the frames per second"),
 ]
 
 
@@ -222,7 +232,7 @@ def test_boxes_without_pictures_are_a_clip_and_a_note(kind: str, pictures: str, 
     (clip,), (note,) = found.clips, found.notes
     assert (clip.pictures, found.missing) == ((), ())
     assert clip.frames == EXPECTED[kind][0] - (kind == "sdd")  # a lost row labels the last frame there
-    assert note.startswith(f"{good(kind)}: no pictures, which belong in ") and pictures in note
+    assert note.startswith(f"{good(kind)}: no pictures; they belong in ") and pictures in note
 
 
 @pytest.mark.parametrize("kind", ["folder", "motchallenge"])
@@ -247,7 +257,7 @@ def test_each_kind_is_documented_and_refuses_unknown_options_and_folders_without
     (tmp_path / "empty").mkdir()
     found = read(kind, tmp_path / "empty")
     assert found.clips == () and found.missing
-    assert all("wanted " in line or "belongs there" in line for line in found.missing)
+    assert all("wanted " in line for line in found.missing)
     with pytest.raises(InputError, match=f"a data set of kind {kind} has no option 'colour'; it takes"):
         read(kind, tmp_path, colour="red")
     docs = (Path(__file__).parents[4] / "docs" / "datasets.md").read_text(encoding="utf-8")
@@ -262,11 +272,19 @@ def test_each_kind_is_documented_and_refuses_unknown_options_and_folders_without
         ("folder", {"still": "cars1"}, "still of a data set of kind folder must be a list of texts, got 'cars1'"),
         ("inria", {"body_height_px": "96"}, "must be a number, got '96'"),
         ("davis", {"year": 2016}, "must be a text, got 2016"),
-        ("visdrone", {"classes": ["dog"]}, "'dog' is no class of VisDrone; wanted some of pedestrian, people"),
-        ("uavdt", {"attributes": ["dawn"]}, "'dawn' is no class of UAVDT's sequences; wanted some of daylight, night"),
-        ("motchallenge", {"benchmark": "MOT18"}, "'MOT18' is no benchmark; wanted one of MOT15, MOT16, MOT17, MOT20"),
-        ("uav123", {"variant": "UAV124"}, "'UAV124' is no variant of UAV123; wanted UAV123, UAV20L, UAV123_10fps"),
-        ("imagenet", {}, "'imagenet' is no kind of data set; wanted one of folder, bms, davis"),
+        ("visdrone", {"classes": ["dog"]}, "'dog' is not a class of VisDrone; wanted some of pedestrian, people"),
+        (
+            "uavdt",
+            {"attributes": ["dawn"]},
+            "'dawn' is not a class of UAVDT's sequences; wanted some of daylight, night",
+        ),
+        (
+            "motchallenge",
+            {"benchmark": "MOT18"},
+            "'MOT18' is not a benchmark; wanted one of MOT15, MOT16, MOT17, MOT20",
+        ),
+        ("uav123", {"variant": "UAV124"}, "'UAV124' is not a variant of UAV123; wanted UAV123, UAV20L, UAV123_10fps"),
+        ("imagenet", {}, "'imagenet' is not a kind of data set; wanted one of folder, bms, davis"),
     ],
 )
 def test_a_wrong_option_is_refused(kind: str, option: dict[str, Any], line: str, tmp_path: Path) -> None:
@@ -278,7 +296,7 @@ def test_a_wrong_option_is_refused(kind: str, option: dict[str, Any], line: str,
 def test_patterns_pick_clips_in_natural_order_from_a_folder_relative_to_the_base(tmp_path: Path) -> None:
     for name in ("car10", "car2", "car1", "people1"):
         MAKE["folder"](tmp_path / "data", name)
-    found = kinds.read(Source("folder", Path("../data"), ("car*",)), tmp_path / "studies")
+    found = kinds.read(DatasetSource("folder", Path("../data"), ("car*",)), tmp_path / "studies")
     assert found.folder == tmp_path / "data"
     assert [clip.name for clip in found.clips] == ["car1", "car2", "car10"]
     (line,) = read("folder", tmp_path / "data", ["boats*"]).missing

@@ -100,8 +100,8 @@ def test_targets_found_in_their_places_score_full():
         "crowds: 100.0 % of 2 seen and located, 0.00 false blobs a frame",
         "error of a crowd's place: mean 0.00 m, median 0.00, 95 % 0.00",
         "error of a target from its people: mean 0.00 m, median 0.00",
-        "95 % ellipses hold the truth in 100.0 %",
-        "mean error of the known places of all crowds over the whole time: 0.00 m; 10 m where no place is known",
+        "95 % ellipses contain the truth in 100.0 %",
+        "mean error of the known places of all crowds over the whole time: 0.00 m; 10 m if no place is known",
     ]
 
 

@@ -187,7 +187,7 @@ def test_a_box_in_a_frame_without_truth_is_false_up_to_the_end_of_the_clip(tmp_p
     truth, out = clip(tmp_path, tracks__txt=FOUND + rows((4, 9), 7))
     report = evaluate(truth, out)
     assert report["clips"]["out"]["tracks"]["n_fp"] == 1
-    assert report["notes"] == ["out: tracks go to frame 9, the truth to 2; no more counts"]
+    assert report["notes"] == ["out: tracks end at frame 9, the truth at 2; later frames are not scored"]
     (tmp_path / "seqinfo.ini").write_text("[Sequence]\nseqLength=5\n")
     scored = evaluate(truth, out)["clips"]["out"]
     assert (scored["frames"], scored["tracks"]["n_fp"]) == (5, 2)
@@ -213,7 +213,7 @@ def test_one_labelled_target_is_scored_by_masks_or_tracks(tmp_path):
     report = evaluate(tmp_path / "boxes.txt", write_result(tmp_path / "masks", [SQUARE, NOTHING, SQUARE]))
     target = report["clips"]["masks"]["target"]
     assert (target["hit"], target["other_blobs_per_frame"]) == (0.5, 0)
-    assert report["notes"] == ["masks: truth goes to frame 4, the result to 3; the rest is not scored"]
+    assert report["notes"] == ["masks: truth ends at frame 4, the result at 3; the rest is not scored"]
     found = "1,3,0,0,10,20,1\n1,4,50,50,5,5,1\n3,5,0,0,10,20,1\n"
     scored = evaluate(*clip(tmp_path, "0,0,10,20\nnan,nan,nan,nan\n0,0,10,20\n", tracks__txt=found))["clips"]["out"]
     assert set(scored) == {"frames", "target_track"}
@@ -228,7 +228,7 @@ def test_masks_do_not_score_tracks_and_a_note_says_so(tmp_path):
         (out / name).unlink()
     report = evaluate(tmp_path / "truth", out)
     assert (report["clips"]["out"]["pixels"]["f"], report["clips"]["out"]["boxes"]["f1"]) == (1, 1)
-    assert report["notes"] == ["out: tracks are not scored, for masks do not tell identities"]
+    assert report["notes"] == ["out: tracks are not scored, because masks hold no identities"]
 
 
 def test_tracks_of_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_counts(tmp_path):

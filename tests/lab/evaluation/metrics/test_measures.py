@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchvision_dddas.lab.evaluation.metrics import boxes, metres, pixels
-from torchvision_dddas.lab.evaluation.metrics.boxes import RATES, Boxes, OneTarget, judged
+from torchvision_dddas.lab.evaluation.metrics.boxes import RATES, BoxCounts, OneTarget, judged
 from torchvision_dddas.lab.evaluation.metrics.matching import counted, pair
 from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable
 
 
 def test_pixels_by_hand():
@@ -38,13 +38,13 @@ def test_boxes_by_hand():
     assert boxes.iou(a, b)[0] == pytest.approx([1, 4 / 28, 0, 4 / 16, 0])
     found = np.array([[0, 0, 10, 10], [0, 1, 10, 10], [50, 50, 5, 5.0]])
     truth = np.array([[0, 1, 10, 10], [0, 0, 10, 10], [90, 90, 5, 5.0]])
-    assert boxes.match(found, truth) == Boxes(hit=2, false=1, missed=1)
-    assert boxes.measures(Boxes(2, 1, 1)) == pytest.approx(dict.fromkeys(("precision", "recall", "f1"), 2 / 3))
+    assert boxes.match(found, truth) == BoxCounts(hit=2, false=1, missed=1)
+    assert boxes.measures(BoxCounts(2, 1, 1)) == pytest.approx(dict.fromkeys(("precision", "recall", "f1"), 2 / 3))
 
 
 @pytest.mark.parametrize(
     ("found", "truth", "expected"),
-    [(1, 2, Boxes(1, 0, 1)), (0, 2, Boxes(0, 0, 2)), (2, 0, Boxes(0, 2, 0)), (0, 0, Boxes())],
+    [(1, 2, BoxCounts(1, 0, 1)), (0, 2, BoxCounts(0, 0, 2)), (2, 0, BoxCounts(0, 2, 0)), (0, 0, BoxCounts())],
 )
 def test_one_detection_serves_one_true_box(found, truth, expected):
     assert boxes.match(np.ones((found, 4)), np.ones((truth, 4))) == expected
@@ -161,10 +161,12 @@ def table(*boxes: tuple[float, float, float, float]) -> TrackTable:
 
 
 PERSON, RIDER, CAR = (0, 0, 10, 20), (100, 0, 10, 20), (102, 0, 10, 20)
-TRUTH = Truth("boxes", Path("gt.txt"), {}, {1: table(PERSON).box_px}, table(PERSON), table(RIDER), ignoring="removed")
+TRUTH = ClipTruth(
+    "boxes", Path("gt.txt"), {}, {1: table(PERSON).box_px}, table(PERSON), table(RIDER), ignoring="removed"
+)
 
 
-def counts(truth: Truth, *boxes: tuple[float, float, float, float]) -> list[bool]:
+def counts(truth: ClipTruth, *boxes: tuple[float, float, float, float]) -> list[bool]:
     found = table(*boxes)
     return counted(truth, found.frame, found.box_px).tolist()
 
@@ -195,7 +197,7 @@ def test_the_same_boxes_are_left_out_as_in_matching_tracks() -> None:
     real = rng.random(320) < 0.6
     found = TrackTable(frame, identity, labelled.box_px + rng.normal(0, 5, (320, 4)) * (1, 1, 0, 0))
     true, ignored = labelled.at(real), labelled.at(~real)
-    truth = Truth("boxes", Path("gt.txt"), {}, true.boxes_by_frame(), true, ignored, ignoring="removed")
+    truth = ClipTruth("boxes", Path("gt.txt"), {}, true.boxes_by_frame(), true, ignored, ignoring="removed")
     kept = counted(truth, found.frame, found.box_px)
     assert 0.3 < kept.mean() < 0.9
     theirs, ours = pair(true, found, ignored, "removed"), pair(true, found.at(kept))

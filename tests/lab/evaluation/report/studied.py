@@ -8,9 +8,9 @@ import numpy as np
 
 from tests.lab.evaluation.studies.scored_clips import found_of, png
 from torchvision_dddas.config import Settings
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
-from torchvision_dddas.lab.evaluation.metrics.truth import Positions, TrackTable, Truth
-from torchvision_dddas.lab.evaluation.studies.records import Case, Found, Results, Spec, Task
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable, TruePositions
+from torchvision_dddas.lab.evaluation.studies.records import Case, Findings, Results, Spec, Task
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 
 SIZE = (160, 120)
@@ -18,7 +18,7 @@ FRAMES = 6
 HOSTILE = 'a <b>bold</b> & "quoted" clip'
 
 
-def found(frame, box_px, identity=None, masks=None, east_north_m=None) -> Found:
+def found(frame, box_px, identity=None, masks=None, east_north_m=None) -> Findings:
     """A result by its boxes."""
     names = np.full(len(frame), -1) if identity is None else identity
     rows = np.c_[np.array(frame), names, np.reshape(box_px, (-1, 4)), np.linspace(0.9, 0.3, len(frame))]
@@ -28,7 +28,7 @@ def found(frame, box_px, identity=None, masks=None, east_north_m=None) -> Found:
     return replace(result, east_north_m=places, covariance_m2=covariance, seconds=seconds, peak_mb=101.0)
 
 
-def scored(clip: Clip, task: Task, result: Found) -> Case:
+def scored(clip: Clip, task: Task, result: Findings) -> Case:
     return Case(clip, task, result, score(clip, task, result))
 
 
@@ -48,12 +48,12 @@ def masked_clip(folder: Path, name: str, off: int) -> Case:
         cv2.imwrite(str(files["masks"][k]), label)
         masks[k] = png(np.roll(label, off * k, axis=1) * 255)
     boxes = [[(10 + off) * k, 40, 20, 20] for k in range(1, FRAMES + 1)]
-    truth = Truth("masks", place / "masks", files["masks"], {})
+    truth = ClipTruth("masks", place / "masks", files["masks"], {})
     clip = Clip(name, place, tuple(files["frames"].values()), 10.0, FRAMES, truth)
     return scored(clip, "motion", found(range(1, FRAMES + 1), boxes, masks=masks))
 
 
-def boxed_truth(place: Path) -> Truth:
+def boxed_truth(place: Path) -> ClipTruth:
     """Two targets side by side, one of which goes to the right, and where they are on the ground."""
     frame = np.repeat(np.arange(1, FRAMES + 1), 2)
     identity = np.tile([1, 2], FRAMES)
@@ -61,8 +61,8 @@ def boxed_truth(place: Path) -> Truth:
     box_px = np.stack([np.where(identity == 1, 10.0 * frame, 100.0), 20.0 + 50 * (identity == 2), side_px, side_px], 1)
     places = np.stack([frame * 1.0, identity * 5.0], axis=1)
     by_frame = {int(k): box_px[frame == k] for k in np.unique(frame)}
-    table, positions = TrackTable(frame, identity, box_px), Positions(frame, identity, places)
-    return Truth("boxes", place, {}, by_frame, table, None, FRAMES, positions=positions)
+    table, positions = TrackTable(frame, identity, box_px), TruePositions(frame, identity, places)
+    return ClipTruth("boxes", place, {}, by_frame, table, None, FRAMES, positions=positions)
 
 
 def tracked_clip(folder: Path, task: Task, name: str) -> Case:
@@ -87,6 +87,6 @@ def study(folder: Path) -> Results:
         tracked_clip(folder, "location", "ground"),
         Case(Clip("broken", folder), "motion", cause="its <masks> are 3x3, the result 4x4"),
     )
-    spec = Spec("small <study>", (Source("folder", folder, ("*",)),))
+    spec = Spec("small <study>", (DatasetSource("folder", folder, ("*",)),))
     facts = {"backend": "onboard", "datasets": [{"kind": "folder", "folder": folder, "terms": "free", "clips": 6}]}
     return Results(spec, Settings(), cases, ("lost: it has no truth",), facts)

@@ -13,7 +13,7 @@ from tests.lab.evaluation.report.studied import FRAMES, HOSTILE, SIZE, masked_cl
 from tests.pages import Page
 from torchvision_dddas.io.output.run_record import finite
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
-from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth
 from torchvision_dddas.lab.evaluation.report import study_report, worst_frames
 from torchvision_dddas.lab.evaluation.report.task_charts import MOST_FAINT, ranked_charts
 from torchvision_dddas.lab.evaluation.report.worst_frames import (
@@ -133,7 +133,9 @@ def test_a_fault_of_few_pixels_is_seen_in_a_large_picture():
 
 def test_boxes_differ_by_their_lines_too():
     true_px, found_px = np.array([[10, 10, 40, 40], [100, 10, 40, 40]], float), np.array([[12, 10, 40, 40.0]])
-    boxes = worst_frames.Boxes(true_px, found_px, np.array([0]), ["", ""], [""], np.zeros(1, bool), np.ones(1, bool))
+    boxes = worst_frames.FrameBoxes(
+        true_px, found_px, np.array([0]), ["", ""], [""], np.zeros(1, bool), np.ones(1, bool)
+    )
     result = decode(worst_frames.box_pair(None, SIZE, boxes).result)
     scale = result.shape[1] / SIZE[0]
     lower = result[round(50 * scale), round(100 * scale) : round(140 * scale)]
@@ -152,7 +154,7 @@ def test_a_change_of_identity_is_named_and_the_lost_target_is_missed(tmp_path):
 
 def test_beside_one_labelled_target_other_boxes_are_not_judged(tmp_path):
     one = {frame: boxes[:1] for frame, boxes in studied.boxed_truth(tmp_path).boxes.items()}
-    clip = Clip("one", tmp_path, (), 10.0, FRAMES, Truth("one target", tmp_path, {}, one))
+    clip = Clip("one", tmp_path, (), 10.0, FRAMES, ClipTruth("one target", tmp_path, {}, one))
     boxes = worst_frames.boxes_at(replace(tracked_clip(tmp_path, "tracking", "x"), clip=clip, task="motion"), 1)
     assert boxes.of_found.tolist() == [0, -1] and boxes.judged.tolist() == [True, False]
 

@@ -9,7 +9,7 @@ import numpy as np
 from torchvision_dddas.config import Settings
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
-from torchvision_dddas.lab.evaluation.studies.records import Case, Found, Results, Scored, Spec, Task
+from torchvision_dddas.lab.evaluation.studies.records import Case, Findings, Results, Scored, Spec, Task
 
 SIZE = (60, 80)
 
@@ -33,10 +33,10 @@ def walk(seed, frames=30, people=4, miss=0.15):
     return np.array(true), np.array(found)[order]
 
 
-def found_of(rows, frames, masks=None, identities=True) -> Found:
+def found_of(rows, frames, masks=None, identities=True) -> Findings:
     """What a stage would have found."""
     count = len(rows)
-    return Found(
+    return Findings(
         rows[:, 0].astype(np.int64),
         rows[:, 2:6],
         rows[:, 6],
@@ -95,7 +95,7 @@ def tracked(folder: Path, seed=0, frames=30):
     return Clip(folder.name, folder, truth=truths.load_truth(folder)), found_of(rows, frames + 3)
 
 
-def as_files(folder: Path, found: Found, interval=1, identities=False) -> Path:
+def as_files(folder: Path, found: Findings, interval=1, identities=False) -> Path:
     """What dddas detect, or dddas track, would have written of it."""
     folder.mkdir(parents=True)
     name = "tracks.txt" if identities else "detections.txt"
@@ -117,6 +117,6 @@ def as_files(folder: Path, found: Found, interval=1, identities=False) -> Path:
     return folder
 
 
-def study_of(*cases: tuple[Clip, Task, Found | None, Scored | None, str], name="study") -> Results:
+def study_of(*cases: tuple[Clip, Task, Findings | None, Scored | None, str], name="study") -> Results:
     """A study that was run."""
     return Results(Spec(name, ()), Settings(), tuple(Case(*case) for case in cases))

@@ -15,13 +15,15 @@ from hypothesis import strategies as st
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import PartFile
+from torchvision_dddas.lab.evaluation.metrics.boxes import BoxCounts
+from torchvision_dddas.lab.evaluation.metrics.metres import LocatedCounts
 from torchvision_dddas.lab.evaluation.studies import cache
 from torchvision_dddas.lab.evaluation.studies.cache import Cache, digest, files_digest, pack, unpack
-from torchvision_dddas.lab.evaluation.studies.records import Found
+from torchvision_dddas.lab.evaluation.studies.records import Findings
 
 KEY, OTHER = "ab" + "0" * 62, "cd" + "0" * 62
 RNG = np.random.default_rng(0)
-FOUND = Found(
+FOUND = Findings(
     *(np.array([1, 1, 4]), RNG.random((3, 4)), RNG.random(3), np.array([7, -1, 7])),
     *(np.full((3, 2), np.nan), np.full((3, 2, 2), np.nan), np.array([1, 2, 4])),
     masks={2: b"\x89PNG", 4: b""},
@@ -35,7 +37,7 @@ WHOLE = pack(FOUND)
 
 def test_a_result_comes_back_to_the_last_digit() -> None:
     back = unpack(WHOLE)
-    assert isinstance(back, Found) and pack(back) == WHOLE
+    assert isinstance(back, Findings) and pack(back) == WHOLE
     for name in ("frame", "box_px", "covariance_m2"):
         before, after = getattr(FOUND, name), getattr(back, name)
         assert after.dtype == before.dtype and after.tobytes() == before.tobytes()
@@ -59,6 +61,11 @@ def test_only_records_are_made(name: str) -> None:
         unpack(hashlib.sha256(file.getvalue()).digest() + file.getvalue())
     with pytest.raises(TypeError, match="a set cannot be stored"):
         pack({"a": {1, 2}})
+
+
+def test_records_keep_their_names_in_files_when_their_classes_are_renamed() -> None:
+    for record, name in ((FOUND, b"Found"), (BoxCounts(), b"Boxes"), (LocatedCounts(), b"GroundLocations")):
+        assert b'{"of": "' + name + b'"' in pack(record) and type(unpack(pack(record))) is type(record)
 
 
 @pytest.mark.parametrize(

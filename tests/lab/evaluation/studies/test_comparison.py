@@ -104,7 +104,7 @@ def test_another_truth_or_other_frames_are_not_compared(missing, tmp_path):
     fewer = replace(clip, truth=replace(clip.truth, tracks=tracks.at(np.arange(1, len(tracks.frame)))))
     other = ScoredCase("tracking", "clip-0", score(fewer, "tracking", found))
     (note,) = compare_studies(one, ScoredStudy("two", (other, two.cases[1])))["notes"]
-    assert "clip-0, tracking: its truth is another" in note
+    assert "clip-0, tracking: its truth differs" in note
     short, found = tracked(tmp_path / "more" / "short", 0, 20)
     other = ScoredCase("tracking", "clip-0", score(short, "tracking", found))
     with pytest.raises(InputError, match="no clip can be compared; clip-0, tracking: other frames were scored"):

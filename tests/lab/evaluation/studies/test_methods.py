@@ -63,7 +63,7 @@ def test_a_clip_that_a_method_lacks_counts_for_none(results, tmp_path):
     (tmp_path / "sort" / "clip-1" / "tracks.txt").unlink()
     content = write_methods(tmp_path / "out", tmp_path / "gt", results)
     assert list(content["methods"]["ours"]["tasks"]["tracking"]["clips"]) == ["clip-0"]
-    assert "clip-1, tracking: not of every method, left out of ours" in content["notes"]
+    assert "clip-1, tracking: not scored for every method, left out of ours" in content["notes"]
     (tmp_path / "sort" / "clip-0" / "tracks.txt").unlink()
     (tmp_path / "sort" / "clip-1" / "tracks.txt").write_text("1,1,0,0,9,9\n")
     (tmp_path / "ours" / "clip-1" / "tracks.txt").unlink()

@@ -7,7 +7,7 @@ import pytest
 
 from tests.lab.evaluation.studies import world
 from torchvision_dddas.errors import InputError
-from torchvision_dddas.lab.evaluation.datasets.record import Source
+from torchvision_dddas.lab.evaluation.datasets.record import DatasetSource
 from torchvision_dddas.lab.evaluation.studies.cache import Cache
 from torchvision_dddas.lab.evaluation.studies.jobs import Workers
 from torchvision_dddas.lab.evaluation.studies.records import Spec
@@ -39,13 +39,13 @@ def test_a_file_says_everything_or_only_its_data_set(tmp_path: Path) -> None:
         still = ["roof"]
     """
     sources = (
-        Source("bms", Path("data"), ("cars*", "people1"), {"rate_hz": 25}),
-        Source("folder", Path("/elsewhere"), ("*",), {"still": ["roof"]}),
+        DatasetSource("bms", Path("data"), ("cars*", "people1"), {"rate_hz": 25}),
+        DatasetSource("folder", Path("/elsewhere"), ("*",), {"still": ["roof"]}),
     )
     overrides = ("track.history=4", "motion.blur_px=3")
     whole = Spec("all of it", sources, ("motion", "tracking"), "fast", overrides, "onboard", 5)
     assert spec(tmp_path, content) == whole
-    assert spec(tmp_path, SET) == Spec("study", (Source("bms", Path("data")),))
+    assert spec(tmp_path, SET) == Spec("study", (DatasetSource("bms", Path("data")),))
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,10 @@ def test_a_file_says_everything_or_only_its_data_set(tmp_path: Path) -> None:
         ("interval = true\n" + SET, "interval must be a whole number of frames from 1 to 1000, got True"),
         ("name = '../up'\n" + SET, "name must consist of letters, digits, blanks"),
         (SET + "[[dataset]]\nkind = 'bms'", "data set 2 has no folder; wanted kind = one of folder, bms"),
-        (SET + "[[dataset]]\nkind = 'imagenet'\nfolder = 'x'", "data set 2: 'imagenet' is no kind of data set; wanted"),
+        (
+            SET + "[[dataset]]\nkind = 'imagenet'\nfolder = 'x'",
+            "data set 2: 'imagenet' is not a kind of data set; wanted",
+        ),
         ("[[dataset]]\nkind = 'bms'\nfolder = 3", "data set 1: folder must be a text, got 3"),
         (SET + "clips = []", "data set 1: clips is empty; wanted patterns of names"),
     ],

@@ -16,7 +16,7 @@ from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.evaluate import evaluate
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
 from torchvision_dddas.lab.evaluation.metrics.registry import figures
-from torchvision_dddas.lab.evaluation.metrics.truth import Labels, Positions, TrackTable, Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, Labels, TrackTable, TruePositions
 from torchvision_dddas.lab.evaluation.studies.cache import pack, unpack
 from torchvision_dddas.lab.evaluation.studies.records import round_as_written
 from torchvision_dddas.lab.evaluation.studies.scoring import score
@@ -120,7 +120,7 @@ def test_results_that_cannot_be_scored_are_one_line(tmp_path):
     clip, found = masked(tmp_path / "clip")
     wide = {f: png(np.zeros((60, 90), np.uint8)) for f in found.masks}
     refused: list[Any] = [
-        (None, "motion", found, "clip has no truth; nothing can be scored"),
+        (None, "motion", found, "clip has no truth, so that it cannot be scored"),
         (clip.truth, "location", found, "no true places"),
         (clip.truth, "motion", replace(found, masks={1: found.masks[1]}), "frame 3 is labelled, but has no result"),
         (clip.truth, "motion", replace(found, masks=wide), "the truth is 80×60 pixels"),
@@ -145,7 +145,7 @@ def located(tmp_path, off=(0.6, 0.8), sigma_m=1.0):
     seen = who != 9
     by_frame = {f: px[(frame == f) & seen] for f in range(1, 11)}
     tracks = TrackTable(frame[seen], who[seen], px[seen])
-    truth = Truth("boxes", tmp_path, {}, by_frame, tracks, positions=Positions(frame, who, place))
+    truth = ClipTruth("boxes", tmp_path, {}, by_frame, tracks, positions=TruePositions(frame, who, place))
     rows = np.insert(np.c_[frame[seen], who[seen], px[seen], np.ones(20)], 4, [3, 77, 500, 500, 8, 16, 1.0], axis=0)
     found = replace(
         found_of(rows, 10),
@@ -174,7 +174,9 @@ def test_an_ellipse_that_is_too_small_does_not_hold_the_truth(tmp_path):
 def test_the_error_relative_to_the_team_is_what_the_landmarks_do_not_share(tmp_path):
     clip, found = located(tmp_path, off=(3.0, 4.0))
     known = clip.truth.positions
-    fleet = Positions(*(column[known.identity == 9] for column in (known.frame, known.identity, known.east_north_m)))
+    fleet = TruePositions(
+        *(column[known.identity == 9] for column in (known.frame, known.identity, known.east_north_m))
+    )
     places = zip(fleet.frame, fleet.east_north_m, strict=True)
     marks = "".join(f"{f},rover,{east + 3.0:.6f},{north + 3.0:.6f}\n" for f, (east, north) in places)
     (tmp_path / "landmarks.csv").write_text(f"frame,landmark,east_m,north_m\n{marks}")

@@ -148,7 +148,7 @@ def test_every_measure_can_be_a_goal_and_a_wrong_name_lists_the_right_ones() -> 
         ("f", "wanted task.group.measure"),
         ("sight.pixels.f", "no task"),
         ("motion.pixels.n_tp", "neither more nor less"),
-        ("motion.pixels.iou", "'iou' is no measure of motion.pixels; wanted accuracy, "),
+        ("motion.pixels.iou", "'iou' is not a measure of motion.pixels; wanted accuracy, "),
         ("tracking.pixels.f", "no group of measures of tracking; wanted tracks, target_track"),
     ):
         with pytest.raises(InputError, match=message):

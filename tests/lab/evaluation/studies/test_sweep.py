@@ -7,7 +7,7 @@ import pytest
 from torchvision_dddas.config import Settings, load_config, with_parameters
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.studies import sweep
-from torchvision_dddas.lab.evaluation.studies.sweep import Axis, Trial, best, parse_grid, parse_ranges
+from torchvision_dddas.lab.evaluation.studies.sweep import ParameterAxis, Trial, best, parse_grid, parse_ranges
 
 NOW = Settings()
 
@@ -33,18 +33,18 @@ def test_axes_have_the_types_of_the_settings_and_no_value_twice() -> None:
     grid = ["difference.threshold=10, 9,9.0", "refine.on=true,false", "difference.near_frames=[1],[1,2]"]
     axes = parse_grid([*grid, "difference.kind=normalized,to_reference"], NOW)
     assert axes == [
-        Axis("difference.threshold", (10.0, 9.0)),
-        Axis("refine.on", (True, False)),
-        Axis("difference.near_frames", ((1,), (1, 2))),
-        Axis("difference.kind", ("normalized", "to_reference")),
+        ParameterAxis("difference.threshold", (10.0, 9.0)),
+        ParameterAxis("refine.on", (True, False)),
+        ParameterAxis("difference.near_frames", ((1,), (1, 2))),
+        ParameterAxis("difference.kind", ("normalized", "to_reference")),
     ]
     assert sweep.count_points(axes) == 16
     ranges = ["difference.threshold=8:30", "difference.blur_px=3:9", "small.gap_frames=2:20:log"]
     assert parse_ranges([*ranges, "refine.on=true,false"], NOW) == [
-        Axis("difference.threshold", (), 8.0, 30.0),
-        Axis("difference.blur_px", (), 3, 9, step=2),
-        Axis("small.gap_frames", (), 2, 20, step=1, log=True),
-        Axis("refine.on", (True, False)),
+        ParameterAxis("difference.threshold", (), 8.0, 30.0),
+        ParameterAxis("difference.blur_px", (), 3, 9, step=2),
+        ParameterAxis("small.gap_frames", (), 2, 20, step=1, log=True),
+        ParameterAxis("refine.on", (True, False)),
     ]
 
 
@@ -54,7 +54,7 @@ MANY = ",".join(str(k) for k in range(50, 250))
 @pytest.mark.parametrize(
     ("parse", "texts", "message"),
     [
-        (parse_grid, ["difference.threshold"], "is no axis of a sweep"),
+        (parse_grid, ["difference.threshold"], "is not an axis of a sweep"),
         (parse_grid, ["difference.threshold=,"], "has no values"),
         (parse_grid, ["difference.treshold=10"], "did you mean difference.threshold"),
         (parse_grid, ["difference.threshold=10,-1"], "between 0.1 and 255"),

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.lab.evaluation.datasets.kinds import read
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
 
 WIDTH, HEIGHT = 176, 132
 
@@ -73,4 +73,4 @@ def three(folder: Path, tracked: int = 10) -> Path:
 
 def clips_in(folder: Path, *names: str) -> tuple[Clip, ...]:
     """The clips of a folder, or some of them."""
-    return tuple(read(Source("folder", folder, names or ("*",)), folder).clips)
+    return tuple(read(DatasetSource("folder", folder, names or ("*",)), folder).clips)

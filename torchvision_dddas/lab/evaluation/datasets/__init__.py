@@ -1,1 +1,1 @@
-"""Data sets as they lie on disk, each read into one record: `Clip`. Nothing is downloaded."""
+"""Data sets on disk, each read into records of the class `Clip`. Nothing is downloaded."""

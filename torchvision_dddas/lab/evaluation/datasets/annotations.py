@@ -8,8 +8,8 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.metrics.matching import lie_within
 from torchvision_dddas.lab.evaluation.metrics.text_rows import LAST
 from torchvision_dddas.lab.evaluation.metrics.truth import (
+    ClipTruth,
     TrackTable,
-    Truth,
     check_identities,
     check_sizes,
     rows_by_frame,
@@ -17,14 +17,15 @@ from torchvision_dddas.lab.evaluation.metrics.truth import (
 
 
 def boxes_of_corners(corners_px: np.ndarray) -> np.ndarray:
-    """(N, 4) x, y, width, height of left, top, right, bottom."""
+    """Return (N, 4) x, y, width, height of left, top, right, bottom."""
     return np.column_stack([corners_px[:, :2], corners_px[:, 2:] - corners_px[:, :2]])
 
 
 def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray, line: np.ndarray) -> TrackTable:
-    """Rows as a table. line: (N,) of the file, for messages.
+    """Return rows as a table. line: (N,) line in the file, for messages.
 
-    Raises InputError with file and line: a size that is not above 0, an identity twice in a frame, or -1 for one.
+    Raise InputError with file and line for a size that is not above 0, and for an identity that is -1 or twice in a
+    frame.
     """
     check_sizes(box_px, line, str(path))
     table = TrackTable.of(frame, identity, box_px)
@@ -38,11 +39,11 @@ def truth_of(
     counts: np.ndarray,
     length: int,
     regions: TrackTable | None = None,
-) -> Truth:
-    """The truth, with boxes of every frame up to the clip's length, or the last labelled one where it is 0.
+) -> ClipTruth:
+    """Return the truth, with boxes of every frame up to the clip's length, or to the last labelled frame if it is 0.
 
-    counts: (N,) which rows count; found boxes on the others neither count nor harm. regions: where nobody labelled; a
-    row that lies there does not count. Raises InputError: rows beyond the clip's end, or none that count at all.
+    counts: (N,) which rows count; found boxes on the other rows are neither right nor false. regions: unlabelled
+    regions; rows in them do not count. Raise InputError for rows beyond the clip's end, and if no row counts.
     """
     last = int(table.frame.max()) if len(table.frame) else 0
     if length and last > length:
@@ -59,7 +60,7 @@ def truth_of(
     if not counts.any():
         raise InputError(f"{place} holds no box that counts")
     kept = table.at(counts)
-    return Truth(
+    return ClipTruth(
         "boxes",
         place,
         {},
@@ -73,5 +74,5 @@ def truth_of(
 
 
 def boxes_by_frame(table: TrackTable, length: int) -> dict[int, np.ndarray]:
-    """The boxes (N, 4) of each frame from 1 to length, in the table's order."""
+    """Return the boxes (N, 4) of each frame from 1 to length, in the table's order."""
     return {frame: np.zeros((0, 4)) for frame in range(1, length + 1)} | table.boxes_by_frame()

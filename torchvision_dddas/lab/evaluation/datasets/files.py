@@ -13,7 +13,7 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".t
 
 
 def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> tuple[Path, ...]:
-    """The images of a folder in natural order, none where it is none. Raises InputError where it cannot be read."""
+    """Return the images of a folder in natural order; none without a folder. Raise InputError if it cannot be read."""
     if not folder.is_dir():
         return ()
     try:
@@ -24,14 +24,14 @@ def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> tuple[
 
 
 def videos_in(folder: Path) -> tuple[Path, ...]:
-    """The videos of a folder, as `images_in`."""
+    """Return the videos of a folder, as `images_in` does."""
     return images_in(folder, VIDEO_SUFFIXES)
 
 
 def folders_in(folder: Path) -> list[str]:
-    """The names of the folders in a folder, without hidden ones; none where it is no folder.
+    """Return the names of the folders in a folder, without hidden ones; none without a folder.
 
-    Raises InputError where it cannot be read.
+    Raise InputError if the folder cannot be read.
     """
     try:
         return sorted(entry.name for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
@@ -42,16 +42,16 @@ def folders_in(folder: Path) -> list[str]:
 
 
 def find_below(folder: Path, is_clip: Callable[[Path], bool], depth: int) -> list[Path]:
-    """The folders that are clips: this one, or those at most so many folders deeper; none lies in another."""
+    """Return the folders that are clips: this folder, or folders up to `depth` levels deeper. None lies in another."""
     if is_clip(folder):
         return [folder]
     return [place for name in folders_in(folder) if depth for place in find_below(folder / name, is_clip, depth - 1)]
 
 
 def count_frames(pictures: tuple[Path, ...], announced: int = 0, source: str = "") -> int:
-    """How many frames a clip has: those of its pictures or its video, else as its source announces; 0 where unknown.
+    """Return the frames of a clip, counted from its pictures or video, else as its source announces; 0 if unknown.
 
-    Raises InputError where the two differ, or the video cannot be opened.
+    Raise InputError if the two numbers differ, or if the video cannot be opened.
     """
     there = len(pictures)
     if there == 1 and is_video(pictures[0]):
@@ -64,18 +64,18 @@ def count_frames(pictures: tuple[Path, ...], announced: int = 0, source: str = "
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is a video by its suffix."""
+    """Return whether a file is a video by its suffix."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def number_of(path: Path) -> int | None:
-    """The last number in a file's name: 12 of frame_0012.jpg, 7 of 7.png; None where there is none."""
+    """Return the last number in a file's name: 12 of frame_0012.jpg, 7 of 7.png; None without a number."""
     found = re.findall(r"[0-9]+", path.stem)
     return int(found[-1]) if found else None
 
 
 def frames_by_number(pictures: Iterable[Path]) -> dict[int, int]:
-    """The number in each picture's name -> its frame from 1; empty where names lack numbers or repeat them."""
+    """Return the frame, from 1, of the number in each picture's name; empty if names lack numbers or repeat them."""
     frames: dict[int, int] = {}
     for frame, path in enumerate(pictures, 1):
         number = number_of(path)
@@ -86,9 +86,9 @@ def frames_by_number(pictures: Iterable[Path]) -> dict[int, int]:
 
 
 def masks_by_frame(masks: Iterable[Path], frames: Mapping[int, int], place: Path) -> dict[int, Path]:
-    """The masks by frame. frames: from `frames_by_number`. place: of the pictures, for messages.
+    """Return the masks by frame. frames: from `frames_by_number`. place: of the pictures, for messages.
 
-    Raises InputError: a mask of whose number there is no picture, or two of one number.
+    Raise InputError for a mask whose number no picture has, and for two masks of one number.
     """
     found: dict[int, Path] = {}
     for path in masks:
@@ -98,33 +98,33 @@ def masks_by_frame(masks: Iterable[Path], frames: Mapping[int, int], place: Path
             span = f"its pictures are {min(frames)} to {max(frames)}" if frames else "it holds no numbered pictures"
             raise InputError(f"{path} labels no picture of {place}: {span}; is it the same clip?")
         if frame in found:
-            raise InputError(f"{found[frame]} and {path} label the same picture; wanted one mask a picture")
+            raise InputError(f"{found[frame]} and {path} label the same picture; wanted one mask for each picture")
         found[frame] = path
     return found
 
 
 def check_numbering(pictures: tuple[Path, ...], first: int) -> tuple[Path, ...]:
-    """Pictures, if they are numbered from `first` without a gap. Raises InputError otherwise."""
+    """Return the pictures if they are numbered from `first` without a gap. Raise InputError otherwise."""
     for wanted, picture in enumerate(pictures, first):
         if number_of(picture) != wanted:
-            raise InputError(f"{picture.parent} has {picture.name} where frame {wanted} belongs; wanted all frames")
+            raise InputError(f"{picture.parent} has {picture.name} in place of frame {wanted}; wanted all frames")
     return pictures
 
 
 def fit_clip(clip: Clip) -> Clip:
-    """The clip unchanged. Raises InputError: no truth, no pictures, other frames or sizes than those of its truth."""
+    """Return the clip. Raise InputError without truth or pictures, or if frames or sizes differ from the truth's."""
     truth, place = clip.truth, clip.place
     if truth is None:
         if not clip.still:
-            raise InputError(f"{place} has no truth; nothing in it can be scored")
+            raise InputError(f"{place} has no truth, so that it cannot be scored")
         if not clip.pictures:
             raise InputError(f"{place} holds no pictures")
         return clip
     if not clip.pictures and (truth.kind != "boxes" or truth.tracks is None):
-        raise InputError(f"{truth.place} is the truth of a clip without pictures; put them into {place}")
+        raise InputError(f"{truth.place} is the truth of a clip without pictures; put the pictures into {place}")
     if clip.frames and truth.kind == "one target" and truth.length != clip.frames:
-        lines = f"{truth.place} has {truth.length} lines, but the clip {clip.frames} frames"
-        raise InputError(f"{lines}; wanted a line a frame")
+        lines = f"{truth.place} has {truth.length} lines, but the clip has {clip.frames} frames"
+        raise InputError(f"{lines}; wanted one line for each frame")
     if clip.pictures and clip.frames:
         last = max(truth.frames, default=0)
         if last > clip.frames:
@@ -133,26 +133,26 @@ def fit_clip(clip: Clip) -> Clip:
         if truth.length > clip.frames:
             raise InputError(f"{truth.place} is of {truth.length} frames, but the clip has {clip.frames}; is it whole?")
     if truth.masks:
-        # The first and the last mask alone: the others are checked when they are scored.
+        # Check only the first and the last mask here. The others are checked when they are scored.
         check_mask_sizes(clip.pictures[0], [truth.masks[truth.frames[0]], truth.masks[truth.frames[-1]]])
     return clip
 
 
 def check_mask_sizes(picture: Path, masks: Iterable[Path]) -> None:
-    """Raises InputError for a mask of another size than the picture or video."""
+    """Raise InputError for a mask of another size than the picture or video."""
     size = VideoSource(str(picture), picture.name).size if is_video(picture) else size_of(picture)
     for mask in masks:
         if (found := size_of(mask)) != size:
             raise InputError(
                 f"{mask} is {found[0]}×{found[1]} pixels, but {picture.name} {size[0]}×{size[1]}; "
-                "wanted masks of the size of the pictures"
+                "wanted masks of the same size"
             )
 
 
 def size_of(path: Path) -> tuple[int, int]:
-    """(width, height), px. Only what is no PNG, BMP, PNM or plain JPEG is decoded.
+    """Return (width, height), px. A file is decoded only if it is not PNG, BMP, PNM or plain JPEG.
 
-    Raises InputError where it is no picture.
+    Raise InputError if it is not a picture.
     """
     try:
         with path.open("rb") as file:
@@ -161,11 +161,11 @@ def size_of(path: Path) -> tuple[int, int]:
                 head += file.read(65536)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-    # Exif may say that the picture is to be turned.
+    # Exif may state that the picture must be rotated.
     size = None if b"Exif" in head or head[:2] in (b"II", b"MM") else size_in_header(head)
     if size is not None and min(size) > 0:
         return size
     image = read_image(path)
     if image is None:
-        raise InputError(f"{path} is no picture that can be read")
+        raise InputError(f"{path} is not a readable picture")
     return image.shape[1], image.shape[0]

@@ -1,4 +1,4 @@
-"""Clips in the project's own layout: a folder a clip, also as `dddas simulate` writes them."""
+"""Clips in the project's own layout: one folder for each clip, also as `dddas simulate` writes them."""
 
 import json
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from torchvision_dddas.io.ground_tables import read_positions
 from torchvision_dddas.lab.evaluation.datasets import files
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.lab.evaluation.metrics.truth import (
-    Positions,
+    ClipTruth,
     SeqInfo,
-    Truth,
+    TruePositions,
     find_truth,
     load_truth,
     read_seqinfo,
@@ -28,10 +28,10 @@ FRAMES = ("frames", "img1")
 
 
 class Folder(Reader):
-    """One's own data: a folder of clips in the plain convention, or one clip."""
+    """The user's own data: a folder of clips in the plain convention, or one clip."""
 
     kind = "folder"
-    layout = "your own: a folder a clip, with frames/ or a video, and masks/, boxes_xywh.txt or gt/gt.txt"
+    layout = "your own: one folder for each clip, with frames/ or a video, and masks/, boxes_xywh.txt or gt/gt.txt"
     defaults: ClassVar = {"still": [], "people": [], "rate_hz": None}
 
     def _places(self) -> Mapping[str, Path]:
@@ -57,7 +57,7 @@ class Simulated(Reader):
     """
 
     kind = "simulated"
-    layout = "what dddas simulate writes: a folder a run"
+    layout = "the output of dddas simulate: one folder for each run"
 
     def _places(self) -> Mapping[str, Path]:
         return clips_in(self.folder, (self.folder / "truth").is_dir())
@@ -65,7 +65,7 @@ class Simulated(Reader):
     def _clip(self, name: str, place: Path) -> Clip:
         truth = place / "truth"
         if not truth.is_dir():
-            raise InputError(f"{place} has no truth/; wanted what `dddas simulate --out` writes")
+            raise InputError(f"{place} has no truth/; wanted the output of `dddas simulate --out`")
         if not _pictures_at(place):
             raise InputError(f"{place} holds neither frames/ nor clip.mp4; simulate it with --save frames,masks")
         clip = clip_at(place, name, _rate_of_run(place / "run.json"))
@@ -73,7 +73,7 @@ class Simulated(Reader):
             if not (truth / part).is_file():
                 raise InputError(f"{truth / part} does not exist; the run was not finished, simulate it again")
         is_empty = not (truth / "gt.txt").read_bytes().strip()
-        labelled = Truth("boxes", truth, {}, {}) if is_empty else load_truth(truth / "gt.txt")
+        labelled = ClipTruth("boxes", truth, {}, {}) if is_empty else load_truth(truth / "gt.txt")
         if (truth / "masks").is_dir():
             masks = load_truth(truth / "masks", 1).masks
             labelled = replace(labelled, kind="masks", place=truth, masks=masks)
@@ -86,26 +86,26 @@ class Simulated(Reader):
 
 
 def clips_in(folder: Path, is_one: bool) -> dict[str, Path]:
-    """The folders of clips by name: those in a folder, or itself where it is one."""
+    """Return the folders of clips by name: the clips in a folder, or the folder if it is a clip."""
     return {folder.resolve().name: folder} if is_one else {name: folder / name for name in files.folders_in(folder)}
 
 
 def is_clip(folder: Path) -> bool:
-    """Whether a folder is a clip, and not one of clips."""
+    """Return whether a folder is a clip, and not a folder of clips."""
     return any((folder / name).is_dir() for name in FRAMES) or find_truth(folder) is not None
 
 
 def clip_at(place: Path, name: str, rate_hz: float | None = None) -> Clip:
-    """A clip's folder. rate_hz: in place of seqinfo.ini's.
+    """Return the clip in a folder. rate_hz: replaces the rate in seqinfo.ini.
 
-    Raises InputError: neither pictures nor truth, several videos, files that cannot be read.
+    Raise InputError without pictures and truth, for several videos, and for files that cannot be read.
     """
     pictures, truth = _pictures_at(place), None
     if (labels := find_truth(place)) is not None:
         numbers = files.frames_by_number(pictures) if len(pictures) > 1 else {}
         if labels.is_dir() and numbers:
             masks = [path for path in files.images_in(labels, frozenset({".png"})) if path.stem.isdecimal()]
-            truth = Truth("masks", labels, files.masks_by_frame(masks, numbers, pictures[0].parent), {})
+            truth = ClipTruth("masks", labels, files.masks_by_frame(masks, numbers, pictures[0].parent), {})
         else:
             truth = load_truth(labels)
     elif not pictures:
@@ -117,7 +117,7 @@ def clip_at(place: Path, name: str, rate_hz: float | None = None) -> Clip:
     positions = first("positions.csv", "truth/positions.csv")
     if truth is not None and positions is not None:
         table = read_positions(positions)
-        true_places = Positions(table.frame, table.target, table.east_north_m, table.lonlat_deg)
+        true_places = TruePositions(table.frame, table.target, table.east_north_m, table.lonlat_deg)
         truth = replace(truth, positions=true_places)
     info = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
     return Clip(
@@ -140,38 +140,38 @@ def _pictures_at(place: Path) -> tuple[Path, ...]:
     for name in FRAMES:
         if found := files.images_in(place / name):
             return found
-    videos = [v for v in files.videos_in(place) if v.stem != "telemetry"]  # MPEG-TS that carries metadata alone
+    videos = [v for v in files.videos_in(place) if v.stem != "telemetry"]  # MPEG-TS that carries only metadata
     if len(videos) > 1:
         raise InputError(f"{place} holds {len(videos)} videos, {videos[0].name} and {videos[1].name}; wanted one")
     return tuple(videos)
 
 
-def _visible_positions(path: Path) -> tuple[Positions, Positions]:
-    """The places of the visible targets, and of the ground vehicles, which are the landmarks. Raises InputError."""
+def _visible_positions(path: Path) -> tuple[TruePositions, TruePositions]:
+    """Return the positions of visible targets, and of ground vehicles, which are the landmarks. Raise InputError."""
     table = read_positions(path)
     header, cells = read_rows(path)
     if absent := [name for name in ("kind", "visible_px") if name not in header]:
-        raise InputError(f"positions {path} lacks {', '.join(absent)}; wanted what `dddas simulate` writes")
+        raise InputError(f"positions {path} lacks {', '.join(absent)}; wanted the output of `dddas simulate`")
     kind, visible = header.index("kind"), header.index("visible_px")
     is_fleet = np.array([row[kind] == "ugv" for row in cells], bool)
     is_visible = np.array([row[visible] not in ("", "0") for row in cells], bool)
 
-    def only(rows: np.ndarray) -> Positions:
+    def only(rows: np.ndarray) -> TruePositions:
         degrees = None if table.lonlat_deg is None else table.lonlat_deg[rows]
-        return Positions(table.frame[rows], table.target[rows], table.east_north_m[rows], degrees)
+        return TruePositions(table.frame[rows], table.target[rows], table.east_north_m[rows], degrees)
 
     return only(is_visible & ~is_fleet), only(is_fleet)
 
 
 def _rate_of_run(path: Path) -> float | None:
-    """Frames a second of the run. Raises InputError where it was not finished, or the file is damaged."""
+    """Return the frames per second of the run. Raise InputError if it was not finished, or the file is damaged."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         rate, state = record["clip"]["rate_hz"], record["state"]
     except FileNotFoundError:
         return None
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise InputError(f"{path} does not hold the frames a second: {str(error)[:80]}") from None
+        raise InputError(f"{path} does not hold the frames per second: {str(error)[:80]}") from None
     if state != "complete":
         raise InputError(f"{path}: the run is {state}; simulate it again")
     return float(rate) if isinstance(rate, (int, float)) and 0 < rate <= 1000 else None

@@ -1,4 +1,4 @@
-"""INRIA person: pictures of people who stand, and pictures without any."""
+"""INRIA person: pictures of standing people, and pictures without people."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -11,10 +11,10 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.datasets.files import images_in, size_of
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.lab.evaluation.metrics.text_rows import read_text
-from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth
 
 WIDTH_SHARE = 0.41
-"""A standing body's width by its height (Dollár et al., 2012)."""
+"""Width of a standing body divided by its height (Dollár et al., 2012)."""
 
 
 class Inria(Reader):
@@ -51,22 +51,22 @@ class Inria(Reader):
                     continue
                 places.setdefault(f"{name}-{size[0]}x{size[1]}", (home / name, []))[1].append(labelled)
         absent = [place for place, _ in readers.values() if not images_in(place)]
-        self.missing += [f"no pictures in {place}, where they belong" for place in absent]
+        self.missing += [f"{place} holds no pictures; wanted pictures there" for place in absent]
         return places
 
     def _clip(self, name: str, place: tuple[Path, list[tuple[Path, np.ndarray]]]) -> Clip:
         home, labelled = place
         boxes = {frame: box_px for frame, (_, box_px) in enumerate(labelled, 1)}
-        truth = Truth("boxes", home, {}, boxes, length=len(labelled))
+        truth = ClipTruth("boxes", home, {}, boxes, length=len(labelled))
         pictures = tuple(picture for picture, _ in labelled)
         return Clip(name, home.parent, pictures, frames=len(labelled), truth=truth, shows=("people",))
 
 
 def body_of(size: tuple[int, int], height_px: float) -> np.ndarray:
-    """(1, 4) the body in the middle of a crop of a size. Raises InputError where it is higher than the crop."""
+    """Return the body in the middle of a crop, (1, 4). Raise InputError if the body is higher than the crop."""
     width, height = size
     if not 0 < height_px <= height:
-        raise InputError(f"a crop is {height} px high, which no body of {height_px:g} px fits; see body_height_px")
+        raise InputError(f"a crop is {height} px high, too low for a body of {height_px:g} px; see body_height_px")
     across = WIDTH_SHARE * height_px
     return np.array([[(width - across) / 2, (height - height_px) / 2, across, height_px]])
 
@@ -74,7 +74,7 @@ def body_of(size: tuple[int, int], height_px: float) -> np.ndarray:
 def _annotated_boxes(picture: Path, size: tuple[int, int]) -> np.ndarray:
     path = picture.parents[1] / "annotations" / f"{picture.stem}.txt"
     if not path.is_file():
-        raise InputError(f"no truth, which belongs in {path}")
+        raise InputError(f"no truth; it belongs in {path}")
     annotation = read_annotation(path)
     if annotation.size != size:
         stated = f"{path} says {annotation.size[0]}×{annotation.size[1]}"
@@ -101,8 +101,8 @@ class Annotation(NamedTuple):
 
 
 def read_annotation(path: Path) -> Annotation:
-    """Read a file. Raises InputError: none of this kind, more or fewer boxes than announced, an empty box."""
-    text = read_text(path, "latin-1").replace("\r\n", "\n")  # INRIA's own name has an accent
+    """Read a file. Raise InputError for another kind of file, a wrong number of boxes, or an empty box."""
+    text = read_text(path, "latin-1").replace("\r\n", "\n")  # INRIA's own name contains an accent
     size, count, corner = _SIZE.search(text), _COUNT.search(text), _CORNER.search(text)
     if size is None or count is None:
         what = "Image size" if size is None else "Objects with ground truth"
@@ -110,11 +110,11 @@ def read_annotation(path: Path) -> Annotation:
     boxes = np.array([[int(number) for number in found.groups()] for found in _BOX.finditer(text)], float)
     boxes = boxes.reshape(-1, 4)
     if len(boxes) != int(count[1]):
-        raise InputError(f"{path} announces {count[1]} objects and has the boxes of {len(boxes)}")
+        raise InputError(f"{path} announces {count[1]} objects, but has {len(boxes)} boxes")
     boxes -= np.tile([float(corner[1]), float(corner[2])] if corner else [0.0, 0.0], 2)
-    boxes[:, 2:] += 1 - boxes[:, :2]  # both corners are in the box
+    boxes[:, 2:] += 1 - boxes[:, :2]  # the box includes both corners
     if not (boxes[:, 2:] > 0).all():
-        raise InputError(f"{path} has a box whose end is before its beginning")
+        raise InputError(f"{path} has a box whose end is before its start")
     width, height = int(size[1]), int(size[2])
     if min(width, height) < 1:
         raise InputError(f"{path} says the picture is {width}×{height} pixels")

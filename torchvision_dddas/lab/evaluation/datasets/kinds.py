@@ -1,4 +1,4 @@
-"""The kinds of data sets, and reading one."""
+"""The kinds of data sets, and the reader of each."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +14,7 @@ from torchvision_dddas.lab.evaluation.datasets.labelled_boxes import Cvml, Stanf
 from torchvision_dddas.lab.evaluation.datasets.labelled_masks import Bms, CdNet, Davis
 from torchvision_dddas.lab.evaluation.datasets.motchallenge import MotChallenge
 from torchvision_dddas.lab.evaluation.datasets.one_target import Uav123, Vivid
-from torchvision_dddas.lab.evaluation.datasets.record import Dataset, Reader, Source
+from torchvision_dddas.lab.evaluation.datasets.record import Dataset, DatasetSource, Reader
 
 _READERS: tuple[type[Reader], ...] = (
     *(Folder, Bms, Davis, CdNet, Uav123, Vivid, MotChallenge),
@@ -23,10 +23,10 @@ _READERS: tuple[type[Reader], ...] = (
 KINDS: Mapping[str, type[Reader]] = {reader.kind: reader for reader in _READERS}
 
 
-def read(source: Source, base: Path) -> Dataset:
-    """The requested clips. base: what the folder is relative to.
+def read(source: DatasetSource, base: Path) -> Dataset:
+    """Return the requested clips. base: the folder to which the data set's folder is relative.
 
-    Raises InputError for an unknown kind or a wrong option. Dataset.missing says what is absent.
+    Raise InputError for an unknown kind or a wrong option. Dataset.missing states what is absent.
     """
     check_kind(source.kind)
     reader = KINDS[source.kind]
@@ -42,12 +42,12 @@ def read(source: Source, base: Path) -> Dataset:
     if not found.clips and not found.missing:
         names = "" if "*" in source.clips else f" by the name {' or '.join(source.clips)}"
         found = replace(found, missing=(f"{folder} holds no clip{names}; wanted {reader.layout}",))
-    # Names of clips and contents of files may hold anything; InputError makes printable lines of them.
+    # Names of clips and contents of files may contain any characters; InputError makes printable lines of them.
     missing, notes = (tuple(str(InputError(line)) for line in lines) for lines in (found.missing, found.notes))
     return replace(found, missing=missing, notes=notes)
 
 
 def check_kind(kind: str) -> None:
-    """Raises InputError, with the list of kinds, for an unknown one."""
+    """Raise InputError, with the list of kinds, for an unknown kind."""
     if kind not in KINDS:
-        raise InputError(f"'{kind}' is no kind of data set; wanted one of {', '.join(KINDS)}")
+        raise InputError(f"'{kind}' is not a kind of data set; wanted one of {', '.join(KINDS)}")

@@ -35,7 +35,7 @@ class Kitti(Reader):
         places = {path.stem: path for path in sorted((self._home / "label_02").glob("*.txt"))}
         if not places:
             return self._refuse(
-                f"{self.folder} holds no training/label_02/0000.txt: the truth of KITTI tracking belongs there"
+                f"{self.folder} holds no training/label_02/0000.txt; wanted the truth of KITTI tracking there"
             )
         self._report_unlabelled(folders_in(self._home / "image_02"), places, f"{self._home / 'label_02'}/{{}}.txt")
         return places

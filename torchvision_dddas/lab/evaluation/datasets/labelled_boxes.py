@@ -1,4 +1,4 @@
-"""Data sets whose truth are boxes with identities: VisDrone-MOT, UAVDT, Stanford Drone, PETS 2009 and CAVIAR."""
+"""Data sets with boxes and identities as truth: VisDrone-MOT, UAVDT, Stanford Drone, PETS 2009 and CAVIAR."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -88,7 +88,7 @@ class Uavdt(Reader):
         truths = next((home for home in homes if any(home.glob(f"*{whole}"))), None)
         if truths is None:
             return self._refuse(
-                f"{folder} holds no UAV-benchmark-MOTD_v1.0/GT/M0101{whole}: the truth of UAVDT belongs there"
+                f"{folder} holds no UAV-benchmark-MOTD_v1.0/GT/M0101{whole}; wanted the truth of UAVDT there"
             )
         places = {path.name.removesuffix(whole): path for path in sorted(truths.glob(f"*{whole}"))}
         sequences = folder / "UAV-benchmark-M"
@@ -99,11 +99,11 @@ class Uavdt(Reader):
         return {n: p for n, p in places.items() if not asked or (self.wanted(n) and asked <= self._attributes(n))}
 
     def _attributes(self, name: str) -> set[str]:
-        """The attributes of a sequence; what is wrong with their file goes to `missing`."""
+        """Return the attributes of a sequence. Errors in their file go to `missing`."""
         paths = [self.folder / "M_attr" / part / f"{name}_attr.txt" for part in ("train", "test", ".")]
         path = next(filter(Path.is_file, paths), None)
         if path is None:
-            self.missing.append(f"{name}: no attributes, which belong in {paths[0]}")
+            self.missing.append(f"{name}: no attributes; they belong in {paths[0]}")
             return set()
         try:
             cells = read_text(path).replace(",", " ").split()
@@ -143,7 +143,7 @@ class StanfordDrone(Reader):
     """
 
     kind = "sdd"
-    layout = "Stanford Drone: annotations/SCENE/VIDEO/annotations.txt, with its videos where they are there"
+    layout = "Stanford Drone: annotations/SCENE/VIDEO/annotations.txt, with the videos if there are any"
     terms = "CC BY-NC-SA 3.0"
     labels = ("Pedestrian", "Biker", "Skater", "Cart", "Car", "Bus")
     defaults: ClassVar = {"classes": list(labels)}
@@ -186,7 +186,7 @@ class Cvml(Reader):
     """
 
     kind = "cvml"
-    layout = "PETS 2009 and CAVIAR as CVML: NAME.xml, with pictures in NAME/ where it has them"
+    layout = "PETS 2009 and CAVIAR as CVML: NAME.xml, with pictures in NAME/ if there are any"
     terms = "research only; cite PETS 2009 or CAVIAR"
     defaults: ClassVar = {"rate_hz": None}
 
@@ -222,7 +222,7 @@ class Cvml(Reader):
 
 
 def _may_be_cvml(path: Path) -> bool:
-    """Whether an XML file may be an annotation: broken ones are, so that they are reported; calibrations are not."""
+    """Return whether an XML file may be an annotation: broken files too, to report them, but not calibrations."""
     try:
         with path.open("rb") as file:
             beginning = file.read(4096)
@@ -232,7 +232,7 @@ def _may_be_cvml(path: Path) -> bool:
 
 
 def _read_cvml(path: Path) -> np.ndarray:
-    """(N, 6) frame from 0, identity, x, y, width, height. Raises InputError with file and frame."""
+    """Return (N, 6) frame from 0, identity, x, y, width, height. Raise InputError with file and frame."""
     try:
         root = ElementTree.fromstring(path.read_bytes())
     except OSError as error:
@@ -251,7 +251,7 @@ def _read_cvml(path: Path) -> np.ndarray:
         number = number_in(frame, "number", "a frame")
         where = f"frame {number:g}"
         if number != int(number) or not 0 <= number < LAST:
-            raise InputError(f"{path}: a frame has the number {number:g}; wanted a whole one, 0 to {LAST - 1}")
+            raise InputError(f"{path}: a frame has the number {number:g}; wanted a whole number, 0 to {LAST - 1}")
         for target in frame.iterfind("objectlist/object"):
             identity, box = number_in(target, "id", where), target.find("box")
             if box is None or identity != int(identity):

@@ -1,4 +1,4 @@
-"""Data sets whose truth are masks: Berkeley motion segmentation, change detection and DAVIS."""
+"""Data sets with masks as truth: Berkeley motion segmentation, change detection and DAVIS."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -11,10 +11,10 @@ from torchvision_dddas.lab.evaluation.datasets import files
 from torchvision_dddas.lab.evaluation.datasets.folder import clip_at, is_clip
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.lab.evaluation.metrics.text_rows import read_text
-from torchvision_dddas.lab.evaluation.metrics.truth import Labels, Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, Labels
 
 _PHOTOS = frozenset({".jpg", ".jpeg", ".png"})
-_LONGEST_NAME = 250  # bytes of a file's name; another suffix may be tried, and 255 is what most systems take
+_LONGEST_NAME = 250  # bytes of a file's name: most systems allow 255, and another suffix may be tried
 
 
 class Davis(Reader):
@@ -34,7 +34,7 @@ class Davis(Reader):
 
     def _places(self) -> Mapping[str, tuple[Path, Path]]:
         photos, masks = (self.folder / name / self.options["resolution"] for name in ("JPEGImages", "Annotations"))
-        parts = {photos: "the frames, a folder a clip", masks: "the masks, a folder a clip"}
+        parts = {photos: "the frames, one folder for each clip", masks: "the masks, one folder for each clip"}
         if absent := [f"{place} does not exist; wanted {what}" for place, what in parts.items() if not place.is_dir()]:
             return self._refuse(*absent)
         try:
@@ -55,7 +55,7 @@ class Davis(Reader):
         return _clip_of_masks(name, place[0], pictures, place[1], masks, rate_hz)
 
     def _read_list(self) -> list[str]:
-        """The clips of a subset. Raises InputError where no list of that name exists."""
+        """Return the clips of a subset. Raise InputError if no list of that name exists."""
         sets, subset, year = self.folder / "ImageSets", self.options["subset"], self.options["year"]
         homes = [sets / name for name in ([year] if year else ["2017", "2016"])]
         if year != "2017":
@@ -82,7 +82,7 @@ class CdNet(Reader):
     """
 
     kind = "cdnet"
-    layout = "CDnet 2012 or 2014: a folder a category, in it one a video with input/ and groundtruth/"
+    layout = "CDnet 2012 or 2014: a folder for each category, in it one for each video with input/ and groundtruth/"
     terms = "whoever publishes results acknowledges changedetection.net and cites its papers"
     defaults: ClassVar = {"rate_hz": None}
 
@@ -109,7 +109,7 @@ class CdNet(Reader):
         first, last = numbers
         masks = [p for p in files.images_in(truth) if first <= (files.number_of(p) or 0) <= last]
         if not masks:
-            raise InputError(f"{truth} labels none of the frames {first} to {last}; wanted masks")
+            raise InputError(f"{truth} labels no frame from {first} to {last}; wanted masks")
         labels = Labels(background=(0, 50), unscored=(85, 170), separate=False)
         return _clip_of_masks(name, place, pictures, truth, masks, self.options["rate_hz"], labels)
 
@@ -123,9 +123,9 @@ def _clip_of_masks(
     rate_hz: float | None,
     labels: Labels | None = None,
 ) -> Clip:
-    """A clip whose masks have the numbers of its pictures. home: of the masks."""
+    """Return a clip whose masks have the numbers of its pictures. home: folder of the masks."""
     found = files.masks_by_frame(masks, files.frames_by_number(pictures), pictures[0].parent)
-    truth = Truth("masks", home, found, {}, length=len(pictures), labels=labels or Labels())
+    truth = ClipTruth("masks", home, found, {}, length=len(pictures), labels=labels or Labels())
     return files.fit_clip(Clip(name, place, pictures, rate_hz, len(pictures), truth))
 
 
@@ -146,13 +146,13 @@ class Bms(Reader):
     terms = "for research purposes only; any commercial use is prohibited; to be cited"
     defaults: ClassVar = {"rate_hz": None}
     sets = ("Trainingset", "Testset", "moseg_dataset", "FBMS_Trainingset", "FBMS_Testset")
-    """Folders of clips, as the archives unpack; they may lie in one another."""
+    """Folders of clips, as in the archives. They may contain each other."""
 
     def _places(self) -> Mapping[str, Path]:
         places: dict[str, Path] = {}
         for place in self._clips_below(self.folder):
             if place.name in places and self.wanted(place.name):
-                read = f"{places[place.name]} is read, {place} of the same name is not"
+                read = f"{places[place.name]} is read; {place} of the same name is not read"
                 self.missing.append(f"{place.name}: {read}")
             places.setdefault(place.name, place)
         return places
@@ -172,14 +172,14 @@ class Bms(Reader):
             raise InputError(f"{place} has no truth; wanted {name}Def.dat and masks in {home}, or frames/ and masks/")
         definition = read_definition(path)
         label_files = {file for _, file, _ in definition.labelled}
-        # A PPM or PGM is a frame only where there is no JPEG: in BMS-26 labels lie among the frames.
+        # A PPM or PGM is a frame only if there is no JPEG, because BMS-26 has labels among the frames.
         pictures = files.images_in(place, _PHOTOS) or tuple(
             p
             for p in files.images_in(place, frozenset({".ppm"}))
             if p.name not in label_files and not p.stem.endswith("_gt")
         )
         if not pictures:
-            raise InputError(f"{path} is the truth of a clip without pictures; put them into {place}")
+            raise InputError(f"{path} is the truth of a clip without pictures; put the pictures into {place}")
         if len(pictures) < definition.frames:
             held = f"{place} holds {len(pictures)} pictures"
             raise InputError(f"{path} is of {definition.frames} frames, but {held}; is it whole?")
@@ -189,19 +189,19 @@ class Bms(Reader):
             frame = frames.get(Path(picture).stem)
             if frame is None:
                 raise InputError(f"{path}: picture {picture} of frame {number} is not in {place}; is it whole?")
-            # Some definitions name a .ppm that is a .pgm, or the other way round.
+            # Some definitions name a .ppm file that is a .pgm file, or vice versa.
             named = home / file
             tried = (named, *(named.with_suffix(suffix) for suffix in (".ppm", ".pgm", ".png")))
             masks[frame] = next(filter(Path.is_file, tried), named)
             if not masks[frame].is_file():
-                raise InputError(f"{named} does not exist; the definition beside it names it")
+                raise InputError(f"{named} does not exist, but the definition beside it names it")
         labels = Labels(background=definition.regions[:1], movers=definition.regions[1:])
-        truth = Truth("masks", home, dict(sorted(masks.items())), {}, length=len(pictures), labels=labels)
+        truth = ClipTruth("masks", home, dict(sorted(masks.items())), {}, length=len(pictures), labels=labels)
         return files.fit_clip(Clip(name, place, pictures, rate_hz, len(pictures), truth))
 
 
 class Definition(NamedTuple):
-    """A clip's *Def.dat. regions: the value of each. labelled: number, file of labels, picture, of each frame."""
+    """A clip's *Def.dat. regions: the value of each. labelled: number, label file, picture of each labelled frame."""
 
     regions: tuple[int, ...]
     frames: int
@@ -209,10 +209,10 @@ class Definition(NamedTuple):
 
 
 def read_definition(path: Path) -> Definition:
-    """Read a definition: lines that end with a colon name what is in the next line. Raises InputError if damaged.
+    """Read a definition, in which a line that ends with a colon names the next line. Raise InputError if damaged.
 
-    Total number of regions; Scale of region K (the value of its pixels); Total number of frames in this shot; and of
-    each labelled frame its Frame number, File name (labels) and Input file name (picture).
+    The names are: Total number of regions; Scale of region K (the value of its pixels); Total number of frames in this
+    shot; and for each labelled frame Frame number, File name (labels) and Input file name (picture).
     """
     lines = [line.strip() for line in read_text(path, "latin-1").splitlines() if line.strip()]
     entries = [
@@ -227,10 +227,10 @@ def read_definition(path: Path) -> Definition:
         return int(text)
 
     def file(text: str) -> str:
-        """The name of a file beside the definition, without the folders of its makers' machine."""
+        """Return the name of a file beside the definition, without the folders of the authors' machine."""
         name = re.split(r"[\\/]", text)[-1]
         if name in ("", ".", "..") or "\0" in name or len(name.encode()) > _LONGEST_NAME:
-            raise InputError(f"{path}: '{text[:40]}' is no name of a file")
+            raise InputError(f"{path}: '{text[:40]}' is not the name of a file")
         return name
 
     regions = [whole(value) for name, value in entries if name.startswith("scale of region")]
@@ -240,7 +240,7 @@ def read_definition(path: Path) -> Definition:
         for wanted in ("frame number", "file name", "input file name")
     )
     if len(regions) < 2 or len(frames) != 1:
-        raise InputError(f"{path} is no definition of a clip; wanted two regions or more, and the number of frames")
+        raise InputError(f"{path} is not a definition of a clip; wanted two regions or more, and the number of frames")
     if not len(numbers) == len(masks) == len(pictures) or not numbers:
         raise InputError(
             f"{path} names {len(numbers)} labelled frames, {len(masks)} files and {len(pictures)} pictures; "

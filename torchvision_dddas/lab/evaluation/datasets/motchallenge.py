@@ -1,4 +1,4 @@
-"""MOTChallenge, 2015 to 2020, and what others published in its layout."""
+"""MOTChallenge, 2015 to 2020, and other data sets in its layout."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,16 +13,16 @@ from torchvision_dddas.lab.evaluation.datasets.annotations import boxes_by_frame
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.lab.evaluation.metrics.text_rows import read_columns, read_text, split_cells
 from torchvision_dddas.lab.evaluation.metrics.truth import (
-    Positions,
+    ClipTruth,
     SeqInfo,
-    Truth,
+    TruePositions,
     load_truth,
     read_seqinfo,
 )
 
 BENCHMARKS = ("MOT15", "MOT16", "MOT17", "MOT20")
 PEDESTRIAN = 1
-DISTRACTORS = (2, 7, 8, 12)  # a person on a vehicle, who stands for ever, distractor, reflection
+DISTRACTORS = (2, 7, 8, 12)  # a person on a vehicle, a person who never moves, distractor, reflection
 NON_MOTORIZED = 6  # a vehicle without a motor, a distractor of 2020
 _COLUMNS = ("frame", "identity", "x", "y", "width", "height", "counts", "class", "visibility")
 _GROUND = ("frame", "identity", "x", "y", "width", "height", "counts", "ground x", "ground y", "ground z")
@@ -30,21 +30,21 @@ _MARKS = ("seqinfo.ini", "gt/gt.txt", "det/det.txt")
 
 
 class MotChallenge(Reader):
-    """MOTChallenge: the folder is a sequence, or holds some, or holds train/ and test/ that do.
+    """MOTChallenge: the folder is a sequence, holds sequences, or holds train/ and test/ with sequences.
 
-        SEQUENCE/seqinfo.ini        frameRate, seqLength, imDir
-        SEQUENCE/img1/000001.jpg    pictures, from 1; a video in SEQUENCE may stand for them
-        SEQUENCE/gt/gt.txt          frame,id,x,y,w,h, then
-                                    2015: counts (0 or 1), and on the ground, in metres: x,y,z; -1 where unknown
-                                    2016 and later: counts, class, visibility
-        SEQUENCE/det/det.txt        public detections
+    SEQUENCE/seqinfo.ini frameRate, seqLength, imDir
+    SEQUENCE/img1/000001.jpg pictures, from 1; a video in SEQUENCE may stand for them
+    SEQUENCE/gt/gt.txt frame,id,x,y,w,h, then
+    2015: counts (0 or 1), and on the ground, in metres: x,y,z; -1 where unknown
+    2016 and later: counts, class, visibility
+    SEQUENCE/det/det.txt public detections
 
-    What counts is what counts for TrackEval. 2015: rows marked 0 are as if not there. Later: pedestrians not marked 0;
-    found boxes on distractors are taken out. Boxes of all classes take part in the matching that finds those.
+    The same rows count as in TrackEval. 2015: rows marked 0 are ignored. Later: pedestrians not marked 0 count, and
+    found boxes on distractors are removed. Boxes of all classes take part in the matching with distractors.
     """
 
     kind = "motchallenge"
-    layout = "MOTChallenge 2015 to 2020 and its like: SEQUENCE/gt/gt.txt, with img1/ or a video if there"
+    layout = "MOTChallenge 2015 to 2020 and similar: SEQUENCE/gt/gt.txt, with img1/ or a video if there is one"
     terms = "CC BY-NC-SA 3.0"
     defaults: ClassVar = {"benchmark": "", "least_visibility": 0.0}
 
@@ -52,7 +52,7 @@ class MotChallenge(Reader):
         super().__init__(*given)
         benchmark = self.options["benchmark"]
         if benchmark and benchmark not in BENCHMARKS:
-            raise InputError(f"'{benchmark}' is no benchmark; wanted one of {', '.join(BENCHMARKS)}")
+            raise InputError(f"'{benchmark}' is not a benchmark; wanted one of {', '.join(BENCHMARKS)}")
 
     def _places(self) -> Mapping[str, Path]:
         return sequences(self.folder) or self._refuse(
@@ -62,12 +62,12 @@ class MotChallenge(Reader):
     def _clip(self, name: str, place: Path) -> Clip:
         clip = sequence(place, **self.options)
         if not clip.pictures:
-            self.notes.append(f"{name}: no pictures, which belong in {place / 'img1'}")
+            self.notes.append(f"{name}: no pictures; they belong in {place / 'img1'}")
         return replace(clip, name=name)
 
 
 def sequences(folder: Path) -> dict[str, Path]:
-    """The sequences in a folder by name: its own, or those up to three folders deep; two of a name by their folders."""
+    """Return sequences by name: the folder or folders up to three levels deep. Equal names get their folder's name."""
     places: dict[str, Path] = {}
     for place in files.find_below(folder, lambda place: any((place / mark).is_file() for mark in _MARKS), 3):
         name = place.name if place.name not in places else "-".join(place.relative_to(folder).parts)
@@ -76,11 +76,11 @@ def sequences(folder: Path) -> dict[str, Path]:
 
 
 def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) -> Clip:
-    """The clip of a sequence's folder. Raises InputError: no truth, broken files, different frame counts."""
+    """Return the clip in a sequence's folder. Raise InputError without truth, for broken files, other frame counts."""
     info = read_seqinfo(place / "seqinfo.ini") if (place / "seqinfo.ini").is_file() else SeqInfo()
     path = place / "gt" / "gt.txt"
     if not path.is_file():
-        raise InputError(f"no truth, which belongs in {path} (that of test sequences is not published)")
+        raise InputError(f"no truth; it belongs in {path} (the truth of test sequences is not published)")
     images = files.images_in(place / info.pictures)
     pictures = files.check_numbering(images, 1) if images else files.videos_in(place)
     if len(pictures) > 1 and not images:
@@ -102,7 +102,7 @@ def sequence(place: Path, benchmark: str = "", least_visibility: float = 0.0) ->
     return Clip(name, place, pictures, info.rate_hz, last, truth, shows=("people",), given=public)
 
 
-def _of_2015(path: Path, has_ground: bool) -> Truth:
+def _of_2015(path: Path, has_ground: bool) -> ClipTruth:
     truth = load_truth(path)
     if truth.tracks is None:
         raise InputError(f"{path} has no identities; wanted MOTChallenge's frame,id,x,y,w,h,counts")
@@ -111,13 +111,13 @@ def _of_2015(path: Path, has_ground: bool) -> Truth:
     rows = read_columns(path, _GROUND)
     ground = rows.stack(*_GROUND[7:])
     known = ~(ground == -1).all(axis=1) & (ground[:, 2] != -1) & (rows["counts"] != 0)
-    if not ground.any() or not known.any():  # zeros alone: nobody measured
+    if not ground.any() or not known.any():  # if all are zero, nobody measured
         return truth
     frame, identity = (rows[name][known].astype(np.int64) for name in ("frame", "identity"))
-    return replace(truth, positions=Positions(frame, identity, ground[known, :2]))
+    return replace(truth, positions=TruePositions(frame, identity, ground[known, :2]))
 
 
-def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: float, length: int) -> Truth:
+def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: float, length: int) -> ClipTruth:
     rows = read_columns(path, _COLUMNS)
     table = table_of(path, rows["frame"], rows["identity"], rows.stack(*_COLUMNS[2:6]), rows.line)
     is_pedestrian = rows["class"] == PEDESTRIAN
@@ -128,4 +128,4 @@ def _with_classes(path: Path, distractors: tuple[int, ...], least_visibility: fl
         raise InputError(f"{path} holds no pedestrian that counts")
     kept, others = table.at(true), table.at(~true & ~ignored)
     boxes = boxes_by_frame(kept, max(length, int(table.frame.max())))
-    return Truth("boxes", path, {}, boxes, kept, table.at(ignored), ignoring="removed", others=others)
+    return ClipTruth("boxes", path, {}, boxes, kept, table.at(ignored), ignoring="removed", others=others)

@@ -1,4 +1,4 @@
-"""Data sets of one labelled target a clip: UAV123 and VIVID; of VIVID also all vehicles, where they are labelled."""
+"""Data sets with one labelled target in each clip: UAV123 and VIVID; in VIVID all vehicles may be labelled."""
 
 import re
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from torchvision_dddas.lab.evaluation.datasets import files
 from torchvision_dddas.lab.evaluation.datasets.annotations import boxes_by_frame, table_of
 from torchvision_dddas.lab.evaluation.datasets.record import Clip, Reader
 from torchvision_dddas.lab.evaluation.metrics.text_rows import FARTHEST, read_text
-from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, Truth, load_truth, read_mask
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable, load_truth, read_mask
 
 
 class Uav123(Reader):
@@ -39,21 +39,21 @@ class Uav123(Reader):
         super().__init__(*given)
         variant = self.options["variant"]
         if variant and variant not in self.rates_hz:
-            raise InputError(f"'{variant}' is no variant of UAV123; wanted {', '.join(self.rates_hz)}")
+            raise InputError(f"'{variant}' is not a variant of UAV123; wanted {', '.join(self.rates_hz)}")
         self._variant = variant or next((v for v in self.rates_hz if (self.folder / "anno" / v).is_dir()), "")
-        # The sequences of UAV20L may be among those of UAV123.
+        # The sequences of UAV20L may be among the sequences of UAV123.
         shared = "UAV123" if self._variant == "UAV20L" else self._variant
         annotations, sequences = self.folder / "anno", self.folder / "data_seq"
         self._annotations = _first_folder(annotations / self._variant, annotations)
         self._sequences = _first_folder(sequences / self._variant, sequences / shared, sequences)
 
     def _places(self) -> Mapping[str, tuple[Any, ...]]:
-        parts = {self._annotations: "the boxes, CLIP.txt", self._sequences: "the frames, a folder a sequence"}
+        parts = {self._annotations: "the boxes, CLIP.txt", self._sequences: "the frames, one folder for each sequence"}
         if absent := [f"{place} does not exist; wanted {what}" for place, what in parts.items() if not place.is_dir()]:
             return self._refuse(*absent)
         path = self.folder / "configSeqs.m"
         text = read_text(path, "latin-1") if path.is_file() else ""
-        # One file may hold a table for each variant, which begins as seqUAV123_10fps = {...
+        # One file may contain a table for each variant, which begins as seqUAV123_10fps = {...
         tables = re.split(r"seq(UAV\w+)\s*=\s*\{", text)
         mine = dict(zip(tables[1::2], tables[2::2], strict=True)).get(self._variant, text)
         spans = {
@@ -65,11 +65,11 @@ class Uav123(Reader):
     def _clip(self, name: str, place: tuple[Any, ...]) -> Clip:
         still = any(fnmatchcase(name, pattern) for pattern in self.options["still"])
         if name.startswith("building") and not still:
-            raise InputError("its target is a building, which does not move; name it in `still` if nothing else does")
+            raise InputError("its target is a building; name the clip in `still` if nothing moves")
         home, span = self._sequences / place[0], place[1:]
         pictures = files.images_in(home)
         if not pictures:
-            wanted = "" if span else f", or configSeqs.m, which says of what sequence {name} is a part"
+            wanted = "" if span else f", or configSeqs.m, which states the sequence that {name} is part of"
             raise InputError(f"{home} holds no pictures; wanted the frames of the clip{wanted}")
         if span:
             first, last = span
@@ -94,12 +94,12 @@ _PART = re.compile(
 class Vivid(Reader):
     """DARPA VIVID, egtest01 to egtest05, as in the tracking evaluation of PETS 2005 (Collins et al.).
 
-    The truth lies in the clip's folder, beside it or in Groundtruth/: NAME_truth.csv (all vehicles), NAME*.txt (the box
-    of one target in each or in some frames) or a folder NAME_mask (masks of one target in some frames).
+    The truth is in the clip's folder, beside it or in Groundtruth/: NAME_truth.csv (all vehicles), NAME*.txt (the box
+    of one target in all or some frames) or a folder NAME_mask (masks of one target in some frames).
     """
 
     kind = "vivid"
-    layout = "VIVID of PETS 2005: egtest01/ and its like, with boxes or masks of every tenth frame"
+    layout = "VIVID of PETS 2005: egtest01/ to egtest05/, with boxes or masks of every tenth frame"
     terms = "for the evaluation of trackers; to be cited as Collins, Zhou and Teh (PETS 2005)"
     defaults: ClassVar = {"rate_hz": None}
 
@@ -117,7 +117,7 @@ class Vivid(Reader):
         truth = self._truth(name, frames, pictures)
         return files.fit_clip(Clip(name, place, pictures, self.options["rate_hz"] or 30.0, len(pictures), truth))
 
-    def _truth(self, name: str, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
+    def _truth(self, name: str, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> ClipTruth:
         homes = (self.folder / name, self.folder, self.folder / "Groundtruth", self.folder / "groundtruth")
         for pattern, reader in (("*_truth.csv", _all_vehicles), ("*.txt", _one_box_a_line)):
             for home in homes:
@@ -128,14 +128,14 @@ class Vivid(Reader):
                 if "mask" in inside.lower() and (home == homes[0] or inside.startswith(name)):
                     return _boxes_about_masks(home / inside, frames, pictures)
         raise InputError(
-            f"{self.folder} has no truth of it; wanted {name}_truth.csv, {name}*.txt or a folder {name}_mask"
+            f"{self.folder} has no truth of this clip; wanted {name}_truth.csv, {name}*.txt or a folder {name}_mask"
         )
 
 
-def _all_vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
-    """name,frame,identity,x,y,width,height under a line of names. frames: number of a picture -> frame.
+def _all_vehicles(path: Path, frames: Mapping[int, int]) -> ClipTruth:
+    """Read name,frame,identity,x,y,width,height under a line of names. frames: number of a picture -> frame.
 
-    Frames without a row are taken as empty up to the last that has one. Raises InputError with file and line.
+    Frames without a row count as empty, up to the last frame with a row. Raise InputError with file and line.
     """
     rows = []
     _, lines, cells_of = read_csv(path, "truth")
@@ -146,20 +146,20 @@ def _all_vehicles(path: Path, frames: Mapping[int, int]) -> Truth:
         row = _numbers(cells[1:], where)
         rows.append([_frame(row[0], frames, where), *row[1:]])
     if not rows:
-        raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height a line")
+        raise InputError(f"{path} holds no boxes; wanted name,frame,identity,x,y,width,height in each line")
     values = np.array(rows)
     if len(fractions := values[values[:, 1] % 1 != 0]):
-        raise InputError(f"{path}: {fractions[0, 1]:g} is no identity; wanted whole numbers")
+        raise InputError(f"{path}: {fractions[0, 1]:g} is not an identity; wanted whole numbers")
     table = table_of(path, values[:, 0], values[:, 1], values[:, 2:], np.array(lines))
-    return Truth("boxes", path, {}, boxes_by_frame(table, int(table.frame.max())), table, length=len(frames))
+    return ClipTruth("boxes", path, {}, boxes_by_frame(table, int(table.frame.max())), table, length=len(frames))
 
 
-def _one_box_a_line(path: Path, frames: Mapping[int, int]) -> Truth:
-    """frame,x,y,width,height of some frames, or x,y,width,height of each. Raises InputError."""
+def _one_box_a_line(path: Path, frames: Mapping[int, int]) -> ClipTruth:
+    """Read frame,x,y,width,height of some frames, or x,y,width,height of each. Raise InputError."""
     lines = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     if not lines or len(lines[0]) not in (4, 5):
         held = f"has {len(lines[0])} columns" if lines else "is empty"
-        raise InputError(f"{path} {held}; wanted frame,x,y,width,height, or x,y,width,height, a line")
+        raise InputError(f"{path} {held}; wanted frame,x,y,width,height or x,y,width,height in each line")
     found: dict[int, np.ndarray] = {}
     for number, cells in enumerate(lines, 1):
         where = f"{path}, line {number}"
@@ -168,15 +168,15 @@ def _one_box_a_line(path: Path, frames: Mapping[int, int]) -> Truth:
         row = _numbers(cells, where, allow_nan=True)
         frame = number if len(row) == 4 else _frame(row[0], frames, where)
         if frame in found:
-            raise InputError(f"{where}: frame {row[0]:g} is there twice; wanted one box a frame")
+            raise InputError(f"{where}: frame {row[0]:g} occurs twice; wanted one box for each frame")
         found[frame] = np.array(row[-4:])
     if len(lines[0]) == 4 and len(lines) != len(frames):
-        raise InputError(f"{path} has {len(lines)} lines, but the clip {len(frames)} frames; wanted a line a frame")
+        raise InputError(f"{path} has {len(lines)} lines, but the clip has {len(frames)} frames; wanted one for each")
     return _one_target(path, found, len(frames))
 
 
-def _boxes_about_masks(place: Path, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> Truth:
-    """One target, by the box about what is not 0 in its masks. Raises InputError."""
+def _boxes_about_masks(place: Path, frames: Mapping[int, int], pictures: tuple[Path, ...]) -> ClipTruth:
+    """Return one target by the box around the nonzero pixels of its masks. Raise InputError."""
     labels = files.masks_by_frame(files.images_in(place), frames, place.parent)
     if not labels:
         raise InputError(f"{place} holds no masks; wanted the truth of every tenth frame")
@@ -188,13 +188,13 @@ def _boxes_about_masks(place: Path, frames: Mapping[int, int], pictures: tuple[P
     return _one_target(place, boxes, len(frames))
 
 
-def _one_target(place: Path, boxes: Mapping[int, np.ndarray], length: int) -> Truth:
-    """boxes: the target's by frame, NaN where it is not visible."""
+def _one_target(place: Path, boxes: Mapping[int, np.ndarray], length: int) -> ClipTruth:
+    """Return the truth of one target. boxes: its box by frame, NaN if it is not visible."""
     frames = sorted(boxes)
     rows = np.array([boxes[frame] for frame in frames])
     seen = ~np.isnan(rows).any(axis=1)
     tracks = TrackTable(np.array(frames)[seen], np.ones(int(seen.sum()), np.int64), rows[seen])
-    return Truth("one target", place, {}, {frame: boxes[frame][None] for frame in frames}, tracks, length=length)
+    return ClipTruth("one target", place, {}, {frame: boxes[frame][None] for frame in frames}, tracks, length=length)
 
 
 def _numbers(cells: list[str], where: str, allow_nan: bool = False) -> list[float]:
@@ -211,7 +211,7 @@ def _numbers(cells: list[str], where: str, allow_nan: bool = False) -> list[floa
 
 
 def _frame(number: float, frames: Mapping[int, int], where: str) -> int:
-    """The frame of the picture with a number. Raises InputError where there is none."""
+    """Return the frame of the picture with a number. Raise InputError if there is no such picture."""
     found = frames.get(int(number)) if number == number and number == int(number) else None
     if found is None:
         raise InputError(f"{where}: there is no picture {number:g}; the clip has {min(frames)} to {max(frames)}")

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from torchvision_dddas.errors import InputError, readable
 from torchvision_dddas.io.images import natural_order
-from torchvision_dddas.lab.evaluation.metrics.truth import Truth
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth
 
 
 @dataclass(frozen=True)
@@ -15,12 +15,12 @@ class Clip:
     """One clip.
 
     name: unique in its data set, and `readable`. place: the file or folder that messages name.
-    pictures: the files of its frames in order, or one video; empty where it has none.
-    rate_hz: None where unknown. frames: how many, 0 where unknown. truth: None where nothing is known.
-    still: nothing moves in it, so that every detection is false.
-    shows: what its truth labels: "movers", or "people", who may stand. A study detects motion in the former and
-        people in the latter.
-    given: a table of public detections. The other files are those that `dddas run` and `dddas locate` take.
+    pictures: the files of its frames in order, or one video; empty if it has none.
+    rate_hz: None if unknown. frames: their number, 0 if unknown. truth: None if unknown.
+    still: nothing moves in the clip, so that every detection is false.
+    shows: kinds of targets that its truth labels: "movers", or "people", who may stand. A study detects motion for the
+    former and people for the latter.
+    given: a table of public detections. The other files are inputs of `dddas run` and `dddas locate`.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Clip:
     pictures: tuple[Path, ...] = ()
     rate_hz: float | None = None
     frames: int = 0
-    truth: Truth | None = None
+    truth: ClipTruth | None = None
     still: bool = False
     shows: tuple[str, ...] = ("movers",)
     given: Path | None = None
@@ -39,15 +39,15 @@ class Clip:
     elevation: Path | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", readable(self.name))  # tables and reports hold it
+        object.__setattr__(self, "name", readable(self.name))  # tables and reports contain the name
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Clips of one kind. terms: of use, as its makers state them.
+    """Clips of one kind. terms: conditions of use, as the authors state them.
 
-    missing: one line for each clip that is left out, and why, or on what the folder should hold. notes: one line for
-    each thing that is absent from clips that are read all the same.
+    missing: one line for each clip that is left out, with the reason, or on the content that the folder should have.
+    notes: one line for each item that is absent from clips that are read nevertheless.
     """
 
     kind: str
@@ -59,7 +59,7 @@ class Dataset:
 
 
 @dataclass(frozen=True)
-class Source:
+class DatasetSource:
     """A data set as a study names it. clips: patterns of names (fnmatch). options: further options of its kind."""
 
     kind: str
@@ -77,11 +77,11 @@ _EXPECTED = {
 
 
 class Reader:
-    """Reads a data set of one kind. A subclass describes its layout on disk; docs/datasets.md says what counts.
+    """A reader of data sets of one kind. A subclass describes its layout on disk; docs/datasets.md states what counts.
 
-    layout: in a line. terms: of use. defaults: of the options; the type of a default is the option's, a list holds
-    texts, and None stands for an optional number above 0. words: by option that lists words, the name of those who use
-    them and the known ones, all by default. missing, notes: see Dataset.
+    layout: in one line. terms: conditions of use. defaults: of the options. The type of a default is the option's type;
+    a list holds texts, and None stands for an optional number above 0. words: for each option that lists words, its
+    data set's name and the known words; the default is all of them. missing, notes: see Dataset.
     """
 
     kind: ClassVar[str]
@@ -91,7 +91,7 @@ class Reader:
     words: ClassVar[Mapping[str, tuple[str, tuple[str, ...]]]] = {}
 
     def __init__(self, folder: Path, options: Mapping[str, Any], wanted: Callable[[str], bool]) -> None:
-        """folder: it exists. wanted: whether a clip of that name is read. Raises InputError for a wrong option."""
+        """folder: must exist. wanted: whether to read a clip by its name. Raise InputError for a wrong option."""
         self.folder, self.wanted = folder, wanted
         self.missing: list[str] = []
         self.notes: list[str] = []
@@ -113,10 +113,10 @@ class Reader:
         for option, (whose, known) in self.words.items():
             for word in self.options[option]:
                 if word not in known:
-                    raise InputError(f"'{word}' is no class of {whose}; wanted some of {', '.join(known)}")
+                    raise InputError(f"'{word}' is not a class of {whose}; wanted some of {', '.join(known)}")
 
     def _places(self) -> Mapping[str, Any]:
-        """What `_clip` needs of each clip, by name; mostly its file or folder."""
+        """Return the input of `_clip` for each clip, by name; usually its file or folder."""
         raise NotImplementedError
 
     def _clip(self, name: str, place: Any) -> Clip:
@@ -124,7 +124,7 @@ class Reader:
         raise NotImplementedError
 
     def read(self) -> Dataset:
-        """The wanted clips in natural order."""
+        """Return the wanted clips in natural order."""
         clips, places = [], self._places()
         for name in sorted(filter(self.wanted, places), key=natural_order):
             try:
@@ -134,19 +134,19 @@ class Reader:
         return Dataset(self.kind, self.folder, tuple(clips), self.terms, tuple(self.missing), tuple(self.notes))
 
     def _refuse(self, *missing: str) -> dict[str, Any]:
-        """No places: the folder does not hold this kind, for these reasons."""
+        """Return no places, and add to `missing` the reasons why the folder does not hold this kind."""
         self.missing += missing
         return {}
 
     def _report_unlabelled(self, names: list[str], labelled: Mapping[str, Any], belongs: str) -> None:
-        """Add to `missing` what has pictures and no truth. belongs: the path of the truth, with {} for the name."""
+        """Add to `missing` clips with pictures but no truth. belongs: path of the truth, with {} for the name."""
         absent = [name for name in names if name not in labelled and self.wanted(name)]
-        self.missing += [f"{name}: no truth, which belongs in {belongs.format(name)}" for name in absent]
+        self.missing += [f"{name}: no truth; it belongs in {belongs.format(name)}" for name in absent]
 
     def _boxes_clip(
-        self, name: str, place: Path, pictures: tuple[Path, ...], truth: Truth, belongs: Path, **more: Any
+        self, name: str, place: Path, pictures: tuple[Path, ...], truth: ClipTruth, belongs: Path, **more: Any
     ) -> Clip:
-        """A clip of labelled boxes, which may lack its pictures; a note then says where they belong."""
+        """Return a clip of labelled boxes. If it lacks pictures, a note states where they belong."""
         if not pictures:
-            self.notes.append(f"{name}: no pictures, which belong in {belongs}")
+            self.notes.append(f"{name}: no pictures; they belong in {belongs}")
         return Clip(name, place, pictures, frames=truth.length or truth.frames[-1], truth=truth, **more)

@@ -1,1 +1,1 @@
-"""How good results are, by the source's measures and the field's."""
+"""Measures of the quality of results, by the source and by common practice."""

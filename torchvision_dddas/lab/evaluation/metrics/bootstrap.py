@@ -13,17 +13,18 @@ RESAMPLES = 1000
 LEVEL = 0.95
 
 FEWEST = 5
-"""Independent blocks below which nothing is said: the range of five values misses their median in 1 of 16 cases."""
+"""Fewest independent blocks for an interval. The range of five values misses their median in 1 of 16 cases."""
 
 LONGER = 2.0
-"""Blocks that tell a variance best are short for an interval: of alike frames it then holds the truth more seldom."""
+"""Blocks of the length that estimates a variance best are too short for an interval: if frames are alike, the interval
+then contains the truth less often."""
 
 Statistic = Callable[[np.ndarray], dict[str, float]]
-"""Weights (U,) of units, how often each counts, to measures by name; NaN where one is undefined."""
+"""A function from weights of units, (U,), how often each unit counts, to measures by name; NaN if undefined."""
 
 
-class Interval(NamedTuple):
-    """Within which the figure lies in 95 of 100 such studies."""
+class ConfidenceInterval(NamedTuple):
+    """The range that contains the figure in 95 of 100 such studies."""
 
     low: float
     high: float
@@ -38,8 +39,8 @@ class Stratum(NamedTuple):
 
 def intervals(
     statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES
-) -> dict[str, Interval | None]:
-    """An interval for each measure; None where there are fewer than FEWEST blocks or too few samples gave a figure.
+) -> dict[str, ConfidenceInterval | None]:
+    """Return an interval for each measure; None with fewer than FEWEST blocks or too few samples with a figure.
 
     Source: Hesterberg, 2015, "expanded percentile interval".
     """
@@ -53,20 +54,20 @@ def intervals(
 
 
 def _by_name(samples: Iterable[Mapping[str, float]]) -> dict[str, np.ndarray]:
-    """(R,) each measure in each sample."""
+    """Return each measure in each sample, (R,)."""
     found = list(samples)
     return {name: np.array([sample[name] for sample in found]) for name in found[0]}
 
 
 def parts(strata: Sequence[Stratum]) -> float:
-    """How many blocks there are, what may be taken as independent."""
+    """Return the number of blocks, which count as independent."""
     return sum(stratum.units / stratum.block for stratum in strata)
 
 
 def weights(strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES) -> Iterator[np.ndarray]:
-    """How often each unit is in each sample, (U,): blocks of neighbours, after the last comes the first.
+    """Yield how often each unit is in each sample, (U,): blocks of neighbours; the first unit follows the last.
 
-    Source: Politis and Romano, 1992, the circular block bootstrap. A block of 1: the plain bootstrap.
+    Source: Politis and Romano, 1992, the circular block bootstrap. Blocks of 1 give the plain bootstrap.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     for _ in range(resamples):
@@ -78,21 +79,22 @@ def weights(strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES) ->
         yield np.concatenate(drawn).astype(float)
 
 
-def percentiles(values: np.ndarray, count: float) -> Interval | None:
-    """The interval by samples of so many independent blocks; None if a tenth of them are no number."""
+def percentiles(values: np.ndarray, count: float) -> ConfidenceInterval | None:
+    """Return the interval of samples of `count` independent blocks; None if over a tenth of them are not finite."""
     known = values[np.isfinite(values)]
     if len(known) < 0.9 * len(values) or not len(known):
         return None
-    # Expanded: widened for few blocks as a t distribution is against the normal one.
+    # Expanded: for few blocks, wider by the ratio of the t distribution to the normal distribution.
     tail = float(ndtr(math.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - LEVEL) / 2)))
     low, high = np.quantile(known, [tail, 1 - tail])
-    return Interval(float(low), float(high))
+    return ConfidenceInterval(float(low), float(high))
 
 
 def block_length(series: np.ndarray) -> int:
-    """How many neighbours a block needs so that blocks may be taken as independent: the most that a column asks for.
+    """Return the number of neighbours in a block so that blocks count as independent: the largest over all columns.
 
-    series: (U, K), what each unit in turn adds to each of some measures. At most a FEWEST-th of the units.
+    series: (U, K), the contribution of each unit, in order, to each measure. The length is at most the units divided by
+    FEWEST.
     Source: Politis and White, 2004, with the correction of 2009, for the circular block bootstrap.
     """
     units = len(series)
@@ -106,7 +108,7 @@ def _asked(column: np.ndarray) -> float:
     count, apart = len(column), column - column.mean()
     if count < 2 * FEWEST or not apart.any():
         return 1.0
-    # The autocorrelation counts as gone after the first `quiet` lags in a row that chance explains.
+    # The autocorrelation counts as zero after the first `quiet` lags in a row that chance explains.
     quiet, farthest = max(5, math.ceil(math.sqrt(math.log10(count)))), math.ceil(math.sqrt(count)) + 5
     lags = min(count - 1, 2 * (farthest + quiet))
     shared = np.array([apart[: count - lag] @ apart[lag:] for lag in range(lags + 1)]) / count
@@ -128,7 +130,7 @@ def _asked(column: np.ndarray) -> float:
 
 
 def seed_of(*parts: str | np.ndarray) -> int:
-    """A seed by the content alone, so that the same counts give the same interval wherever they stand."""
+    """Return a seed that depends only on the content, so that the same counts always give the same interval."""
     digest = hashlib.sha256()
     for part in parts:
         content = part.encode() if isinstance(part, str) else np.ascontiguousarray(part, float).tobytes()
@@ -137,20 +139,20 @@ def seed_of(*parts: str | np.ndarray) -> int:
 
 
 EXCHANGES = 2000
-"""Ways to exchange two results that are gone through."""
+"""Largest number of ways to exchange two results that are tried."""
 
 _ROUNDING = 1e-9
 
 
 class Effect(NamedTuple):
-    """How a measure differs, the second result less the first. interval: None where too little is there to tell one.
+    """The difference of a measure, the second result minus the first. interval: None if there are too few blocks.
 
-    p: how likely a difference as large is if the two results were exchangeable; NaN where that cannot be asked. least:
-    the smallest p that so few blocks could give.
+    p: probability of so large a difference if the two results were exchangeable; NaN if it cannot be computed. least:
+    the smallest p that so few blocks can give.
     """
 
     value: float
-    interval: Interval | None
+    interval: ConfidenceInterval | None
     p: float
     least: float
 
@@ -158,10 +160,11 @@ class Effect(NamedTuple):
 def effects(
     statistic: Statistic, strata: Sequence[Stratum], seed: int, resamples: int = RESAMPLES, most: int = EXCHANGES
 ) -> dict[str, Effect]:
-    """The effect on each measure. strata: of the units of one result; blocks of them are drawn, or exchanged, together.
+    """Return the effect on each measure. strata: of one result's units, whose blocks are drawn or exchanged together.
 
-    statistic: of weights (2 U,): how often each unit of the first result counts, and then of the second.
-    resamples: drawn for the interval; most: ways to exchange the results that are gone through, all where no more.
+    statistic: of weights (2 U,): how often each unit of the first result counts, then of the second. resamples: number
+    of samples for the interval. most: largest number of ways to exchange the results; all ways are tried if there are
+    no more.
     """
     units = sum(stratum.units for stratum in strata)
     ones, none = np.ones(units), np.zeros(units)
@@ -173,7 +176,7 @@ def effects(
     whole, drawn = difference(ones, none), None
     if parts(strata) >= FEWEST:
         drawn = _by_name(difference(weight, none) for weight in weights(strata, seed, resamples))
-    # Blocks, none much shorter than the others: every way to exchange their two results, or random ones of many.
+    # Try every way to exchange the two results of blocks of about equal length, or random ways if there are too many.
     sizes: list[int] = []
     for stratum in strata:
         count = max(1, stratum.units // stratum.block)
@@ -185,7 +188,7 @@ def effects(
     )
     swaps = (np.repeat(np.array(side, float), sizes) for side in sides)
     exchanged = _by_name(difference(1 - swap, swap) for swap in swaps)
-    # Exchanging everything only turns the sign of the difference.
+    # Exchanging all blocks only changes the sign of the difference.
     least = 2 ** (1 - len(sizes)) if every else 1 / (most + 1)
     return {
         name: Effect(
@@ -203,12 +206,12 @@ def _p(value: float, exchanged: np.ndarray, every: bool) -> float:
     if not math.isfinite(value) or len(known) < 0.9 * len(exchanged) or not len(known):
         return math.nan
     as_large = int((np.abs(known) >= abs(value) * (1 - _ROUNDING) - _ROUNDING * 1e-3).sum())
-    # What was seen is one of the ways itself; random ones may have missed it.
+    # The observed result is one of the ways. Random ways may have missed it.
     return as_large / len(known) if every else (as_large + 1) / (len(known) + 1)
 
 
 def holm(p: Mapping[str, float]) -> dict[str, float]:
-    """The p values of several questions asked at once, each as sure as if it were the only one. NaN stays NaN.
+    """Correct the p values of several questions, so that each is as reliable as a single question. NaN stays NaN.
 
     Source: Holm, 1979.
     """

@@ -10,11 +10,11 @@ import numpy as np
 from torchvision_dddas.lab.evaluation.metrics.pixels import ratio
 
 LEAST_PX = 40
-"""A labelled region of fewer pixels has no true box: it is a sliver at the border or behind something."""
+"""A labelled region of fewer pixels has no true box: it is a sliver at the border or behind an object."""
 
 
-class Boxes(NamedTuple):
-    """Boxes matched, found where nothing is, and missed."""
+class BoxCounts(NamedTuple):
+    """Numbers of matched boxes, of found boxes without a target, and of missed boxes."""
 
     hit: int = 0
     false: int = 0
@@ -22,7 +22,7 @@ class Boxes(NamedTuple):
 
 
 class OneTarget(NamedTuple):
-    """Frames with the one labelled target; those where it is hit, where a box meets it at IoU 0.3; blobs elsewhere."""
+    """Frames with the one labelled target, frames with a hit, frames with a box at IoU 0.3, and blobs elsewhere."""
 
     frames: int = 0
     hit: int = 0
@@ -31,7 +31,7 @@ class OneTarget(NamedTuple):
 
 
 def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
-    """(N, 4) boxes x, y, width, height of the values above 0 that cover at least `least_px` pixels."""
+    """Return (N, 4) boxes x, y, width, height of the values above 0 that cover at least `least_px` pixels."""
     boxes = []
     for value in np.unique(labels[labels > 0]):
         mine = labels == value
@@ -41,7 +41,7 @@ def boxes_of(labels: np.ndarray, least_px: int = LEAST_PX) -> np.ndarray:
 
 
 def areas(box_px: np.ndarray, other_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(...) what two boxes (..., 4) share and what they cover together, px²; broadcast against each other.
+    """Return the area of the intersection and of the union of boxes (..., 4), px²; the arrays broadcast.
 
     The pipeline has its own formula: measures share no code with it.
     """
@@ -52,24 +52,24 @@ def areas(box_px: np.ndarray, other_px: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(N, M) intersection over union of boxes (N, 4) and (M, 4), x, y, width, height."""
+    """Return the intersection over union, (N, M), of boxes (N, 4) and (M, 4), x, y, width, height."""
     common, union = areas(boxes[:, None], others[None])
     return np.divide(common, union, out=np.zeros_like(common), where=union > 0)
 
 
-def match(found: np.ndarray, truth: np.ndarray, least: float = 0.5) -> Boxes:
-    """Each true box in turn takes its best remaining detection, if that reaches `least`."""
+def match(found: np.ndarray, truth: np.ndarray, least: float = 0.5) -> BoxCounts:
+    """Match boxes: each true box in turn takes its best remaining detection, if their IoU reaches `least`."""
     scores, hits = iou(truth, found), 0
     for i in range(len(truth)):
         j = int(np.argmax(scores[i])) if len(found) else -1
         if j >= 0 and scores[i, j] >= least:
             hits += 1
             scores[:, j] = -1
-    return Boxes(hits, len(found) - hits, len(truth) - hits)
+    return BoxCounts(hits, len(found) - hits, len(truth) - hits)
 
 
-def measures(boxes: Boxes) -> dict[str, float]:
-    """Precision, recall and F1; NaN for 0/0."""
+def measures(boxes: BoxCounts) -> dict[str, float]:
+    """Return precision, recall and F1; NaN for 0/0."""
     hit, false, missed = boxes
     return {
         "precision": ratio(hit, hit + false),
@@ -79,9 +79,10 @@ def measures(boxes: Boxes) -> dict[str, float]:
 
 
 def one_target(mask: np.ndarray, found: np.ndarray, target: np.ndarray) -> OneTarget:
-    """One frame of a clip with one labelled target (4,), other movers unlabelled; a NaN box is a frame without it.
+    """Count one frame of a clip with one labelled target (4,); other movers have no label. A NaN box: no target.
 
-    Hit: over a tenth of the box is foreground. A blob is elsewhere if its box meets the target's at IoU below 0.05.
+    A hit has foreground in over a tenth of the box. A blob is elsewhere if its box meets the target's at IoU below
+    0.05.
     """
     if np.isnan(target).any():
         return OneTarget()
@@ -93,7 +94,7 @@ def one_target(mask: np.ndarray, found: np.ndarray, target: np.ndarray) -> OneTa
 
 
 def one_target_measures(counts: OneTarget) -> dict[str, float]:
-    """Shares of frames, and other blobs a frame."""
+    """Return shares of frames, and other blobs for each frame."""
     frames, hit, near, other = counts
     return {"hit": ratio(hit, frames), "iou_0.3": ratio(near, frames), "other_blobs_per_frame": ratio(other, frames)}
 
@@ -102,17 +103,17 @@ SAME = 0.5
 """IoU from which a detection is right."""
 
 RATES = np.logspace(-2, 0, 9)
-"""False positives an image over which the miss rate is averaged: nine, evenly in the logarithm from 0.01 to 1."""
+"""Numbers of false positives for each image over which the miss rate is averaged: nine, logarithmic from 0.01 to 1."""
 
 LEAST_MISS = 1e-10
-"""So small a miss rate stands for none: the logarithm of 0 is no number."""
+"""Smallest miss rate in the mean of logarithms, because the logarithm of 0 is not finite."""
 
 
 def judged(found: np.ndarray, score: np.ndarray, truth: np.ndarray, least: float = SAME) -> np.ndarray:
-    """(N,) 1.0 for detections that are right, 0.0 for others, in one image; each true box takes at most one.
+    """Return 1.0 for right detections of one image and 0.0 for others, (N,). Each true box takes at most one.
 
-    The best score first takes the true box that it fits best of those left; of equal scores the better fit is first.
-    found: (N, 4), score: (N,), truth: (M, 4), x, y, width, height.
+    By falling score, each detection takes the best of the remaining true boxes; of equal scores the better fit is
+    first. found: (N, 4), score: (N,), truth: (M, 4), x, y, width, height.
     """
     right = np.zeros(len(found))
     if len(found) and len(truth):
@@ -126,7 +127,7 @@ def judged(found: np.ndarray, score: np.ndarray, truth: np.ndarray, least: float
 
 
 class Curve(NamedTuple):
-    """Right and false detections (K,) of at least each score (K,), which falls."""
+    """Right and false detections (K,) with at least each score (K,). Scores fall."""
 
     score: np.ndarray
     right: np.ndarray
@@ -137,9 +138,9 @@ class Curve(NamedTuple):
 class Ranking:
     """Detections of many images or clips, to be pooled with any weights.
 
-    right: (M,) 1 or 0, best score first. unit: (M,) int64, which image or clip each is of. ends: (K,) the last row of
-    each score, for detections of one score come together. score: (K,). true, images: (U,) true boxes and images of each
-    unit.
+    right: (M,) 1 or 0, best score first. unit: (M,) int64, the image or clip of each detection. ends: (K,) the last row
+    of each score, because detections of one score are counted together. score: (K,). true, images: (U,) true boxes and
+    images of each unit.
     """
 
     right: np.ndarray
@@ -150,7 +151,7 @@ class Ranking:
     images: np.ndarray
 
     def curve(self, weight: np.ndarray | None = None) -> Curve:
-        """weight: (U,) how often each unit counts; by default once."""
+        """Return the curve. weight: (U,) how often each unit counts; by default once."""
         if not len(self.right):
             return Curve(*np.zeros((3, 0)))
         of_each = np.ones(len(self.right)) if weight is None else weight[self.unit]
@@ -158,12 +159,12 @@ class Ranking:
         return Curve(self.score, right, np.cumsum(of_each)[self.ends] - right)
 
     def measures(self, weight: np.ndarray | None = None) -> dict[str, float]:
-        """AP, log-average miss rate, and the miss rate at 0.1 and at 1 false positives an image.
+        """Return AP, log-average miss rate, and the miss rate at 0.1 and at 1 false positives for each image.
 
-        AP: the area under the precision-recall curve, in which the precision at a recall is the best one at that recall
-        or above; 0 if nothing right is found. Miss rate: the share of true boxes missed with at most so many false
-        positives; its geometric mean is over RATES. NaN without a true box. Source: PASCAL VOC from 2010 on; Dollár et
-        al., 2012.
+        AP is the area under the precision-recall curve, where the precision at a recall is the best precision at this
+        recall or above; 0 if nothing right is found. The miss rate is the share of true boxes that are missed with at
+        most so many false positives; its geometric mean is over RATES. NaN without a true box. Source: PASCAL VOC from
+        2010 on; Dollár et al., 2012.
         """
         once = np.ones(len(self.true)) if weight is None else weight
         true, images = float(once @ self.true), float(once @ self.images)
@@ -188,9 +189,9 @@ class Ranking:
 def ranking(
     score: np.ndarray, right: np.ndarray, unit: np.ndarray, true: np.ndarray, images: np.ndarray | None = None
 ) -> Ranking:
-    """Rank (M,) detections. right: 1, 0, or NaN for what does not count. true, images: (U,) of each unit.
+    """Rank detections (M,). right: 1, 0, or NaN for detections that do not count. true, images: (U,) of each unit.
 
-    images: 1 each by default.
+    images: by default 1 for each unit.
     """
     known = ~np.isnan(right)
     score, right, unit = score[known], right[known], unit[known]
@@ -201,7 +202,7 @@ def ranking(
 
 
 def precision_recall(curve: Curve, true: float) -> tuple[np.ndarray, np.ndarray]:
-    """(K,) precision and (K,) recall over the thresholds; NaN for 0/0."""
+    """Return (K,) precision and (K,) recall over the thresholds; NaN for 0/0."""
     found = curve.right + curve.false
     precision = np.divide(curve.right, found, out=np.full_like(found, np.nan), where=found > 0)
     return precision, curve.right / true if true else np.full_like(found, np.nan)

@@ -1,7 +1,7 @@
 """How well crowds were detected, tracked, located and confirmed in a simulated run, from truth and results.
 
-Every measure is defined at its field of CrowdScore. Boxes are x, y of the top left pixel, width, height; a pixel is in
-a box that holds its centre. Metres are the truth's.
+Each measure is defined at its field of CrowdScore. Boxes are x, y of the top left pixel, width, height. A box contains
+a pixel if it contains the pixel's centre. Metres are those of the truth.
 """
 
 import math
@@ -26,48 +26,48 @@ LEAST_VISIBLE = 0.5
 """A crowd counts in frames that show at least this share of its people."""
 
 COVERING = 0.3
-"""A box over a crowd shares at least so much of the smaller of the two boxes."""
+"""A box covers a crowd if the intersection is at least this share of the smaller of the two boxes."""
 
 NEAR_M = 2.0
-"""A target this near to a small crowd's middle is it, wherever its box lies."""
+"""A target this near to the middle of a small crowd covers it, wherever its box is."""
 
 LARGEST, MARGIN_PX = 10.0, 10.0
-"""A box of more than so many times the area of what it holds, grown by a margin on every side, covers nothing."""
+"""A box larger than this number of times the area of its bodies, grown by a margin on every side, covers nothing."""
 
 TOUCHING_PX = 5.0
-"""A blob this near to a pixel of something that can move is no false one: it may be its shadow or its edge."""
+"""A blob this near to a pixel of a movable body is not false: it may be the body's shadow or edge."""
 
 STILL_M_S = 0.2
-"""People slower than this on average stand."""
+"""People whose mean speed is lower than this are standing."""
 
 STAYS = 0.25
-"""A crowd keeps its identity until another target holds this share of its pixels more than the one that has it."""
+"""A crowd keeps its identity until another target exceeds the identity's target by this share of the crowd's pixels."""
 
 CAP_M = 10.0
-"""What not knowing where a crowd is costs, as if it were known to within so much, and the most that an error does."""
+"""The error that is charged if the place of a crowd is unknown, and the largest error that is charged."""
 
 HOLD_S = 1.0
-"""So long the last known place of a crowd stands for it, moved on at its velocity."""
+"""The last known place of a crowd is used for this time, moved on at the crowd's velocity."""
 
 IOU_LEAST = 0.3
-"""From which a box is the target's, for IDF1: blobs fit crowds less tightly than labels do people."""
+"""IoU from which a box is the target's, for IDF1: blobs fit crowds less tightly than labels fit people."""
 
 ToLocal = Callable[[np.ndarray], np.ndarray]
-"""(N, 2) longitude, latitude to the truth's metres."""
+"""A function from longitude, latitude (N, 2) to the metres of the truth."""
 
 
 class TrueFrame:
-    """What a frame truly shows, without its picture: some kilobytes.
+    """The truth of a frame without its picture, in a few kilobytes.
 
-    u, v: (P,) int32 the pixels of all that can move; body: (P,) whose they are, a row of the bodies, -1 for none.
-    place_m: (N, 2) of the bodies. pixels: (N,) that show each; low_px, high_px: (N, 2) the first and the last column
-    and row of them.
+    u, v: (P,) int32 the pixels of all movable bodies. body: (P,) row of each pixel's body, -1 for none. place_m: (N, 2)
+    of the bodies. pixels: (N,) number of visible pixels of each body. low_px, high_px: (N, 2) the first and the last
+    column and row of these pixels.
     """
 
     def __init__(self, truth: Truth) -> None:
         self.frame, self.time_s, self.bodies = truth.frame, truth.time_s, truth.bodies
         self.place_m = np.asarray(self.bodies.place_m, float)[:, :2]
-        there = cv2.findNonZero(truth.mask | truth.people)  # a third of np.nonzero's time
+        there = cv2.findNonZero(truth.mask | truth.people)  # this takes a third of np.nonzero's time
         self.u: np.ndarray
         self.v: np.ndarray
         self.u, self.v = np.zeros((2, 0), np.int32) if there is None else there[:, 0].T
@@ -85,7 +85,7 @@ class TrueFrame:
         np.maximum.at(self.high_px, self.body[known], at_px)
 
     def box_about(self, bodies: np.ndarray) -> np.ndarray:
-        """(4,) the box about the pixels of some bodies, rows or a mask of them; NaN where none shows."""
+        """Return the box around the pixels of some bodies, (4,), given by rows or a mask; NaN if none is visible."""
         visible = self.pixels > 0
         chosen = np.zeros(len(visible), bool)
         chosen[bodies] = True
@@ -96,14 +96,14 @@ class TrueFrame:
         return np.concatenate([low, high - low + 1])
 
     def _within(self, box_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
-        """(P,) bool, which of the pixels lie in a box (4,), grown by a margin."""
+        """Return which pixels lie in a box (4,) that is grown by a margin, (P,) bool."""
         x, y, width, height = box_px.tolist()
         low_u, low_v = x - 0.5 - margin_px, y - 0.5 - margin_px
         within: np.ndarray = (self.u >= low_u) & (self.u <= low_u + width + 2 * margin_px)
         return within & (self.v >= low_v) & (self.v <= low_v + height + 2 * margin_px)
 
     def pixels_in(self, box_px: np.ndarray) -> np.ndarray:
-        """(T, N) int64, how many pixels of each body lie in each of the boxes (T, 4)."""
+        """Return how many pixels of each body lie in each of the boxes (T, 4), (T, N) int64."""
         held = np.zeros((len(box_px), len(self.pixels)), np.int64)
         for row, box in enumerate(box_px):
             body = self.body[self._within(box)]
@@ -111,21 +111,21 @@ class TrueFrame:
         return held
 
     def bodies_in(self, pixels: np.ndarray) -> np.ndarray:
-        """(T, N) bool, which bodies have half of their visible pixels in each box. pixels: (T, N) of `pixels_in`."""
+        """Return which bodies have half of their visible pixels in each box, (T, N) bool. pixels: as of `pixels_in`."""
         lies: np.ndarray = (self.pixels > 0) & (2 * pixels >= self.pixels)
         return lies
 
     def untouched(self, box_px: np.ndarray) -> int:
-        """How many boxes (B, 4) have nothing that can move in them or within TOUCHING_PX of them."""
+        """Return how many of the boxes (B, 4) have no movable body in them or within TOUCHING_PX of them."""
         return sum(not self._within(box, TOUCHING_PX).any() for box in box_px)
 
 
 @dataclass(frozen=True)
 class Crowd:
-    """A crowd in a frame. people, visible: rows of the bodies, all of it and those that the picture shows.
+    """A crowd in a frame. people: rows of all its bodies. visible: rows of the bodies that the picture shows.
 
-    place_m: (2,) mean of all its people. middle_m: (2,) mean of those that show, radius_m that of a disc that is evenly
-    filled with them. box_px: (4,) about their pixels. counts: whether enough of them show.
+    place_m: (2,) mean of all its people. middle_m: (2,) mean of its visible people. radius_m: radius of a disc that
+    they fill evenly. box_px: (4,) around their pixels. counts: whether enough of them are visible.
     """
 
     number: int
@@ -140,7 +140,7 @@ class Crowd:
 
 
 def crowds(frame: TrueFrame, least_visible: float = LEAST_VISIBLE) -> list[Crowd]:
-    """The crowds of the world at a frame, in the picture or not."""
+    """Return the crowds of the world at a frame, whether visible or not."""
     found, bodies = [], frame.bodies
     for number in np.unique(bodies.target[bodies.kind == "person"]).tolist():
         people = np.flatnonzero((bodies.target == number) & (bodies.kind == "person"))
@@ -160,11 +160,11 @@ def crowds(frame: TrueFrame, least_visible: float = LEAST_VISIBLE) -> list[Crowd
 
 @dataclass(frozen=True)
 class FoundTargets:
-    """The targets of a frame in the results, one row a target.
+    """The targets of a frame in the results, one row per target.
 
-    box_px: (T, 4). identity: (T,) int64. place_m: (T, 2), NaN where it is not located. covariance_m2: (T, 2, 2).
-    velocity_m_s: (T, 2), NaN where unknown. kind: (T,) human, not_human or unseen.
-    blob_px: (B, 4) boxes of all that was detected, whether tracked or not.
+    box_px: (T, 4). identity: (T,) int64. place_m: (T, 2), NaN if not located. covariance_m2: (T, 2, 2). velocity_m_s:
+    (T, 2), NaN if unknown. kind: (T,) human, not_human or unseen.
+    blob_px: (B, 4) boxes of all detections, tracked or not.
     """
 
     box_px: np.ndarray
@@ -177,9 +177,9 @@ class FoundTargets:
 
     @classmethod
     def of(cls, result: FrameResult, local: ToLocal | None = None) -> "FoundTargets":
-        """Those that were seen, located or not. local: as in CrowdScorer."""
+        """Return the targets that were seen, located or not. local: as in CrowdScorer."""
         tracks = result.tracked.tracks
-        seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is where nothing was found
+        seen = np.flatnonzero(tracks.row >= 0)  # a box that bridges a gap is at a place where nothing was found
         place, velocity = np.full((2, len(seen), 2), np.nan)
         covariance, kind = np.full((len(seen), 2, 2), np.nan), ["unseen"] * len(seen)
         if (located := result.locations) is not None:
@@ -196,28 +196,28 @@ class FoundTargets:
 
     @property
     def located(self) -> np.ndarray:
-        """(T,) bool."""
+        """Whether each target is located, (T,) bool."""
         known: np.ndarray = np.isfinite(self.place_m).all(axis=1)
         return known
 
     def mean_place(self, rows: np.ndarray) -> np.ndarray:
-        """(2,) the mean of some located targets, weighted by the areas of their boxes."""
+        """Return the mean of some located targets, (2,), weighted by the areas of their boxes."""
         area = np.maximum(self.box_px[rows, 2] * self.box_px[rows, 3], 1e-9)
         place: np.ndarray = np.average(self.place_m[rows], axis=0, weights=area)
         return place
 
 
 def covering(frame: TrueFrame, found: list[Crowd], targets: FoundTargets, held: np.ndarray) -> np.ndarray:
-    """(C, T) bool, which targets stand for which crowds. held: (T, N) bool, `bodies_in` the targets' boxes.
+    """Return which targets cover which crowds, (C, T) bool. held: (T, N) bool, `bodies_in` the targets' boxes.
 
-    A target covers a crowd if its box holds someone of it and shares COVERING of the smaller of the two boxes; or if it
-    is located within the crowd's radius, at least NEAR_M, of the middle of its visible people. So a blob over two
-    crowds that cross covers both, and each of the parts in which a crowd was found covers it. A box more than LARGEST
-    times as large as what it holds covers nothing by its pixels.
+    A target covers a crowd if its box contains one of its people and the intersection is COVERING of the smaller of the
+    two boxes. It also covers a crowd if it is located within the crowd's radius, at least NEAR_M, of the middle of its
+    visible people. A blob over two crossing crowds therefore covers both, and each part of a crowd that was found in
+    parts covers it. A box more than LARGEST times as large as its bodies covers nothing by its pixels.
     """
     about = np.array([frame.box_about(row) for row in held]).reshape(-1, 4)
     size = targets.box_px[:, 2] * targets.box_px[:, 3]
-    fits = size <= LARGEST * np.prod(about[:, 2:] + 2 * MARGIN_PX, axis=1)  # False where a box holds nobody
+    fits = size <= LARGEST * np.prod(about[:, 2:] + 2 * MARGIN_PX, axis=1)  # False if a box contains nobody
     covers = np.zeros((len(found), len(size)), bool)
     for row, crowd in enumerate(found):
         if not len(crowd.visible):
@@ -227,13 +227,13 @@ def covering(frame: TrueFrame, found: list[Crowd], targets: FoundTargets, held: 
         share = np.divide(shared, smaller, out=np.zeros_like(shared), where=smaller > 0)
         over = held[:, crowd.visible].any(axis=1) & fits & (share >= COVERING)
         away = np.linalg.norm(targets.place_m - crowd.middle_m, axis=1)
-        covers[row] = over | (away <= max(crowd.radius_m, NEAR_M))  # False where a place is NaN
+        covers[row] = over | (away <= max(crowd.radius_m, NEAR_M))  # False if a place is NaN
     return covers
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Of errors in metres; NaN where there are none."""
+    """Spread of errors in metres; NaN without errors."""
 
     count: int
     mean: float
@@ -243,24 +243,24 @@ class Spread:
 
 @dataclass(frozen=True)
 class CrowdScore:
-    """The measures of one run; shares in [0, 1], NaN where there is nothing to judge.
+    """The measures of one run; shares in [0, 1], NaN if there is nothing to judge.
 
-    frames: the processed ones. crowd_frames: over them, crowds of which at least half of the people show. recall:
-    share of those that a located target covers; detected: that any target covers; recall_moving: recall without crowds
-    that stand, which do not move against their background.
-    false_blobs: detections a frame that touch nothing that can move; false_targets: the same of targets with an
-    identity. landmark_blobs: detections a frame that hold a landmark alone.
-    target_error_m: of each located target that holds people, from their mean place. crowd_error_m: of each crowd that
-    located targets cover, from their mean, weighted by the areas of their boxes, to the mean of its visible people.
-    inside: share of targets whose 95 % ellipse holds that place of their people.
-    switches: how often a crowd's identity changed while its people stayed the same, under a one-to-one assignment of
-    crowds to targets by pixels held in which an identity stays with its crowd until another target holds STAYS more;
+    frames: number of processed frames. crowd_frames: over them, number of crowds with at least half of their people
+    visible. recall: share of these crowds that a located target covers. detected: share that any target covers.
+    recall_moving: recall without standing crowds, which do not move against their background.
+    false_blobs: detections for each frame that touch no movable body. false_targets: the same for targets with an
+    identity. landmark_blobs: detections for each frame that contain only a landmark.
+    target_error_m: distance of each located target that holds people from their mean place. crowd_error_m: for each
+    crowd that located targets cover, distance of their mean, weighted by the areas of their boxes, from the mean of its
+    visible people. inside: share of targets whose 95 % ellipse contains the mean place of their people.
+    switches: number of changes of a crowd's identity while its people stayed the same. Crowds are assigned to targets
+    one to one by pixels held, and an identity stays with its crowd until another target holds STAYS more.
     switches_a_minute: for each crowd and minute in which it counts. idf1: of crowds and cars, boxes at IoU IOU_LEAST.
-    kind_right: share of identities that some ground vehicle saw whose last kind, human or not_human, is right; a target
-    is truly human if most of its boxes hold people. blob_kind_right: the same for each frame and target.
-    knowledge_m: the error of what is known at every moment of the clip, in looked-at frames and between, of every crowd
-    of the world, in the picture or not: the last known place within HOLD_S, moved on at its velocity; CAP_M where there
-    is none, and at most. known: share of those moments with one.
+    kind_right: share of the identities that a ground vehicle saw whose last kind, human or not_human, is right. A
+    target is truly human if most of its boxes contain people. blob_kind_right: the same for each frame and target.
+    knowledge_m: mean error of the known places of every crowd of the world, visible or not, at every moment of the
+    clip, also between processed frames. The known place is the last place within HOLD_S, moved on at its velocity. The
+    error is at most CAP_M, and CAP_M if no place is known. known: share of these moments with a known place.
     """
 
     frames: int
@@ -285,7 +285,7 @@ class CrowdScore:
     known: float
 
     def by_name(self) -> dict[str, object]:
-        """All figures by name, as JSON has them: None where there is none."""
+        """Return all figures by name, as in JSON: None if undefined."""
 
         def plain(pairs: list[tuple[str, object]]) -> dict[str, object]:
             return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in pairs}
@@ -293,7 +293,7 @@ class CrowdScore:
         return asdict(self, dict_factory=plain)
 
     def lines(self) -> list[str]:
-        """The figures in words, one line a subject; none of subjects without a figure."""
+        """Return the figures in words, one line for each subject that has figures."""
         crowd, target, lines = self.crowd_error_m, self.target_error_m, []
         if self.crowd_frames:
             lines.append(
@@ -306,27 +306,27 @@ class CrowdScore:
         if target.count:
             lines.append(f"error of a target from its people: mean {target.mean:.2f} m, median {target.median:.2f}")
         if not math.isnan(self.inside):
-            lines.append(f"95 % ellipses hold the truth in {100 * self.inside:.1f} %")
+            lines.append(f"95 % ellipses contain the truth in {100 * self.inside:.1f} %")
         if not math.isnan(self.switches_a_minute):
             switches = f"{self.switches_a_minute:.2f} switches a crowd and minute"
             lines.append(f"identities: {switches}, IDF1 {100 * self.idf1:.1f} %")
         if self.kinds:
             lines.append(f"human or not: right for {100 * self.kind_right:.1f} % of {self.kinds} targets seen close up")
         if not math.isnan(self.knowledge_m):
-            known = f"{self.knowledge_m:.2f} m; {CAP_M:g} m where no place is known"
+            known = f"{self.knowledge_m:.2f} m; {CAP_M:g} m if no place is known"
             lines.append(f"mean error of the known places of all crowds over the whole time: {known}")
         return lines
 
 
 class CrowdScorer:
-    """Scores a run from its streams: feed it the truth of each frame, and then what was found in it, in order.
+    """Score a run from its streams: `feed` takes, in order, the truth of each frame and then the frame's result.
 
-    Frames without truth are left out, and so are those that could not be read. It holds the truth of frames that are
-    not yet settled, without their pictures, and some numbers for each target and frame.
+    Frames without truth, and frames that could not be read, are left out. The scorer keeps the truth of frames without
+    a result, without their pictures, and some numbers for each target and frame.
     """
 
     def __init__(self, local: ToLocal | None = None, least_visible: float = LEAST_VISIBLE) -> None:
-        """local: None where the results are in the truth's metres."""
+        """local: None if the results are in the truth's metres."""
         self._local, self._least = local, least_visible
         self._waiting: dict[int, TrueFrame] = {}
         self._before: tuple[TrueFrame, list[Crowd]] | None = None
@@ -336,12 +336,12 @@ class CrowdScorer:
         self._minutes = self._cost = 0.0
         self._true_rows: list[tuple[int, int, np.ndarray]] = []
         self._found_rows: list[tuple[int, int, np.ndarray]] = []
-        self._human_boxes: Counter[int] = Counter()  # boxes of an identity that hold people, less those that do not
+        self._human_boxes: Counter[int] = Counter()  # boxes of an identity with people, minus boxes without people
         self._kind: dict[int, str] = {}
         self._known: dict[int, tuple[float, np.ndarray, np.ndarray]] = {}  # last time, place and velocity of each crowd
 
     def feed(self, item: Truth | TrueFrame | FrameResult) -> None:
-        """The truth of a frame, or what was found in one whose truth was fed before."""
+        """Take the truth of a frame, or the result of a frame whose truth was fed before."""
         if not isinstance(item, FrameResult):
             self._waiting[item.frame] = TrueFrame(item) if isinstance(item, Truth) else item
             return
@@ -368,7 +368,7 @@ class CrowdScorer:
         self._before = truth, found
 
     def score(self) -> CrowdScore:
-        """The measures of what was fed until now."""
+        """Return the measures of the frames so far."""
         n, frames = self._counts, self._counts["frames"]
         idf1 = math.nan
         if frames:
@@ -465,7 +465,7 @@ class CrowdScorer:
             self._charge(crowd.number, truth.time_s, crowd.place_m)
 
     def _charge(self, number: int, time_s: float, place_m: np.ndarray) -> None:
-        """Add the error of what is known of a crowd at a moment. place_m: (2,) its true one."""
+        """Add the error of the known place of a crowd at a moment. place_m: (2,) the true place."""
         known_s, known_m, velocity_m_s = self._known.get(number, (-math.inf, place_m, place_m))
         age_s, cost = time_s - known_s, CAP_M
         if age_s <= HOLD_S + 1e-9:

@@ -1,4 +1,4 @@
-"""How large a change between two results is beside its spread over the clips, and how many clips would show it."""
+"""The size of a change between two results relative to its spread over clips, and the number of clips that show it."""
 
 import math
 
@@ -6,14 +6,14 @@ import numpy as np
 from scipy.special import nctdtr, stdtrit
 
 FEWEST_CLIPS = 3
-"""Clips below which the spread of the changes says nothing."""
+"""Fewest clips from which the spread of the changes is estimated."""
 MOST_CLIPS = 1_000_000
 
 
 def paired_effect_size(before_after: np.ndarray) -> float:
-    """Cohen's d_z of (N, 2) figures of the same clips: the mean change over the standard deviation of the changes.
+    """Return Cohen's d_z of (N, 2) figures of the same clips: mean change over standard deviation of the changes.
 
-    NaN for fewer than FEWEST_CLIPS known changes, or where all of them are equal.
+    NaN for fewer than FEWEST_CLIPS known changes, or if all of them are equal.
 
     >>> round(paired_effect_size(np.array([[0.5, 0.6], [0.4, 0.7], [0.6, 0.8]])), 2)
     2.0
@@ -28,7 +28,7 @@ def paired_effect_size(before_after: np.ndarray) -> float:
 
 
 def count_needed(effect: float, level: float = 0.05, power: float = 0.8) -> int | None:
-    """The fewest clips whose two-sided paired t test at a level shows an effect size with a power.
+    """Return the fewest clips with which a two-sided paired t test at `level` shows an effect size with `power`.
 
     The power follows from the noncentral t distribution. None without an effect, or above MOST_CLIPS.
 

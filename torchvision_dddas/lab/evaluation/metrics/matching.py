@@ -1,4 +1,4 @@
-"""True and found boxes matched frame by frame, and found boxes that count neither as right nor as false."""
+"""Match true and found boxes frame by frame, and choose the found boxes that count neither as right nor as false."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -8,13 +8,13 @@ from scipy.optimize import linear_sum_assignment
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.lab.evaluation.metrics.boxes import areas, iou
-from torchvision_dddas.lab.evaluation.metrics.truth import Ignoring, TrackTable, Truth, rows_by_frame
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, Ignoring, TrackTable, rows_by_frame
 
 LEAST = 0.5
 """IoU from which a box counts as found."""
 
 WITHIN = 0.5
-"""A found box lies in a region if more than this share of its area does."""
+"""A found box lies in a region that covers more than this share of its area."""
 
 EPSILON = float(np.finfo(float).eps)
 
@@ -28,7 +28,7 @@ class FramePair(NamedTuple):
 
 
 class Paired(NamedTuple):
-    """A clip's frames that hold any box, in order, and how many boxes each true and each found identity has.
+    """The frames of a clip with any box, in order, and the number of boxes of each true and each found identity.
 
     numbers: of the frames.
     """
@@ -42,12 +42,12 @@ class Paired(NamedTuple):
 def pair(
     truth: TrackTable, found: TrackTable, ignored: TrackTable | None = None, ignoring: Ignoring = "dropped"
 ) -> Paired:
-    """A clip's true and found boxes by frame; all tracking measures start here.
+    """Pair a clip's true and found boxes by frame. All tracking measures start here.
 
-    ignored: true boxes that do not count. "dropped": they are as if never labelled, so that a found box on one is
-    false; TrackEval does so for MOT15. "removed": a found box whose best match (IoU ≥ 0.5, all true boxes taking
-    part) is one of them is taken out; TrackEval does so for the distractors of later benchmarks. Frames without any
-    box change no measure. Raises InputError if an identity has two boxes in a frame.
+    ignored: true boxes that do not count. "dropped": treat them as unlabelled, so that a found box on one is false, as
+    TrackEval does for MOT15. "removed": remove a found box whose best match (IoU ≥ 0.5, among all true boxes) is one of
+    them, as TrackEval does for the distractors of later benchmarks. Frames without any box change no measure. Raise
+    InputError if an identity has two boxes in a frame.
     """
     for table, what in ((truth, "truth"), (found, "result")):
         both, counts = np.unique(np.stack([table.frame, table.identity], axis=1), axis=0, return_counts=True)
@@ -70,19 +70,19 @@ def pair(
 
 
 def match(overlap: np.ndarray, least: float = LEAST) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of an IoU matrix (n, m) that match one to one, of at least so much, for the largest sum."""
+    """Return rows and columns of an IoU matrix (n, m) that match one to one at `least` or more, for the largest sum."""
     worth = np.where(overlap >= least - EPSILON, overlap, 0.0)
     i, j = linear_sum_assignment(worth, maximize=True)
     hit = worth[i, j] > 0
     return i[hit], j[hit]
 
 
-def counted(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N,) bool: whether each found box counts. frame: (N,), box_px: (N, 4), in any order.
+def counted(truth: ClipTruth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """Return whether each found box counts, (N,) bool. frame: (N,), box_px: (N, 4), in any order.
 
-    Boxes do not count whose best match (IoU ≥ 0.5, all labelled boxes of the frame taking part, those of `others` too)
-    is an ignored one, where `truth.ignoring` is "removed"; and of those that match none, boxes that lie by more than
-    half of their area in one of the regions. TrackEval does so for MOTChallenge from 2016 on and for KITTI.
+    A box does not count if its best match (IoU ≥ 0.5, among all labelled boxes of the frame, also `others`) is an
+    ignored box and `truth.ignoring` is "removed". A box without a match does not count if more than half of its area
+    lies in a region. TrackEval does so for MOTChallenge from 2016 on and for KITTI.
     """
     ignored = truth.ignored if truth.ignoring == "removed" else None
     if ignored is None and truth.regions is None:
@@ -114,7 +114,7 @@ def _match_labels(
     counting: Sequence[Mapping[int, np.ndarray]],
     ignored: Mapping[int, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(M,) bool: which found boxes match an ignored label, and which match any. Labels are boxes (n, 4) by frame."""
+    """Return which found boxes match an ignored label, and which match any, (M,) bool. Labels: (n, 4) by frame."""
     on_ignored, matched, nothing = np.zeros(len(frame), bool), np.zeros(len(frame), bool), np.zeros((0, 4))
     for number, rows in rows_by_frame(frame).items():
         labelled = [boxes.get(number, nothing) for boxes in (*counting, ignored)]

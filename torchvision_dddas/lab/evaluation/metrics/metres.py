@@ -1,4 +1,4 @@
-"""How far located targets are from where they truly are, and whether their ellipses say so."""
+"""Errors of located targets in metres, and whether their ellipses contain the errors."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,25 +12,25 @@ from torchvision_dddas.lab.evaluation.metrics.pixels import ratio
 from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable, rows_by_frame
 
 INSIDE = 5.991
-"""Of chi-square with two degrees of freedom, in 95 %."""
+"""The 95 % quantile of chi-square with two degrees of freedom."""
 
 LEAST_IOU = 0.3
-"""From which a box is a target's: blobs fit less tightly than labels."""
+"""IoU from which a box is a target's: blobs fit less tightly than labels."""
 
 FARTHEST_M = 10.0
-"""Where there are no boxes, no place further off than this is taken to be a target's."""
+"""Without boxes, a place further than this from a target does not belong to it."""
 
 
-class GroundLocations(NamedTuple):
-    """Counts of true places in processed frames, of reported places, and of reported places that match no target."""
+class LocatedCounts(NamedTuple):
+    """Numbers of true places in processed frames, of reported places, and of reported places that match no target."""
 
     targets: int = 0
     told: int = 0
     strays: int = 0
 
 
-def located_measures(counts: GroundLocations) -> dict[str, float]:
-    """Share of the true places that were reported, and of the reported ones that match a target."""
+def located_measures(counts: LocatedCounts) -> dict[str, float]:
+    """Return the share of true places that were reported, and the share of reported places that match a target."""
     return {
         "located": ratio(counts.told, counts.targets),
         "belongs": ratio(counts.told, counts.told + counts.strays),
@@ -38,7 +38,7 @@ def located_measures(counts: GroundLocations) -> dict[str, float]:
 
 
 def by_boxes(frame: np.ndarray, box_px: np.ndarray, truth: TrackTable) -> np.ndarray:
-    """(N,) int64 the row of the true box that each found box is, one to one at an IoU of LEAST_IOU, -1 for none."""
+    """Return the row of each found box's true box, (N,) int64, one to one at an IoU of LEAST_IOU; -1: none."""
     which = np.full(len(frame), -1)
     for rows, true in _rows_in_both(frame, truth.frame):
         i, j = match(iou(box_px[rows], truth.box_px[true]), LEAST_IOU)
@@ -49,9 +49,9 @@ def by_boxes(frame: np.ndarray, box_px: np.ndarray, truth: TrackTable) -> np.nda
 def by_places(
     frame: np.ndarray, place_m: np.ndarray, true_frame: np.ndarray, true_m: np.ndarray, farthest_m: float = FARTHEST_M
 ) -> np.ndarray:
-    """(N,) int64 the row of the true place that matches each reported one, one to one within `farthest_m`; -1: none.
+    """Return the row of each reported place's true place, (N,) int64, one to one within `farthest_m`; -1: none.
 
-    Places further off match none, so that errors are at most `farthest_m`.
+    Places further away match none, so that errors are at most `farthest_m`.
     """
     which = np.full(len(frame), -1)
     for rows, true in _rows_in_both(frame, true_frame):
@@ -64,13 +64,13 @@ def by_places(
 
 
 def _rows_in_both(frame: np.ndarray, other: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The rows of each frame in two tables that both have, in order."""
+    """Yield the rows of each frame that both tables have, in order."""
     mine, others = rows_by_frame(frame), rows_by_frame(other)
     return ((mine[number], others[number]) for number in mine if number in others)
 
 
 def inside(off_m: np.ndarray, covariance_m2: np.ndarray) -> np.ndarray:
-    """(N,) 1.0 where the 95 % ellipse of a covariance (N, 2, 2) holds the error (N, 2), 0.0 if not, NaN if unknown."""
+    """Return 1.0 if the 95 % ellipse of a covariance (N, 2, 2) contains the error (N, 2), else 0.0; NaN if unknown."""
     a, b, c = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
     size = a * c - b * b
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -87,11 +87,11 @@ def shared_error(
     who: np.ndarray,
     true_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (F,) and how far the whole team of landmarks is off in each (F, 2), by where they report to be.
+    """Return frames (F,), and the error (F, 2) that all landmarks share in each, from their reports.
 
-    frame, mark (N,), place_m (N, 2): what landmarks report. true_frame, who, true_m: the true places of all. Which mark
-    is whose is told by the smallest median distance over the clip, one to one. What is told relative to the team has
-    this error taken off: the mean over the marks of a frame.
+    frame, mark (N,), place_m (N, 2): the reports. true_frame, who, true_m: the true places of all. Marks are assigned
+    to targets one to one by the smallest median distance over the clip. The shared error, the mean over the marks of a
+    frame, is subtracted from results that are relative to the landmarks.
     """
     marks, people = np.unique(mark), np.unique(who)
     gaps: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -117,9 +117,9 @@ def shared_error(
 
 
 def measures(samples: dict[str, np.ndarray], weight: np.ndarray | None = None) -> dict[str, float]:
-    """Mean, median, 95 % and root mean square of the errors, and how often ellipses hold them; NaN without any.
+    """Return mean, median, 95 % and root mean square of the errors, and how often ellipses contain them; NaN if none.
 
-    samples: error_m, inside, relative_error_m, relative_inside, (S,) each; NaN where unknown. weight: (S,).
+    samples: error_m, inside, relative_error_m, relative_inside, (S,) each; NaN if unknown. weight: (S,).
     """
     found: dict[str, float] = {}
     for prefix in ("", "relative_"):
@@ -137,7 +137,7 @@ def measures(samples: dict[str, np.ndarray], weight: np.ndarray | None = None) -
 
 
 def quantile(value: np.ndarray, share: float, weight: np.ndarray) -> float:
-    """The smallest value that at least this share of the weight does not exceed; NaN without values."""
+    """Return the smallest value that at least this share of the weight does not exceed; NaN without values."""
     if not len(value):
         return float("nan")
     order = np.argsort(value, kind="stable")

@@ -16,14 +16,14 @@ class Pixels(NamedTuple):
 
 
 def add_counts(one: Any, other: Any) -> Any:
-    """The counts of both, of any of the NamedTuples of counts: their fields are numbers, arrays or counts again."""
+    """Add two NamedTuples of counts of one kind, whose fields are numbers, arrays or counts again."""
     if isinstance(one, tuple):
         return type(one)(*map(add_counts, one, other))
     return one + other
 
 
 def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
-    """Compare two masks of one shape; anything above 0 is foreground. Where the truth is below 0 nothing counts."""
+    """Compare two masks of one shape: values above 0 are foreground. Pixels with a truth below 0 do not count."""
     if truth.min(initial=0) < 0:
         known = truth >= 0
         found, truth = found[known], truth[known]
@@ -33,7 +33,7 @@ def count(found: np.ndarray, truth: np.ndarray) -> Pixels:
 
 
 def measures(pixels: Pixels) -> dict[str, float]:
-    """Accuracy, specificity, precision, recall, F and Gmean; NaN where a measure is 0/0, as recall is if nothing moves.
+    """Return accuracy, specificity, precision, recall, F and Gmean; NaN for 0/0, as for recall if nothing moves.
 
     Source: appendix B, eq. 10 and 11.
     """
@@ -50,12 +50,12 @@ def measures(pixels: Pixels) -> dict[str, float]:
 
 
 def ratio(part: float, whole: float) -> float:
-    """Part / whole, NaN for 0/0."""
+    """Return part / whole, NaN for 0/0."""
     return part / whole if whole else math.nan
 
 
 class Still(NamedTuple):
-    """Processed frames of a clip in which nothing moves, those with any blob, and the blobs."""
+    """Numbers of processed frames of a clip without motion, of those with any blob, and of blobs."""
 
     frames: int = 0
     alarmed: int = 0
@@ -63,7 +63,7 @@ class Still(NamedTuple):
 
 
 def still_measures(counts: Still) -> dict[str, float]:
-    """False blobs a frame, and the share of frames with any."""
+    """Return the false blobs for each frame, and the share of frames with any."""
     return {
         "false_blobs_per_frame": ratio(counts.blobs, counts.frames),
         "alarmed": ratio(counts.alarmed, counts.frames),

@@ -1,7 +1,7 @@
-"""Every measure and group of measures: its title, unit, direction and decimals, and how counts become measures.
+"""Every measure and group of measures: its title, unit, direction and decimals, and its computation from counts.
 
-Tables, reports, comparisons and the goals of sweeps read it. A new measure is computed in its group's module and has
-one line in METRICS; a new group has its counts beside its measures, and an entry in GROUPS.
+Tables, reports, comparisons and the goals of sweeps read the registry. A new measure is computed in its group's module
+and has one line in METRICS. A new group has its counts beside its measures, and an entry in GROUPS.
 """
 
 import math
@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchvision_dddas.lab.evaluation.metrics import boxes, metres, pixels, tracking
-from torchvision_dddas.lab.evaluation.metrics.boxes import Boxes, OneTarget
-from torchvision_dddas.lab.evaluation.metrics.metres import GroundLocations
+from torchvision_dddas.lab.evaluation.metrics.boxes import BoxCounts, OneTarget
+from torchvision_dddas.lab.evaluation.metrics.metres import LocatedCounts
 from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, Still, add_counts
 from torchvision_dddas.lab.evaluation.metrics.tracking import TargetTrack, TrackCounts
 
-Counts = dict[str, Pixels | Boxes | OneTarget | TrackCounts | TargetTrack | Still | GroundLocations]
-"""The counts of a clip by group; they add over frames and clips."""
+Counts = dict[str, Pixels | BoxCounts | OneTarget | TrackCounts | TargetTrack | Still | LocatedCounts]
+"""The counts of a clip by group; counts add over frames and clips."""
 
 
 class Metric(NamedTuple):
@@ -50,11 +50,11 @@ METRICS: Mapping[str, Metric] = {
     "accuracy": Metric("accuracy", "share of all that was classified correctly", short="acc."),
     "gmean": Metric("Gmean", "geometric mean of recall and specificity"),
     "ap": Metric("AP", "average precision: area below precision over recall"),
-    "log_average_miss_rate": Metric("LAMR", "log-average miss rate, 0.01 to 1 false positives an image", -1),
+    "log_average_miss_rate": Metric("LAMR", "log-average miss rate, 0.01 to 1 false positives per image", -1),
     "miss_rate_at_0.1": Metric(
-        "missed at 0.1", "share missed at 0.1 false positives an image", -1, short="miss at 0.1"
+        "missed at 0.1", "share missed at 0.1 false positives per image", -1, short="miss at 0.1"
     ),
-    "miss_rate_at_1": Metric("missed at 1", "share missed at 1 false positive an image", -1, short="miss at 1"),
+    "miss_rate_at_1": Metric("missed at 1", "share missed at 1 false positive per image", -1, short="miss at 1"),
     "hit": Metric("hit", "share of frames in which the target is hit"),
     "iou_0.3": Metric("IoU ≥ 0.3", "share of frames in which a box meets the target at IoU 0.3"),
     "other_blobs_per_frame": Metric("other blobs", "boxes elsewhere, a frame", -1, 2, False),
@@ -91,13 +91,14 @@ METRICS: Mapping[str, Metric] = {
 }
 
 
-class Group(NamedTuple):
+class MetricGroup(NamedTuple):
     """Measures that come from the same counts.
 
-    title: in reports. tasks: of a study that can have it. columns: the measures of its table on the terminal; shown:
-    of its table in reports; compared: those that a comparison of two studies tests, the first also clip by clip.
-    counts: its counts with nothing in them, and measures: from counts to measures by name; both None where the measures
-    come from samples that are pooled, `boxes.Ranking` and `metres.measures`.
+    title: in reports. tasks: the tasks of a study that can have the group. columns: the measures of its table on the
+    terminal. shown: the measures of its table in reports. compared: the measures that a comparison of two studies
+    tests; the first is also compared clip by clip. counts: its counts, all zero. measures: function from counts to
+    measures by name. Both are None if the measures come from samples that are pooled, `boxes.Ranking` and
+    `metres.measures`.
     """
 
     title: str
@@ -110,7 +111,7 @@ class Group(NamedTuple):
 
 
 RANKED, METRES = "ranking", "metres"
-"""The groups of samples: detections ranked by score, errors on the ground."""
+"""The groups whose measures come from samples: detections ranked by score, errors on the ground."""
 
 _PIXELS = ("f", "precision", "recall", "specificity", "accuracy", "gmean")
 _BOXES = ("f1", "precision", "recall")
@@ -119,11 +120,11 @@ _ONE_TARGET = ("hit", "iou_0.3", "other_blobs_per_frame")
 _TARGET_TRACK = ("found", "same_identity", "n_switches", "n_fragmentations")
 _STILL = ("false_blobs_per_frame", "alarmed")
 
-GROUPS: Mapping[str, Group] = {
-    "pixels": Group("pixels", ("motion",), _PIXELS, _PIXELS, _PIXELS, Pixels(), pixels.measures),
-    "boxes": Group("boxes, IoU ≥ 0.5", ("motion", "people"), _BOXES, _BOXES, _BOXES, Boxes(), boxes.measures),
-    RANKED: Group("boxes ranked by score", ("motion", "people"), _RANKED, _RANKED, _RANKED[:2]),
-    "target": Group(
+GROUPS: Mapping[str, MetricGroup] = {
+    "pixels": MetricGroup("pixels", ("motion",), _PIXELS, _PIXELS, _PIXELS, Pixels(), pixels.measures),
+    "boxes": MetricGroup("boxes, IoU ≥ 0.5", ("motion", "people"), _BOXES, _BOXES, _BOXES, BoxCounts(), boxes.measures),
+    RANKED: MetricGroup("boxes ranked by score", ("motion", "people"), _RANKED, _RANKED, _RANKED[:2]),
+    "target": MetricGroup(
         "one labelled target",
         ("motion",),
         _ONE_TARGET,
@@ -132,7 +133,7 @@ GROUPS: Mapping[str, Group] = {
         OneTarget(),
         boxes.one_target_measures,
     ),
-    "tracks": Group(
+    "tracks": MetricGroup(
         "tracks",
         ("tracking", "association"),
         ("hota", "deta", "assa", "mota", "idf1", "n_switches", "ar_3"),
@@ -141,7 +142,7 @@ GROUPS: Mapping[str, Group] = {
         TrackCounts(),
         tracking.measures,
     ),
-    "target_track": Group(
+    "target_track": MetricGroup(
         "the labelled target's track, IoU ≥ 0.3",
         ("tracking",),
         _TARGET_TRACK,
@@ -150,19 +151,19 @@ GROUPS: Mapping[str, Group] = {
         TargetTrack(),
         tracking.one_target_measures,
     ),
-    "still": Group(
+    "still": MetricGroup(
         "false alarms where nothing moves", ("motion",), _STILL, _STILL, _STILL[:1], Still(), pixels.still_measures
     ),
-    "location": Group(
+    "location": MetricGroup(
         "targets that were located",
         ("location",),
         ("located", "belongs"),
         ("located", "belongs", "n_targets", "n_told", "n_strays"),
         ("located",),
-        GroundLocations(),
+        LocatedCounts(),
         metres.located_measures,
     ),
-    METRES: Group(
+    METRES: MetricGroup(
         "errors on the ground",
         ("location",),
         ("median_m", "p95_m", "in_ellipse", "relative_median_m", "relative_p95_m", "relative_in_ellipse"),
@@ -173,7 +174,7 @@ GROUPS: Mapping[str, Group] = {
         ("median_m", "in_ellipse", "relative_median_m", "relative_in_ellipse"),
     ),
 }
-"""In the order of metrics.json, of tables and of reports."""
+"""The order is that of metrics.json, of tables and of reports."""
 
 HEADLINES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "motion": (("pixels", "f"), ("boxes", "f1"), ("target", "hit"), ("still", "false_blobs_per_frame")),
@@ -182,13 +183,13 @@ HEADLINES: Mapping[str, tuple[tuple[str, str], ...]] = {
     "people": ((RANKED, "ap"), ("boxes", "f1")),
     "location": ((METRES, "median_m"), ("location", "located")),
 }
-"""The group and measure that sum up a task: the first that there is."""
+"""The group and measure that sum up a task; the first that a clip has is used."""
 
 _WITH_WORST = ("f", "f1", "idf1")
 
 
 def describe(name: str) -> Metric:
-    """What is known of a measure; only a title from its name for one that is not in METRICS."""
+    """Return the description of a measure; a title made from its name if it is not in METRICS."""
     if name in METRICS:
         return METRICS[name]
     if name.startswith("n_"):
@@ -197,36 +198,36 @@ def describe(name: str) -> Metric:
 
 
 def is_lower_better(name: str) -> bool:
-    """Whether less of a measure is better; False where nothing is known."""
+    """Return whether smaller values of a measure are better; False if unknown."""
     return describe(name).better < 0
 
 
 def title_of_group(group: str) -> str:
-    """The group's title; its name for an unknown one."""
+    """Return the title of a group; its name for an unknown group."""
     return GROUPS[group].title if group in GROUPS else group
 
 
 def groups_of_task(task: str) -> tuple[str, ...]:
-    """The groups of measures that a task can have; which of them a clip has depends on its truth."""
+    """Return the groups of measures that a task can have. The truth of a clip decides which of them it has."""
     return tuple(name for name, group in GROUPS.items() if task in group.tasks)
 
 
 def measure_names(group: str) -> tuple[str, ...]:
-    """The measures of a group, and those of its counts of which less is better."""
+    """Return the measures of a group, and its counts of which smaller values are better."""
     counts = GROUPS[group].counts
     names = GROUPS[group].shown if counts is None else figures({group: counts})[group]
     return tuple(name for name in names if not name.startswith("n_") or is_lower_better(name))
 
 
 def measure(group: str, counts: Any) -> dict[str, float]:
-    """The measures of a group's counts."""
+    """Return the measures of a group's counts."""
     measures = GROUPS[group].measures
     assert measures is not None
     return measures(counts)
 
 
 def figures(counts: Counts) -> dict[str, dict[str, float]]:
-    """The measures of each group, and the counts that they come from as n_NAME."""
+    """Return the measures of each group, and the counts that they come from as n_NAME."""
     groups: dict[str, dict[str, float]] = {}
     for group, value in counts.items():
         by_name: dict[str, int] = value.by_name() if isinstance(value, TrackCounts) else value._asdict()
@@ -235,7 +236,7 @@ def figures(counts: Counts) -> dict[str, dict[str, float]]:
 
 
 def pooled(clips: Sequence[Counts]) -> Counts:
-    """The counts of all clips together, in their order."""
+    """Return the counts of all clips together, in their order."""
     whole: Counts = {}
     for counts in clips:
         for group, value in counts.items():
@@ -244,7 +245,7 @@ def pooled(clips: Sequence[Counts]) -> Counts:
 
 
 def mean(clips: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """The mean of each measure over the clips that have it, and of F, F1 and IDF1 the worst."""
+    """Return the mean of each measure over the clips that have it, and the worst value of F, F1 and IDF1."""
     means: dict[str, dict[str, float]] = {}
     for group in GROUPS:
         having = [clip[group] for clip in clips if group in clip]

@@ -1,4 +1,4 @@
-"""Annotations as text, a row a box: numbers in named columns, read quickly, and with file and line of what is wrong."""
+"""Annotations as text, one row per box: numbers in named columns, read quickly. Errors name file and line."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -11,19 +11,19 @@ import numpy as np
 from torchvision_dddas.errors import InputError
 
 FARTHEST = 1e9
-"""No place, size or mark is larger."""
+"""Largest absolute value of a place, size or mark."""
 
 LAST = 1_000_000
-"""No frame of a data set has a larger number: nine hours at 30 Hz."""
+"""Largest frame number of a data set: nine hours at 30 Hz."""
 
-_MOST = 2**53  # the whole numbers that floats tell apart
+_MOST = 2**53  # largest whole number up to which floats represent every whole number
 _WHOLE = ("frame", "identity")
 _QUOTES = "\"' \t"
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The rows of a file. columns: (N,) by name, numbers or words. line: (N,) of the file, from 1."""
+    """The rows of a file. columns: (N,) by name, numbers or words. line: (N,) line in the file, from 1."""
 
     path: Path
     columns: Mapping[str, np.ndarray]
@@ -36,15 +36,15 @@ class Rows:
         return self.columns[name]
 
     def at(self, mask: np.ndarray) -> "Rows":
-        """The rows that a mask (N,) picks."""
+        """Return the rows that a mask (N,) selects."""
         return Rows(self.path, {name: column[mask] for name, column in self.columns.items()}, self.line[mask])
 
     def stack(self, *names: str) -> np.ndarray:
-        """(N, C) some columns side by side."""
+        """Return some columns side by side, (N, C)."""
         return np.stack([self.columns[name] for name in names], axis=1)
 
     def check_known(self, name: str, known: Collection[Any], wanted: str) -> None:
-        """Raises InputError with file and line where a value of a column is not among the known ones."""
+        """Raise InputError with file and line if a value of a column is not among the known values."""
         unknown = ~np.isin(self[name], list(known))
         if unknown.any():
             i = int(unknown.argmax())
@@ -62,11 +62,11 @@ def read_columns(
     what: str = "",
     may_end_early: bool = False,
 ) -> Rows:
-    """Read a table separated by commas or blanks; columns after the named ones are ignored.
+    """Read a table separated by commas or blanks; columns after the named columns are ignored.
 
-    columns: names; "frame" and "identity" are whole, frames from `first` to `last`. word: the column that holds a word,
-    whose quotes are taken off. what: it holds, for messages. may_end_early: a line without its last cell has a 1
-    there. Raises InputError with file and line: too few columns, no finite number.
+    columns: names; "frame" and "identity" are whole, frames from `first` to `last`. word: the column that holds a word;
+    quotes around it are removed. what: the content, for messages. may_end_early: a line without its last cell has a 1
+    there. Raise InputError with file and line for too few columns and for numbers that are not finite.
     """
     file = f"{what} {path}".strip()
     lines = [(n, text) for n, text in enumerate(read_text(path, name=file).splitlines(), 1) if text.strip()]
@@ -92,7 +92,7 @@ def read_columns(
 
 
 def _read_fast(texts: Sequence[str], columns: Sequence[str], word: str) -> tuple[np.ndarray, list[str]] | None:
-    """Values (N, C) and words by NumPy's own reader, which is several times as fast; None where it fails."""
+    """Return values (N, C) and words by NumPy's reader, which is several times as fast; None if it fails."""
     values, words = np.full((len(texts), len(columns)), np.nan), [""] * len(texts)
     if not texts:
         return values, words
@@ -124,22 +124,22 @@ def _read_slowly(
 
 
 def read_text(path: Path, encoding: str = "utf-8-sig", name: str = "") -> str:
-    """A file's text. name: for messages, its path by default. Raises InputError where it cannot be read or is none."""
+    """Return a file's text. name: for messages, by default the path. Raise InputError if it cannot be read as text."""
     try:
         return path.read_text(encoding=encoding)
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise InputError(f"{name or path} cannot be read: {reason}") from None
 
 
 def split_cells(line: str) -> list[str]:
-    """The cells of a line, separated by commas, or by blanks where there are none."""
+    """Split the cells of a line, separated by commas, or by blanks if there are no commas."""
     return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
 
 
 def to_number(cell: str) -> float:
-    """A cell's number, NaN for none."""
+    """Return a cell's number; NaN if it is not a number."""
     try:
-        return float(cell) if "_" not in cell else math.nan  # 1_0 is a number to Python alone
+        return float(cell) if "_" not in cell else math.nan  # only Python reads 1_0 as a number
     except ValueError:
         return math.nan

@@ -17,16 +17,16 @@ ONE_TARGET_LEAST = 0.3
 
 
 Each = dict[str, np.ndarray]
-"""Counts frame by frame, (F,) float64 each, by name; `frame` has the frames."""
+"""Counts frame by frame, (F,) float64 each, by name; `frame` holds the frame numbers."""
 
 
 class Clear(NamedTuple):
     """Counts that may be added over clips.
 
-    tp, fn, fp: boxes found, missed, false. switches: a target is found under another identity than the last time.
-    fragmentations: a target is found again after frames without, also those in which the truth itself has a gap.
-    mostly_tracked, partly_tracked, mostly_lost: targets found in over 80 %, in 20 to 80 %, in under 20 % of their
-    frames. overlap: sum of the IoU.
+    tp, fn, fp: boxes found, missed, false. switches: a target is found under another identity than before.
+    fragmentations: a target is found again after frames without it, also if the truth itself has a gap. mostly_tracked,
+    partly_tracked, mostly_lost: targets found in over 80 %, in 20 to 80 %, in under 20 % of their frames. overlap: sum
+    of the IoU.
     """
 
     tp: int = 0
@@ -41,16 +41,16 @@ class Clear(NamedTuple):
 
 
 ALPHA = np.arange(0.05, 0.99, 0.05)
-"""The nineteen IoUs from which a box counts as found; the same numbers to the last bit as TrackEval's."""
+"""The nineteen IoUs from which a box counts as found, equal to TrackEval's to the last bit."""
 
 _NONE = np.zeros(len(ALPHA))
 
 
 class Hota(NamedTuple):
-    """Sums that may be added over clips, each (19,): one a value of ALPHA.
+    """Sums that may be added over clips, each (19,), one for each value of ALPHA.
 
-    tp, fn, fp: boxes found, missed, false. association, recall, precision: sums over the boxes found of how well the
-    two identities go together over the whole clip. overlap: sum of the IoU of the boxes found.
+    tp, fn, fp: boxes found, missed, false. association, recall, precision: sums over the found boxes of how well the
+    two identities agree over the whole clip. overlap: sum of the IoU of the found boxes.
     """
 
     tp: np.ndarray = _NONE
@@ -63,7 +63,7 @@ class Hota(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """Boxes with the right identity, true boxes without it, found boxes without it."""
+    """Numbers of boxes with the right identity, of true boxes without it, and of found boxes without it."""
 
     idtp: int = 0
     idfn: int = 0
@@ -71,14 +71,14 @@ class Identity(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """Windows that hold any found target, and the sum of their accuracy ratios."""
+    """Number of windows with any found target, and the sum of their accuracy ratios."""
 
     windows: int = 0
     total: float = 0.0
 
     @classmethod
     def of(cls, ratios: dict[int, float]) -> "Windows":
-        """The windows of a clip together, in the order of their frames."""
+        """Return the windows of a clip together, in the order of their frames."""
         return cls(len(ratios), sum(ratios.values(), 0.0))
 
     @property
@@ -88,7 +88,7 @@ class Windows(NamedTuple):
 
 
 class TrackCounts(NamedTuple):
-    """The counts of clips, pooled as TrackEval combines sequences. true, found: how many identities there are.
+    """The counts of clips, pooled as TrackEval combines sequences. true, found: numbers of identities.
 
     links_2, links_3: the source's accuracy ratio over two and three frames.
     """
@@ -102,7 +102,7 @@ class TrackCounts(NamedTuple):
     links_3: Windows = Windows()
 
     def by_name(self) -> dict[str, int]:
-        """The counts of boxes and identities; those of HOTA are curves and stay out."""
+        """Return the counts of boxes and identities, without those of HOTA, which are curves."""
         whole = {name: n for name, n in self.clear._asdict().items() if name != "overlap"}
         return {**whole, **self.identity._asdict(), "true": self.true, "found": self.found}
 
@@ -114,10 +114,10 @@ def count(
     ignoring: Ignoring = "dropped",
     interval: int = 1,
 ) -> tuple[TrackCounts, Each]:
-    """Count one clip's tracks, of every interval-th frame, against the truth; also by frame that has any box.
+    """Count one clip's tracks, of every interval-th frame, against the truth; also for each frame that has any box.
 
-    By frame: the counts of CLEAR; windows_K: whether a window of K frames ends there, ar_K: its ratio. What HOTA and
-    IDF1 count belongs to whole tracks. ignored, ignoring: see `matching.pair`.
+    For each frame: the counts of CLEAR; windows_K: whether a window of K frames ends there; ar_K: its ratio. The counts
+    of HOTA and IDF1 belong to whole tracks. ignored, ignoring: see `matching.pair`.
     """
     clip = pair(truth, found, ignored, ignoring)
     clear, each = count_clear(clip)
@@ -133,14 +133,14 @@ def count(
 
 
 def measures(counts: TrackCounts) -> dict[str, float]:
-    """HOTA, CLEAR and identity measures by name, and the source's AR_2 and AR_3."""
+    """Return HOTA, CLEAR and identity measures by name, and the source's AR_2 and AR_3."""
     hota = {name: float(curve.mean()) for name, curve in curves(counts.hota).items()}
     field = {**hota, **clear_measures(counts.clear), **identity_measures(counts.identity)}
     return {**field, "ar_2": counts.links_2.mean, "ar_3": counts.links_3.mean}
 
 
 class TargetTrack(NamedTuple):
-    """One labelled target among others that are not: frames, those found, switches, gaps, most under one identity."""
+    """Counts of one labelled target among unlabelled ones: frames, found, switches, gaps, most under one identity."""
 
     frames: int = 0
     found: int = 0
@@ -150,9 +150,9 @@ class TargetTrack(NamedTuple):
 
 
 def count_one_target(truth: TrackTable, found: TrackTable) -> tuple[TargetTrack, Each]:
-    """Count the track of the one labelled target (IoU ≥ 0.3); boxes elsewhere may be of targets without a label.
+    """Count the track of the one labelled target (IoU ≥ 0.3). Boxes elsewhere may belong to targets without a label.
 
-    By frame that has any box: whether the target is there, is found, and is found under a new identity.
+    For each frame with any box: whether the target is present, is found, and is found under a new identity.
     """
     clip = pair(truth, found)
     counts, each = count_clear(clip, ONE_TARGET_LEAST)
@@ -164,24 +164,24 @@ def count_one_target(truth: TrackTable, found: TrackTable) -> tuple[TargetTrack,
 
 
 def one_target_measures(counts: TargetTrack) -> dict[str, float]:
-    """Share of frames in which the target has a box, and in which it has the identity that it has most."""
+    """Return the share of frames in which the target has a box, and in which it has its most frequent identity."""
     return {"found": ratio(counts.found, counts.frames), "same_identity": ratio(counts.same, counts.frames)}
 
 
 PER_FRAME = ("tp", "fn", "fp", "switches", "overlap")
-"""The counts that are those of single frames."""
+"""The counts that can be given for single frames."""
 
 
 def count_clear(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarray]:
-    """The counts, and (F, 5) what of them each of the clip's frames adds, in the order of PER_FRAME.
+    """Return the counts, and (F, 5) the contribution of each frame, in the order of PER_FRAME.
 
-    Matches each frame's boxes at an IoU of at least `least`: pairs of the frame before are kept, then IoU decides. The
-    frame before is the last in which there were both true and found boxes, as TrackEval has it; a switch is seen over
-    any gap. Source: Bernardin and Stiefelhagen, 2008, with TrackEval's matching.
+    Match each frame's boxes at an IoU of at least `least`: keep the pairs of the previous frame, then decide by IoU.
+    The previous frame is the last frame with both true and found boxes, as in TrackEval. A switch is seen over any gap.
+    Source: Bernardin and Stiefelhagen, 2008, with TrackEval's matching.
     """
     targets = len(clip.true_boxes)
-    last = np.full(targets, -1)  # the identity that each target was last found under, whenever that was
-    before = np.full(targets, -1)  # the same, of the frame before alone
+    last = np.full(targets, -1)  # the last identity under which each target was found, at any time
+    before = np.full(targets, -1)  # the same, only in the previous frame
     found_boxes, begun = np.zeros(targets, int), np.zeros(targets, int)
     each = np.zeros((len(clip.frames), len(PER_FRAME)))
     for row, (true, found, score) in zip(each, clip.frames, strict=True):
@@ -219,9 +219,9 @@ def count_clear(clip: Paired, least: float = LEAST) -> tuple[Clear, np.ndarray]:
 
 
 def clear_measures(counts: Clear) -> dict[str, float]:
-    """MOTA, MOTP (mean IoU of the boxes found), recall, precision, shares of targets mostly tracked and lost.
+    """Return MOTA, MOTP (mean IoU of the found boxes), recall, precision, shares of mostly tracked and lost targets.
 
-    NaN where a clip has no true box; 0 where there are some and nothing was found, as in TrackEval.
+    NaN if a clip has no true box; 0 if it has some and nothing was found, as in TrackEval.
     """
     true = counts.tp + counts.fn
     targets = counts.mostly_tracked + counts.partly_tracked + counts.mostly_lost
@@ -236,7 +236,7 @@ def clear_measures(counts: Clear) -> dict[str, float]:
 
 
 def count_hota(clip: Paired) -> Hota:
-    """Match each frame's boxes by IoU times how well their identities go together over the clip.
+    """Match each frame's boxes by IoU times how well their identities agree over the clip.
 
     Source: Luiten et al., 2021, with TrackEval's matching, which is the same for every alpha.
     """
@@ -267,9 +267,10 @@ def count_hota(clip: Paired) -> Hota:
 
 
 def curves(sums: Hota) -> dict[str, np.ndarray]:
-    """HOTA, its parts DetA and AssA, LocA, recall and precision of both parts, (19,) each over ALPHA.
+    """Return HOTA, its parts DetA and AssA, LocA, recall and precision of both parts, (19,) each over ALPHA.
 
-    The measures are their means. LocA is 1 where nothing is found, as in TrackEval; all are NaN without truth.
+    The measures are the means of these curves. LocA is 1 if nothing is found, as in TrackEval; all are NaN without
+    truth.
     """
     tp, fn, fp, association, recall, precision, overlap = sums
     known = np.where(tp + fn > 0, 1.0, np.nan)
@@ -288,10 +289,10 @@ def curves(sums: Hota) -> dict[str, np.ndarray]:
 
 
 def count_identity(clip: Paired, least: float = LEAST) -> Identity:
-    """Name found identities after targets so that most boxes agree (IoU of at least `least`).
+    """Assign found identities to targets so that most boxes agree (IoU of at least `least`).
 
-    Maximising the agreeing boxes is the same as minimising false and missing ones, since each pair that agrees takes
-    one off both. Source: Ristani et al., 2016.
+    This also minimises the false and missing boxes, because each pair that agrees removes one of both. Source: Ristani
+    et al., 2016.
     """
     together = np.zeros((len(clip.true_boxes), len(clip.found_boxes)))
     for true, found, score in clip.frames:
@@ -302,7 +303,7 @@ def count_identity(clip: Paired, least: float = LEAST) -> Identity:
 
 
 def identity_measures(counts: Identity) -> dict[str, float]:
-    """IDF1, IDP and IDR. NaN where a clip has no true box; 0 where there are some and nothing was found."""
+    """Return IDF1, IDP and IDR. NaN if a clip has no true box; 0 if it has some and nothing was found."""
     idtp, idfn, idfp = counts
     true = idtp + idfn
     return {
@@ -313,9 +314,9 @@ def identity_measures(counts: Identity) -> dict[str, float]:
 
 
 def accuracy_ratio(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray, "N"]]) -> float:
-    """1 - mismatches / ((K - 1) · the largest number of targets in a frame), in [0, 1]; 1 for empty frames.
+    """Return 1 - mismatches / ((K - 1) · largest number of targets in a frame), in [0, 1]; 1 for empty frames.
 
-    rows: what was associated, newest frame first, counted from 1, 0 for the dummy. identities: the true ones of each
+    rows: the associations, newest frame first, counted from 1, 0 for the dummy. identities: the true identities of each
     frame's targets, newest frame first.
     """
     most = max(len(known) for known in identities)
@@ -323,11 +324,11 @@ def accuracy_ratio(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.nda
 
 
 def mismatches(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray, "N"]]) -> int:
-    """The number of mismatches, mme; at most one for each target of an older frame and the link from it to the next.
+    """Return the number of mismatches, mme: at most one for each target of an older frame and its link to the next.
 
-    A target is mismatched when its successor is another one, when it has the dummy although it is there, or when the
-    frame between is bridged to another one. A bridge that was not made is no mismatch.
-    Raises InputError if a row has not one column a frame, or if a frame's real target is not in exactly one row.
+    A target is mismatched if its successor is another target, if it has the dummy although it is present, or if the
+    frame between is bridged to another target. A missing bridge is not a mismatch.
+    Raise InputError if a row has another number of columns than frames, or if a real target is not in exactly one row.
     """
     if rows.ndim != 2 or rows.shape[1] != len(identities):
         raise InputError(f"an association of {len(identities)} frames needs as many columns; got shape {rows.shape}.")
@@ -356,10 +357,10 @@ def mismatches(rows: Int[np.ndarray, "Z K"], identities: Sequence[Int[np.ndarray
 
 
 def link_ratios(clip: Paired, interval: int, size: int) -> dict[int, float]:
-    """AR_K by the newest frame, in order, of all windows of `size` frames, `interval` apart, with a target.
+    """Return AR_K by the newest frame, in order, of all windows of `size` frames, `interval` apart, with a target.
 
     A frame's targets are the true boxes that were found (IoU ≥ 0.5): the ratio is about links, not about boxes. Boxes
-    of one found identity are linked; one that is absent from a look within the window is a bridge.
+    of one found identity are linked. An identity that is absent from a look within the window is a bridge.
     Source: appendix C, eq. 11.
     """
     looks = {}
@@ -369,7 +370,7 @@ def link_ratios(clip: Paired, interval: int, size: int) -> dict[int, float]:
         looks[frame] = true[i[hit]] + 1, found[j[hit]]
     nobody = np.zeros(0, np.int64), np.zeros(0, np.int64)
     whole = range(min(looks, default=1) + (size - 1) * interval, max(looks, default=0) + 1, interval)
-    # Frame numbers may be any, and far apart: only the windows that hold a look are gone through.
+    # Frames may have any numbers, and be far apart: visit only the windows that contain a look.
     held = {frame + age * interval for frame in looks for age in range(size)}
     ratios = {}
     for newest in sorted(frame for frame in held if frame in whole):

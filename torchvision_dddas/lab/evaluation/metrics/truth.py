@@ -1,4 +1,4 @@
-"""Truth of a clip: masks, one labelled box a frame, or MOTChallenge boxes."""
+"""The truth of a clip: masks, one labelled box for each frame, or MOTChallenge boxes."""
 
 import configparser
 import math
@@ -14,15 +14,15 @@ from torchvision_dddas.io.tables import LAST_FRAME, check_crowding
 from torchvision_dddas.lab.evaluation.metrics.text_rows import FARTHEST, read_columns, read_text
 
 UNNAMED = 1 << 24
-"""The label of a mover whose value is 0, where 0 is not the background; no picture of 8 bits holds it."""
+"""The label of a mover whose value is 0, if 0 is not the background. No 8-bit picture contains it."""
 
 
 Ignoring = Literal["dropped", "removed"]
-"""What becomes of a found box on an ignored true one, see `matching.pair`."""
+"""The treatment of a found box on an ignored true box, see `matching.pair`."""
 
 
 class TrackTable(NamedTuple):
-    """A clip's boxes with identities, one row a box, in any order.
+    """The boxes of a clip with identities, one row per box, in any order.
 
     frame: (N,) int64 from 1. identity: (N,) int64, any numbers. box_px: (N, 4), x, y, width, height.
     """
@@ -33,24 +33,24 @@ class TrackTable(NamedTuple):
 
     @classmethod
     def of(cls, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray) -> "TrackTable":
-        """A table of columns of any number type."""
+        """Return a table of columns of any number type."""
         return cls(frame.astype(np.int64), identity.astype(np.int64), box_px)
 
     def at(self, rows: np.ndarray) -> "TrackTable":
-        """The rows that an index or a mask picks."""
+        """Return the rows that an index or a mask selects."""
         return TrackTable(self.frame[rows], self.identity[rows], self.box_px[rows])
 
     def every(self, interval: int) -> "TrackTable":
-        """The rows of frames 1, 1 + interval, 1 + 2 interval, ..."""
+        """Return the rows of frames 1, 1 + interval, 1 + 2 interval, ..."""
         return self.at((self.frame - 1) % interval == 0)
 
     def boxes_by_frame(self) -> dict[int, np.ndarray]:
-        """The boxes (n, 4) of each frame that has any, in the table's order."""
+        """Return the boxes (n, 4) of each frame that has any, in the table's order."""
         return {number: self.box_px[rows] for number, rows in rows_by_frame(self.frame).items()}
 
 
 def rows_by_frame(frame: np.ndarray) -> dict[int, np.ndarray]:
-    """The rows of each number in frame (N,), in order."""
+    """Return the rows of each number in frame (N,), in order."""
     order = np.argsort(frame, kind="stable")
     numbers, starts = np.unique(frame[order], return_index=True)
     return dict(zip(numbers.tolist(), np.split(order, starts[1:]), strict=True)) if len(frame) else {}
@@ -58,10 +58,10 @@ def rows_by_frame(frame: np.ndarray) -> dict[int, np.ndarray]:
 
 @dataclass(frozen=True)
 class Labels:
-    """What the values of a mask mean. background: nothing moves there. unscored: unknown, or outside what counts.
+    """The meaning of the values of a mask. background: nothing moves there. unscored: unknown, or not to be scored.
 
-    Each other value is a mover; movers: where given, only these are, and any other value is unscored. separate: each is
-    one target, so that boxes can be scored too.
+    Each other value is a mover. movers: if given, only these values are movers, and all others are unscored. separate:
+    each value is one target, so that boxes can be scored too.
     """
 
     background: tuple[int, ...] = (0,)
@@ -71,10 +71,10 @@ class Labels:
 
 
 @dataclass(frozen=True)
-class Positions:
-    """Where the targets truly are on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres.
+class TruePositions:
+    """The true positions of targets on the ground. frame, identity: (N,) int64. east_north_m: (N, 2), local metres.
 
-    lonlat_deg: (N, 2), None where unknown; needed where results have another origin of their metres.
+    lonlat_deg: (N, 2), None if unknown; needed if the metres of results have another origin.
     """
 
     frame: np.ndarray
@@ -84,14 +84,14 @@ class Positions:
 
 
 @dataclass(frozen=True)
-class Truth:
+class ClipTruth:
     """The truth of one clip, frames from 1. masks: the file of each labelled frame. boxes: (N, 4) of each.
 
-    tracks: the boxes with their identities, None where the truth has none. ignored: boxes that do not count.
-    length: frames of the clip, 0 where unknown. labels: of the masks. positions: None where unknown; fleet: those of
-    the landmarks, with identities of their own. ignoring, others and regions are for `matching.counted`: what becomes
-    of a found box on an ignored one; boxes that are neither true nor ignored but may take a found box; and regions
-    that are unlabelled, whose identities mean nothing.
+    tracks: the boxes with their identities; None if the truth has none. ignored: boxes that do not count. length:
+    frames of the clip, 0 if unknown. labels: of the masks. positions: None if unknown. fleet: positions of the
+    landmarks, with their own identities. `matching.counted` uses ignoring, others and regions. ignoring: the treatment
+    of a found box on an ignored box. others: boxes that are neither true nor ignored but may match a found box.
+    regions: unlabelled regions, whose identities have no meaning.
     """
 
     kind: Literal["masks", "one target", "boxes"]
@@ -102,8 +102,8 @@ class Truth:
     ignored: TrackTable | None = None
     length: int = 0
     labels: Labels = Labels()
-    positions: Positions | None = None
-    fleet: Positions | None = None
+    positions: TruePositions | None = None
+    fleet: TruePositions | None = None
     ignoring: Ignoring = "dropped"
     others: TrackTable | None = None
     regions: TrackTable | None = None
@@ -115,7 +115,7 @@ class Truth:
 
 
 def find_truth(place: Path) -> Path | None:
-    """Where the truth of a clip lies: a file, a folder of PNGs, or what a clip's folder holds; None if it has none."""
+    """Return the place of a clip's truth: a file, a folder of PNGs, or either in the clip's folder; None if absent."""
     if place.is_file() or _numbered(place):
         return place
     for inside in (place / "masks", place / "boxes_xywh.txt", place / "gt.txt", place / "gt" / "gt.txt"):
@@ -124,10 +124,10 @@ def find_truth(place: Path) -> Path | None:
     return None
 
 
-def load_truth(place: Path, first_frame: int | None = None) -> Truth:
-    """Read the truth. first_frame is the number in a mask's name that is the clip's first frame.
+def load_truth(place: Path, first_frame: int | None = None) -> ClipTruth:
+    """Read the truth. first_frame: the number in a mask's name that denotes the clip's first frame.
 
-    By default it is 0 if there is a file of that number, else 1. Raises InputError if nothing usable is there.
+    By default it is 0 if there is a file of that number, else 1. Raise InputError if nothing usable is there.
     """
     if not place.exists():
         raise InputError(f"no truth at {place}")
@@ -140,12 +140,12 @@ def load_truth(place: Path, first_frame: int | None = None) -> Truth:
         early = [n for n in numbers if n < first]
         if early:
             raise InputError(f"{numbers[early[0]]} is numbered below the first frame, {first}: see --first-frame")
-        return Truth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
+        return ClipTruth("masks", found, {n - first + 1: path for n, path in numbers.items()}, {})
     return _load_boxes(found)
 
 
-def labels_of(truth: Truth, frame: int) -> np.ndarray:
-    """(H, W) int32 of a frame's mask: 0 background, above it movers, -1 where nothing counts. Raises as `read_mask`."""
+def labels_of(truth: ClipTruth, frame: int) -> np.ndarray:
+    """Return (H, W) int32 of a frame's mask: 0 background, above 0 movers, -1 unscored. Raise as `read_mask` does."""
     values, meaning = read_mask(truth.masks[frame]), truth.labels
     if meaning == Labels():
         return values
@@ -162,7 +162,7 @@ def _numbered(folder: Path) -> dict[int, Path]:
     return {int(p.stem): p for p in sorted(folder.glob("*.png")) if p.stem.isdecimal()}
 
 
-def _load_boxes(path: Path) -> Truth:
+def _load_boxes(path: Path) -> ClipTruth:
     lines = [line.replace(",", " ").split() for line in read_text(path).splitlines() if line.strip()]
     if not lines:
         raise InputError(f"{path} is empty: wanted one box a line")
@@ -170,14 +170,14 @@ def _load_boxes(path: Path) -> Truth:
         try:
             boxes_px = np.array([[float(v) for v in row] for row in lines])
         except ValueError as error:
-            raise InputError(f"{path} is no table of boxes: {error}") from error
+            raise InputError(f"{path} is not a table of boxes: {error}") from error
         if (is_far := (np.abs(boxes_px) > FARTHEST).any(axis=1)).any():
             far = ",".join(lines[int(is_far.argmax())])
             raise InputError(f"{path}: a box is {far}; wanted numbers from {-FARTHEST:g} to {FARTHEST:g}")
         there = np.flatnonzero(~np.isnan(boxes_px).any(axis=1))
         tracks = TrackTable(there + 1, np.ones(len(there), np.int64), boxes_px[there])
         by_frame = {frame: row[None] for frame, row in enumerate(boxes_px, 1)}
-        return Truth("one target", path, {}, by_frame, tracks, None, len(boxes_px))
+        return ClipTruth("one target", path, {}, by_frame, tracks, None, len(boxes_px))
     if len(lines[0]) < 6:
         raise InputError(
             f"{path} has {len(lines[0])} columns; wanted 4 (x,y,w,h) or MOTChallenge's (frame,id,x,y,w,h,...)"
@@ -188,20 +188,20 @@ def _load_boxes(path: Path) -> Truth:
     kept = rows.table.at(counts)
     boxes = dict.fromkeys(np.unique(rows.table.frame).tolist(), np.zeros((0, 4))) | kept.boxes_by_frame()
     if not rows.named:
-        return Truth("boxes", path, {}, boxes)
+        return ClipTruth("boxes", path, {}, boxes)
     table = rows.table
     check_identities(table, rows.line, path)
     # The clip's length is in MOTChallenge's seqinfo.ini, beside the truth or above its folder.
     ini = next((p for p in (path.parent / "seqinfo.ini", path.parent.parent / "seqinfo.ini") if p.is_file()), None)
     length = read_seqinfo(ini).length if ini is not None else 0
-    return Truth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
+    return ClipTruth("boxes", path, {}, boxes, table.at(counts), table.at(~counts), length)
 
 
 _COLUMNS = ("frame", "identity", "x", "y", "width", "height", "counts")
 
 
 class MotRows(NamedTuple):
-    """The rows of a file. mark: (N,) its seventh column, 1 where there is none. line: (N,) of the file, from 1."""
+    """The rows of a file. mark: (N,) its seventh column, 1 if absent. line: (N,) line in the file, from 1."""
 
     table: TrackTable
     mark: np.ndarray
@@ -209,14 +209,14 @@ class MotRows(NamedTuple):
 
     @property
     def named(self) -> bool:
-        """Whether the rows have identities: -1 stands for none. A file without rows may be either."""
+        """Whether the rows have identities; -1 means none. A file without rows may be of either kind."""
         return not len(self.line) or bool((self.table.identity != -1).any())
 
 
 def read_rows(path: Path, what: str) -> MotRows:
-    """Read a file; `what` names it in errors.
+    """Read a file. what: its name in errors.
 
-    Raises InputError as `read_columns`, for a size that is not positive, and for too many boxes in a frame.
+    Raise InputError as `read_columns` does, for a size that is not positive, and for too many boxes in a frame.
     """
     rows = read_columns(path, _COLUMNS, what=what, last=LAST_FRAME, may_end_early=True)
     check_crowding(rows["frame"], f"{what} {path}")
@@ -226,7 +226,7 @@ def read_rows(path: Path, what: str) -> MotRows:
 
 
 def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
-    """Raises InputError with the line where a box has no size. line: (N,) of the file. name: of the file."""
+    """Raise InputError with the line if a box has no size. line: (N,) line in the file. name: of the file."""
     if (flat := ~(box_px[:, 2:] > 0).all(axis=1)).any():
         i = int(flat.argmax())
         size = f"{box_px[i, 2]:g}×{box_px[i, 3]:g}"
@@ -234,9 +234,9 @@ def check_sizes(box_px: np.ndarray, line: np.ndarray, name: str) -> None:
 
 
 def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
-    """Raises InputError with file and lines where a row has not an identity of its own in its frame.
+    """Raise InputError with file and lines unless each row has its own identity in its frame.
 
-    line: (N,) of the file.
+    line: (N,) line in the file.
     """
     unnamed = np.flatnonzero(table.identity == -1)
     if len(unnamed):
@@ -254,7 +254,7 @@ def check_identities(table: TrackTable, line: np.ndarray, path: Path) -> None:
 
 _LONGEST_INI = 16_384
 MOST_FRAMES = 10_000_000
-"""No clip is longer."""
+"""Largest length of a clip, in frames."""
 
 
 class SeqInfo(NamedTuple):
@@ -266,11 +266,11 @@ class SeqInfo(NamedTuple):
 
 
 def read_seqinfo(path: Path) -> SeqInfo:
-    """Read the file. Raises InputError: no such format, no usable seqLength or imDir under [Sequence]."""
+    """Read the file. Raise InputError for another format, and without a usable seqLength or imDir under [Sequence]."""
     ini = configparser.ConfigParser(interpolation=None)
     text = read_text(path)
-    if len(text) > _LONGEST_INI:  # bad lines take time as their number squared
-        raise InputError(f"{path} has {len(text)} characters; wanted at most {_LONGEST_INI}, none has more")
+    if len(text) > _LONGEST_INI:  # the time for bad lines grows with the square of their number
+        raise InputError(f"{path} has {len(text)} characters; wanted at most {_LONGEST_INI}")
     try:
         ini.read_string(text)
         length = ini.getint("Sequence", "seqLength")
@@ -283,6 +283,6 @@ def read_seqinfo(path: Path) -> SeqInfo:
     except ValueError:
         rate_hz = math.nan
     pictures = Path(ini.get("Sequence", "imDir", fallback="") or "img1").name
-    if len(pictures.encode()) > 255:  # no folder's name is longer
-        raise InputError(f"{path}: imDir = {pictures} is no folder's name")
+    if len(pictures.encode()) > 255:  # longest name of a folder
+        raise InputError(f"{path}: imDir = {pictures} is not a folder's name")
     return SeqInfo(length, rate_hz if 0 < rate_hz <= 1000 else None, pictures)

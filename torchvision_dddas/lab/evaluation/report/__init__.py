@@ -1,4 +1,4 @@
-"""report.html of a study: measures, charts, the frames that went worst, costs."""
+"""report.html of a study: measures, charts, the worst frames, costs."""
 
 from torchvision_dddas.lab.evaluation.report.study import study_report, study_tables
 

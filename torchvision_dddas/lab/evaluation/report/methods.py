@@ -22,11 +22,11 @@ from torchvision_dddas.lab.evaluation.studies.comparison import (
 )
 
 Methods = Mapping[str, Mapping[str, Any]]
-"""By method, the pooled measures of a task."""
+"""The pooled measures of a task, by method."""
 
 
 def save_methods(folder: Path, content: Mapping[str, Any]) -> None:
-    """Write report.html, tables/ and figures/. content: that of comparison.json, NaN as None."""
+    """Write report.html, tables/ and figures/. content: of comparison.json, with None for NaN."""
     methods = content["methods"]
     tables: dict[str, Table] = {}
     tasks: list[dict[str, Any]] = []
@@ -63,7 +63,7 @@ def save_methods(folder: Path, content: Mapping[str, Any]) -> None:
 
 
 def _method_table(methods: Methods, group: str) -> Table:
-    """A row a method: the figures over all clips with their intervals, the best of each measure in bold."""
+    """Return a row for each method: figures over all clips with their intervals, the best of each measure in bold."""
     names = [name for name in GROUPS[group].shown if any(name in mine.get(group, {}) for mine in methods.values())]
     columns: list[list[Cell]] = []
     for name in names:
@@ -83,7 +83,7 @@ def _method_chart(methods: Methods, group: str, name: str) -> Any:
 
 
 def _verdict_line(name: str, first: str, changes: Mapping[str, Any]) -> str:
-    """The change of the first measure in words."""
+    """Return the change of the first measure in words."""
     if not (entries := entries_of(changes["pooled"])):
         return ""
     _, measure, entry = entries[0]

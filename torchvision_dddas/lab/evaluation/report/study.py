@@ -1,4 +1,4 @@
-"""report.html of a study: how good, how sure, where it fails, what it cost; one page that opens offline."""
+"""report.html of a study: the results, their uncertainty, the worst frames and the costs, on one page for offline use."""
 
 import json
 import math
@@ -31,11 +31,11 @@ MAX_STAGES = 8
 """Columns of the table of costs."""
 
 Groups = Mapping[str, Any]
-"""Measures by group, and beside them their "intervals", as metrics.json has them of a clip, pooled and in the mean."""
+"""Measures by group, and their "intervals", as metrics.json has them for a clip, pooled and in the mean."""
 
 
 def study_report(metrics: Mapping[str, Any], results: Results) -> str:
-    """The HTML. metrics: as `summarize` returns them, NaN as None; pictures are read from the clips' files."""
+    """Return the HTML. metrics: from `summarize`, with None for NaN. Pictures are read from the clips' files."""
     by_task = {task: [case for case in results.cases if case.task == task] for task in TASKS}
     tasks = [_task(task, metrics["tasks"].get(task, {}), cases) for task, cases in by_task.items() if cases]
     n_clips = len({str(case.clip.place) + case.clip.name for case in results.cases if case.scored is not None})
@@ -60,7 +60,7 @@ def study_report(metrics: Mapping[str, Any], results: Results) -> str:
 
 
 def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict[str, Any]:
-    """What the page shows of a task: its card and its section."""
+    """Return the card and the section of a task."""
     clips: Mapping[str, Groups] = metrics.get("clips", {})
     groups = [group for group in GROUPS if any(group in clip for clip in clips.values())]
     worst, n_other_faults = find_worst_frames(cases)
@@ -84,7 +84,7 @@ def _task(task: Task, metrics: Mapping[str, Any], cases: Sequence[Case]) -> dict
 
 
 def figure_of(groups: Groups, group: str, measure: str, name: str = "") -> Interval:
-    """A measure with its interval, NaN where unknown. name: what it is of."""
+    """Return a measure with its interval, NaN if unknown. name: of the clip or set that it belongs to."""
     low, high = groups.get("intervals", {}).get(group, {}).get(measure) or (None, None)
     value, low, high = (
         math.nan if number is None else float(number) for number in (groups.get(group, {}).get(measure), low, high)
@@ -93,18 +93,18 @@ def figure_of(groups: Groups, group: str, measure: str, name: str = "") -> Inter
 
 
 def _known_figures(metrics: Mapping[str, Any], group: str, measure: str) -> list[Interval]:
-    """The figures of all clips that have the measure."""
+    """Return the figures of all clips that have the measure."""
     figures = [figure_of(clip, group, measure, name) for name, clip in metrics["clips"].items()]
     return [figure for figure in figures if math.isfinite(figure.value)]
 
 
 def _shown(metrics: Mapping[str, Any], group: str) -> list[str]:
-    """The measures of a group's table that any clip has a value of."""
+    """Return the measures of a group's table for which any clip has a value."""
     return [name for name in GROUPS[group].shown if _known_figures(metrics, group, name)]
 
 
 def study_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
-    """The tables of measures by TASK-GROUP. metrics: as `study_report` takes them."""
+    """Return the tables of measures by TASK-GROUP. metrics: as for `study_report`."""
     return {
         f"{task}-{group}": _measure_table(mine, group)
         for task, mine in metrics["tasks"].items()
@@ -114,7 +114,7 @@ def study_tables(metrics: Mapping[str, Any]) -> dict[str, Table]:
 
 
 def _measure_table(metrics: Mapping[str, Any], group: str) -> Table:
-    """A row a clip, and below them what belongs to all; each figure with its interval."""
+    """Return a row for each clip, then rows for all clips together; each figure with its interval."""
     names = _shown(metrics, group)
     known = [describe(name) for name in names]
     columns = [Column("clip", text=True), Column("frames", "frames scored")]
@@ -132,23 +132,23 @@ def _measure_table(metrics: Mapping[str, Any], group: str) -> Table:
 
 
 def _measure_plot(metrics: Mapping[str, Any], group: str) -> list[tuple[Markup, str]]:
-    """The group's first measure clip by clip, the worst first, and a note; none where no clip has it."""
+    """Return a plot of the group's first measure for each clip, worst first, and a note; empty if no clip has it."""
     names = _shown(metrics, group)
-    if not names or group == "location":  # its plot would say no more than its table
+    if not names or group == "location":  # its plot would show no more than its table
         return []
     known, rows = describe(names[0]), _known_figures(metrics, group, names[0])
     rows.sort(key=lambda row: -row.value if known.better < 0 else row.value)
     whole = figure_of(metrics["pooled"], group, names[0], "pooled") if len(rows) > 1 else None
     title, span = f"{known.title}, {title_of_group(group)}", (0.0, 1.0 if known.is_share else 0.0)
     more = max(len(rows) - MOST_ROWS, 0)
-    note = f"the worst {len(metrics['clips']) - more}; {more} better ones are in the table" if more else ""
+    note = f"the worst {len(metrics['clips']) - more}; {more} better clips are in the table" if more else ""
     return [(interval_chart(title, rows, whole, span), note)]
 
 
 def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> dict[str, str] | None:
-    """The measure that a task is judged by, as its card shows it: that of HEADLINES that most clips have.
+    """Return the card of the measure that sums up a task: the measure of HEADLINES that most clips have.
 
-    Where none has any, the first that any clip has; None without one.
+    If no clip has any of them, use the first measure that a clip has; None if there is none.
     """
     of_clips, pooled = metrics["clips"].values(), metrics["pooled"]
     counts = {(group, name): sum(name in clip.get(group, {}) for clip in of_clips) for group, name in HEADLINES[task]}
@@ -180,7 +180,7 @@ def _headline(task: Task, metrics: Mapping[str, Any], groups: Sequence[str]) -> 
 
 
 def _format_cost(cases: Sequence[Case]) -> str:
-    """The images a second, seconds and memory of all cases together; empty if unknown."""
+    """Return the pictures per second, seconds and memory of all cases together; empty if unknown."""
     cost = sum_costs([case for case in cases if case.found is not None and case.found.seconds])
     if not cost["seconds"] or not cost["frames"]:
         return ""
@@ -189,7 +189,7 @@ def _format_cost(cases: Sequence[Case]) -> str:
 
 
 def _cost_table(cases: Sequence[Case]) -> Markup:
-    """A row a case: time, rate, memory, and the time a frame of the longest stages."""
+    """Return a row for each case: time, rate, memory, and the time per frame of the longest stages."""
     costs = [(case, sum_costs([case])) for case in cases]
     total: Counter[str] = Counter()
     for _, cost in costs:
@@ -200,8 +200,8 @@ def _cost_table(cases: Sequence[Case]) -> Markup:
         Column("task", text=True),
         Column("frames", "processed pictures"),
         Column("s", "seconds in all"),
-        Column("frames/s", "processed pictures a second"),
-        Column("MB", "the most memory that the process held"),
+        Column("frames/s", "processed pictures per second"),
+        Column("MB", "the largest memory of the process"),
         *(Column(f"{stage}, ms", "milliseconds a frame") for stage in stages),
     ]
     rows = [
@@ -216,7 +216,7 @@ def _cost_table(cases: Sequence[Case]) -> Markup:
         ]
         for case, cost in costs
     ]
-    return table("what each clip cost", columns, rows)
+    return table("the cost of each clip", columns, rows)
 
 
 def _format_rate(per_s: float) -> str:
@@ -224,11 +224,11 @@ def _format_rate(per_s: float) -> str:
 
 
 def _fact_table(results: Results) -> Markup:
-    """What was run on what, and the versions of the libraries."""
+    """Return the table of data, settings and engine of the study, and the versions of the libraries."""
     spec = results.spec
     facts: dict[str, Any] = {
         "datasets": [f"{source.kind}: {', '.join(source.clips)}" for source in spec.sources],
-        "tasks": spec.tasks or ["all that each clip allows"],
+        "tasks": spec.tasks or ["all tasks that each clip allows"],
         "configuration": spec.config or "defaults",
         "set": spec.overrides or "nothing",
         "interval": f"{spec.interval} frames, of tracking and association",

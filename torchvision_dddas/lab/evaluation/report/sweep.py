@@ -1,4 +1,4 @@
-"""report.html of a sweep: its trials, and the measure over each parameter; tables and figures as files."""
+"""report.html of a sweep: its trials, and the measure over each parameter. Tables and figures are also files."""
 
 import math
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def save_sweep(record: "SweepRecord") -> None:
-    """Write report.html, tables/ and figures/ into the sweep's folder. Raises InputError if the disk refuses."""
+    """Write report.html, tables/ and figures/ into the sweep's folder. Raise InputError if the disk refuses."""
     goal, first, best = record.goal, record.trials[0], record.best
     assert best is not None
     known, parameters = describe(goal.measure), list(record.defaults)
@@ -29,14 +29,14 @@ def save_sweep(record: "SweepRecord") -> None:
         values = [record.value_of(trial, name) for name in parameters]
         value = number_cell(trial.value, 4)
         cells = [Cell(str(v), float(v) if isinstance(v, int | float) else str(v)) for v in values]
-        note = trial.cause or ("the settings as they were" if trial is first else "")
+        note = trial.cause or ("the original settings" if trial is first else "")
         value = Cell(value.text, value.value, best=trial is best)
         rows.append([number_cell(trial.number), *cells, value, text_cell(note)])
     trials = Table("trials", columns, rows)
-    lines = [f"best: trial {best.number}, {best.value:.4f}; as they were: {number_cell(first.value, 4).text}"]
+    lines = [f"best: trial {best.number}, {best.value:.4f}; the original settings: {number_cell(first.value, 4).text}"]
     if record.on_held is not None:
         before, after = (number_cell(value, 4).text for value, _ in record.on_held)
-        lines.append(f"on the clips held out: {after} with the best, {before} as they were")
+        lines.append(f"on the clips held out: {after} with the best, {before} with the original settings")
     charts = [_chart(record, name) for name in parameters]
     task = {"id": "trials", "title": f"{len(rows)} trials", "lines": lines, "tables": [trials.markup], "sections": []}
     title, meaning = "Sweep", f"{record.heading}; {'less' if goal.minimize else 'more'} is better"
@@ -48,7 +48,7 @@ def save_sweep(record: "SweepRecord") -> None:
 
 
 def _chart(record: "SweepRecord", parameter: str) -> Markup:
-    """The measure over a parameter; empty where its values are no numbers. A line where it alone was changed."""
+    """Return the measure over a parameter, as a line if only it was varied; empty if its values are not numbers."""
     tried = [trial for trial in record.trials if math.isfinite(trial.value)]
     points = [(record.value_of(trial, parameter), trial.value, trial is record.best) for trial in tried]
     numbers = [(float(v), y, best) for v, y, best in points if isinstance(v, int | float) and not isinstance(v, bool)]

@@ -12,19 +12,19 @@ from torchvision_dddas.lab.evaluation.studies.records import Case, Scored
 from torchvision_dddas.lab.evaluation.studies.summary import rank
 
 MOST_CLIPS = 6
-"""Clips with a map."""
+"""Largest number of clips with a map."""
 MOST_FAINT = 40
-"""Curves of single clips behind that of all."""
+"""Largest number of curves of single clips behind the curve of all."""
 _LEAST, _MOST = 0.01, 10.0
-"""False positives an image from which and up to which misses are drawn."""
+"""Smallest and largest number of false positives per image in the plot of misses."""
 _MOST_TARGETS = 60
 _MOST_ERRORS = 500
 
 
 class Tally(NamedTuple):
-    """Of each frame (F,): what is right, false, missed, changed identity, and the rest (of pixels) that is right too.
+    """Numbers for each frame (F,): right, false, missed, changed identities, and other right pixels.
 
-    unit: what is counted. measure: what 2 right / (2 right + false + missed) is called.
+    unit: of the numbers. measure: name of 2 right / (2 right + false + missed).
     """
 
     right: np.ndarray
@@ -37,7 +37,7 @@ class Tally(NamedTuple):
 
 
 def tally(scored: Scored) -> Tally | None:
-    """The counts of each frame in the group that shows best where a clip goes wrong, 0 where it has no use for one.
+    """Return the counts of each frame in the group that shows errors best; counts that the group lacks are 0.
 
     None without such a group.
     """
@@ -53,7 +53,7 @@ def tally(scored: Scored) -> Tally | None:
 
     right, false = first_of("tp", "hit", "found"), first_of("fp", "false", "blobs")
     missed, switched = first_of("fn", "missed"), first_of("switches")
-    if group in ("target", "target_track"):  # in a frame with the target it is found or missed
+    if group in ("target", "target_track"):  # in a frame with the target, it is found or missed
         missed = np.maximum(first_of("frames") - right, 0)
         return Tally(right, false, missed, switched, np.zeros(len(right)), "boxes", "hit")
     if group == "pixels":
@@ -62,7 +62,7 @@ def tally(scored: Scored) -> Tally | None:
 
 
 def ranked_charts(cases: Sequence[Case]) -> list[Markup]:
-    """Precision against recall, and the miss rate against false positives an image, of all clips with scores."""
+    """Return precision against recall, and miss rate against false positives per image, of all clips with scores."""
     having = [(case.clip.name, [case.scored]) for case in cases if case.scored and "boxes" in case.scored.ranked]
     each = [(name, clips) for name, clips in having if rank(clips).true.any()]
     if not each:
@@ -78,12 +78,12 @@ def ranked_charts(cases: Sequence[Case]) -> list[Markup]:
         curve = ranked.curve()
         precision, recall = precision_recall(curve, float(ranked.true.sum()))
         false = curve.false / sum(len(scored.frames) for scored in clips)
-        # Both curves go on to where nothing is found, and the second to where no more can be had.
+        # Both curves begin where nothing is found; the second ends where no more can be found.
         start, end = precision[:1], recall[-1:]
         exact.append(Line(label, np.r_[np.zeros(len(start)), recall], np.r_[start, precision], colour, is_faint))
         ways = np.r_[_LEAST, np.maximum(false, _LEAST), _MOST], 1 - np.r_[0.0, recall, end if len(end) else 0.0]
         missing.append(Line(label, *ways, colour, is_faint, steps=True))
-    across = Axis("false positives an image", _LEAST, _MOST, log=True)
+    across = Axis("false positives per image", _LEAST, _MOST, log=True)
     return [
         chart("Precision and recall", Axis("recall", 0, 1), Axis("precision", 0, 1), exact),
         chart("Misses and false alarms", across, Axis("miss rate", 0, 1), missing),
@@ -91,7 +91,7 @@ def ranked_charts(cases: Sequence[Case]) -> list[Markup]:
 
 
 def maps(cases: Sequence[Case]) -> list[Markup]:
-    """A map a clip with places, of the first MOST_CLIPS: true ways, and those that were found for the same targets."""
+    """Return maps of the first MOST_CLIPS clips with places: true paths, and found paths of the same targets."""
     drawn: list[Markup] = []
     for case in cases:
         scored, truth = case.scored, case.clip.truth
@@ -104,7 +104,7 @@ def maps(cases: Sequence[Case]) -> list[Markup]:
         row_of = {key: row for row, key in enumerate(zip(true.frame.tolist(), true.identity.tolist(), strict=True))}
         whose = zip(samples["frame"].tolist(), samples["identity"].tolist(), strict=True)
         rows = [row_of[int(frame), int(identity)] for frame, identity in whose]
-        # The error is added to the true place: each side may count its metres from an origin of its own.
+        # Add the error to the true place, because each side may count its metres from another origin.
         found_m = true.east_north_m[rows] + np.stack([samples["east_m"], samples["north_m"]], axis=1)
         lines = [
             *_ways("true", true.identity[seen], true.frame[seen], true.east_north_m[seen], 5, True),
@@ -117,7 +117,7 @@ def maps(cases: Sequence[Case]) -> list[Markup]:
 def _ways(
     name: str, identity: np.ndarray, frame: np.ndarray, east_north_m: np.ndarray, colour: int, dashed: bool
 ) -> list[Line]:
-    """A line an identity, the longest first; a single name for all of them."""
+    """Return a line for each identity, the longest first, with a single name for all lines."""
     numbers, counts = np.unique(identity, return_counts=True)
     lines: list[Line] = []
     for number in numbers[np.argsort(-counts, kind="stable")][:_MOST_TARGETS].tolist():
@@ -128,7 +128,7 @@ def _ways(
 
 
 def error_clouds(cases: Sequence[Case]) -> list[Markup]:
-    """The errors of all clips together, east and north; a cloud off the middle is a bias."""
+    """Return the errors of all clips together, east and north. A cloud off the centre shows a bias."""
     having = [case.scored.samples for case in cases if case.scored and len(case.scored.samples.get("east_m", ()))]
     if not having:
         return []

@@ -1,4 +1,4 @@
-"""The frames of a study that went worst, as pictures with truth and result side by side."""
+"""The worst frames of a study, as pictures with truth and result side by side."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,20 +18,21 @@ from torchvision_dddas.lab.evaluation.metrics.boxes import iou
 from torchvision_dddas.lab.evaluation.metrics.matching import counted
 from torchvision_dddas.lab.evaluation.metrics.truth import TrackTable
 from torchvision_dddas.lab.evaluation.report.task_charts import tally
-from torchvision_dddas.lab.evaluation.studies.records import Case, Found
+from torchvision_dddas.lab.evaluation.studies.records import Case, Findings
 
 MAX_PICTURES = 8
-"""Pictures of a task on the page."""
+"""Largest number of pictures of a task on the page."""
 MAX_WIDTH, MAX_HEIGHT = 560, 420
-"""Pixels of a picture on the page; a smaller one is enlarged up to three times."""
+"""Largest size of a picture on the page, in pixels. Smaller pictures are enlarged up to three times."""
 HIT: Colour = (233, 180, 86)
 FALSE: Colour = (0, 94, 213)
 TRUE: Colour = (66, 228, 240)
-"""Sky blue, vermilion and yellow of Okabe and Ito, in blue, green, red. True is also what was missed."""
+"""Sky blue, vermilion and yellow of Okabe and Ito, in blue, green, red. Missed targets also have the colour of the
+truth."""
 UNSCORED: Colour = (150, 150, 150)
-_GREY = 70  # in place of a picture
+_GREY = 70  # grey level that replaces a missing picture
 _MAX_OF_A_CLIP = 3
-_SMALL, _RING = 4, 6  # px of a picture on the page
+_SMALL, _RING = 4, 6  # px on the page
 
 Size = tuple[int, int]
 
@@ -45,7 +46,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Worst:
-    """A frame. wrong: how much of it. text: what went wrong. pair: None where it cannot be shown, and why: trouble."""
+    """A frame. wrong: amount of errors. text: describes the errors. pair: None if it cannot be shown. trouble: why."""
 
     case: Case
     frame: int
@@ -56,7 +57,7 @@ class Worst:
 
 
 def find_worst_frames(cases: Sequence[Case]) -> tuple[list[Worst], int]:
-    """The frames with the most faults, of many clips rather than of one, and the number of other frames with faults."""
+    """Return the frames with most errors, from many clips rather than one, and the number of other faulty frames."""
     by_rank: list[list[Worst]] = [[] for _ in range(_MAX_OF_A_CLIP)]
     total = 0
     for case in cases:
@@ -69,13 +70,13 @@ def find_worst_frames(cases: Sequence[Case]) -> tuple[list[Worst], int]:
 
 
 def _worst_of_case(case: Case) -> tuple[list[Worst], int]:
-    """The worst frames of a clip, a tenth of its length apart, and the number of frames with faults."""
+    """Return the worst frames of a clip, a tenth of its length apart, and the number of frames with errors."""
     scored = case.scored
     counts = tally(scored) if scored is not None else None
     if scored is None or counts is None or case.found is None or not len(scored.frames):
         return [], 0
     errors = counts.false + counts.missed + counts.switched
-    # Pixels as a share of the picture, so that large pictures are not the worst of all.
+    # Count pixels as a share of the picture, so that large pictures do not always seem worst.
     whole = counts.right + errors + counts.rest if counts.unit == "pixels" else np.ones(len(errors))
     wrong = np.divide(errors, whole, out=np.zeros(len(errors)), where=whole > 0)
     chosen: list[Worst] = []
@@ -98,7 +99,7 @@ def _worst_of_case(case: Case) -> tuple[list[Worst], int]:
 
 
 def draw_pictures(chosen: Sequence[Worst]) -> list[Worst]:
-    """The same frames with their pictures; the pictures of a clip are read once, in order."""
+    """Return the same frames with their pictures. The pictures of a clip are read once, in order."""
     drawn: dict[int, Worst] = {}
     for case in {id(one.case): one.case for one in chosen}.values():
         of_clip = [one for one in chosen if one.case is case]
@@ -139,7 +140,7 @@ def _draw(case: Case, frame: int, picture: np.ndarray | None) -> Pair:
         return mask_pair(np.full(labels.shape, _GREY, np.uint8) if picture is None else picture, labels, mask)
     if picture is not None:
         return box_pair(picture, (picture.shape[1], picture.shape[0]), boxes_at(case, frame))
-    # The size of a clip without pictures holds all its boxes.
+    # Without pictures, the frame size is the extent of all boxes.
     all_px = np.concatenate([found.box_px, *(truth.boxes.values() if truth is not None else ())])
     far = np.nan_to_num(np.nanmax(all_px[:, :2] + all_px[:, 2:], axis=0, initial=1), nan=1.0)
     width, height = np.clip(far + 8, 64, 20_000).astype(int).tolist()
@@ -149,7 +150,7 @@ def _draw(case: Case, frame: int, picture: np.ndarray | None) -> Pair:
 def mask_pair(picture: np.ndarray, labels: np.ndarray, found: np.ndarray) -> Pair:
     """A frame whose truth is a mask.
 
-    picture: (h, w[, 3]) uint8 of any size. labels: (H, W), -1 where nothing counts. found: (H, W), nonzero is
+    picture: (h, w[, 3]) uint8 of any size. labels: (H, W), -1 where pixels do not count. found: (H, W), nonzero is
     foreground.
     """
     left, right, _ = _sides(picture, (labels.shape[1], labels.shape[0]))
@@ -162,7 +163,7 @@ def mask_pair(picture: np.ndarray, labels: np.ndarray, found: np.ndarray) -> Pai
     for area, colour in ((true & found, HIT), (true & ~found, TRUE), (found & ~true, FALSE)):
         _tint(right, area, colour, 0.7)
         _outline(right, area, colour, 1)
-    # A ring around each single area that is too small to see in the reduced picture.
+    # Draw a ring around each single area that is too small to see in the reduced picture.
     share = np.array([right.shape[1] / true.shape[1], right.shape[0] / true.shape[0]])
     for contour in _contours(right, true | found):
         low, high = contour.min(axis=(0, 1)), contour.max(axis=(0, 1))
@@ -175,11 +176,11 @@ def mask_pair(picture: np.ndarray, labels: np.ndarray, found: np.ndarray) -> Pai
     return Pair(_jpeg(left), _jpeg(right))
 
 
-class Boxes(NamedTuple):
-    """The boxes of a frame: (N, 4) true and (M, 4) found in px, what stands beside each, and which are right.
+class FrameBoxes(NamedTuple):
+    """The boxes of a frame, px: (N, 4) true and (M, 4) found, with the names beside them.
 
-    of_found: (M,) the true box that each found one is, -1 for none. marked: (M,) those with a change of identity.
-    judged: (M,) those that count: where targets may be unlabelled, other boxes are neither right nor false.
+    of_found: (M,) the true box of each found box, -1 for none. marked: (M,) boxes with a change of identity. judged:
+    (M,) boxes that count: if targets may be unlabelled, other boxes are neither right nor false.
     """
 
     true_px: np.ndarray
@@ -191,7 +192,7 @@ class Boxes(NamedTuple):
     judged: np.ndarray
 
 
-def box_pair(picture: np.ndarray | None, size_px: Size, boxes: Boxes) -> Pair:
+def box_pair(picture: np.ndarray | None, size_px: Size, boxes: FrameBoxes) -> Pair:
     """Draw true and found boxes side by side, on grey without a picture. size_px: width and height of the frame."""
     left, right, scale = _sides(np.full((1, 1), _GREY, np.uint8) if picture is None else picture, size_px)
     for box, name in zip(boxes.true_px * scale, boxes.true_names, strict=True):
@@ -205,17 +206,17 @@ def box_pair(picture: np.ndarray | None, size_px: Size, boxes: Boxes) -> Pair:
     return Pair(_jpeg(left), _jpeg(right))
 
 
-def boxes_at(case: Case, frame: int) -> Boxes:
-    """The boxes of a frame, with identities where the task is about them, and which of these changed since last seen.
+def boxes_at(case: Case, frame: int) -> FrameBoxes:
+    """Return the boxes of a frame, with identities if the task is about them, and which identities have changed.
 
-    In a still clip all are false; where one target is labelled, other boxes are not judged.
+    In a still clip all boxes are false. If one target is labelled, other boxes are not judged.
     """
     found, truth = case.found, case.clip.truth
     assert found is not None
     rows = np.flatnonzero(found.frame == frame)
     found_px, marked, names = found.box_px[rows], np.zeros(len(rows), bool), [""] * len(rows)
     if truth is None:
-        return Boxes(np.zeros((0, 4)), found_px, np.full(len(rows), -1), [], names, marked, ~marked)
+        return FrameBoxes(np.zeros((0, 4)), found_px, np.full(len(rows), -1), [], names, marked, ~marked)
     table = truth.tracks if case.task in ("tracking", "association") else None
     if table is None:
         true_px = truth.boxes.get(frame, np.zeros((0, 4)))
@@ -236,13 +237,13 @@ def boxes_at(case: Case, frame: int) -> Boxes:
     judged = of_found >= 0
     if not is_one:
         judged |= counted(truth, found.frame[rows], found_px)
-    return Boxes(true_px, found_px, of_found, true_names, names, marked, judged)
+    return FrameBoxes(true_px, found_px, of_found, true_names, names, marked, judged)
 
 
 def matched(overlap: np.ndarray, least: float = 0.5) -> np.ndarray:
-    """(M,) the true box of each found one, -1 for none: each true box in turn takes the best left, as in the counts.
+    """Return the true box of each found box, (M,), -1 for none: each true box in turn takes the best remaining box.
 
-    overlap: (N, M), the IoU of true and found boxes.
+    The counts use the same matching. overlap: (N, M), the IoU of true and found boxes.
     """
     of_found, left = np.full(overlap.shape[1], -1), overlap.copy()
     for i in range(len(left) if left.size else 0):
@@ -253,8 +254,8 @@ def matched(overlap: np.ndarray, least: float = 0.5) -> np.ndarray:
     return of_found
 
 
-def _last_identity(found: Found, table: TrackTable, identity: int, frame: int) -> int | None:
-    """The identity of a target when it was last found before a frame; None if it was not."""
+def _last_identity(found: Findings, table: TrackTable, identity: int, frame: int) -> int | None:
+    """Return the identity under which a target was last found before a frame; None if it was not found."""
     mine = (table.identity == identity) & (table.frame < frame)
     for row in np.flatnonzero(mine)[np.argsort(-table.frame[mine], kind="stable")].tolist():
         there = np.flatnonzero(found.frame == table.frame[row])
@@ -265,7 +266,7 @@ def _last_identity(found: Found, table: TrackTable, identity: int, frame: int) -
 
 
 def _sides(picture: np.ndarray, size_px: Size) -> tuple[np.ndarray, np.ndarray, float]:
-    """The picture as large as on the page; the same grey and darker, for lines to stand out; the scale of the frame."""
+    """Return the picture in its size on the page, a dark grey copy on which lines stand out, and the scale."""
     scale = min(MAX_WIDTH / size_px[0], MAX_HEIGHT / size_px[1], 3.0)
     width, height = (max(1, round(side * scale)) for side in size_px)
     how = cv2.INTER_AREA if width < picture.shape[1] else cv2.INTER_LINEAR
@@ -285,7 +286,7 @@ def _outline(picture: np.ndarray, area: np.ndarray, colour: Colour, thick: int) 
 
 
 def _contours(picture: np.ndarray, area: np.ndarray) -> list[np.ndarray]:
-    """(N, 1, 2) each, in pixels of the picture on the page."""
+    """Return contours, (N, 1, 2) each, in pixels of the picture on the page."""
     contours, _ = cv2.findContours(area.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     scale = picture.shape[1] / area.shape[1], picture.shape[0] / area.shape[0]
     return [(contour + 0.5) * scale for contour in contours]
@@ -311,7 +312,7 @@ def _dashed(picture: np.ndarray, box: np.ndarray, colour: Colour) -> None:
 
 
 def _jpeg(picture: np.ndarray) -> bytes:
-    # Thin lines need their colour at each pixel.
+    # Thin lines need their full colour at each pixel.
     finest = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
     how = [cv2.IMWRITE_JPEG_QUALITY, 80, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, finest]
     return cv2.imencode(".jpg", picture, how)[1].tobytes()

@@ -22,28 +22,31 @@ import numpy as np
 
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import cannot_write, remove, remove_left_behind, write_whole
-from torchvision_dddas.lab.evaluation.metrics.boxes import Boxes, OneTarget
-from torchvision_dddas.lab.evaluation.metrics.metres import GroundLocations
+from torchvision_dddas.lab.evaluation.metrics.boxes import BoxCounts, OneTarget
+from torchvision_dddas.lab.evaluation.metrics.metres import LocatedCounts
 from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, Still
 from torchvision_dddas.lab.evaluation.metrics.tracking import Clear, Hota, Identity, TargetTrack, TrackCounts, Windows
-from torchvision_dddas.lab.evaluation.studies.records import Found, Scored, ScoredCase, ScoredStudy
+from torchvision_dddas.lab.evaluation.studies.records import Findings, Scored, ScoredCase, ScoredStudy
 from torchvision_dddas.runtime import VERSION
 
 SCORES = "scores.bin"
 """The file of a study's folder that holds its counts, frame by frame."""
 
-_COUNTS = (Pixels, Boxes, OneTarget, TrackCounts, TargetTrack, Still, GroundLocations, Clear, Hota, Identity, Windows)
-_RECORDS = {kind.__name__: kind for kind in (Found, Scored, ScoredCase, ScoredStudy, *_COUNTS)}
+_COUNTS = (Pixels, OneTarget, TrackCounts, TargetTrack, Still, Clear, Hota, Identity, Windows)
+# The names of records in files. Three differ from the class names, because files of earlier versions have them.
+_RECORDS: dict[str, Any] = {"Found": Findings, "Boxes": BoxCounts, "GroundLocations": LocatedCounts}
+_RECORDS |= {kind.__name__: kind for kind in (Scored, ScoredCase, ScoredStudy, *_COUNTS)}
+_NAMES = {kind: name for name, kind in _RECORDS.items()}
 
 
 class DamagedError(ValueError):
-    """The bytes are not those that were stored."""
+    """The bytes differ from those that were stored."""
 
 
 def pack(record: Any) -> bytes:
-    """Bytes of a record: dataclasses, NamedTuples, arrays, mappings, tuples, texts, numbers, bytes.
+    """Return a record as bytes: dataclasses, NamedTuples, arrays, mappings, tuples, texts, numbers, bytes.
 
-    The first 32 bytes are the SHA-256 of the rest. Raises TypeError for any other content.
+    The first 32 bytes are the SHA-256 of the rest. Raise TypeError for any other content.
     """
     arrays: dict[str, np.ndarray] = {}
     content = json.dumps(_encode(record, arrays))
@@ -54,9 +57,9 @@ def pack(record: Any) -> bytes:
 
 
 def unpack(content: bytes) -> Any:
-    """The record of such bytes. Raises DamagedError if they are damaged, or hold no known record."""
+    """Return the record in these bytes. Raise DamagedError if they are damaged, or contain no known record."""
     if not _is_whole(content):
-        raise DamagedError("its digest is another")
+        raise DamagedError("its digest does not match")
     try:
         with np.load(io.BytesIO(content[32:]), allow_pickle=False) as arrays:
             return _decode(json.loads(arrays["content"].tobytes()), arrays)
@@ -65,7 +68,7 @@ def unpack(content: bytes) -> Any:
 
 
 def digest(*values: Any) -> str:
-    """The SHA-256 of values that `pack` takes. Values that differ in content, type or order have different digests."""
+    """Return the SHA-256 of values that `pack` takes. It depends on their content, type and order."""
     return pack(values)[:32].hex()
 
 
@@ -86,7 +89,8 @@ def _encode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return {"map": [[_encode(k, arrays), _encode(v, arrays)] for k, v in value.items()]}
     fields = value._asdict() if hasattr(value, "_asdict") else vars(value) if dataclasses.is_dataclass(value) else None
     if fields is not None:
-        return {"of": type(value).__name__, "fields": {name: _encode(v, arrays) for name, v in fields.items()}}
+        name = _NAMES.get(type(value), type(value).__name__)
+        return {"of": name, "fields": {key: _encode(v, arrays) for key, v in fields.items()}}
     if isinstance(value, tuple | list):
         return {type(value).__name__: [_encode(v, arrays) for v in value]}
     raise TypeError(f"a {type(value).__name__} cannot be stored")
@@ -96,7 +100,7 @@ def _decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     if not isinstance(value, dict):
         return value
     if "of" in value:
-        kind = _RECORDS[value["of"].rpartition(":")[2]]  # older files say module:class
+        kind = _RECORDS[value["of"].rpartition(":")[2]]  # older files contain module:class
         return kind(**{name: _decode(v, arrays) for name, v in value["fields"].items()})
     ((kind, inner),) = value.items()
     if kind in ("array", "bytes"):
@@ -107,15 +111,15 @@ def _decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
 
 
 def cache_folder() -> Path:
-    """The default folder of cached results."""
+    """Return the default folder of cached results."""
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(home) / "torchvision_dddas" / "studies"
 
 
 class Cache:
-    """A folder of records, one file per key. Each file is whole or absent; several processes may use it at once.
+    """A folder of records, one file per key. Each file is whole or absent. Several processes may use it at once.
 
-    notes: a line for each damaged entry that was met. Raises InputError if the folder cannot be made.
+    notes: a line for each damaged entry that was found. Raise InputError if the folder cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -127,22 +131,22 @@ class Cache:
             raise InputError(f"cannot make the folder {folder}: {error.strerror}; choose another --cache") from None
 
     def path(self, key: str) -> Path:
-        """The file of a key."""
+        """Return the file of a key."""
         return self.folder / key[:2] / f"{key}.npz"
 
     def has_newer(self, since_s: float) -> bool:
-        """Whether an entry was written after a time, as `time.time` gives it."""
+        """Return whether an entry was written after a time, in the unit of `time.time`."""
         with suppress(OSError):
             return any(entry.stat().st_mtime > since_s for entry in self.folder.glob("*/*.npz"))
         return False
 
     def has(self, key: str) -> bool:
-        """Whether there is a whole entry. A damaged one is noted and removed."""
+        """Return whether there is a whole entry. A damaged entry is noted and removed."""
         content = self.read(key)
         return content is not None and (_is_whole(content) or self._drop(key))
 
     def get(self, key: str) -> Any | None:
-        """The record of a key; None if there is none. A damaged one is noted and removed."""
+        """Return the record of a key; None if there is none. A damaged entry is noted and removed."""
         content = self.read(key)
         try:
             return None if content is None else unpack(content)
@@ -151,22 +155,22 @@ class Cache:
             return None
 
     def read(self, key: str) -> bytes | None:
-        """The bytes of an entry, unchecked; None if there is none. Marks the entry as used now."""
+        """Return the bytes of an entry, unchecked; None if there is none. The entry counts as used now."""
         path = self.path(key)
         try:
             content = path.read_bytes()
         except OSError:
             return None
-        with suppress(OSError):  # the cache may be read only
+        with suppress(OSError):  # the cache may be read-only
             path.touch()
         return content
 
     def put(self, key: str, record: Any) -> None:
-        """Keep a record. Raises InputError if the disk refuses."""
+        """Store a record. Raise InputError if the disk refuses."""
         self.write(key, pack(record))
 
     def write(self, key: str, content: bytes) -> None:
-        """Keep the bytes of a record. Raises InputError if the disk refuses."""
+        """Store the bytes of a record. Raise InputError if the disk refuses."""
         path = self.path(key)
         try:
             path.parent.mkdir(exist_ok=True)
@@ -175,15 +179,15 @@ class Cache:
             raise InputError(str(cannot_write(path, error)).replace("another --out", "another --cache")) from None
 
     def tidy(self) -> None:
-        """Remove the hidden files of entries that killed processes left under way."""
+        """Remove hidden files that killed processes left unfinished."""
         for folder in self.folder.glob("??"):
             remove_left_behind(folder)
 
     def prune(self, days: float) -> tuple[int, int]:
-        """Remove entries that were not used for so many days; returns their number and bytes."""
+        """Remove entries that were not used for `days`, and return their number and bytes."""
         count = size = 0
         for path in self.folder.rglob("*"):
-            with suppress(OSError):  # another process may prune too
+            with suppress(OSError):  # another process may remove entries at the same time
                 found = path.stat()
                 if path.is_file() and time.time() - found.st_mtime > days * 86400:
                     path.unlink()
@@ -191,25 +195,25 @@ class Cache:
         return count, size
 
     def _drop(self, key: str) -> bool:
-        self.notes.append(f"{self.path(key)} is damaged: it is computed again")
+        self.notes.append(f"{self.path(key)} is damaged and is computed again")
         remove(self.path(key))
         return False
 
 
 def write_scores(folder: Path, name: str, cases: Iterable[ScoredCase]) -> None:
-    """Write scores.bin, whole or not at all. Raises OSError."""
+    """Write scores.bin, whole or not at all. Raise OSError."""
     ordered = tuple(sorted(cases, key=lambda case: (case.task, case.clip)))
     write_whole(folder / SCORES, pack(ScoredStudy(name, ordered)))
 
 
 def read_scores(folder: Path) -> ScoredStudy:
-    """Read scores.bin. Raises InputError if the folder holds no study, or the file is damaged."""
+    """Read scores.bin. Raise InputError if the folder is not a study's, or the file is damaged."""
     path = folder / SCORES
     try:
         study = unpack(path.read_bytes())
     except FileNotFoundError:
         raise InputError(
-            f"{folder} holds no study: no {SCORES}; wanted a folder that dddas evaluate --dataset wrote, or "
+            f"{folder} is not a study: it lacks {SCORES}; wanted a folder that dddas evaluate --dataset wrote, or "
             "that of a method of dddas evaluate --names"
         ) from None
     except OSError as error:
@@ -224,18 +228,18 @@ def read_scores(folder: Path) -> ScoredStudy:
 PACKAGE = Path(__file__).resolve().parents[3]
 
 _ABOVE = ("cli", "live", "lab/tuning", "lab/export", "lab/evaluation/report")
-"""Folders of the package that no stage and no score imports: a change there leaves results as they are."""
+"""Folders of the package that no stage and no score imports. Changes there do not affect results."""
 
 _LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "onnxruntime", "pymap3d", "av", "torch", "kornia")
-_SETTLED_S = 2.0  # a file that was written a moment ago may be written again within one tick of its time stamp
+_SETTLED_S = 2.0  # a file that was just written may be written again within one tick of its time stamp
 
 
 @cache
 def code_digest(backend: str) -> str:
-    """The digest of all that results depend on beside their inputs.
+    """Return the digest of everything besides the inputs that results depend on.
 
-    It covers the files of the package, data files too, the versions of the libraries, torch's only if it is the
-    backend, and the processor's architecture. Machines where it is the same get the same results.
+    It covers the files of the package, also data files; the versions of the libraries, of torch only if torch is the
+    backend; and the processor's architecture. Machines with the same digest get the same results.
     """
     above = tuple(PACKAGE / folder for folder in _ABOVE)
     files = [path for path in sorted(PACKAGE.rglob("*")) if path.is_file() and path.suffix != ".pyc"]
@@ -254,9 +258,9 @@ def _file_digest(path: Path) -> str:
 
 
 def files_digest(paths: Sequence[Path], memory: Path | None = None) -> str:
-    """The digest of the content of files, in order. Raises InputError if one cannot be read.
+    """Return the digest of the content of files, in order. Raise InputError if a file cannot be read.
 
-    memory: the folder that remembers digests: a list whose sizes and times are unchanged is not read again.
+    memory: folder that stores digests. Files whose sizes and times have not changed are not read again.
     """
     if not paths:
         return ""

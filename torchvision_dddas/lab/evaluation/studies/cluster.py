@@ -1,7 +1,7 @@
-"""The processes of a study, through Dask: those of this machine, which nobody else can reach, or a scheduler's.
+"""The processes of a study, by Dask: private processes of this machine, or those of a scheduler.
 
-Whoever reaches a port of Dask runs code as the user who opened it. The processes of this machine therefore talk by TLS,
-and take only connections with a key that is made anew for them. None of them serves HTTP.
+Anyone who reaches a port of Dask can run code as the user who opened it. The processes of this machine therefore
+communicate by TLS, and accept only connections with a key that is made for the run. None of them serves HTTP.
 """
 
 import atexit
@@ -23,9 +23,9 @@ from distributed.deploy.spec import close_clusters
 from torchvision_dddas.errors import InputError
 
 CONNECT_S = 5.0
-"""How long a scheduler may take to answer."""
+"""Time in which a scheduler must answer."""
 
-_LATE_S = 0.5  # after a signal, workers that were about to start have started by then
+_LATE_S = 0.5  # workers that were about to start at a signal have started after this time
 _ONE_THREAD = {
     **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
     "OMP_WAIT_POLICY": "PASSIVE",
@@ -33,14 +33,14 @@ _ONE_THREAD = {
 
 
 class _WithoutHttp:
-    """A node of Dask that serves no HTTP: Dask opens a port for it even where no dashboard is wanted."""
+    """A node of Dask without HTTP. Dask would open a port for HTTP even without a dashboard."""
 
     def start_http_server(self, *_: object, **__: object) -> None:
         """Start nothing."""
 
 
 class LocalScheduler(_WithoutHttp, Scheduler):
-    """The scheduler, a thread of this process."""
+    """The scheduler, as a thread of this process."""
 
 
 class LocalWorker(_WithoutHttp, Worker):
@@ -48,10 +48,10 @@ class LocalWorker(_WithoutHttp, Worker):
 
 
 def start_local(jobs: int, deaths: int, silent_s: float, stack: ExitStack) -> Client:
-    """A client of new processes on this machine, which end with the stack.
+    """Return a client of new processes on this machine, which end with the stack.
 
-    deaths: after so many of a process over one job it is given up. silent_s: a process that gives no sign for so long
-    is killed and replaced, which counts as a death.
+    deaths: a job is given up after this many deaths of its process. silent_s: a process that gives no sign for this
+    time is killed and replaced, which counts as a death.
     """
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     _start_tracker()
@@ -68,7 +68,7 @@ def start_local(jobs: int, deaths: int, silent_s: float, stack: ExitStack) -> Cl
     settings = {
         "distributed.scheduler.allowed-failures": deaths - 1,
         "distributed.scheduler.worker-ttl": f"{silent_s} s",
-        # Dask imports code from here. Its default is a folder in /tmp that any user may have made before, and it stays.
+        # Dask imports code from this folder. The default is in /tmp, where any user may have made it before.
         "temporary-directory": stack.enter_context(TemporaryDirectory(prefix="dddas-")),
     }
     with dask.config.set(settings):
@@ -83,16 +83,16 @@ def start_local(jobs: int, deaths: int, silent_s: float, stack: ExitStack) -> Cl
 
 
 def kill_local(client: Any) -> None:
-    """End the processes of this machine at once: what is finished is in the cache, and Dask would wait for the rest.
+    """End the processes of this machine at once. Finished results are in the cache; Dask would wait for the others.
 
-    client: of `start_local`; None if a signal came while they started. The user does not see what Dask says of it.
+    client: of `start_local`; None if a signal came while the processes started. Dask's messages are not shown.
     """
     for name in ("asyncio", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     atexit.unregister(close_clusters)
     for nanny in client.cluster.workers.values() if client is not None else ():
-        nanny.close_gracefully()  # else it starts another process
-    # Those that were about to start would write a traceback once this process has gone.
+        nanny.close_gracefully()  # otherwise it starts another process
+    # Workers that were about to start would print a traceback after this process has ended.
     until_s = time.monotonic() + (_LATE_S if client is None else 0.0)
     while True:
         for child in multiprocessing.active_children():
@@ -104,7 +104,7 @@ def kill_local(client: Any) -> None:
 
 
 def _start_tracker() -> None:
-    """Start the process that cleans up behind workers: it heeds no SIGHUP, as it heeds no Ctrl-C and no SIGTERM."""
+    """Start the process that cleans up after workers, so that it ignores SIGHUP, as it ignores Ctrl-C and SIGTERM."""
     if hasattr(signal, "pthread_sigmask") and hasattr(signal, "SIGHUP"):
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
         try:
@@ -114,13 +114,13 @@ def _start_tracker() -> None:
 
 
 def connect(scheduler: str) -> Client:
-    """A client of a scheduler; the keys for a tls:// address are those of Dask's own settings.
+    """Return a client of a scheduler. The keys for a tls:// address are those of Dask's own settings.
 
-    Raises InputError if it cannot be reached.
+    Raise InputError if the scheduler cannot be reached.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # lost workers are reported by the study anyway
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the study reports lost workers
     try:
-        # Checked before there is a client, which would complain about a bad address again as it ends.
+        # Check the address first: a client would complain about a bad address again when it ends.
         scheme, host = parse_address(scheduler)
         get_backend(scheme)
         if scheme in ("tcp", "tls"):

@@ -1,4 +1,4 @@
-"""Two studies of the same clips compared: what changed, whether it is beyond noise, and the page compare.html."""
+"""Compare two studies of the same clips: the changes, whether they are beyond noise, and the page compare.html."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ LEVEL = 0.05
 
 MEANING = (
     "Better and worse are beyond noise: corrected p below 0.05, by Holm's method for all tests of one kind of a task. "
-    "“On these clips”: significant over blocks of their frames, which holds for these clips alone. "
+    "“On these clips”: significant over blocks of their frames, which holds only for these clips. "
     "“Within noise”: no change is shown, nor that there is none. "
     "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures. "
     "Effect size: the mean of the clips' changes over their standard deviation (Cohen's d_z). Clips needed: so many "
@@ -37,15 +37,15 @@ Pairs = dict[str, tuple[Scored, Scored]]
 
 
 def compare_studies(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
-    """What changed from the first study to the second, on the clips that both have.
+    """Return the changes from the first study to the second, on the clips that both have.
 
-    {"first", "second": names, "tasks": {task: {"same": clips whose counts are alike to the last digit, "pooled":
-    {group: {measure: {"first", "second", "change", "over_clips", "over_frames", "says"}}}, "clips": {name: {group:
-    {measure: {"first", "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames,
-    {"interval", "p", "p_holm", "enough"} or None, hold for other clips like these, and for other frames of the same
-    clips. p_holm is corrected for all tests of a task's pooled figures, or of all its clips. Not enough: so few clips
-    or blocks of frames could not make it small, whatever changed. Pooled entries have "effect_size" and "clips_needed"
-    too, see `effect_size`. Raises InputError where no task has a clip in both.
+    {"first", "second": names, "tasks": {task: {"same": clips whose counts are equal, "pooled": {group: {measure:
+    {"first", "second", "change", "over_clips", "over_frames", "says"}}}, "clips": {name: {group: {measure: {"first",
+    "second", "change", "over_frames", "says"}}}}}}, "notes": [...]}. over_clips and over_frames are {"interval", "p",
+    "p_holm", "enough"} or None. They hold for other clips like these, and for other frames of the same clips. p_holm is
+    corrected for all tests of a task's pooled figures, or of all its clips. enough is False if so few clips or blocks
+    of frames cannot give a small p_holm, whatever changed. Pooled entries also have "effect_size" and "clips_needed",
+    see `effect_size`. Raise InputError if no task has a clip in both studies.
     """
     return compare_methods((first, second))[0]
 
@@ -86,7 +86,7 @@ def _compare(first: ScoredStudy, second: ScoredStudy) -> dict[str, Any]:
 
 
 def differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """{"group.parameter": [first, second]} of the settings that differ. first, second: by group, as in run.json."""
+    """Return {"group.parameter": [first, second]} of settings that differ. first, second: by group, as in run.json."""
     flat = [
         {f"{group}.{name}": value for group in side for name, value in side[group].items()} for side in (first, second)
     ]
@@ -95,7 +95,7 @@ def differing_settings(first: Mapping[str, Any], second: Mapping[str, Any]) -> d
 
 
 def settings_lines(settings: Mapping[str, Sequence[Any]] | None) -> list[str]:
-    """A line for each setting that differs. None: not known."""
+    """Return a line for each setting that differs. None: unknown settings."""
     if settings is None:
         return ["settings: unknown, as a run.json lacks them"]
     return [f"{name}: {one} in A, {other} in B" for name, (one, other) in settings.items()] or ["settings: the same"]
@@ -118,7 +118,7 @@ def _correct(tasks: Sequence[Mapping[str, Any]]) -> None:
     of_clips = [entry for task in tasks for clip in task["clips"].values() for _, _, entry in entries_of(clip)]
     of_pooled = [entry for task in tasks for _, _, entry in entries_of(task["pooled"])]
     for entries, way in ((of_clips, "over_frames"), (of_pooled, "over_clips"), (of_pooled, "over_frames")):
-        # Holm's correction covers all p-values of one kind of test.
+        # Holm's correction covers all p values of one kind of test.
         effects = [entry[way] for entry in entries if entry[way] is not None]
         adjusted = bootstrap.holm({str(i): one["p"] for i, one in enumerate(effects)})
         for i, one in enumerate(effects):
@@ -138,7 +138,7 @@ def _correct(tasks: Sequence[Mapping[str, Any]]) -> None:
 def _changes(
     pairs: Sequence[tuple[Scored, Scored]], most: int | None, estimates: Mapping[str, Mapping[str, Estimate]]
 ) -> dict[str, dict[str, Entry]]:
-    """Each measure before and after by group. most: measures of a group. estimates: of ways beside over_frames."""
+    """Return each measure before and after, by group. most: measures of a group. estimates: besides over_frames."""
     sides = [list(side) for side in zip(*pairs, strict=True)]
     before, after = (measures(side) for side in sides)
     estimates = {**estimates, "over_frames": over_frames([*sides[0], *sides[1]])}
@@ -163,9 +163,9 @@ def _changes(
 
 
 def _effects(estimate: Estimate) -> dict[str, Effect]:
-    """The effects between the two halves of an estimate's units; none for fewer than FEWEST clips."""
+    """Return the effects between the two halves of an estimate's units; empty for fewer than FEWEST clips."""
     half = len(estimate.strata) // 2
-    if half:  # a clip's frames are drawn in the longer of the blocks that its two results ask for
+    if half:  # the frames of a clip are drawn in blocks of the larger length of its two results
         halves = zip(estimate.strata[:half], estimate.strata[half:], strict=True)
         strata = [Stratum(one.units, max(one.block, other.block)) for one, other in halves]
     else:
@@ -176,7 +176,7 @@ def _effects(estimate: Estimate) -> dict[str, Effect]:
 
 
 def verdict(entry: Mapping[str, Any], name: str, p: str = "p_holm") -> str:
-    """What a change of a measure amounts to, in words. p: the entry's own, `p`, or the one corrected for all."""
+    """Return the verdict on a change of a measure, in words. p: the key of the p value, single or corrected."""
     change = entry["change"]
     if not change:
         return "the same"
@@ -195,22 +195,22 @@ def _same(one: Scored, other: Scored) -> bool:
 
 
 def _unlike(one: Scored, other: Scored) -> str:
-    """Why two results of a clip cannot be compared; empty where they can."""
+    """Return the reason why two results of a clip cannot be compared; empty if they can."""
     if one.counts.keys() != other.counts.keys():
         return f"one has {', '.join(one.counts)}, the other {', '.join(other.counts)}"
     if not np.array_equal(one.frames, other.frames):
         return f"other frames were scored, {len(one.frames)} and {len(other.frames)}"
     names = {"pixels": ("tp", "fn"), "boxes": ("hit", "missed"), "tracks": ("tp", "fn"), "location": ("targets",)}
     for group in one.counts:
-        columns = names.get(group, ("frames",))  # what there truly is in each frame: pixels, boxes, the target, places
+        columns = names.get(group, ("frames",))  # the truth of each frame: pixels, boxes, the target, places
         true = [sum(np.nan_to_num(scored.per_frame[group][name]) for name in columns) for scored in (one, other)]
         if not np.array_equal(true[0], true[1]):
-            return f"its truth is another, {np.sum(true[0]):g} and {np.sum(true[1]):g} in {group}"
+            return f"its truth differs, {np.sum(true[0]):g} and {np.sum(true[1]):g} in {group}"
     return ""
 
 
 def comparison_report(comparison: Mapping[str, Any]) -> str:
-    """The HTML of compare.html. comparison: as `compare_studies` returns it, NaN as None; "settings": that differ."""
+    """Return compare.html. comparison: of `compare_studies`, with None for NaN and the "settings" that differ."""
     first, second = str(comparison["first"]), str(comparison["second"])
     tasks = []
     for task, changes in comparison["tasks"].items():
@@ -250,7 +250,7 @@ def comparison_report(comparison: Mapping[str, Any]) -> str:
 
 
 def comparison_section(anchor: str, title: str, changes: Mapping[str, Any], first: str, second: str) -> Markup:
-    """The section of a task: plots clip by clip, all clips together, single clips.
+    """Return the section of a task: plots clip by clip, all clips together, single clips.
 
     anchor: the target of links. changes: of this task, as in `compare_studies`. first, second: names of columns.
     """
@@ -290,7 +290,7 @@ def _columns(first: str, second: str, ways: Mapping[str, str]) -> list[Column]:
 
 
 def _charts(clips: Mapping[str, Mapping[str, Any]]) -> list[tuple[Markup, str]]:
-    """The change of each group's first measure clip by clip, the largest loss first, and a note."""
+    """Return the change of each group's first measure for each clip, the largest loss first, and a note."""
     charts = []
     for group in dict.fromkeys(group for groups in clips.values() for group in groups):
         changed = {clip: next(iter(groups[group].items())) for clip, groups in clips.items() if groups.get(group)}
@@ -317,24 +317,24 @@ def _cells(group: str, name: str, entry: Mapping[str, Any], ways: Sequence[str])
 
 
 def entries_of(groups: Mapping[str, Mapping[str, Entry]]) -> list[tuple[str, str, Entry]]:
-    """Group, measure and entry of each change."""
+    """Return group, measure and entry of each change."""
     return [(group, name, entry) for group, names in groups.items() for name, entry in names.items()]
 
 
 def _change(entry: Mapping[str, Any]) -> tuple[float, float, float]:
-    """The change and the ends of its interval: over clips where there is one, else over frames."""
+    """Return the change and the ends of its interval: over clips if there is one, else over frames."""
     spans = [effect["interval"] for way in WAYS if (effect := entry.get(way)) is not None and effect["interval"]]
     low, high = spans[0] if spans else (math.nan, math.nan)
     return math.nan if entry["change"] is None else float(entry["change"]), low, high
 
 
 def signed_change(entry: Mapping[str, Any], name: str) -> str:
-    """The change of a measure with its sign and its decimals."""
+    """Return the change of a measure with its sign and its decimals."""
     change = entry["change"]
     text = format_number(math.nan if change is None else change, describe(name).digits)
     return f"+{text}" if change and change > 0 else text
 
 
 def measure_title(group: str, name: str) -> str:
-    """The measure and its group in words."""
+    """Return the measure and its group in words."""
     return f"{describe(name).title}, {title_of_group(group)}"

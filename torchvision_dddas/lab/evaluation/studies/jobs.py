@@ -1,7 +1,7 @@
-"""Jobs: one clip from its files to its measures, each stage from the cache or computed; shared among processes by Dask.
+"""Jobs: compute the measures of one clip, stage by stage, with a cache. Dask shares jobs among processes.
 
-One job at a time needs no Dask. Workers of a cluster read the clips' files, and keep results in the cache, where this
-machine has them: both folders must be shared.
+One job at a time needs no Dask. The workers of a cluster must share the folders of clips and of the cache with this
+machine.
 """
 
 import os
@@ -24,7 +24,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.interrupts import is_stop
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
 from torchvision_dddas.lab.evaluation.studies.cache import Cache, code_digest, digest, files_digest
-from torchvision_dddas.lab.evaluation.studies.records import Found, Task
+from torchvision_dddas.lab.evaluation.studies.records import Findings, Task
 from torchvision_dddas.lab.evaluation.studies.scoring import score
 from torchvision_dddas.lab.evaluation.studies.stages import (
     PARAMETER_GROUPS,
@@ -38,23 +38,24 @@ from torchvision_dddas.lab.evaluation.studies.stages import (
 from torchvision_dddas.runtime import VERSION
 
 MAX_DEATHS = 3
-"""If so many workers die over a job, or give no sign, its clip is left out."""
+"""The clip of a job is left out if this number of workers die over it, or give no sign."""
 
 NO_WORKER_S = 30.0
-"""How long a scheduler may be without any worker."""
+"""Longest time that a scheduler may be without workers."""
 
 SILENT_S = 60.0
-"""A local worker that has given no sign for so long, as one that was stopped, is replaced; its clip begins again."""
+"""A local worker that gives no sign for this time, for example because it was stopped, is replaced. Its clip is
+restarted."""
 
 _POLL_S = _REPORT_S = 0.25
 _TOPIC = "dddas-frames"
-_CLUSTER = "torchvision_dddas.lab.evaluation.studies.cluster"  # imported only where it is needed, as Dask is an extra
+_CLUSTER = "torchvision_dddas.lab.evaluation.studies.cluster"  # imported only when needed, because Dask is an extra
 _INSTALL = "dask, distributed and cryptography; pip install 'torchvision-dddas[distributed]'"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A clip and what is asked of it. number: its place in the study. tasks: each after those it builds upon."""
+    """A clip and its requested tasks. number: its place in the study. tasks: each after tasks that it depends on."""
 
     number: int
     clip: Clip
@@ -66,9 +67,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Done:
-    """The outcome of a task. found, scored: keys in the cache, empty without a result; cause: why there is none.
+    """The outcome of a task. found, scored: keys in the cache, empty without a result. cause: why there is no result.
 
-    computed: the stages that were not in the cache. trace: the traceback of a fault of the program.
+    computed: the stages that were not in the cache. trace: the traceback of an error in the program.
     """
 
     task: Task
@@ -80,8 +81,8 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Event:
-    """Progress of a job. done: its outcome once it ends. frames: processed since the last event. note: for the user."""
+class JobEvent:
+    """Progress of a job. done: its outcome, if it ended. frames: processed since the last event. note: for the user."""
 
     job: Job
     done: tuple[Done, ...] | None = None
@@ -89,13 +90,13 @@ class Event:
     note: str = ""
 
 
-OnEvent = Callable[[Event], object]
+OnEvent = Callable[[JobEvent], object]
 Keys = Mapping[Task, Done]
-"""The outcomes of a job's tasks, and of those they build upon, once all of it is computed."""
+"""Receives the outcomes of a job's tasks, and of the tasks that they depend on, when all are computed."""
 
 
 def make_keys(job: Job, memory: Path | None = None) -> Keys:
-    """The keys of a job's results: digests of all that they depend on, and of nothing else.
+    """Return the keys of a job's results: digests of everything that they depend on, and of nothing else.
 
     memory: as in `files_digest`.
     """
@@ -123,7 +124,7 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
                 None if task in ("motion", "people") else job.interval,
                 before.found,
             )
-            whole: Any = None  # the content of the truth, without where it is written
+            whole: Any = None  # the content of the truth, without its location
             if clip.truth is not None:
                 numbers = sorted(clip.truth.masks)
                 rest = {name: value for name, value in vars(clip.truth).items() if name not in ("masks", "place")}
@@ -136,21 +137,21 @@ def make_keys(job: Job, memory: Path | None = None) -> Keys:
 
 
 def _content(group: Group) -> tuple[dict[str, Any], list[str]]:
-    """The values of a group of settings, and which of them are set: a value that is set wins over a log's."""
+    """Return the values of a group of settings, and the values that are set: these take precedence over a log's."""
     return group.model_dump(), sorted(group.model_fields_set)
 
 
 def find_cached(job: Job, keys: Keys, cache: Cache) -> tuple[Done, ...] | None:
-    """The outcome of a job if all of it is in the cache, else None."""
+    """Return the outcome of a job if all of it is in the cache, else None."""
     done = tuple(keys[task] for task in job.tasks)
     return done if all(not d.cause and cache.has(d.found) and cache.has(d.scored) for d in done) else None
 
 
 def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None) -> tuple[Done, ...]:
-    """Do all tasks of a job. Bad input of one does not stop the others. on_frame: called once per frame."""
+    """Do all tasks of a job. Bad input of one task does not stop the others. on_frame: called once for each frame."""
 
-    def find_or_get(task: Task, on_frame: OnFrame, computed: list[str]) -> Found:
-        found: Found | None = store.get(keys[task].found)
+    def find_or_get(task: Task, on_frame: OnFrame, computed: list[str]) -> Findings:
+        found: Findings | None = store.get(keys[task].found)
         if found is None:
             need = upstream_task(job.clip, task)
             before = None if need is None else find_or_get(need, lambda: None, computed)
@@ -183,20 +184,20 @@ def do_job(job: Job, keys: Keys, store: Cache, on_frame: OnFrame = lambda: None)
 
 
 def _do_on_one_thread(job: Job, keys: Keys, store: Cache, report: OnEvent) -> tuple[tuple[Done, ...], str]:
-    """Do a job and report the number of new frames a few times a second; its outcome, and the store's notes."""
+    """Do a job and report the number of new frames a few times a second. Return its outcome and the store's notes."""
     frames, reported_s = 0, time.monotonic()
 
     def count_frame() -> None:
         nonlocal frames, reported_s
         frames += 1
         if time.monotonic() - reported_s >= _REPORT_S:
-            report(Event(job, frames=frames))
+            report(JobEvent(job, frames=frames))
             frames, reported_s = 0, time.monotonic()
 
     with _one_thread(job.backend):
         done = do_job(job, keys, store, count_frame)
     if frames:
-        report(Event(job, frames=frames))
+        report(JobEvent(job, frames=frames))
     notes = "; ".join(store.notes)
     store.notes.clear()
     return done, notes
@@ -205,10 +206,10 @@ def _do_on_one_thread(job: Job, keys: Keys, store: Cache, report: OnEvent) -> tu
 class Workers:
     """The processes that do jobs, each on one thread. A context manager: they end with the block.
 
-    jobs: how many; 1 is this process itself; None is one per core, or 1 without Dask. scheduler: the address of a Dask
-    scheduler, whose workers are taken instead. Local workers start when they are first needed. silent_s: a local worker
-    that gives no sign for so long counts as dead; a scheduler has its own limit. Raises InputError if Dask is needed
-    and not installed, or the scheduler does not answer.
+    jobs: their number; 1 is this process; None is one for each core, or 1 without Dask. scheduler: address of a Dask
+    scheduler whose workers replace the local ones. Local workers start when they are first needed. silent_s: a local
+    worker that gives no sign for this time counts as dead; a scheduler has its own limit. Raise InputError if Dask is
+    needed but not installed, or if the scheduler does not answer.
     """
 
     def __init__(self, jobs: int | None = None, scheduler: str | None = None, silent_s: float = SILENT_S) -> None:
@@ -237,17 +238,17 @@ class Workers:
         self._stack.close()
 
     def run(self, jobs: Iterable[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
-        """Do jobs in the order given; report each one's progress and outcome. Results are in the cache afterwards.
+        """Do jobs in the given order and report progress and outcome of each. The cache then contains the results.
 
-        Results do not depend on the number of workers, but for the last digits where BLAS runs on several threads in
-        this process. Raises InputError if no worker can do them.
+        Results do not depend on the number of workers, except for the last digits if BLAS runs on several threads in
+        this process. Raise InputError if no worker can do the jobs.
         """
         iterator = iter(jobs)
         if self._scheduler is None and self._jobs == 1:
             for job, keys in iterator:
                 done, note = _do_on_one_thread(job, keys, cache, on_event)
-                on_event(Event(job, done, note=note))
-        elif (first := next(iterator, None)) is not None:  # otherwise no worker has to start
+                on_event(JobEvent(job, done, note=note))
+        elif (first := next(iterator, None)) is not None:  # without jobs, no worker has to start
             self._share(chain([first], iterator), cache, on_event)
 
     def _share(self, jobs: Iterator[tuple[Job, Keys]], cache: Cache, on_event: OnEvent) -> None:
@@ -260,7 +261,7 @@ class Workers:
         alone_since = time.monotonic()
         try:
             while True:
-                # No more jobs than threads: Dask blames a worker's death on the jobs that wait there, too.
+                # Submit no more jobs than threads: Dask also blames a worker's death on the jobs that wait there.
                 threads = sum(client.nthreads().values())
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
                     code = "" if self._scheduler is None else code_digest(job.backend)
@@ -282,14 +283,14 @@ class Workers:
                     elif isinstance(new, tuple):
                         for job in running.values():
                             if job.number == new[0]:
-                                on_event(Event(job, frames=new[1]))
+                                on_event(JobEvent(job, frames=new[1]))
         except OSError as error:
-            raise InputError(f"the Dask scheduler is gone ({error})") from None
+            raise InputError(f"the Dask scheduler has stopped ({error})") from None
         finally:
             client.unsubscribe_topic(_TOPIC)
             client.cancel(list(running), force=True)
 
-    def _outcome(self, job: Job, future: Any, cache: Cache) -> Event:
+    def _outcome(self, job: Job, future: Any, cache: Cache) -> JobEvent:
         from distributed import KilledWorker
 
         try:
@@ -297,14 +298,14 @@ class Workers:
         except KilledWorker as error:
             cause = f"its worker died or gave no sign {error.allowed_failures + 1} times; "
             cause += f"is there memory enough for {job.clip.name} and {job.backend}?"
-            return Event(job, tuple(Done(task, cause=cause) for task in job.tasks))
+            return JobEvent(job, tuple(Done(task, cause=cause) for task in job.tasks))
         except InputError:
             raise
-        except Exception as error:  # `do_job` raises none: the worker cannot even start it
+        except Exception as error:  # `do_job` raises no error, so the worker could not even start it
             raise InputError(f"a worker cannot do jobs ({type(error).__name__}: {error}); {self._advice()}") from None
         if not all(cache.path(key).exists() for d in done if not d.cause for key in (d.found, d.scored)):
             raise InputError(f"workers do not write to {cache.folder}; give a --cache that all machines share")
-        return Event(job, done, note=notes)
+        return JobEvent(job, done, note=notes)
 
     def _advice(self) -> str:
         return (
@@ -314,7 +315,7 @@ class Workers:
 
 
 def _do_remotely(job: Job, keys: Keys, cache: Cache, code: str) -> tuple[tuple[Done, ...], str]:
-    """A job on a worker: its outcome and notes. code: what the digest of its package must be."""
+    """Do a job on a worker; return its outcome and notes. code: the digest that its package must have."""
     from distributed import get_worker
 
     if code and code_digest(job.backend) != code:
@@ -325,7 +326,7 @@ def _do_remotely(job: Job, keys: Keys, cache: Cache, code: str) -> tuple[tuple[D
 
 @contextmanager
 def _one_thread(backend: str) -> Iterator[None]:
-    """Hold OpenCV, and torch if it is the engine, to one thread: sums on several differ in their last digits."""
+    """Limit OpenCV, and torch if it is the engine, to one thread: sums on several threads differ in last digits."""
     libraries: list[tuple[Callable[[int], object], int]] = [(cv2.setNumThreads, cv2.getNumThreads())]
     if backend == "torch":
         import torch

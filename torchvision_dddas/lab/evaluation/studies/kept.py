@@ -1,4 +1,4 @@
-"""What a study found in its clips, as files: tracks and detections as MOTChallenge text, masks as PNG."""
+"""Save the findings of a study as files: tracks and detections as MOTChallenge text, masks as PNG."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,22 +6,22 @@ from pathlib import Path
 from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.io.tables import MOT_TRACKS, mot_rows
-from torchvision_dddas.lab.evaluation.studies.records import Found, Results
+from torchvision_dddas.lab.evaluation.studies.records import Findings, Results
 
 KINDS = ("tracks", "detections", "masks")
 
 
 def check_kinds(kinds: Sequence[str]) -> None:
-    """Raises InputError for a kind that is not in KINDS."""
+    """Raise InputError for a kind that is not in KINDS."""
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise InputError(f"--keep takes {', '.join(KINDS)}, got '{unknown[0]}'")
 
 
 def keep_found(folder: Path, results: Results, kinds: Sequence[str]) -> list[str]:
-    """Write FOLDER/TASK/CLIP/ with tracks.txt, detections.txt and masks/, as `dddas evaluate GT FOLDER/TASK` takes it.
+    """Write FOLDER/TASK/CLIP/ with tracks.txt, detections.txt and masks/, as `dddas evaluate GT FOLDER/TASK` needs.
 
-    Tracks are the boxes with an identity. Only labelled frames have masks. Returns a note for each kind that no clip
-    has. Raises InputError if the disk refuses.
+    Tracks are the boxes with an identity. Only labelled frames have masks. Return a note for each kind that no clip
+    has. Raise InputError if the disk refuses.
     """
     written: set[str] = set()
     for case in results.cases:
@@ -38,7 +38,7 @@ def keep_found(folder: Path, results: Results, kinds: Sequence[str]) -> list[str
     return [f"--keep {kind}: no task of this study has {kind}" for kind in kinds if kind not in written]
 
 
-def _boxes(found: Found, named: bool) -> bytes:
+def _boxes(found: Findings, named: bool) -> bytes:
     rows = found.identity != -1 if named else slice(None)
     boxes = mot_rows(0, found.box_px[rows], found.score[rows], found.identity[rows])
     return MOT_TRACKS.format_rows(boxes | {"frame": found.frame[rows]}).encode()

@@ -1,4 +1,4 @@
-"""Results of several methods on the same clips: each becomes a study, and each is compared with the first."""
+"""Results of several methods on the same clips. Each method becomes a study, which is compared with the first."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -28,12 +28,12 @@ def write_methods(
     interval: int = 1,
     ignoring: Ignoring = "dropped",
 ) -> dict[str, Any]:
-    """Score the results of methods by name, and write a study of each and a comparison with the first into a folder.
+    """Score the results of methods by name. Write a study of each, and a comparison with the first, into a folder.
 
-    The study of a method is in the folder of its name, as `dddas compare` takes it; report.html, comparison.json,
-    tables/ and figures/ show all methods. A clip without a score of every method is left out, with a note. Returns the
-    content of comparison.json: {"methods": {name: measures}, "comparisons": [as `compare_studies`], "notes": [...]}.
-    Raises InputError as `evaluate` does, and if no clip is scored for every method.
+    The folder of a method's name holds its study, which `dddas compare` can read. report.html, comparison.json, tables/
+    and figures/ show all methods. A clip without a score of every method is left out, with a note. Return the content
+    of comparison.json: {"methods": {name: measures}, "comparisons": [as `compare_studies`], "notes": [...]}.
+    Raise InputError as `evaluate` does, and if no clip is scored for every method.
     """
     notes: list[str] = []
     with claimed(folder):
@@ -46,7 +46,9 @@ def write_methods(
         measures, studies = {}, []
         for name, mine in cases.items():
             alone = [case for case in mine if (case.task, case.clip.name) not in shared]
-            notes += [f"{case.clip.name}, {case.task}: not of every method, left out of {name}" for case in alone]
+            notes += [
+                f"{case.clip.name}, {case.task}: not scored for every method, left out of {name}" for case in alone
+            ]
             kept = Results(Spec(name, ()), Settings(), tuple(case for case in mine if case not in alone))
             try:
                 measures[name] = write_measures(folder / name, kept)
@@ -66,9 +68,10 @@ def write_methods(
 
 
 def name_results(places: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
-    """The results by name; the names of their files or folders if none are given.
+    """Return the results by name; by default the names of their files or folders.
 
-    Raises InputError for another number of names than results, a name twice, or one that cannot name a folder.
+    Raise InputError if the numbers of names and results differ, for a name that occurs twice, and for a name that is
+    not a folder name.
     """
     names = names or [place.resolve().stem if place.is_file() else place.resolve().name for place in places]
     if len(names) != len(places):
@@ -84,7 +87,7 @@ def name_results(places: Sequence[Path], names: Sequence[str]) -> dict[str, Path
 def _score(
     method: str, truth: Path, result: Path, notes: list[str], first_frame: int | None, interval: int, ignoring: Ignoring
 ) -> list[Case]:
-    """The cases of a method. The only clip of a result is named after its truth, as its file is named by the method."""
+    """Return the cases of a method. A single clip gets the truth's name, because its file has the method's name."""
     own: list[str] = []
     scored = score_files(truth, result, own, first_frame, interval, ignoring)
     notes += [f"{method}: {note}" for note in own]

@@ -1,6 +1,6 @@
-"""A study from its TOML file to the files of its results: data sets are read, jobs done, measures written.
+"""Run a study, from its TOML file to the files of its results: read data sets, do jobs, write measures.
 
-The files: measures (JSON, CSV, Parquet), counts for comparisons, a report, and run.json.
+The files are the measures (JSON, CSV, Parquet), counts for comparisons, a report, and run.json.
 """
 
 import csv
@@ -25,14 +25,14 @@ from torchvision_dddas.io.output import finite, versions
 from torchvision_dddas.io.report.figure_files import save_figures
 from torchvision_dddas.io.report.table_files import save_tables
 from torchvision_dddas.lab.evaluation.datasets import kinds
-from torchvision_dddas.lab.evaluation.datasets.record import Clip, Source
+from torchvision_dddas.lab.evaluation.datasets.record import Clip, DatasetSource
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 from torchvision_dddas.lab.evaluation.report import study_report, study_tables
 from torchvision_dddas.lab.evaluation.studies.cache import SCORES, Cache, cache_folder, code_digest, write_scores
 from torchvision_dddas.lab.evaluation.studies.jobs import (
     Done,
-    Event,
     Job,
+    JobEvent,
     Keys,
     OnEvent,
     Workers,
@@ -56,7 +56,7 @@ _NAME = re.compile(r"[\w][\w .+-]{0,99}")
 def read_spec(path: Path) -> Spec:
     """Read a study's TOML file. Folders of data sets stay relative to the file's own folder.
 
-    Raises InputError with one line for an unreadable file, an unknown or missing key, or a bad value.
+    Raise InputError with one line for an unreadable file, an unknown or missing key, or a bad value.
     """
     content = read_toml(path, "study")
     where = f"study {path}"
@@ -89,11 +89,11 @@ def read_spec(path: Path) -> Spec:
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can name a study and its folder."""
+    """Return whether a text can name a study and its folder."""
     return _NAME.fullmatch(text) is not None
 
 
-def _source(table: Mapping[str, Any], where: str) -> Source:
+def _source(table: Mapping[str, Any], where: str) -> DatasetSource:
     for key in ("kind", "folder"):
         if not _text(table, key, where, ""):
             raise InputError(f"{where} has no {key}; wanted kind = one of {', '.join(kinds.KINDS)}, and folder")
@@ -105,11 +105,11 @@ def _source(table: Mapping[str, Any], where: str) -> Source:
     if not patterns:
         raise InputError(f'{where}: clips is empty; wanted patterns of names, as clips = ["cars*"], or leave it out')
     options = {key: value for key, value in table.items() if key not in ("kind", "folder", "clips")}
-    return Source(table["kind"], Path(table["folder"]), patterns, options)
+    return DatasetSource(table["kind"], Path(table["folder"]), patterns, options)
 
 
 def _text(table: Mapping[str, Any], key: str, where: str, default: Any) -> Any:
-    """A text, or a list of texts if the default is a list."""
+    """Return a text, or a list of texts if the default is a list."""
     value, is_list = table.get(key, default), isinstance(default, list)
     if isinstance(value, list) != is_list or not all(isinstance(text, str) for text in (value if is_list else [value])):
         raise InputError(f"{where}: {key} must be {'a list of texts' if is_list else 'a text'}, got {value!r}")
@@ -117,8 +117,8 @@ def _text(table: Mapping[str, Any], key: str, where: str, default: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a study will do. left_out: what it will not; notes: what else is missing. facts: of the data sets."""
+class StudyPlan:
+    """The plan of a study. left_out: clips and tasks left out. notes: other missing data. facts: of the data sets."""
 
     settings: Settings
     jobs: tuple[Job, ...]
@@ -128,22 +128,22 @@ class Plan:
 
     @property
     def frames(self) -> int:
-        """Frames of all tasks, as far as their number is known."""
+        """The number of frames of all tasks, as far as it is known."""
         return sum(map(_length, self.jobs))
 
 
 def _length(job: Job) -> int:
-    """Frames of a job over all its tasks; 0 where unknown."""
+    """Return the number of frames of a job over all its tasks; 0 if unknown."""
     clip = job.clip
     labelled = clip.truth.frames if clip.truth is not None else []
     pictures = len(clip.pictures) if len(clip.pictures) > 1 else 0
     return (clip.frames or pictures or (labelled[-1] if labelled else 0)) * len(job.tasks)
 
 
-def plan_study(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
-    """Read the data sets of a study. base: what their folders are relative to. clips: patterns of names.
+def plan_study(spec: Spec, base: Path, clips: Sequence[str] = ()) -> StudyPlan:
+    """Read the data sets of a study. base: the folder to which their folders are relative. clips: patterns of names.
 
-    Raises InputError for wrong settings, an unknown kind of data set or engine, and if no clip is left.
+    Raise InputError for wrong settings, an unknown kind of data set or engine, and if no clip is left.
     """
     settings = load_config(spec.config, spec.overrides)
     backend = "onboard" if spec.backend == "auto" else spec.backend
@@ -167,7 +167,7 @@ def plan_study(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
             allowed = allowed_tasks(clip)
             tasks = tuple(task for task in TASKS if task in allowed and (not spec.tasks or task in spec.tasks))
             if clip.name in jobs:
-                left_out.append(f"{clip.name} of {found.folder}: a clip of that name is in the study already")
+                left_out.append(f"{clip.name} of {found.folder}: the study already has a clip of this name")
             elif tasks:
                 jobs[clip.name] = Job(len(jobs), clip, tasks, settings, backend, spec.interval)
             else:
@@ -175,13 +175,13 @@ def plan_study(spec: Spec, base: Path, clips: Sequence[str] = ()) -> Plan:
     if not jobs:
         raise InputError(f"no clip is left to evaluate by {spec.name}{_why_no_clip(clips, names, left_out)}")
     facts = {"datasets": sets, "backend": backend, "code": code_digest(backend)}
-    return Plan(settings, tuple(jobs.values()), tuple(left_out), tuple(notes), facts)
+    return StudyPlan(settings, tuple(jobs.values()), tuple(left_out), tuple(notes), facts)
 
 
 def _why_no_task(spec: Spec, clip: Clip, allowed: Sequence[Task]) -> str:
     if clip.truth is None and not clip.still:
         return f"it has no truth ({clip.place})"
-    return f"it allows {', '.join(allowed) or 'no task'}, and {', '.join(spec.tasks)} was asked for"
+    return f"it allows {', '.join(allowed) or 'no task'}, and the study asks for {', '.join(spec.tasks)}"
 
 
 def _why_no_clip(patterns: Sequence[str], names: Sequence[str], left_out: Sequence[str]) -> str:
@@ -196,10 +196,10 @@ def _why_no_clip(patterns: Sequence[str], names: Sequence[str], left_out: Sequen
 def run_jobs(
     jobs: Sequence[Job], workers: Workers, cache: Cache, on_event: OnEvent = lambda event: None
 ) -> dict[int, tuple[Done, ...]]:
-    """Do jobs, the longest first; their outcomes by number. What is in the cache needs no worker."""
+    """Do jobs, the longest first; return their outcomes by number. Results from the cache need no worker."""
     outcomes: dict[int, tuple[Done, ...]] = {}
 
-    def collect_outcome(event: Event) -> None:
+    def collect_outcome(event: JobEvent) -> None:
         if event.done is not None:
             outcomes[event.job.number] = event.done
         on_event(event)
@@ -208,7 +208,7 @@ def run_jobs(
         for job in sorted(jobs, key=lambda job: (-_length(job), job.number)):
             keys = make_keys(job, cache.folder / "files")
             if (done := find_cached(job, keys, cache)) is not None:
-                collect_outcome(Event(job, done))
+                collect_outcome(JobEvent(job, done))
             else:
                 yield job, keys
 
@@ -223,20 +223,21 @@ def run_study(
     cache: Path | None = None,
     clips: Sequence[str] = (),
     on_event: OnEvent = lambda event: None,
-    on_start: Callable[[Plan], object] = lambda planned: None,
+    on_start: Callable[[StudyPlan], object] = lambda planned: None,
 ) -> Results:
     """Run a study.
 
-    base: what its folders are relative to. workers: by default this process alone. cache: the folder of results.
-    clips: patterns of names, none for all. on_start: called with the plan before the first job. The results depend on
-    none of these but the clips. Raises InputError as `plan_study` does, and if the workers cannot do the jobs.
+    base: the folder to which its folders are relative. workers: by default only this process. cache: the folder of
+    results. clips: patterns of names; empty for all. on_start: called with the plan before the first job. Of these
+    arguments only the clips affect the results. Raise InputError as `plan_study` does, and if the workers cannot do the
+    jobs.
     """
     planned = plan_study(spec, base, clips)
     store = Cache(cache or cache_folder())
     store.tidy()
     notes = list(planned.notes)
 
-    def collect_note(event: Event) -> None:
+    def collect_note(event: JobEvent) -> None:
         if event.note:
             notes.append(event.note)
         on_event(event)
@@ -273,22 +274,22 @@ def write_study(
     cache: Path | None = None,
     clips: Sequence[str] = (),
     on_event: OnEvent = lambda event: None,
-    on_start: Callable[[Plan], object] = lambda planned: None,
+    on_start: Callable[[StudyPlan], object] = lambda planned: None,
 ) -> tuple[Results, dict[str, Any]]:
-    """Run a study as `run_study` does and write FILES into a folder; its results and its measures.
+    """Run a study as `run_study` does and write FILES into a folder; return its results and its measures.
 
-    run.json says whether the study is running, complete or interrupted. Raises InputError as `run_study` does, and if
-    the disk refuses; bad input leaves the files of an earlier study in the folder as they were.
+    run.json states whether the study is running, complete or interrupted. Raise InputError as `run_study` does, and if
+    the disk refuses. After bad input, the files of an earlier study in the folder are unchanged.
     """
     start_s, begun_s, place = time.perf_counter(), time.time(), cache or cache_folder()
     has_begun, finished = False, 0
 
-    def count(event: Event) -> None:
+    def count(event: JobEvent) -> None:
         nonlocal finished
         finished += event.done is not None
         on_event(event)
 
-    def begin(planned: Plan) -> None:
+    def begin(planned: StudyPlan) -> None:
         nonlocal has_begun
         _write_json(folder / "run.json", {"state": "running", "study": spec.name})
         has_begun = True
@@ -330,7 +331,7 @@ def write_study(
 
 
 def write_measures(folder: Path, results: Results) -> dict[str, Any]:
-    """Write the measures of a study and its counts for comparisons, and return the measures. Raises OSError."""
+    """Write the measures of a study and its counts for comparisons, and return the measures. Raise OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     measures = summarize(results)
     _write_json(folder / "metrics.json", measures)
@@ -342,9 +343,9 @@ def write_measures(folder: Path, results: Results) -> dict[str, Any]:
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[Any, ...]]:
-    """Every figure of metrics.json in METRIC_COLUMNS.
+    """Return every figure of metrics.json in METRIC_COLUMNS.
 
-    scope: clip, pooled or mean. clip: its name if it is of one. low, high: its interval, NaN if none.
+    scope: clip, pooled or mean. clip: its name if the figure belongs to a clip. low, high: the interval, NaN if none.
     """
     rows = []
     for task, mine in metrics["tasks"].items():
@@ -360,7 +361,7 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[Any, ...]]:
 
 
 def frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
-    """Every count of every frame in FRAME_COLUMNS, by task and clip; without frames that a group does not use."""
+    """Yield every count of every frame in FRAME_COLUMNS, by task and clip, without frames that a group does not use."""
     for case in sorted(results.cases, key=lambda case: (case.task, case.clip.name)):
         if case.scored is None:
             continue
@@ -373,17 +374,17 @@ def frame_rows(results: Results) -> Iterator[tuple[Any, ...]]:
 
 
 def write_csv(path: Path, metrics: Mapping[str, Any]) -> None:
-    """Write metrics.csv. A cell is empty if its figure is undefined. Raises OSError."""
+    """Write metrics.csv. A cell is empty if its figure is undefined. Raise OSError."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(METRIC_COLUMNS)
     for row in metric_rows(metrics):
-        table.writerow(["" if value != value else value for value in row])  # NaN alone differs from itself
+        table.writerow(["" if value != value else value for value in row])  # only NaN differs from itself
     write_whole(path, text.getvalue().encode())
 
 
 def write_parquet(folder: Path, metrics: Mapping[str, Any], results: Results) -> None:
-    """Write metrics.parquet and frames.parquet; nothing without pyarrow. Raises OSError."""
+    """Write metrics.parquet and frames.parquet; nothing without pyarrow. Raise OSError."""
     try:
         import pyarrow
         import pyarrow.parquet

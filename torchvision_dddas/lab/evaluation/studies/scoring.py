@@ -16,21 +16,21 @@ from torchvision_dddas.lab.evaluation.evaluate import ClipScore, Result, score_c
 from torchvision_dddas.lab.evaluation.metrics import boxes, metres
 from torchvision_dddas.lab.evaluation.metrics import truth as truths
 from torchvision_dddas.lab.evaluation.metrics.matching import WITHIN, counted
-from torchvision_dddas.lab.evaluation.metrics.metres import GroundLocations
+from torchvision_dddas.lab.evaluation.metrics.metres import LocatedCounts
 from torchvision_dddas.lab.evaluation.metrics.pixels import Still
 from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
-from torchvision_dddas.lab.evaluation.metrics.truth import Positions, TrackTable, Truth
-from torchvision_dddas.lab.evaluation.studies.records import Found, Scored, Task, round_as_written
+from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable, TruePositions
+from torchvision_dddas.lab.evaluation.studies.records import Findings, Scored, Task, round_as_written
 
 _NOBODY, _NOT_ASKED = -1, -2
-"""In place of a row: a place that belongs to no target; one of a target that does not count."""
+"""Values in place of a row: no target has the place, or its target does not count."""
 
 
-def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
+def score(clip: Clip, task: Task, found: Findings, interval: int = 1) -> Scored:
     """Score one case. interval: of tracking and association, as `dddas evaluate --interval`.
 
-    Boxes that count neither as right nor as false (see `matching.counted`) are left out. Raises InputError if
-    the truth is missing, or does not fit what was found.
+    Boxes that count neither as right nor as false (see `matching.counted`) are left out. Raise InputError if
+    the truth is missing, or does not fit the findings.
     """
     if task == "location":
         return _score_places(clip, found)
@@ -41,11 +41,11 @@ def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
         still = Still(len(frames), int((blobs > 0).sum()), int(blobs.sum()))
         return Scored(frames, {"still": still}, {"still": each})
     if clip.truth is None:
-        raise InputError(f"{clip.name} has no truth; nothing can be scored")
+        raise InputError(f"{clip.name} has no truth, so that it cannot be scored")
     is_tracked = task in ("tracking", "association")
     truth = judged = clip.truth
     if is_tracked and truth.kind == "masks":
-        # A simulated clip has both masks and boxes; only its boxes have identities, but for the ground vehicles'.
+        # A simulated clip has both masks and boxes, but only boxes have identities, and ground vehicles have no boxes.
         vehicles = _fleet(truth)
         truth = replace(truth, kind="boxes")
         judged = replace(truth, ignored=vehicles, regions=vehicles, ignoring="removed")
@@ -74,7 +74,7 @@ def score(clip: Clip, task: Task, found: Found, interval: int = 1) -> Scored:
 
 
 def by_task(clip: ClipScore, interval: int = 1) -> dict[Task, Scored]:
-    """The counts of a clip that was scored from files, by the task that they belong to: motion or tracking."""
+    """Return the counts of a clip that was scored from files, by their task: motion or tracking."""
     found: dict[Task, Scored] = {}
     steps: dict[Task, int] = {"motion": 0, "tracking": interval}
     for task, step in steps.items():
@@ -85,9 +85,9 @@ def by_task(clip: ClipScore, interval: int = 1) -> dict[Task, Scored]:
 
 
 def _spread(clip: ClipScore, interval: int) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]]:
-    """The scored frames (F,) and the counts of each (F,), by group and name. interval: of tracks; 0 for boxes, masks.
+    """Return the scored frames (F,) and their counts (F,), by group and name. interval: of tracks; 0 for boxes, masks.
 
-    Tracks are scored on frames without any box too: such frames count nothing, which is a result.
+    Tracks are also scored on frames without boxes. Such frames have counts of 0, which is a result.
     """
     whole = 1 + interval * np.arange(clip.frames) if interval else np.zeros(0, np.int64)
     frames = np.unique(np.concatenate([whole, *(columns["frame"] for columns in clip.each.values())])).astype(np.int64)
@@ -108,19 +108,19 @@ class _Held(Result):
 
     @property
     def name(self) -> str:
-        """The clip's."""
+        """The name of the clip."""
         return self.clip_name
 
     def mask_at(self, frame: int) -> np.ndarray:
-        """(H, W) mask of a frame. Raises InputError if it is not there."""
+        """Return the mask of a frame, (H, W). Raise InputError if it is missing."""
         mask = decode_image(self.masks[frame], cv2.IMREAD_UNCHANGED) if frame in self.masks else None
         if mask is None:
             raise InputError(f"{self.clip_name}: frame {frame} is labelled, but has no result; was the clip cut short?")
         return mask if mask.ndim == 2 else mask.max(axis=2)
 
 
-def _fleet(truth: Truth) -> TrackTable:
-    """The boxes of the ground vehicles, which masks show by their numbers."""
+def _fleet(truth: ClipTruth) -> TrackTable:
+    """Return the boxes of the ground vehicles, which masks show by their numbers."""
     rows: list[tuple[float, ...]] = []
     fleet = np.zeros(0) if truth.fleet is None else truth.fleet.identity
     for frame in truth.frames if len(fleet) else ():
@@ -130,8 +130,8 @@ def _fleet(truth: Truth) -> TrackTable:
     return TrackTable.of(table[:, 0], table[:, 1], table[:, 2:])
 
 
-def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """(N,) bool: boxes of which more than half the pixels are marked as unlabelled in the masks."""
+def _unlabelled(truth: ClipTruth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """Return (N,) bool: boxes with more than half of their pixels marked as unlabelled in the masks."""
     out = np.zeros(len(frame), bool)
     if truth.kind != "masks" or not truth.labels.unscored:
         return out
@@ -147,8 +147,10 @@ def _unlabelled(truth: Truth, frame: np.ndarray, box_px: np.ndarray) -> np.ndarr
     return out
 
 
-def _ranked(truth: Truth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(N, 3) score, right or not, frame; see Scored."""
+def _ranked(
+    truth: ClipTruth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarray, counts: np.ndarray
+) -> np.ndarray:
+    """Return (N, 3) score, right or not, frame; see Scored."""
     right = np.full(len(frame), np.nan)
     for number, there in truths.rows_by_frame(frame).items():
         rows = there[counts[there]]
@@ -158,24 +160,23 @@ def _ranked(truth: Truth, frame: np.ndarray, box_px: np.ndarray, score: np.ndarr
 
 
 def _per_frame(frames: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """(F,) how often each of the sorted frames is among those found."""
+    """Return how often each of the sorted frames is among `found`, (F,)."""
     return np.bincount(np.searchsorted(frames, found), minlength=len(frames))[: len(frames)].astype(float)
 
 
-def _score_places(clip: Clip, found: Found) -> Scored:
-    """Score the places of a clip in frames that were processed.
+def _score_places(clip: Clip, found: Findings) -> Scored:
+    """Score the places of a clip in processed frames.
 
-    A place is that of the target whose true box its box is; without boxes, that of the target nearest to it. Degrees
-    are compared where both sides have them, for each may count its metres from an origin of its own. The error
-    relative to the team is what is left without the mean error of the landmarks' own reports, where the truth knows
-    where they were.
-    Raises InputError where the truth has no places, or none of a processed frame.
+    A place belongs to the target whose true box matches its box; without boxes, to the nearest target. Degrees are
+    compared if both sides have them, because the metres of each side may have another origin. The error relative to the
+    landmarks is the error minus the mean error of the landmarks' own reports, if the truth contains their positions.
+    Raise InputError if the truth has no places, or none of a processed frame.
     """
     truth = clip.truth
     if truth is None or truth.positions is None:
-        raise InputError(f"{clip.name} has no true places; nothing can be scored in metres")
+        raise InputError(f"{clip.name} has no true places, so that errors in metres cannot be computed")
     true = truth.positions
-    origin: tuple[float, float] | None = None  # longitude and latitude; None: both sides' own metres are compared
+    origin: tuple[float, float] | None = None  # longitude and latitude; None: compare the metres of both sides
     if true.lonlat_deg is not None and len(true.lonlat_deg) and "lonlat_deg" in found.more:
         origin = (float(true.lonlat_deg[0, 0]), float(true.lonlat_deg[0, 1]))
     true_m = _in_metres(true, origin)
@@ -213,17 +214,22 @@ def _score_places(clip: Clip, found: Found) -> Scored:
         "east_m": off[:, 0],
         "north_m": off[:, 1],
     }
-    counts = GroundLocations(len(wanted), len(mine), len(strays))
+    counts = LocatedCounts(len(wanted), len(mine), len(strays))
     return Scored(frames, {"location": counts}, {"location": each}, {}, samples, tuple(notes))
 
 
 def whose_places(
-    truth: Truth, places: Positions, true_m: np.ndarray, frame: np.ndarray, box_px: np.ndarray, place_m: np.ndarray
+    truth: ClipTruth,
+    places: TruePositions,
+    true_m: np.ndarray,
+    frame: np.ndarray,
+    box_px: np.ndarray,
+    place_m: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """(N,) the row of the true place of each located box, below 0 for none; and the rows whose boxes count, in order.
+    """Return the row of each located box's true place, (N,), below 0: none, and the rows whose boxes count, in order.
 
-    The latter None where the truth has no boxes, and the nearest places are taken. true_m: of all places, (P, 2), in
-    the metres of place_m, (N, 2).
+    The second result is None if the truth has no boxes; the nearest places are then used. true_m: of all places, (P,
+    2), in the metres of place_m, (N, 2).
     """
     labelled = truth.tracks
     if labelled is None or not len(labelled.frame) or not np.isfinite(box_px).all():
@@ -237,16 +243,16 @@ def whose_places(
     return of_place[metres.by_boxes(frame, box_px, labelled)], np.unique(of_place[of_place >= 0])
 
 
-def _in_metres(true: Positions, origin: tuple[float, float] | None) -> np.ndarray:
+def _in_metres(true: TruePositions, origin: tuple[float, float] | None) -> np.ndarray:
     if origin is None or true.lonlat_deg is None:
         return true.east_north_m
     return geometry.east_north(true.lonlat_deg, origin)
 
 
 def _team_error(
-    clip: Clip, fleet: Positions | None, origin: tuple[float, float] | None
+    clip: Clip, fleet: TruePositions | None, origin: tuple[float, float] | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frames, and the error that the landmarks' reports share in each; none where it cannot be known."""
+    """Return frames, and the error that the landmarks' reports share in each; empty if it is unknown."""
     if clip.landmarks is not None and fleet is not None:
         table = read_landmarks(clip.landmarks, rate_hz=clip.rate_hz)
         if table.geographic == (origin is not None):

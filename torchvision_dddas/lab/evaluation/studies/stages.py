@@ -1,4 +1,4 @@
-"""The stages that process one clip, each as its own command does: motion, tracking, association, people, location."""
+"""The stages that process one clip as their own commands do: motion, tracking, association, people, location."""
 
 import time
 from collections import defaultdict
@@ -20,7 +20,7 @@ from torchvision_dddas.io.detection_tables import check_table, read_detections
 from torchvision_dddas.io.images import IMAGE_SUFFIXES
 from torchvision_dddas.io.sources import ImageSource, open_source
 from torchvision_dddas.lab.evaluation.datasets.record import Clip
-from torchvision_dddas.lab.evaluation.studies.records import Found, Task, round_as_written
+from torchvision_dddas.lab.evaluation.studies.records import Findings, Task, round_as_written
 from torchvision_dddas.memory import peak_memory_mb, reset_peak_memory
 from torchvision_dddas.people import detect_in_clip, load_scorer
 from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files, read_locator
@@ -58,7 +58,7 @@ PARAMETER_GROUPS: Mapping[Task, tuple[str, ...]] = {
     "people": ("people",),
     "location": (*_MOTION, *_TRACKING, "people", "ground", "landmarks", "aerial", "crowds"),
 }
-"""The groups of settings that each stage depends on by itself. It gets the defaults of all others."""
+"""The groups of settings that each stage itself depends on. All other groups have their defaults."""
 
 _FILES: Mapping[Task, tuple[str, ...]] = {
     "motion": ("pictures",),
@@ -76,9 +76,9 @@ _COLUMNS = {
     "east_north_m": np.zeros((0, 2)),
     "covariance_m2": np.zeros((0, 2, 2)),
 }
-"""The columns of every `Found`, and their types; others go to its `more`."""
+"""The columns of every `Findings`, and their types. Other columns go to `more`."""
 
-_SHUFFLE_SEED = 7  # the order of true boxes within their frames must not reveal their identities
+_SHUFFLE_SEED = 7  # the order of true boxes within a frame must not reveal their identities
 
 
 def find(
@@ -87,19 +87,22 @@ def find(
     settings: Settings,
     backend: str = "auto",
     interval: int = 1,
-    before: Found | None = None,
+    before: Findings | None = None,
     on_frame: OnFrame = lambda: None,
-) -> Found:
+) -> Findings:
     """Run a stage on a clip. before: the result of `upstream_task`. on_frame: called once per frame.
 
-    Raises InputError if the clip's files are unusable.
+    Raise InputError if the clip's files are unusable.
     """
     reset_peak_memory()
-    start, run = time.perf_counter(), _Run(clip, narrow_settings(settings, task), backend, interval, before, on_frame)
+    start, run = (
+        time.perf_counter(),
+        _StageRun(clip, narrow_settings(settings, task), backend, interval, before, on_frame),
+    )
     STAGES[task](run)
     run.seconds["other"] = time.perf_counter() - start - sum(run.seconds.values())
     more = {name: np.concatenate(parts) for name, parts in run.columns.items()}
-    return Found(
+    return Findings(
         **{name: more.pop(name, empty).astype(empty.dtype) for name, empty in _COLUMNS.items()},
         looked=np.array(run.looked, np.int64),
         masks=run.masks,
@@ -112,7 +115,7 @@ def find(
 
 
 def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
-    """The tasks that a clip's pictures and truth allow, each after those that it depends on."""
+    """Return the tasks that a clip's pictures and truth allow, each after the tasks that it depends on."""
     truth, has_pictures = clip.truth, bool(clip.pictures)
     shows_movers = has_pictures and "movers" in clip.shows
     tasks: list[Task] = []
@@ -133,23 +136,23 @@ def allowed_tasks(clip: Clip) -> tuple[Task, ...]:
 
 
 def upstream_task(clip: Clip, task: Task) -> Task | None:
-    """The task whose result a task depends on; None if there is none."""
+    """Return the task whose result a task depends on; None if there is none."""
     return "motion" if task == "tracking" and bool(clip.pictures) and "movers" in clip.shows else None
 
 
 def narrow_settings(settings: Settings, task: Task) -> Settings:
-    """The settings that a stage gets: defaults for all groups that its key in the cache does not hold."""
+    """Return the settings of a stage: groups that its key in the cache does not contain have their defaults."""
     return Settings().model_copy(update={group: getattr(settings, group) for group in PARAMETER_GROUPS[task]})
 
 
 def files_of(clip: Clip, task: Task) -> list[Path]:
-    """The files that a stage reads."""
+    """Return the files that a stage reads."""
     values = [getattr(clip, name) for name in _FILES[task]]
     return [path for value in values for path in (value if isinstance(value, tuple) else (value,)) if path is not None]
 
 
 def open_clip(clip: Clip) -> Source:
-    """Open the pictures of a clip. Raises InputError if they cannot be read."""
+    """Open the pictures of a clip. Raise InputError if they cannot be read."""
     if not clip.pictures:
         raise InputError(f"{clip.name} has no pictures: {clip.place}")
     if len(clip.pictures) == 1 and clip.pictures[0].suffix.lower() not in IMAGE_SUFFIXES:
@@ -158,13 +161,13 @@ def open_clip(clip: Clip) -> Source:
 
 
 def labelled_frames(clip: Clip) -> set[int]:
-    """The frames whose masks are kept: those for which the truth labels pixels."""
+    """Return the frames whose masks are kept, because the truth labels their pixels."""
     truth = clip.truth
     return set() if truth is None or truth.kind == "boxes" else set(truth.frames)
 
 
 def true_boxes(clip: Clip, interval: int) -> DetectionTable:
-    """The true boxes of each interval-th frame as certain detections. Raises InputError if there are none."""
+    """Return the true boxes of each interval-th frame as certain detections. Raise InputError if there are none."""
     assert clip.truth is not None and clip.truth.tracks is not None, "allowed_tasks() asks for tracks"
     table = clip.truth.tracks.every(interval)
     if not len(table.frame):
@@ -175,8 +178,8 @@ def true_boxes(clip: Clip, interval: int) -> DetectionTable:
     return DetectionTable(clip.name, frame, box_px, np.ones(len(frame)), np.arange(1, len(frame) + 1))
 
 
-def replay_scenes(clip: Clip, found: Found) -> Iterator[Scene]:
-    """The scenes of a clip as the detector gave them, without their masks. The pictures are read again."""
+def replay_scenes(clip: Clip, found: Findings) -> Iterator[Scene]:
+    """Yield the scenes of a clip as the detector gave them, without their masks. The pictures are read again."""
     source = open_clip(clip)
     shape: tuple[int, ...] = (source.size[1], source.size[0])
     pictures = iter(source)
@@ -198,14 +201,14 @@ def replay_scenes(clip: Clip, found: Found) -> Iterator[Scene]:
 
 
 @dataclass
-class _Run:
-    """The input of a stage, see `find`; and its results so far, frame by frame."""
+class _StageRun:
+    """The input of a stage, see `find`, and its results so far, frame by frame."""
 
     clip: Clip
     settings: Settings
     backend: str
     interval: int
-    before: Found | None
+    before: Findings | None
     on_frame: OnFrame
     looked: list[int] = field(default_factory=list)
     columns: dict[str, list[np.ndarray]] = field(default_factory=lambda: defaultdict(list))
@@ -231,15 +234,15 @@ class _Run:
         self.on_frame()
 
 
-def _find_motion(run: _Run) -> None:
-    """Moving targets: `dddas detect`."""
+def _find_motion(run: _StageRun) -> None:
+    """Find moving targets, as `dddas detect` does."""
     source, labelled, causes = open_clip(run.clip), labelled_frames(run.clip), dict[int, str]()
     for scene in detect_motion(source, run.settings, run.backend):
         number = scene.frame.number
         names = ("box_px", "score", "middle_px", "area_px", "heading_rad", "speed_px")
         run.add(number, scene.seconds, **{name: getattr(scene.detections, name) for name in names})
         if number in labelled:
-            # One bit would be enough; the numbers of the targets cost little more, and reports show them.
+            # One bit would suffice, but the numbers of the targets cost little more, and reports show them.
             mask = np.minimum(scene.mask, 255).astype(np.uint8)
             run.masks[number] = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         if scene.step is not None and scene.step.reliable:
@@ -252,8 +255,8 @@ def _find_motion(run: _Run) -> None:
     run.notes += map(str, source.problems)
 
 
-def _find_tracks(run: _Run) -> None:
-    """Identities: `dddas track CLIP`, or of the data set's own detections."""
+def _find_tracks(run: _StageRun) -> None:
+    """Find identities as `dddas track CLIP` does, or identities of the data set's own detections."""
     if upstream_task(run.clip, "tracking") is not None:
         assert run.before is not None, "tracking needs the result of motion"
         scenes, size = replay_scenes(run.clip, run.before), open_clip(run.clip).size
@@ -263,13 +266,13 @@ def _find_tracks(run: _Run) -> None:
         _track_table(run, read_detections(run.clip.given))
 
 
-def _find_associations(run: _Run) -> None:
-    """Identities of the true boxes."""
+def _find_associations(run: _StageRun) -> None:
+    """Find identities of the true boxes."""
     _track_table(run, true_boxes(run.clip, run.interval))
 
 
-def _track_table(run: _Run, table: DetectionTable) -> None:
-    """Track the boxes of a table, with the clip's pictures where it has any."""
+def _track_table(run: _StageRun, table: DetectionTable) -> None:
+    """Track the boxes of a table, with the clip's pictures if it has any."""
     if not run.clip.pictures:
         run.notes += check_table(table, run.interval)
         _add_tracks(run, track_table(table, run.settings, run.interval))
@@ -281,15 +284,15 @@ def _track_table(run: _Run, table: DetectionTable) -> None:
     run.notes += map(str, source.problems)
 
 
-def _add_tracks(run: _Run, frames: Iterable[TrackedFrame]) -> None:
+def _add_tracks(run: _StageRun, frames: Iterable[TrackedFrame]) -> None:
     for result in frames:
         tracks = result.tracks
         box_px = round_as_written(tracks.box_px)
         run.add(result.number, result.seconds, box_px=box_px, score=tracks.score, identity=tracks.identity)
 
 
-def _find_people(run: _Run) -> None:
-    """People by their shape: `dddas people`."""
+def _find_people(run: _StageRun) -> None:
+    """Find people by their shape, as `dddas people` does."""
     source = open_clip(run.clip)
     for result in detect_in_clip(source, load_scorer(run.settings.people, run.backend), run.settings):
         box_px = round_as_written(result.people.box_px)
@@ -297,8 +300,8 @@ def _find_people(run: _Run) -> None:
     run.notes += map(str, source.problems)
 
 
-def _find_locations(run: _Run) -> None:
-    """Places on the ground: `dddas run`, or `dddas locate` of the data set's own detections."""
+def _find_locations(run: _StageRun) -> None:
+    """Find places on the ground as `dddas run` does, or as `dddas locate` does for the data set's own detections."""
     clip = run.clip
     if clip.landmarks is None:
         _locate_from_ground(run)
@@ -310,12 +313,12 @@ def _find_locations(run: _Run) -> None:
 
 
 def _aerial_input(clip: Clip) -> AerialInput:
-    """The files that locating from the air takes."""
+    """Return the files that are needed to locate from the air."""
     assert clip.landmarks is not None
     return AerialInput(clip.landmarks, clip.telemetry, clip.camera, clip.elevation, None, clip.colours)
 
 
-def _locate_clip(run: _Run) -> None:
+def _locate_clip(run: _StageRun) -> None:
     clip, source = run.clip, open_clip(run.clip)
     aerial = _aerial_input(clip)
     ready = assemble_files(aerial, clip.telemetry, run.settings, source, run.backend, str(clip.pictures[0]))
@@ -330,7 +333,7 @@ def _locate_clip(run: _Run) -> None:
     run.notes += [*ready.notes, *map(str, source.problems)]
 
 
-def _locate_table(run: _Run) -> None:
+def _locate_table(run: _StageRun) -> None:
     clip = run.clip
     if clip.given is None:
         raise InputError(f"{clip.place} has no pictures and no detections: there is nothing to locate")
@@ -347,7 +350,7 @@ def _locate_table(run: _Run) -> None:
     run.notes += notes
 
 
-def _locate_from_ground(run: _Run) -> None:
+def _locate_from_ground(run: _StageRun) -> None:
     clip = run.clip
     if clip.given is None or clip.camera is None:
         raise InputError(f"{clip.place} has no detections and camera: locating from the ground needs both")
@@ -360,7 +363,7 @@ def _locate_from_ground(run: _Run) -> None:
 
 
 def _given_columns(table: DetectionTable, frame: int, box_px: np.ndarray, score: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of a frame's given detections."""
+    """Return the columns of a frame's given detections."""
     identity = np.full(len(box_px), -1) if table.identity is None else table.identity[table.rows(frame)]
     return {"box_px": round_as_written(box_px), "score": score.clip(0, 1), "identity": identity}
 
@@ -368,7 +371,7 @@ def _given_columns(table: DetectionTable, frame: int, box_px: np.ndarray, score:
 def _place_columns(
     count: int, row: np.ndarray | None = None, found: Positions | None = None, relative_m2: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """The columns of places of a frame's boxes, NaN where not located. row: the box of each position."""
+    """Return the columns of places of a frame's boxes, NaN if not located. row: the box of each position."""
     shapes = {"east_north_m": (2,), "covariance_m2": (2, 2), "lonlat_deg": (2,), "relative_m2": (2, 2)}
     places = {name: np.full((count, *shape), np.nan) for name, shape in shapes.items()}
     for name, column in places.items() if found is not None else ():
@@ -377,7 +380,7 @@ def _place_columns(
     return places
 
 
-STAGES: Mapping[Task, Callable[[_Run], None]] = {
+STAGES: Mapping[Task, Callable[[_StageRun], None]] = {
     "motion": _find_motion,
     "tracking": _find_tracks,
     "association": _find_associations,

@@ -1,6 +1,7 @@
-"""The measures of a study with their intervals, the content of metrics.json; what it cost; the goal of a sweep.
+"""The measures of a study with their intervals, as in metrics.json; its costs; the goal of a sweep.
 
-metrics.json has nothing of the machine, the time or the folders: the same data, code and settings give the same bytes.
+metrics.json contains nothing about the machine, the time or the folders: the same data, code and settings give the same
+bytes.
 """
 
 import math
@@ -37,14 +38,14 @@ FORMAT = 1
 
 
 def summarize(results: Results) -> dict[str, Any]:
-    """By task: "clips" by name, "pooled" over all counts, "mean" over clips, "worst" clip of each measure.
+    """Return by task: "clips" by name, "pooled" over all counts, "mean" over clips, "worst" clip of each measure.
 
-    {"tasks": {task: {"clips": {name: {"frames": F, group: {measure: value}, "intervals": {group: {measure:
-    [low, high] or None}}}}, "pooled": {group: ..., "intervals": ..., "over": {group: "clips" or "frames"}},
-    "mean": {group: {measure: value}}, "worst": {group: {measure: {"clip": name, "value": value}}}, "notes": [...]}},
-    "left_out": [...]}. Groups, measures and n_ counts are those of `dddas evaluate`, and ranking, still, location and
-    metres beside. Intervals of a clip are over blocks of its frames; of all together over clips, where there are
-    enough, else over blocks of frames, which holds for these clips alone.
+    {"tasks": {task: {"clips": {name: {"frames": F, group: {measure: value}, "intervals": {group: {measure: [low, high]
+    or None}}}}, "pooled": {group: ..., "intervals": ..., "over": {group: "clips" or "frames"}}, "mean": {group:
+    {measure: value}}, "worst": {group: {measure: {"clip": name, "value": value}}}, "notes": [...]}}, "left_out":
+    [...]}. Groups, measures and n_ counts are those of `dddas evaluate`, and also ranking, still, location and metres.
+    The interval of a clip is over blocks of its frames. The interval of all clips is over clips if there are enough,
+    else over blocks of frames, which holds only for these clips.
     """
     tasks: dict[str, Any] = {}
     for task, meaning in TASKS.items():
@@ -76,7 +77,7 @@ def _by_name(results: Results, task: Task) -> list[Case]:
 
 
 def _pooled_measures(cases: Sequence[Scored]) -> dict[str, Any]:
-    """The measures of all counts together. Cases in the order of their names: sums of reals depend on it."""
+    """Return the measures of all counts together. Sort cases by name first, because sums depend on the order."""
     by_frame = over_frames(cases)
     spread, over = {}, {}
     for group, estimate in over_clips(cases).items():
@@ -88,7 +89,7 @@ def _pooled_measures(cases: Sequence[Scored]) -> dict[str, Any]:
 
 
 def measures(cases: Sequence[Scored]) -> dict[str, dict[str, float]]:
-    """The figures of one case, or of several together, by group."""
+    """Return the figures of one case, or of several cases together, by group."""
     found = figures(pooled([scored.counts for scored in cases]))
     if having := [scored for scored in cases if "boxes" in scored.ranked]:
         ranked = rank(having)
@@ -115,16 +116,16 @@ def _worst(clips: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, dict[s
 
 
 def _without_folders(text: str) -> str:
-    """The text with only the last part of each path, as folders are this machine's own."""
+    """Return the text with only the last part of each path, because folders belong to this machine."""
     return re.sub(r"(?:(?<=[\s('\"])|^)(?:[A-Za-z]:)?[\\/](?:[^\s:;,'\"()]*[\\/])?([^\s:;,'\"()\\/]*)", r"\1", text)
 
 
 def summarize_costs(results: Results) -> dict[str, Any]:
-    """What a study cost, for run.json: by task "clips" by name, and "all" of them together.
+    """Return the costs of a study for run.json: by task "clips" by name, and "all" of them together.
 
     {task: {"clips": {name: {"frames": processed, "seconds": in all stages, "frames_per_s": .., "ms_per_frame": {stage:
-    ..}, "peak_mb": ..}}, "all": the same, of all clips; peak_mb the most}}. Times are those that the stages took where
-    they were computed, kept with their results; a stage that another task shares is in the cost of both.
+    ..}, "peak_mb": ..}}, "all": the same over all clips; peak_mb is the largest}}. Times were measured when the stages
+    were computed, and are stored with their results. A stage that two tasks share counts in both.
     """
     found: dict[str, Any] = {}
     for task in TASKS:
@@ -134,7 +135,7 @@ def summarize_costs(results: Results) -> dict[str, Any]:
 
 
 def sum_costs(cases: Sequence[Case]) -> dict[str, Any]:
-    """The cost of the cases that have a result together; see `summarize_costs`."""
+    """Return the cost of all cases that have a result; see `summarize_costs`."""
     results = [case.found for case in cases if case.found is not None]
     seconds: Counter[str] = Counter()
     for found in results:
@@ -150,9 +151,9 @@ def sum_costs(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 class Estimate(NamedTuple):
-    """Measures of a group as a function of how often each unit counts, which is what resampling asks for.
+    """Measures of a group as a function of how often each unit counts, for resampling.
 
-    seed: of the resampling; it comes from the group and the content alone.
+    seed: of the resampling; it depends only on the group and the content.
     """
 
     statistic: Statistic
@@ -166,9 +167,9 @@ def _intervals(estimate: Estimate) -> dict[str, list[float] | None]:
 
 
 def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
-    """Units are frames, in blocks within each clip: what these very clips tell.
+    """Return estimates whose units are frames, in blocks within each clip; they hold for these clips.
 
-    HOTA and IDF1 are of whole tracks and have no such estimate.
+    HOTA and IDF1 belong to whole tracks and have no such estimate.
     """
     found = {}
     for group in dict.fromkeys(group for scored in cases for group in scored.per_frame):
@@ -197,7 +198,7 @@ def over_frames(cases: Sequence[Scored]) -> dict[str, Estimate]:
 
 
 def over_clips(cases: Sequence[Scored]) -> dict[str, Estimate]:
-    """Units are whole clips: what clips like these tell."""
+    """Return estimates whose units are whole clips; they hold for clips like these."""
     found = {}
     for group in dict.fromkeys(group for scored in cases for group in scored.counts):
         counts = [scored.counts[group] for scored in cases if group in scored.counts]
@@ -233,7 +234,7 @@ def _samples_of(cases: Sequence[Scored]) -> dict[str, np.ndarray]:
 
 
 def rank(cases: Sequence[Scored], by_frame: bool = False) -> Ranking:
-    """Pool the scored detections of all cases into one ranking, grouped by case, or by frame."""
+    """Pool the scored detections of all cases into one ranking, grouped by case or by frame."""
     rows = np.concatenate([scored.ranked["boxes"] for scored in cases])
     unit: list[np.ndarray] = []
     true: list[np.ndarray] = []
@@ -249,14 +250,14 @@ def rank(cases: Sequence[Scored], by_frame: bool = False) -> Ranking:
 
 
 def flat(counts: Any) -> np.ndarray:
-    """Counts, of counts or of curves, as one row."""
+    """Return counts, which may contain counts or curves, as one row."""
     if isinstance(counts, tuple):
         return np.concatenate([flat(part) for part in counts])
     return np.atleast_1d(np.asarray(counts, float))
 
 
 def _shaped(row: np.ndarray, like: Any) -> Any:
-    """The counts of such a row, as those of another one are."""
+    """Return such a row as counts in the form of `like`."""
     parts, at = [], 0
     for part in like:
         size = len(flat(part))
@@ -269,7 +270,7 @@ def _shaped(row: np.ndarray, like: Any) -> Any:
 
 
 def _columns(group: str) -> tuple[tuple[str, ...], Callable[[np.ndarray], dict[str, float]]]:
-    """The counts of frames that a group's measures come of, and how their sums (C,) become measures."""
+    """Return the counts of frames that a group's measures need, and the function from their sums (C,) to measures."""
     if group == "tracks":
         return (*tracking.PER_FRAME, "windows_2", "ar_2", "windows_3", "ar_3"), _of_tracks
     if group == "target_track":
@@ -286,19 +287,19 @@ def _of_tracks(sums: np.ndarray) -> dict[str, float]:
 
 
 def _known(scored: Scored, group: str) -> np.ndarray:
-    """(F,) bool: the frames that a group has a use for."""
+    """Return the frames that a group uses, (F,) bool."""
     first: np.ndarray = next(iter(scored.per_frame[group].values()))
     return ~np.isnan(first)
 
 
 def _table(scored: Scored, group: str, names: Sequence[str]) -> np.ndarray:
-    """(U, C) the counts of the frames that the group has a use for."""
+    """Return the counts of the frames that the group uses, (U, C)."""
     known = _known(scored, group)
     return np.stack([scored.per_frame[group][name][known] for name in names], axis=1)
 
 
 def _influence(table: np.ndarray, of_sums: Callable[[np.ndarray], dict[str, float]]) -> np.ndarray:
-    """(U, K) what each frame adds to each measure, to the first order."""
+    """Return what each frame adds to each measure, to first order, (U, K)."""
     whole = table.sum(axis=0)
     slopes = []
     for step in np.diag(1e-4 * np.maximum(np.abs(whole), 1)):
@@ -322,37 +323,37 @@ class Goal:
 
     @property
     def minimize(self) -> bool:
-        """Whether less is better."""
+        """Whether smaller values are better."""
         return is_lower_better(self.measure)
 
     @property
     def name(self) -> str:
-        """As `parse_goal` takes it."""
+        """The text that `parse_goal` reads."""
         return f"{self.task}.{self.group}.{self.measure}"
 
 
 def parse_goal(text: str, by: str = "pooled") -> Goal:
-    """A goal from `task.group.measure`. Raises InputError if there is none of that name, or it is a mere count."""
+    """Return a goal from `task.group.measure`. Raise InputError for an unknown name, and for a mere count."""
     parts = text.split(".", 2)
     if len(parts) != 3 or not all(parts):
-        raise InputError(f"'{text}' is no measure; wanted task.group.measure, such as motion.pixels.f")
+        raise InputError(f"'{text}' is not a measure; wanted task.group.measure, such as motion.pixels.f")
     named, group, measure = parts
     task = next((known for known in TASKS if known == named), None)
     if task is None:
-        raise InputError(f"'{named}' is no task of a study; wanted {', '.join(TASKS)}")
+        raise InputError(f"'{named}' is not a task of a study; wanted {', '.join(TASKS)}")
     if by not in BY:
-        raise InputError(f"a goal is over all clips by {', '.join(BY)}; got '{by}'")
+        raise InputError(f"a goal combines clips by {', '.join(BY)}; got '{by}'")
     if group not in groups_of_task(task):
-        raise InputError(f"'{group}' is no group of measures of {task}; wanted {', '.join(groups_of_task(task))}")
+        raise InputError(f"'{group}' is not a group of measures of {task}; wanted {', '.join(groups_of_task(task))}")
     if measure.startswith("n_") and not is_lower_better(measure):
-        raise InputError(f"{measure} is a count, of which neither more nor less is better; wanted a measure")
+        raise InputError(f"{measure} is a count, for which neither more nor less is better; wanted a measure")
     if measure not in measure_names(group):
-        raise InputError(f"'{measure}' is no measure of {task}.{group}; wanted {', '.join(measure_names(group))}")
+        raise InputError(f"'{measure}' is not a measure of {task}.{group}; wanted {', '.join(measure_names(group))}")
     return Goal(task, group, measure, by)
 
 
 def possible_groups(clip: Clip, task: Task) -> tuple[str, ...]:
-    """The groups of measures that a clip's truth allows, of a task that the clip allows."""
+    """Return the groups of measures that a clip's truth allows for a task."""
     truth = clip.truth
     if task == "motion" and clip.still:
         return ("still",)
@@ -367,7 +368,7 @@ def possible_groups(clip: Clip, task: Task) -> tuple[str, ...]:
 
 
 def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
-    """Raises InputError if no clip's truth has the goal's group of measures."""
+    """Raise InputError if no clip's truth has the goal's group of measures."""
     having = dict.fromkeys(group for clip in clips for group in possible_groups(clip, goal.task))
     if goal.group not in having:
         there = ", ".join(f"{goal.task}.{group}" for group in having)
@@ -375,10 +376,10 @@ def check_possible(goal: Goal, clips: Sequence[Clip]) -> None:
 
 
 def goal_value(goal: Goal, cases: Sequence[Case]) -> tuple[float, str]:
-    """The goal's value and "", or NaN and the reason. Raises InputError if no clip can have such a measure."""
+    """Return the goal's value and "", or NaN and the reason. Raise InputError if no clip can have such a measure."""
     scored: list[Scored] = []
     for case in sorted((case for case in cases if case.task == goal.task), key=lambda case: case.clip.name):
-        if case.scored is None:  # without its worst clip any setting would look better
+        if case.scored is None:  # without its worst clip, any setting would seem better
             return math.nan, f"{case.clip.name}: {case.cause}"
         scored.append(case.scored)
 

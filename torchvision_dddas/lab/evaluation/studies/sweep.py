@@ -1,7 +1,7 @@
-"""Sweeps: the same study with other parameters, on a grid or as Optuna proposes, and which of them measure best.
+"""Sweeps: run one study with other parameters, on a grid or as Optuna proposes, and rank the results.
 
-Everything random has a seed, and every study takes from the cache what was computed before: an interrupted sweep
-measures the same points when it is started again, and soon continues where it was.
+All random numbers have a seed, and every study takes earlier results from the cache. An interrupted sweep that is
+started again measures the same points, and soon continues at the point where it stopped.
 """
 
 import glob
@@ -22,25 +22,25 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
 from torchvision_dddas.lab.evaluation.report.sweep import save_sweep
 from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
-from torchvision_dddas.lab.evaluation.studies.jobs import Event, Workers
+from torchvision_dddas.lab.evaluation.studies.jobs import JobEvent, Workers
 from torchvision_dddas.lab.evaluation.studies.records import Spec
 from torchvision_dddas.lab.evaluation.studies.runner import plan_study, run_jobs, run_study
 from torchvision_dddas.lab.evaluation.studies.summary import Goal, goal_value
 
 MAX_POINTS = 10_000
-AHEAD = 12  # points of a grid whose clips the workers share
+AHEAD = 12  # number of grid points whose clips the workers share
 
 _RANGE = re.compile(r"\s*([^\s:,\[\]]+)\s*:\s*([^\s:,\[\]]+)\s*(?::\s*(\w+)\s*)?")
 
 Measured = tuple[float, str]
-"""The measure, NaN if there is none, and then why."""
+"""The measure, NaN if there is none, and the reason."""
 
 Measure = Callable[[Mapping[str, object]], Measured]
-"""What a study measures with some parameters changed."""
+"""A function from changed parameters to the measure of a study with them."""
 
 
 @dataclass(frozen=True)
-class Axis:
+class ParameterAxis:
     """A parameter and its values; without values the range from low to high, both included.
 
     step: of whole numbers; 0: continuous. log: sample on a logarithmic scale.
@@ -54,12 +54,13 @@ class Axis:
     log: bool = False
 
 
-def parse_grid(texts: Sequence[str], settings: Settings) -> list[Axis]:
-    """Axes from texts such as `difference.threshold=10,20,30`.
+def parse_grid(texts: Sequence[str], settings: Settings) -> list[ParameterAxis]:
+    """Return axes from texts such as `difference.threshold=10,20,30`.
 
-    Raises InputError for an unknown parameter, one that is named twice, no values, a bad value, or too many points.
+    Raise InputError for an unknown parameter, a parameter that is named twice, no values, a bad value, or too many
+    points.
     """
-    axes: list[Axis] = []
+    axes: list[ParameterAxis] = []
     for text in texts:
         parameter, values = _split(text, "group.parameter=value,value", axes)
         axes.append(_choice(parameter, values, text, settings))
@@ -68,12 +69,12 @@ def parse_grid(texts: Sequence[str], settings: Settings) -> list[Axis]:
     return axes
 
 
-def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
-    """Axes from texts such as `difference.threshold=8:30`, `small.gap_frames=2:20:log`, `difference.kind=a,b`.
+def parse_ranges(texts: Sequence[str], settings: Settings) -> list[ParameterAxis]:
+    """Return axes from texts such as `difference.threshold=8:30`, `small.gap_frames=2:20:log`, `difference.kind=a,b`.
 
-    Raises InputError as `parse_grid`, and for bad ends of a range.
+    Raise InputError as `parse_grid` does, and for bad ends of a range.
     """
-    axes: list[Axis] = []
+    axes: list[ParameterAxis] = []
     for text in texts:
         parameter, values = _split(text, "group.parameter=low:high", axes)
         found = _RANGE.fullmatch(values)
@@ -81,14 +82,14 @@ def parse_ranges(texts: Sequence[str], settings: Settings) -> list[Axis]:
     return axes
 
 
-def parameter_notes(axes: Sequence[Axis], settings: Settings) -> list[str]:
-    """What parameters mean with these settings, where that differs from the default; and those without effect."""
+def parameter_notes(axes: Sequence[ParameterAxis], settings: Settings) -> list[str]:
+    """Return notes on parameters whose meaning with these settings differs from the default, or that have no effect."""
     tried = {axis.parameter: axis for axis in axes}
     kinds = tried["difference.kind"].values if "difference.kind" in tried else (settings.difference.kind,)
     others = ", ".join(str(kind) for kind in kinds if kind != "normalized")
     notes = [
         f"{parameter} is in grey levels with difference.kind = {others}, and in units of noise with normalized, the "
-        "default: a value of one cannot be used with the other"
+        "default: a value for one unit cannot be used for the other"
         for parameter in ("difference.threshold", "difference.peak")
         if parameter in tried and others
     ]
@@ -99,15 +100,15 @@ def parameter_notes(axes: Sequence[Axis], settings: Settings) -> list[str]:
     return notes
 
 
-def count_points(axes: Sequence[Axis]) -> int:
-    """The number of points of a grid."""
+def count_points(axes: Sequence[ParameterAxis]) -> int:
+    """Return the number of points of a grid."""
     return math.prod(len(axis.values) for axis in axes)
 
 
-def _split(text: str, wanted: str, axes: Sequence[Axis]) -> tuple[str, str]:
+def _split(text: str, wanted: str, axes: Sequence[ParameterAxis]) -> tuple[str, str]:
     parameter, equals, values = (part.strip() for part in text.partition("="))
     if not equals or not parameter or not values:
-        raise InputError(f"'{text}' is no axis of a sweep; wanted {wanted}, such as difference.threshold=10,20")
+        raise InputError(f"'{text}' is not an axis of a sweep; wanted {wanted}, such as difference.threshold=10,20")
     names = [known.name for known in all_parameters()]
     if parameter not in names:
         raise InputError(f"unknown parameter '{parameter}'; {nearest(parameter, names)}")
@@ -116,8 +117,8 @@ def _split(text: str, wanted: str, axes: Sequence[Axis]) -> tuple[str, str]:
     return parameter, values
 
 
-def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Axis:
-    """Values between commas, as TOML has them; words need no quotes."""
+def _choice(parameter: str, listed: str, text: str, settings: Settings) -> ParameterAxis:
+    """Return values between commas, as in TOML; words need no quotes."""
     try:
         values = list(tomllib.loads(f"values = [{listed}]")["values"])
     except (ValueError, RecursionError):
@@ -134,13 +135,13 @@ def _choice(parameter: str, listed: str, text: str, settings: Settings) -> Axis:
         _check(parameter, value, settings)
     if isinstance(_current(settings, parameter), float):
         values = [float(value) if isinstance(value, int) else value for value in values]
-    return Axis(parameter, tuple(dict.fromkeys(values)))
+    return ParameterAxis(parameter, tuple(dict.fromkeys(values)))
 
 
-def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> Axis:
+def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) -> ParameterAxis:
     current = _current(settings, parameter)
     if isinstance(current, bool) or not isinstance(current, int | float):
-        raise InputError(f"{parameter} is no number and has no range; give its values, as {parameter}=first,second")
+        raise InputError(f"{parameter} is not a number and has no range; give its values, as {parameter}=first,second")
     try:
         low, high = float(found[1]), float(found[2])
     except ValueError:
@@ -161,18 +162,18 @@ def _range(parameter: str, found: re.Match[str], text: str, settings: Settings) 
         _check(parameter, end, settings)
     if log and odd:
         raise InputError(f"{parameter} takes odd numbers, which have no logarithmic range; leave out :log")
-    return Axis(parameter, (), low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
+    return ParameterAxis(parameter, (), low, high, 0 if isinstance(current, float) else 2 if odd else 1, log)
 
 
 def _check(parameter: str, value: object, settings: Settings) -> None:
-    """Raises InputError for a bad value. Rules over several parameters are checked at each point."""
+    """Raise InputError for a bad value. Rules over several parameters are checked at each point."""
     cause = _why_impossible(settings, {parameter: value})
     if cause.startswith((f"{parameter} = ", f"{parameter} must ")):
         raise InputError(cause)
 
 
 def _why_impossible(settings: Settings, parameters: Mapping[str, object]) -> str:
-    """Why parameters cannot have these values together; empty if they can."""
+    """Return the reason why parameters cannot have these values together; empty if they can."""
     try:
         with_parameters(settings, parameters)
     except InputError as error:
@@ -187,7 +188,7 @@ def _current(settings: Settings, parameter: str) -> object:
 
 @dataclass(frozen=True)
 class Trial:
-    """One point. number: 0 for the settings as they were. cause: why it has no value."""
+    """One point. number: 0 for the original settings. cause: why it has no value."""
 
     number: int
     parameters: Mapping[str, object]
@@ -196,15 +197,15 @@ class Trial:
 
 
 def search_grid(
-    axes: Sequence[Axis],
+    axes: Sequence[ParameterAxis],
     settings: Settings,
     measure: Measure,
     prepare: Callable[[Sequence[Mapping[str, object]]], None] = lambda points: None,
 ) -> Iterator[Trial]:
-    """Measure the settings as they are, then every point of a grid, the last axis the quickest.
+    """Measure the original settings, then every point of a grid; the last axis varies fastest.
 
     prepare: called with the next points before they are measured. A point whose values exclude each other has a cause
-    and no value. Raises InputError if no point is possible.
+    and no value. Raise InputError if no point is possible.
     """
     points: list[tuple[dict[str, object], str]] = [({}, "")]
     for values in itertools.product(*(axis.values for axis in axes)):
@@ -220,23 +221,28 @@ def search_grid(
 
 
 def check_optuna() -> None:
-    """Raises InputError if Optuna is not installed."""
+    """Raise InputError if Optuna is not installed."""
     if find_spec("optuna") is None:
         raise InputError("--optuna needs optuna; pip install 'torchvision-dddas[tune]', or take --grid")
 
 
 def search_ranges(
-    axes: Sequence[Axis], settings: Settings, measure: Measure, count: int, seed: int = 0, minimize: bool = False
+    axes: Sequence[ParameterAxis],
+    settings: Settings,
+    measure: Measure,
+    count: int,
+    seed: int = 0,
+    minimize: bool = False,
 ) -> Iterator[Trial]:
-    """Measure the settings as they are, then `count` points that Optuna's TPESampler proposes.
+    """Measure the original settings, then `count` points that Optuna's TPESampler proposes.
 
-    Raises InputError if Optuna is not installed.
+    Raise InputError if Optuna is not installed.
     """
     check_optuna()
     import optuna
 
-    def suggest(axis: Axis) -> object:
-        if axis.values:  # by their places, as Optuna takes no lists as values
+    def suggest(axis: ParameterAxis) -> object:
+        if axis.values:  # values are given by index, because Optuna takes no lists as values
             return axis.values[proposal.suggest_categorical(axis.parameter, range(len(axis.values)))]
         if axis.step:
             return proposal.suggest_int(axis.parameter, int(axis.low), int(axis.high), step=axis.step, log=axis.log)
@@ -259,19 +265,19 @@ def search_ranges(
 
 
 def ranked(trials: Sequence[Trial], minimize: bool) -> list[Trial]:
-    """The best first, equal ones in their order, those without a value last."""
+    """Return the trials, best first, equal trials in their order, trials without a value last."""
     sign = 1 if minimize else -1
     return sorted(trials, key=lambda t: (math.isnan(t.value), 0 if math.isnan(t.value) else sign * t.value, t.number))
 
 
 def best(trials: Sequence[Trial], minimize: bool) -> Trial | None:
-    """The trial with the best value, of equal ones the first; None if none has a value."""
+    """Return the trial with the best value, the first of equal trials; None if none has a value."""
     return next((trial for trial in ranked(trials, minimize) if not math.isnan(trial.value)), None)
 
 
 @dataclass
 class StudyMeasure:
-    """Runs the studies of a sweep. on_progress: called with the number of clips that are done, and of all."""
+    """Run the studies of a sweep. on_progress: called with the number of finished clips, and of all clips."""
 
     spec: Spec
     base: Path
@@ -281,7 +287,7 @@ class StudyMeasure:
     on_progress: Callable[[int, int], object]
 
     def measure(self, parameters: Mapping[str, object], clips: Sequence[str]) -> Measured:
-        """The goal's value over clips of these names; if it has none, why."""
+        """Return the goal's value over clips of these names, or the reason if it has none."""
         changed = tuple(f"{name}={toml_value(value)}" for name, value in parameters.items())
         spec = replace(self.spec, overrides=(*self.spec.overrides, *changed))
         names = [glob.escape(name) for name in clips]
@@ -289,16 +295,16 @@ class StudyMeasure:
         return goal_value(self.goal, results.cases)
 
     def prepare(self, points: Sequence[Mapping[str, object]], clips: Sequence[str]) -> None:
-        """Compute what the studies of several points need, so that no worker has to wait between them."""
+        """Compute the results that the studies of several points need, so that no worker has to wait between them."""
         planned = plan_study(self.spec, self.base, [glob.escape(name) for name in clips])
         pairs = enumerate(itertools.product(points, planned.jobs))
         jobs = [replace(j, number=k, settings=with_parameters(j.settings, point)) for k, (point, j) in pairs]
         run_jobs(jobs, self.workers, Cache(self.cache or cache_folder()), self._counter(len(jobs)))
 
-    def _counter(self, total: int) -> Callable[[Event], None]:
+    def _counter(self, total: int) -> Callable[[JobEvent], None]:
         done = 0
 
-        def count(event: Event) -> None:
+        def count(event: JobEvent) -> None:
             nonlocal done
             done += event.done is not None
             self.on_progress(done, total)
@@ -309,7 +315,7 @@ class StudyMeasure:
 def split_clips(
     spec: Spec, base: Path, clips: Sequence[str], holdout: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The names of the clips that are tuned on, and of those held out. Raises InputError if either is empty."""
+    """Return the names of the clips to tune on, and of the held-out clips. Raise InputError if either is empty."""
     names = [job.clip.name for job in plan_study(spec, base, clips).jobs]
     held = tuple(name for name in names if any(fnmatchcase(name, pattern) for pattern in holdout))
     tuned = tuple(name for name in names if name not in held)
@@ -322,10 +328,10 @@ def split_clips(
 
 @dataclass
 class SweepRecord:
-    """What a sweep has found so far: sweep.json after every trial, best.toml and the report at the end.
+    """The results of a sweep so far: sweep.json after every trial; best.toml and the report at the end.
 
     tuned, held: names of clips. notes: of `parameter_notes`.
-    on_held: the measure on those held out, with the settings as they were and the best.
+    on_held: the measure on held-out clips, with the original and with the best settings.
     """
 
     folder: Path
@@ -340,15 +346,15 @@ class SweepRecord:
     notes: Sequence[str] = ()
 
     def add(self, trial: Trial) -> None:
-        """Record a trial. Raises InputError if it cannot be written."""
+        """Record a trial. Raise InputError if it cannot be written."""
         self.trials.append(trial)
         self._write_json()
 
     def finish(self, best: Trial, on_held: tuple[Measured, Measured] | None) -> None:
-        """Record the best trial. Raises InputError if it cannot be written."""
+        """Record the best trial. Raise InputError if it cannot be written."""
         self.best, self.on_held = best, on_held
         before = format_value(self.trials[0].value)
-        about = [f"dddas sweep: {self.heading}: {format_value(best.value)}, with the settings as they were {before}."]
+        about = [f"dddas sweep: {self.heading}: {format_value(best.value)}, with the original settings {before}."]
         about += [f"{name}: {value} (default {self.defaults[name]})" for name, value in best.parameters.items()]
         if on_held is not None:
             about.append(f"On the clips held out: {format_value(on_held[1][0])}, before {format_value(on_held[0][0])}.")
@@ -359,7 +365,7 @@ class SweepRecord:
 
     @property
     def heading(self) -> str:
-        """What is measured, in words."""
+        """The measure, in words."""
         return f"{self.goal.name}, {self.goal.by} over {len(self.tuned)} clip{'s' * (len(self.tuned) != 1)}"
 
     @property
@@ -369,7 +375,7 @@ class SweepRecord:
         return {known.name: known.default for known in all_parameters() if known.name in tried}
 
     def value_of(self, trial: Trial, parameter: str) -> object:
-        """A parameter in a trial: what was tried, else as the settings have it."""
+        """Return a parameter in a trial: the tried value, else that of the settings."""
         return trial.parameters.get(parameter, _current(self.settings, parameter))
 
     def _write_json(self) -> None:
@@ -399,7 +405,7 @@ class SweepRecord:
 
 
 def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
-    """What differs from the defaults, as `--config` takes it, below some lines of comment."""
+    """Return the settings that differ from the defaults, as `--config` reads them, below some lines of comment."""
     groups: dict[str, dict[str, object]] = {}
     for name, value in changes(settings).items():
         group, parameter = name.split(".")
@@ -408,10 +414,10 @@ def settings_toml(settings: Settings, heading: Sequence[str]) -> str:
 
 
 def toml_value(value: object) -> str:
-    """A parameter's value as `--set` takes it."""
+    """Return a parameter's value as `--set` reads it."""
     return format_toml({"value": value}).removeprefix("value = ").rstrip()
 
 
 def format_value(value: float) -> str:
-    """A measure to four digits; a dash if there is none."""
+    """Return a measure to four digits; a dash if there is none."""
     return "–" if math.isnan(value) else f"{value:.4f}"
