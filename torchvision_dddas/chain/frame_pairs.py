@@ -38,15 +38,15 @@ def near_pairs(at: int, gaps: Sequence[int], first: int, last: int) -> list[tupl
 
 
 def later_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
-    """List the source's pair: one and two intervals later, else earlier, closer at an end; empty if none fits."""
+    """Return the source's pair in a list: one and two intervals later. At an end use earlier or closer frames."""
     later = [(at + side * gap, at + 2 * side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
-    # The middle one of three frames has one neighbour on each side.
+    # The middle frame of three has one neighbour on each side.
     pair = _first_within([*later, (at - 1, at + 1)], first, last)
     return [] if pair is None else [pair]
 
 
 def next_pair(at: int, interval: int, first: int, last: int) -> list[tuple[int, int]]:
-    """List the frame of a two-frame difference, twice: later, else earlier, closer at an end; empty if none fits."""
+    """Return one pair of equal frames in a list: one interval later. At an end use an earlier or closer frame."""
     single = [(at + side * gap, at + side * gap) for gap in range(interval, 0, -1) for side in (1, -1)]
     pair = _first_within(single, first, last)
     return [] if pair is None else [pair]

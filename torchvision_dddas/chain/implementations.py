@@ -30,14 +30,14 @@ IMPLEMENTATIONS = (
         "cpu",
         "Kornia",
         1.2,
-        "floats, kernel 7; of bytes our former form took a half to a quarter of the time",
+        "floats, kernel 7; for bytes our earlier implementation took a half to a quarter of the time",
     ),
     Implementation("points transformed", "cpu", "Kornia", 1.01),
     Implementation("transfer error", "cpu", "Kornia", _NAN),
     Implementation(
-        "homography fit", "cpu", "ours", 0.73, "tells which fits are degenerate; Kornia's is in no ONNX graph"
+        "homography fit", "cpu", "ours", 0.73, "reports degenerate fits; Kornia's cannot be exported to ONNX"
     ),
-    Implementation("resize", "cpu", "ours", 0.29, "the scores of a trained HOG detector move by .15 with Kornia's"),
+    Implementation("resize", "cpu", "ours", 0.29, "with Kornia's, scores of a trained HOG detector change by 0.15"),
     Implementation("gradient", "cpu", "ours", 9.6),
     Implementation("corners", "cpu", "ours", 6.7),
     Implementation("pyramid", "cpu", "ours", 11.0),
@@ -52,13 +52,15 @@ IMPLEMENTATIONS = (
     Implementation("points transformed", "cuda", "Kornia", 0.90),
     Implementation("transfer error", "cuda", "Kornia", _NAN),
     Implementation(
-        "homography fit", "cuda", "ours", 0.91, "tells which fits are degenerate; Kornia's is in no ONNX graph"
+        "homography fit", "cuda", "ours", 0.91, "reports degenerate fits; Kornia's cannot be exported to ONNX"
     ),
-    Implementation("resize", "cuda", "ours", 0.28, "the scores of a trained HOG detector move by .15 with Kornia's"),
+    Implementation(
+        "resize", "cuda", "ours", 0.28, "with Kornia's, scores of a trained HOG detector change by 0.15"
+    ),
     Implementation("gradient", "cuda", "Kornia", 1.1),
     Implementation("corners", "cuda", "Kornia", 1.1),
     Implementation("pyramid", "cuda", "ours", 3.3),
-    Implementation("morphology", "cuda", "ours", 2.1, "the erosion; for the closing it is 20"),
+    Implementation("morphology", "cuda", "ours", 2.1, "the erosion; the closing has 20"),
     Implementation("RANSAC", "cuda", "ours", 5.3),
     Implementation("histograms", "cuda", "ours", 6.7),
     Implementation("connected components", "cuda", "Kornia", 0.67),

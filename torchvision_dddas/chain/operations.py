@@ -7,7 +7,7 @@ tensors (batch evaluation, gradients, ONNX export). Their results agree within o
 from typing import Any, Protocol, TypeVar
 
 View = TypeVar("View", contravariant=True)
-"""A frame as an engine holds it: a `detection.View`, or a (B, 1, H, W) float tensor of whole grey levels."""
+"""A frame in the form of an engine: a `detection.View`, or a (B, 1, H, W) float tensor of whole grey levels."""
 
 Picture = TypeVar("Picture")
 """A map of whole numbers 0 to 255: (H, W) uint8 array, or (B, 1, H, W) uint8 tensor.

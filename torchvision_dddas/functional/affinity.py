@@ -31,9 +31,7 @@ def triplet_affinity(
     b_valid: Bool[Tensor, "B M"],
     c_valid: Bool[Tensor, "B L"],
 ) -> Float[Tensor, "B N M L"]:
-    """Return the sum of the numerators of (a, b) and (b, c) over the sum of their denominators.
-
-    Source: appendix C, eq. 4 and 5, newest frame first.
+    """Return (numerators of (a, b) and (b, c), summed) / (their denominators, summed): eq. 4 and 5, newest frame first.
 
     >>> a, b, c = (torch.tensor([[[1.0, 3.0]]]) for _ in range(3))
     >>> there = torch.ones(1, 1, dtype=torch.bool)
@@ -51,8 +49,7 @@ def _sums(
 ) -> tuple[Float[Tensor, "B N M"], Float[Tensor, "B N M"]]:
     """Return numerator Σ min(a, b) and denominator Σ max(a, b) of each pair.
 
-    Because min + max = a + b and max - min = |a - b|, both follow from one distance, and no (B, N, M, D) tensor is
-    needed.
+    Because min + max = a + b and max - min = |a - b|, both follow from one distance, without a (B, N, M, D) tensor.
     """
     total = a.sum(-1)[..., :, None] + b.sum(-1)[..., None, :]
     # ONNX has no L1 distance of all pairs, so an exported graph does hold a (B, N, M, D) tensor.

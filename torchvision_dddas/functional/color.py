@@ -17,8 +17,7 @@ BINS = 256  # in the histogram of a channel
 def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
     """Convert blue, green, red in [0, 1] to hue, 0 to 180, saturation and value, 0 to 255.
 
-    Hue and saturation of grey are 0. The values are OpenCV's for 8-bit pictures before rounding, by Kornia's
-    rgb_to_hsv.
+    Hue and saturation of grey are 0. They are OpenCV's for 8-bit pictures before rounding.
 
     >>> F.bgr_to_hsv(torch.tensor([1.0, 0, 0]).reshape(1, 3, 1, 1)).flatten()
     tensor([120.0000, 255.0000, 255.0000])
@@ -30,11 +29,10 @@ def bgr_to_hsv(image: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B 3 H W"]:
 def within_ranges(
     hsv: Float[Tensor, "B 3 H W"], low: Float[Tensor, "K 3"], high: Float[Tensor, "K 3"], *, softness: float = 0.0
 ) -> Float[Tensor, "B K H W"]:
-    """Return how far each pixel belongs to each range of colours: 0 or 1 with softness 0. softness: in units of hsv.
+    """Return how far each pixel is in each range of colours: 0 or 1 with softness 0. softness: in units of hsv.
 
     A range whose lowest hue is above its highest hue wraps around 0. The bounds are whole 8-bit levels. A number that
-    rounds to a bound is inside: each range extends half a level beyond its bounds, and the number that is nearest to
-    leaving it, or furthest outside, decides.
+    rounds to a bound is inside: each range extends by half a level, and the worst of the three numbers decides.
 
     >>> red = F.bgr_to_hsv(torch.tensor([0, 0, 1.0]).reshape(1, 3, 1, 1))
     >>> F.within_ranges(red, torch.tensor([[170.0, 80, 80]]), torch.tensor([[10.0, 255, 255]])).flatten()

@@ -86,7 +86,7 @@ def match_exposure(
 def level_quantiles(levels: Float[Tensor, "B 1 H W"]) -> Float[Tensor, "B 33"]:
     """Return the grey levels below which 2 to 98 % of a picture lie, float64. Pixels of a level are spread over it.
 
-    Use every 3rd pixel of every 5th row; `chain.exposure.measure_level_shares` says why both are odd.
+    Use every 3rd pixel of every 5th row; `chain.exposure.measure_level_shares` states why both steps are odd.
     """
     sample = levels[..., ::5, ::3].flatten(1).round().long().clamp(0, 255)
     counts = torch.zeros(len(levels), 257, dtype=torch.float64, device=levels.device)
@@ -103,8 +103,8 @@ def fit_quantiles(
 ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"]]:
     """Fit gain and offset that convert the quantiles `given` to the quantiles `wanted`.
 
-    Return 1 and 0 if they are nearly equal, or if gain and offset do not explain the difference. This is the batched
-    form of `chain.exposure.fit_exposure`.
+    Return 1 and 0 if they are nearly equal, or if they do not explain the difference. Batched
+    `chain.exposure.fit_exposure`.
     """
     one = torch.ones_like(wanted[:, 0])
     kept = (torch.minimum(wanted, given) > 3.0) & (torch.maximum(wanted, given) < 252.0)
@@ -147,8 +147,7 @@ def regional_medians(
 ) -> Float[Tensor, "B 1 R C"]:
     """Return lower medians of regions of `side` pixels, clipped to `least` and `most`.
 
-    A region in which at most a tenth of the mask is set has the value `least`. A median filter removes outliers among
-    the regions.
+    A region in which at most a tenth of the mask is set has the value `least`. A median filter removes outliers.
     """
     down, across = (-length % side for length in values.shape[-2:])
     cells = functional.pad(values.masked_fill(~mask, torch.inf), (0, across, 0, down), value=torch.inf)

@@ -32,8 +32,7 @@ def gaussian_blur2d(
 ) -> Shaped[Tensor, "B C H W"]:
     """Smooth as `kornia.filters.gaussian_blur2d` does; without a sigma as cv2.GaussianBlur. Bytes stay bytes.
 
-    Halves are rounded up. Pictures may have any size. For kernels up to 9 the weights differ from OpenCV's by up to
-    0.006.
+    Halves are rounded up. Pictures may have any size. Weights up to size 9 differ from OpenCV's by up to 0.006.
 
     Raise InputError for an even size, and for another border than `reflect` without a sigma.
 

@@ -138,8 +138,7 @@ def bins_of_knots(bins: int) -> Tensor:
 def cell_weights(layout: Layout) -> Tensor:
     """Return the weight of each row or column of a block's pixels in each of its cells, (cells, block) float64.
 
-    The weight is a Gaussian with a sigma of a quarter of the block, centred half a pixel off as in OpenCV, times a
-    bilinear hat.
+    The weight is a Gaussian with a sigma of a quarter of the block, half a pixel off like OpenCV's, times a hat.
     """
     place = torch.arange(layout.block, dtype=torch.float64)
     sigma = layout.block / 4
@@ -187,8 +186,8 @@ def hog(bordered: Tensor, layout: Layout, *, clip: Tensor | None = None) -> Tens
 def arrange_weights(weights: Tensor, layout: Layout) -> Tensor:
     """Rearrange a linear SVM's weights from OpenCV's order, (down x across x F,), to (down, across, F).
 
-    OpenCV stores the blocks of a window, and the cells of a block, column by column; the bins vary fastest.
-    `svm_scores` takes the result.
+    OpenCV stores the blocks of a window, and the cells of a block, by columns; bins vary fastest. `svm_scores` takes
+    the result.
 
     >>> F.arrange_weights(torch.zeros(3780), F.Layout()).shape
     torch.Size([15, 7, 36])

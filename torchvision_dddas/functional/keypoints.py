@@ -62,9 +62,8 @@ def grid_features(
 ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N"], Bool[Tensor, "B N"]]:
     """Return the best pixel of every cell of cell_px x cell_px, row by row, its score, and whether it is valid.
 
-    Points are spread over the frame, and found faster than in `frame_features`. N is the number of whole cells in the
-    frame, possibly 0. valid: the score is above quality times the frame's maximum, and above `least`, which exceeds the
-    rounding of a blank picture.
+    They are spread out, and found faster. N is the number of whole cells in the frame, possibly 0. valid: the score is
+    above quality times the frame's maximum, and above `least`, which exceeds the rounding of a blank picture.
 
     >>> points, score, valid = F.grid_features(torch.rand(1, 1, 64, 64), 16)
     >>> points.shape, valid.shape

@@ -31,9 +31,9 @@ Kernel = Shaped[Tensor, "h w"] | Shaped[np.ndarray, "h w"]
 Run = tuple[int, int, int]
 """A run of set columns [first, last) in a row of the kernel."""
 
-# Pixels outside the picture are not set. Not -inf: the log-sum-exp of infinities alone has no gradient.
+# Pixels outside the picture are not set. Not -inf, because the log-sum-exp of only infinities has no gradient.
 _NOTHING = -1e4
-# Pixels are numbered within tiles of this side. The rest of the 32 bits resolves so many steps of the value.
+# Pixels are numbered within tiles of this side. The other bits of 32 resolve this number of steps of the value.
 _TILE = 64
 _STEPS = (1 << 19) - 2
 _SHAPES = {"rectangle": cv2.MORPH_RECT, "ellipse": cv2.MORPH_ELLIPSE}

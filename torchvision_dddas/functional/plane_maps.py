@@ -210,9 +210,9 @@ def ransac(
     """Return later_from_earlier from pairs of which many are wrong, the inliers, and whether it is reliable.
 
     Take the best of all hypotheses, then fit least squares to its inliers with tightening tolerances (appendix B, step
-    S3). Hypotheses are ranked by their truncated squared error, which also ranks hypotheses with equally many inliers.
-    samples: from `draw_samples`; the numbers are spread over the valid points if some are not valid. If no hypothesis
-    fits, return the identity, not reliable.
+    S3). Hypotheses are ranked by their truncated squared error, which also ranks equal numbers of inliers. samples:
+    from `draw_samples`; the numbers are spread over the valid points if some are not valid. If none fits, return the
+    identity, not reliable.
     Raise InputError without any points.
 
     >>> p = torch.rand(1, 50, 2) * 100

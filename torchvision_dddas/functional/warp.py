@@ -61,7 +61,7 @@ def warp_perspective(
     rows, columns = dsize
     matrix = M.double() if inverse_map else invert_map(M.double())
     u = torch.arange(columns, dtype=torch.float64, device=src.device)
-    # The position of row y is the first of these rows plus y times the second, in steps of the rounding.
+    # The positions of row y are start + y * slope, in steps of the rounding.
     scale = matrix.new_tensor([max(subpixels, 1), max(subpixels, 1), 1])[:, None]
     start = ((matrix[:, :, 0, None] * u + matrix[:, :, 2:]) * scale).to(src.dtype)[:, :, None]
     slope = (matrix[:, :, 1, None] * scale).to(src.dtype)[:, :, None]

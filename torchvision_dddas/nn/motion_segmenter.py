@@ -228,7 +228,7 @@ class MotionSegmenter(nn.Module):
         softness, texture = self.softness if softness is None else softness, differences.texture
         chain = self.chain(values, softness=softness, dtype=texture.dtype)
         least, both = differences.least, differences.both
-        pairs = [(least[:, k : k + 1], both[:, k : k + 1]) for k in range(least.shape[1])]  # a graph has no split
+        pairs = [(least[:, k : k + 1], both[:, k : k + 1]) for k in range(least.shape[1])]  # graphs have no split
         largest = chain.find_evidence(pairs, Reference(differences.grey, texture))
         margin, unit = chain.find_core(largest), evidence_scale(self.settings)
         evidence = largest.to(texture.dtype) / unit

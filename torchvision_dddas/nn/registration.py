@@ -2,8 +2,7 @@
 
 A few points, the scouts, search the whole pyramid for the motion. The other points start where this motion takes them
 and search only at full resolution, which is much faster. If the scouts do not agree, all points search the whole
-pyramid. On a GPU and in a trace both searches are done for every pair and the device selects the result, so that the
-host need not wait.
+pyramid. On a GPU and in a trace both searches are done for every pair, and the device selects the result.
 """
 
 from dataclasses import dataclass
@@ -137,8 +136,7 @@ class FrameRegistration(nn.Module):
         """Return the motion of the keypoints between two pyramids.
 
         samples: numbers of the keypoints from which hypotheses are drawn. By default they are the same for every pair
-        and call, so that the result of a pair does not depend on the rest of its batch. ransac_px: replaces the
-        parameter.
+        and call, so that pairs of a batch do not affect each other. ransac_px: replaces the parameter.
         """
         effort, parameters = self.effort, self.settings
         ransac_px = parameters.ransac_px if ransac_px is None else ransac_px

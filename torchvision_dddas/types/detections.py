@@ -191,9 +191,8 @@ class DetectionTable(Table):
 
     frame: (N,) int64 from 1. box_px: (N, 4) float64, x, y, width, height. score: (N,) as given, else 1.
     line: (N,) int64, the row's line in the file, from 1. identity: (N,) int64 from 1, -1 if unknown.
-    cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both None if not given.
-    own: whether `dddas detect` wrote the table, with moving targets only. ours: whether `dddas detect` or `dddas track`
-    wrote it.
+    cut: (N,) bool, the picture's border cuts the target. feet_px: (N, 2) u, v between the feet. Both may be None. own:
+    `dddas detect` wrote the table, with moving targets only. ours: `dddas detect` or `dddas track` wrote it.
     label: (N,) str, the class, empty if unknown; class_id: (N,) int64, its number, -1 if unknown; None if not given.
     kind: (N,) str, the kind of a row. `dddas track` writes detection, bridge (a box between two detections, where
     nothing was seen) or untracked (a detection without identity). None if not given. notes: how the boxes were read.
@@ -257,7 +256,7 @@ class DetectionTable(Table):
         return float(width), float(height)
 
     def classes(self, rows: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
-        """Return name and number of the class of each of some rows, as in Detections."""
+        """Return the names and numbers of the classes of the given rows, as in Detections."""
         label = np.full(len(self), "", object) if self.label is None else self.label
         return label[rows], (np.full(len(self), -1) if self.class_id is None else self.class_id)[rows]
 

@@ -146,8 +146,7 @@ class Registration(Record):
 
     later_from_earlier: (3, 3) float64 homography on pixel coordinates (u, v, 1).
     tracked, inliers: numbers of keypoints tracked, and of inliers, which fit the homography.
-    error_px: median error of the inliers. flow_px: median background displacement. cause: why the registration is not
-    reliable.
+    error_px: median error of the inliers. flow_px: median background displacement. cause: why it is unreliable.
 
     >>> td.Registration(np.eye(3), tracked=120, inliers=110, error_px=0.2, flow_px=3.5)
     Registration(later_from_earlier: 3x3 0 to 1, tracked=120, inliers=110, error_px=0.2, flow_px=3.5)
@@ -188,8 +187,8 @@ class Scene(Record):
     """The result of motion detection for one frame.
 
     mask: (H, W) uint16, 0 background, i + 1 = row i of the detections.
-    reliable: False if the frame could not be registered to the one before, as at a cut; `cause` says why. It is then
-    compared only with later frames; without later frames its mask is empty.
+    reliable: False if the frame could not be registered to the previous frame, as at a cut; `cause` says why. It is
+    then compared only with later frames; without later frames its mask is empty.
     interval_frames: the detection interval in force. seconds: time spent per stage.
     step: background motion since the previous frame, or None.
     core: (H, W) bool, the mask before gaps and hulls are filled; None: the same as the mask.

@@ -276,8 +276,8 @@ class Fix(Record):
 class Elevation(Record):
     """Terrain heights on a grid in local metres.
 
-    up_m: (R, C) above the local plane, rows to the north, columns to the east; NaN where unknown. corner_m: east and
-    north of the first cell. step_m: cell size. base_m: the raster's height where up is 0.
+    up_m: (R, C) above the local plane, rows to the north, columns to the east; NaN if unknown. corner_m: east and north
+    of the first cell. step_m: cell size. base_m: the raster's height where up is 0.
 
     >>> td.Elevation(np.zeros((3, 4)), corner_m=(-50.0, -50.0), step_m=25.0, base_m=210.0)
     Elevation(up_m: 3x4 0, corner_m=(-50.0, -50.0), step_m=25, base_m=210)
@@ -294,9 +294,9 @@ class Positions(Table):
     """Positions of targets on the ground, one row per sighting, sorted by frame.
 
     frame: (N,) int64 from 1. target: (N,) int64, the identity, else the row within the frame, from 1.
-    east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN where unknown. score: (N,) in [0, 1].
+    east_north_m: (N, 2) local metres. covariance_m2: (N, 2, 2), NaN if unknown. score: (N,) in [0, 1].
     origin_deg: WGS84 longitude and latitude of east = north = 0. lonlat_deg: (N, 2). Both None without an origin.
-    label, class_id: (N,) as in Detections. above_sea_m, above_ellipsoid_m: (N,) of the ground, NaN where unknown.
+    label, class_id: (N,) as in Detections. above_sea_m, above_ellipsoid_m: (N,) of the ground, NaN if unknown.
 
     >>> east_north_m, covariance_m2 = np.array([[3.0, 4], [0, 2]]), np.tile(np.eye(2), (2, 1, 1))
     >>> places = td.Positions(np.array([1, 1]), np.array([7, 9]), east_north_m, covariance_m2, np.ones(2))
@@ -459,8 +459,7 @@ class GroundCrowds(Table):
 
     target: (N,) int64 as in Positions. east_north_m: (N, 2) the people's centroid, local metres. velocity_m_s: (N, 2)
     east, north, NaN if unknown. people: (N,) int64, largest number of people in one picture. seen_by: (N,) str, the
-    vehicles, separated by semicolons. steers: (N,) bool, whether this position steers, because the air has lost the
-    crowd.
+    vehicles, separated by semicolons. steers: (N,) bool, whether it steers, because the air has lost the crowd.
 
     >>> crowds = td.GroundCrowds(np.array([4]), np.array([[10.0, 20]]), np.array([[1.0, 0]]), people=np.array([6]))
     >>> crowds.people, crowds.steers

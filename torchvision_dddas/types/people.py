@@ -71,8 +71,7 @@ class PeopleFrame(Record):
     """The result of searching one frame for people.
 
     regions_px: (R, 4) the regions searched in addition to the scheduled pyramid levels; None: the whole picture.
-    share: number of scored windows, relative to a full search. cause: why there is no result. adjustments, seconds: as
-    in Scene.
+    share: scored windows, relative to a full search. cause: why there is no result. adjustments, seconds: as in Scene.
 
     >>> types.PeopleFrame(td.Frame(1, 0.0, np.zeros((48, 64), np.uint8)), td.People(), share=0.25)
     PeopleFrame(frame=Frame(...), people=People(0 rows), share=0.25)

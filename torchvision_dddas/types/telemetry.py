@@ -169,7 +169,7 @@ COLUMNS_OF_TELEMETRY = (
 
 @dataclass(frozen=True)
 class Flight(Record):
-    """Telemetry at one moment; fields as in Telemetry, NaN where unknown.
+    """Telemetry at one moment; fields as in Telemetry, NaN if unknown.
 
     >>> round(td.Flight(altitude_m=50.0, pitch_rad=np.radians(30)).distance_m, 6)
     100.0

@@ -16,10 +16,10 @@ from torchvision_dddas.types.zones import ZoneEvent
 
 @dataclass(frozen=True)
 class AppearanceUse(Record):
-    """Whether the association of a frame looked at the targets' appearance, and the reason.
+    """Whether the association of a frame used the appearance of targets, and the reason.
 
-    weight: of their locations in the source's association; NaN in the default one, where appearance adds to scores.
-    location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN where not computed.
+    weight: of the locations in the source's association; NaN in the default association, which adds appearance to
+    scores. location_dispersion, appearance_dispersion: of the source's rule, in [0, 1]; NaN if not computed.
 
     >>> td.AppearanceUse(looked=True, cause="two boxes overlap")
     AppearanceUse(looked=True, cause='two boxes overlap')
@@ -77,7 +77,7 @@ class TrackedFrame(Record):
     number: 1-based position in the clip. frame: the picture, or None. detections: the tracker's input.
     tracks: detections with an identity, and boxes that bridge gaps.
     now_from_before: (3, 3) pixel homography from the previous tracked frame; None: no motion, or unknown.
-    lines: (N,) int64, lines of the detections in their file; empty for own ones.
+    lines: (N,) int64, lines of the detections in their file; empty for own detections.
     cause: why there is no result. adjustments, seconds, repeats: as in Scene.
 
     >>> found = td.Detections([[10, 20, 5, 9], [40, 20, 5, 9]], [0.9, 0.8])

@@ -93,9 +93,8 @@ class Bodies(Table):
 class Truth(Record):
     """Ground truth of a simulated frame.
 
-    mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all bodies in the
-    world.
-    pose: of the camera at mid-exposure. events: in words, faults and crowds that join or split.
+    mask: (H, W) uint16, target number of each pixel, or 0. people: (H, W), body number. bodies: all in the world.
+    pose: of the camera at mid-exposure. events: faults, joins and splits of crowds, in words.
 
     >>> none, pair, triple = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
     >>> nobody = types.Bodies(none, none, none, triple, pair, none, none, none, triple, triple, none)

@@ -12,9 +12,8 @@ from torchvision_dddas.types.record import Record
 class Zone(Record):
     """A named area, or a line that targets cross.
 
-    rings: outlines (N, 2) of an area; the first point is not repeated, and rings within rings are holes. For a line,
-    its pieces. unit: deg (WGS84, longitude and latitude), m (the run's local metres, east and north) or px (u, v of the
-    picture).
+    rings: outlines (N, 2) of an area, without a repeated first point; rings in rings are holes. For a line, its pieces.
+    unit: deg (WGS84, longitude and latitude), m (the run's local metres, east and north) or px (u, v of the picture).
     dwell_s: a target that has been inside for this time dwells.
 
     >>> td.Zone("door", (np.array([[0.0, 0], [4, 0], [4, 3]]),), unit="m")

@@ -83,9 +83,8 @@ class DescentStep:
 class Descended:
     """The result of a descent. parameters: the best state, after step `best`. ended: the reason for the end.
 
-    failed: one line that names the clip, frame and parameter that gave a value that is not finite; empty otherwise.
-    idle: parameters without any effect on the loss. taken: number of steps in `seconds`, without the steps of a
-    checkpoint.
+    failed: one line with the clip, frame and parameter of a value that is not finite; else empty. idle: parameters
+    without any effect on the loss. taken: number of steps in `seconds`, without the steps of a checkpoint.
     """
 
     parameters: Parameters
@@ -114,10 +113,9 @@ def descend(
 ) -> Descended:
     """Minimize the family's loss. The parameters are changed in place and end in their best state.
 
-    tell: called with each step, including the steps of a resumed checkpoint. place: file of a checkpoint, written at
-    every measurement. resume: continue from the checkpoint if it exists. Raise InputError if there are no examples, if
-    no parameter has an effect on the loss, if the loss is not finite at the start, and for a checkpoint of another
-    descent.
+    tell: called with each step, also those of a resumed checkpoint. place: file of a checkpoint, written at every
+    measurement. resume: continue from the checkpoint if it exists. Raise InputError if there are no examples, if no
+    parameter has an effect on the loss, if the loss is not finite at the start, and for another descent's checkpoint.
     """
     plan = plan or Plan()
     if not examples:
@@ -321,13 +319,13 @@ class _Run:
         problem = f"the loss of {self._family.name} is not finite for"
         example = next((one for one in batch if not finite([one], values)), None)
         if example is None:
-            return f"{problem} {batch[0].clip}, frame {batch[0].frame} and those beside it"
+            return f"{problem} {batch[0].clip}, frame {batch[0].frame} and the other examples of its batch"
         where = f"{problem} {example.clip}, frame {example.frame}"
         known = [self.history[i].parameters for i in (-1, self.best_step, 0)] if self.history else []
         earlier = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
         good = next((before for before in earlier if finite([example], before)), None)
         if good is None:
-            return f"{where}, whatever the parameters"
+            return f"{where}, for all earlier parameters"
         guilty = [name for name in values if finite([example], {**values, name: good[name]})]
         return f"{where}, with {', '.join(f'{name} = {float(values[name].detach()):.6g}' for name in guilty or values)}"
 
@@ -347,7 +345,7 @@ class _Run:
 
 
 def split_examples(examples: Sequence[Example], watched: float, most: int) -> tuple[list[Example], list[Example]]:
-    """Return the examples to learn from, and the examples to watch: the last ones of each clip.
+    """Return the examples to learn from, and the examples to watch: the last examples of each clip.
 
     A clip with three or more examples has at least one example of each kind. most: largest number to watch, chosen
     evenly. Neighbouring frames are similar, so a contiguous part is a better test than single frames. If no clip has
@@ -370,8 +368,8 @@ def split_examples(examples: Sequence[Example], watched: float, most: int) -> tu
 def draw_batch(step: int, clips: Sequence[str], batch: int, seed: int) -> list[int]:
     """Return the indices of the examples of a step, counted from 0. clips: the clip of each example.
 
-    A round takes all examples in a random order and repeats the examples of shorter clips, so that every clip has the
-    same weight. The next round draws a new order. The result depends only on the arguments, so that a descent can be
+    A round takes all examples in a random order, and repeats those of clips with fewer examples, so that all clips
+    weigh the same. The next round draws a new order. The arguments alone determine the result, so that descents can be
     resumed.
     """
     batch = min(batch, len(clips))

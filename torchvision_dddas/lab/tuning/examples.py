@@ -47,8 +47,7 @@ def boxed_frames(
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray | None]]:
     """Yield number, identities (n,), boxes (n, 4) and picture of every `interval`-th frame, up to the last with boxes.
 
-    Frames are counted from the first picture. A clip without pictures begins at its first frame with boxes, and its
-    pictures are None.
+    Frames are counted from the first picture. Without pictures, begin at the first frame with boxes, and yield None.
     """
     if not len(table.frame):
         return
@@ -69,8 +68,7 @@ class OwnedBoxes(NamedTuple):
     """Boxes with their true identities, ordered by frame. Each false alarm has its own identity below 0.
 
     score: (N,), 1 for a certain box. begins: (N,) whether a box may begin a track. size: (width, height) of an area
-    that holds nearly all boxes; None if there are too few. own: whether the boxes are moving targets that `dddas
-    detect` found.
+    with nearly all boxes; None if there are too few. own: whether they are moving targets that `dddas detect` found.
     """
 
     table: TrackTable
@@ -83,8 +81,8 @@ class OwnedBoxes(NamedTuple):
 def match_owners(found: DetectionTable, truth: ClipTruth, interval: int, parameters: TrackParameters) -> OwnedBoxes:
     """Match the detections of frames 1, 1 + interval, ... with the truth as the measures do, by IoU of 0.5 or more.
 
-    Detections that are too doubtful for the tracker are left out. Targets that the measures ignore own boxes too. Raise
-    InputError if an identity occurs twice in a frame.
+    Detections that are too doubtful for the tracker are left out. Ignored targets may own boxes too. Raise InputError
+    if an identity occurs twice in a frame.
     """
     assert truth.tracks is not None
     parts = [truth.tracks]
@@ -121,8 +119,7 @@ def stack_padded(
 ) -> _Record:
     """Return a dataclass of tensors whose first axis is the row; shorter arrays are padded at the end of each axis.
 
-    rows: an array for each field of `kind`. pad: "zero", or "edge" to repeat the last number. Bools are padded with
-    False.
+    rows: an array for each field of `kind`. pad: "zero", or "edge" to repeat the last number. Pad bools with False.
     """
     batch: dict[str, Any] = {}
     for field in fields(kind):  # type: ignore[arg-type]

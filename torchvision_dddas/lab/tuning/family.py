@@ -32,8 +32,7 @@ FAMILIES = {
 class Example:
     """One labelled piece of a clip. clip, frame: names in messages. content: the input of the loss, on the CPU.
 
-    settings: the settings that the example was prepared with, for parameters that are not tuned. All examples of a
-    descent have the same settings.
+    settings: used in its preparation, for parameters that are not tuned; the same for all examples of a descent.
     """
 
     clip: str

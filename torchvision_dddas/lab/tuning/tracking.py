@@ -41,8 +41,7 @@ FRAMES = 25
 MISSED = 4.0
 """Margin of a true link by detections. By likelihood alone, the best gate is so narrow that true links are lost to
 avoid false alarms, and after each broken link the track counts as another target. Chosen from 0, 2, 4 and 6 by IDF1 on
-MOT15 sequences that were held out; not every value was tried with all margins of wrong links, pulls and sets of
-parameters."""
+MOT15 sequences that were held out; not each was tried with all margins of wrong links, pulls and parameters."""
 
 # Rounds of messages for each frame. More rounds change the loss by less than a hundredth in a crowd.
 _ROUNDS = 10

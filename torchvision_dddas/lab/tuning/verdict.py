@@ -28,8 +28,7 @@ class Side:
 
     says: whether the pooled goal is better or worse beyond noise, or neither; no other question is asked. changes:
     every measure and clip, as from `compare_studies`, corrected for the number of comparisons; None if nothing can be
-    compared. frame_ms: time for a frame before and after, if it was computed. notes: clips without a result, and the
-    reasons.
+    compared. frame_ms: time for a frame before and after, if it was computed. notes: clips without a result, and why.
     """
 
     clips: tuple[str, ...]

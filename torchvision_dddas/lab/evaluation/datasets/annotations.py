@@ -24,8 +24,7 @@ def boxes_of_corners(corners_px: np.ndarray) -> np.ndarray:
 def table_of(path: Path, frame: np.ndarray, identity: np.ndarray, box_px: np.ndarray, line: np.ndarray) -> TrackTable:
     """Return rows as a table. line: (N,) line in the file, for messages.
 
-    Raise InputError with file and line for a size that is not above 0, and for an identity that is -1 or twice in a
-    frame.
+    Raise InputError with file and line for sizes not above 0, and identities that are -1 or twice in a frame.
     """
     check_sizes(box_px, line, str(path))
     table = TrackTable.of(frame, identity, box_px)

@@ -138,7 +138,7 @@ class StanfordDrone(Reader):
         annotations/SCENE/VIDEO/annotations.txt   id xmin ymin xmax ymax frame lost occluded generated "label"
         videos/SCENE/VIDEO/video.mov              (or .mp4)
 
-    or folders of any names with annotations.txt, and a video where there is one. Frames count from 0. Lost rows lie
+    or folders of any names with annotations.txt, and a video if there is one. Frames count from 0. Lost rows lie
     outside the picture and are left out; occluded and generated (interpolated) ones count.
     """
 

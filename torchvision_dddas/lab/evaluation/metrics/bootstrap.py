@@ -16,8 +16,7 @@ FEWEST = 5
 """Fewest independent blocks for an interval. The range of five values misses their median in 1 of 16 cases."""
 
 LONGER = 2.0
-"""Blocks of the length that estimates a variance best are too short for an interval: if frames are alike, the interval
-then contains the truth less often."""
+"""Blocks that estimate a variance best are too short for intervals, which then contain the truth less often."""
 
 Statistic = Callable[[np.ndarray], dict[str, float]]
 """A function from weights of units, (U,), how often each unit counts, to measures by name; NaN if undefined."""
@@ -163,8 +162,8 @@ def effects(
     """Return the effect on each measure. strata: of one result's units, whose blocks are drawn or exchanged together.
 
     statistic: of weights (2 U,): how often each unit of the first result counts, then of the second. resamples: number
-    of samples for the interval. most: largest number of ways to exchange the results; all ways are tried if there are
-    no more.
+    of samples for the interval. most: largest number of ways to exchange the results; if there are fewer, all are
+    tried.
     """
     units = sum(stratum.units for stratum in strata)
     ones, none = np.ones(units), np.zeros(units)

@@ -81,8 +81,7 @@ def measures(boxes: BoxCounts) -> dict[str, float]:
 def one_target(mask: np.ndarray, found: np.ndarray, target: np.ndarray) -> OneTarget:
     """Count one frame of a clip with one labelled target (4,); other movers have no label. A NaN box: no target.
 
-    A hit has foreground in over a tenth of the box. A blob is elsewhere if its box meets the target's at IoU below
-    0.05.
+    A hit has foreground in over a tenth of the box. A blob with IoU below 0.05 to the box is elsewhere.
     """
     if np.isnan(target).any():
         return OneTarget()

@@ -44,8 +44,8 @@ def _distance(title: str, meaning: str, short: str = "") -> Metric:
 METRICS: Mapping[str, Metric] = {
     "f": Metric("F", "harmonic mean of precision and recall, of pixels"),
     "f1": Metric("F1", "harmonic mean of precision and recall"),
-    "precision": Metric("precision", "share of what was found that is true", short="prec."),
-    "recall": Metric("recall", "share of what is true that was found"),
+    "precision": Metric("precision", "share of the found pixels or boxes that are true", short="prec."),
+    "recall": Metric("recall", "share of the true pixels or boxes that were found"),
     "specificity": Metric("specificity", "share of the background that was not detected", short="spec."),
     "accuracy": Metric("accuracy", "share of all that was classified correctly", short="acc."),
     "gmean": Metric("Gmean", "geometric mean of recall and specificity"),
@@ -80,13 +80,15 @@ METRICS: Mapping[str, Metric] = {
     "median_m": _distance("median", "median error on the Earth, metres", "median"),
     "p95_m": _distance("95 %", "error that 95 % of the positions stay below, metres", "95 %"),
     "rms_m": _distance("RMS", "root mean square of the errors, metres"),
-    "in_ellipse": Metric("in ellipse", "share of positions whose 95 % ellipse holds the true one", 0, short="inside"),
+    "in_ellipse": Metric(
+        "in ellipse", "share of positions whose 95 % ellipse contains the true position", 0, short="inside"
+    ),
     "relative_mean_m": _distance("team mean", "mean error relative to the team, metres"),
     "relative_median_m": _distance("team median", "median error relative to the team, metres", "to team"),
     "relative_p95_m": _distance("team 95 %", "error relative to the team that 95 % stay below, metres", "95 %"),
     "relative_rms_m": _distance("team RMS", "root mean square of the errors relative to the team"),
     "relative_in_ellipse": Metric(
-        "team in ellipse", "share whose ellipse relative to the team holds the position", 0, short="inside"
+        "team in ellipse", "share whose ellipse relative to the team contains the position", 0, short="inside"
     ),
 }
 

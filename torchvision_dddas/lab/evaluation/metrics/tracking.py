@@ -269,8 +269,7 @@ def count_hota(clip: Paired) -> Hota:
 def curves(sums: Hota) -> dict[str, np.ndarray]:
     """Return HOTA, its parts DetA and AssA, LocA, recall and precision of both parts, (19,) each over ALPHA.
 
-    The measures are the means of these curves. LocA is 1 if nothing is found, as in TrackEval; all are NaN without
-    truth.
+    The measures are their means. LocA is 1 if nothing is found, as in TrackEval. All are NaN without truth.
     """
     tp, fn, fp, association, recall, precision, overlap = sums
     known = np.where(tp + fn > 0, 1.0, np.nan)

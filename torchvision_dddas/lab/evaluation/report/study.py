@@ -1,4 +1,4 @@
-"""report.html of a study: the results, their uncertainty, the worst frames and the costs, on one page for offline use."""
+"""report.html of a study: results, uncertainty, worst frames and costs, on one page for offline use."""
 
 import json
 import math

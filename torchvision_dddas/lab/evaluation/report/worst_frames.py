@@ -27,8 +27,7 @@ MAX_WIDTH, MAX_HEIGHT = 560, 420
 HIT: Colour = (233, 180, 86)
 FALSE: Colour = (0, 94, 213)
 TRUE: Colour = (66, 228, 240)
-"""Sky blue, vermilion and yellow of Okabe and Ito, in blue, green, red. Missed targets also have the colour of the
-truth."""
+"""Sky blue, vermilion and yellow of Okabe and Ito, in blue, green, red. Missed targets have the colour of the truth."""
 UNSCORED: Colour = (150, 150, 150)
 _GREY = 70  # grey level that replaces a missing picture
 _MAX_OF_A_CLIP = 3

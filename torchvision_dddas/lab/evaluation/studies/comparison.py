@@ -22,12 +22,11 @@ LEVEL = 0.05
 MEANING = (
     "Better and worse are beyond noise: corrected p below 0.05, by Holm's method for all tests of one kind of a task. "
     "“On these clips”: significant over blocks of their frames, which holds only for these clips. "
-    "“Within noise”: no change is shown, nor that there is none. "
-    "“Too little to tell”: so few frames or clips could not show any change. “The same”: equal figures. "
-    "Effect size: the mean of the clips' changes over their standard deviation (Cohen's d_z). Clips needed: so many "
-    "show an effect of this size in 4 of 5 studies (power 0.8), by a paired t test at 0.05 divided by the number of "
-    "tests. "
-    "The effect of few clips is itself uncertain, and so is this number."
+    "“Within noise”: neither a change nor its absence is shown. "
+    "“Too little to tell”: too few frames or clips to show any change. “The same”: equal figures. "
+    "Effect size: the mean of the clips' changes over their standard deviation (Cohen's d_z). "
+    "Clips needed: this number shows an effect of this size in 4 of 5 studies (power 0.8), by a paired t test at 0.05 "
+    "divided by the number of tests. The effect of few clips is uncertain, and so is the number of clips needed."
 )
 
 WAYS = ("over_clips", "over_frames")

@@ -44,8 +44,7 @@ NO_WORKER_S = 30.0
 """Longest time that a scheduler may be without workers."""
 
 SILENT_S = 60.0
-"""A local worker that gives no sign for this time, for example because it was stopped, is replaced. Its clip is
-restarted."""
+"""A local worker that gives no sign for this time, for example a stopped one, is replaced. Its clip starts again."""
 
 _POLL_S = _REPORT_S = 0.25
 _TOPIC = "dddas-frames"
@@ -261,7 +260,7 @@ class Workers:
         alone_since = time.monotonic()
         try:
             while True:
-                # Submit no more jobs than threads: Dask also blames a worker's death on the jobs that wait there.
+                # Submit no more jobs than threads: Dask also blames a worker's death on jobs that wait at this worker.
                 threads = sum(client.nthreads().values())
                 for job, keys in islice(jobs, max(threads - len(running), 0)):
                     code = "" if self._scheduler is None else code_digest(job.backend)

@@ -70,8 +70,7 @@ def write_methods(
 def name_results(places: Sequence[Path], names: Sequence[str]) -> dict[str, Path]:
     """Return the results by name; by default the names of their files or folders.
 
-    Raise InputError if the numbers of names and results differ, for a name that occurs twice, and for a name that is
-    not a folder name.
+    Raise InputError if the numbers of names and results differ, for equal names, and for names that no folder can have.
     """
     names = names or [place.resolve().stem if place.is_file() else place.resolve().name for place in places]
     if len(names) != len(places):

@@ -227,10 +227,9 @@ def run_study(
 ) -> Results:
     """Run a study.
 
-    base: the folder to which its folders are relative. workers: by default only this process. cache: the folder of
-    results. clips: patterns of names; empty for all. on_start: called with the plan before the first job. Of these
-    arguments only the clips affect the results. Raise InputError as `plan_study` does, and if the workers cannot do the
-    jobs.
+    base: folder to which its folders are relative. workers: by default only this process. cache: the folder of results.
+    clips: patterns of names; empty for all. on_start: called with the plan before the first job. Of these only the
+    clips affect the results. Raise InputError as `plan_study` does, and if the workers cannot do the jobs.
     """
     planned = plan_study(spec, base, clips)
     store = Cache(cache or cache_folder())

@@ -1,7 +1,6 @@
 """The measures of a study with their intervals, as in metrics.json; its costs; the goal of a sweep.
 
-metrics.json contains nothing about the machine, the time or the folders: the same data, code and settings give the same
-bytes.
+metrics.json has nothing about machine, time or folders: the same data, code and settings give the same bytes.
 """
 
 import math

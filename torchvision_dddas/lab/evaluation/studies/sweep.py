@@ -57,8 +57,7 @@ class ParameterAxis:
 def parse_grid(texts: Sequence[str], settings: Settings) -> list[ParameterAxis]:
     """Return axes from texts such as `difference.threshold=10,20,30`.
 
-    Raise InputError for an unknown parameter, a parameter that is named twice, no values, a bad value, or too many
-    points.
+    Raise InputError for an unknown parameter, a repeated parameter, no values, a bad value, or too many points.
     """
     axes: list[ParameterAxis] = []
     for text in texts:
