@@ -68,7 +68,7 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     assert (tmp_path / "out" / "report.html").read_text().lower().startswith("<!doctype html>")
     lines = done.stdout.splitlines()
     assert "association: Tracks" in done.stdout and "pooled" in done.stdout and "│ car[red]s " in done.stdout
-    assert any(x.startswith(f"left out: {long_name}") and x.endswith("can be scored") for x in lines)
+    assert any(x.startswith(f"left out: {long_name}") and x.endswith("so that it cannot be scored") for x in lines)
     assert "2 of 2" in done.stderr and "(tracking, association)" in done.stderr
     assert (tmp_path / "home" / "torchvision_dddas" / "studies").is_dir()
     again = study("--set", "track.memory_frames=1", "--prune-cache", 0, "--out", tmp_path / "other")

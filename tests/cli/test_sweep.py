@@ -101,7 +101,7 @@ def test_a_repeated_sweep_and_a_study_of_its_best_compute_nothing(run, swept, tm
         ((*GRID, "--by", "median"), "pooled, mean, worst"),
         ((*GRID, "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"), "give only one"),
         ((*GRID, "--clips", "none*"), "no clip is left"),
-        ((*GRID, "--measure", "motion.tracks.idf1"), "no group of measures of motion; wanted pixels"),
+        ((*GRID, "--measure", "motion.tracks.idf1"), "not a group of measures of motion; wanted pixels"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, words, message) -> None:

@@ -191,7 +191,7 @@ def test_a_loss_that_is_no_number_ends_in_one_line_and_keeps_the_last_good_setti
         ("--device meta", "--device meta"),
         ("--minutes 0", "--minutes must be more than 0"),
         ("--measure motion.pixels", "is not a measure"),
-        ("--measure motion.pixels.iou", "no measure of motion.pixels; wanted accuracy, "),
+        ("--measure motion.pixels.iou", "not a measure of motion.pixels; wanted accuracy, "),
         ("--measure motion.target.hit", "no clip has truth for motion.target.hit"),
     ],
 )

@@ -54,9 +54,7 @@ IMPLEMENTATIONS = (
     Implementation(
         "homography fit", "cuda", "ours", 0.91, "reports degenerate fits; Kornia's cannot be exported to ONNX"
     ),
-    Implementation(
-        "resize", "cuda", "ours", 0.28, "with Kornia's, scores of a trained HOG detector change by 0.15"
-    ),
+    Implementation("resize", "cuda", "ours", 0.28, "with Kornia's, scores of a trained HOG detector change by 0.15"),
     Implementation("gradient", "cuda", "Kornia", 1.1),
     Implementation("corners", "cuda", "Kornia", 1.1),
     Implementation("pyramid", "cuda", "ours", 3.3),

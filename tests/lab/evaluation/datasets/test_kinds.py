@@ -399,7 +399,7 @@ def test_of_inria_pictures_of_one_size_are_a_clip(tmp_path: Path) -> None:
     nobody, people, _ = map(truth_of, found.clips)
     assert nobody.boxes[1].shape == (0, 4) and people.boxes[2].tolist() == [[10, 2, 10, 20]] and people.tracks is None
     (tmp_path / "Test/neg/n.png").unlink()
-    assert read("inria", tmp_path).missing[0].startswith("no pictures in ")
+    assert read("inria", tmp_path).missing[0].endswith(" holds no pictures; wanted pictures there")
     path = text(tmp_path / "a.txt", layouts.inria_text(origin=1))  # pixels may count from 1
     assert read_annotation(path).box_px.tolist() == [[9, 1, 10, 20]]
     assert read_annotation(text(path, layouts.inria_text(boxes=0))).box_px.shape == (0, 4)

@@ -109,7 +109,7 @@ def test_masks_that_do_not_fit_are_named(tmp_path, labelled, line):
         ("empty", "out", "holds no truth"),
         ("nowhere", "out", "no truth at"),
         ("empty", "empty", "no clip to score"),
-        ("truth", "empty", r"no result of dddas detect: it holds no detections\.txt"),
+        ("truth", "empty", r"not a result of dddas detect or dddas track: it holds neither detections\.txt"),
     ],
 )
 def test_empty_and_missing_places_are_refused(tmp_path, truth, result, line):
@@ -178,7 +178,7 @@ def test_an_interval_scores_every_nth_frame_and_is_advised_where_tracks_have_no_
     clip(tmp_path, rows(range(1, 12)), tracks__txt=rows((1, 6, 11)))
     report = evaluate(truth, out)
     assert report["clips"]["out"]["tracks"]["recall"] == pytest.approx(3 / 11)
-    assert "every 5th frame alone" in report["notes"][0]
+    assert "only every 5th frame" in report["notes"][0]
     report = evaluate(truth, out, interval=5)
     assert (report["clips"]["out"]["tracks"]["recall"], report["notes"]) == (1, [])
 
@@ -264,7 +264,7 @@ def test_tracks_of_clips_are_paired_by_name_with_folders_or_files_and_pooled_by_
         (TRUTH, rows([101], 7), r"share no frame: truth 1 to 2, result 101 to 101"),
         (TRUTH + rows([2]), FOUND, r"gt\.txt, lines 3 and 5: identity 1 twice in frame 2"),
         (TRUTH + rows([2], "x"), FOUND, r"truth .*gt\.txt, line 5: identity is 'x'"),
-        ("1,2,3,4\n1,2", FOUND, "no table"),
+        ("1,2,3,4\n1,2", FOUND, "not a table"),
     ],
 )
 def test_a_mistake_in_a_table_is_one_line_with_file_and_line(tmp_path, truth, found, line):

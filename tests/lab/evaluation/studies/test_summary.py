@@ -146,10 +146,10 @@ def test_every_measure_can_be_a_goal_and_a_wrong_name_lists_the_right_ones() -> 
             assert parse_goal(f"{task}.{group}.{measure_names(group)[0]}").group == group
     for text, message in (
         ("f", "wanted task.group.measure"),
-        ("sight.pixels.f", "no task"),
+        ("sight.pixels.f", "not a task"),
         ("motion.pixels.n_tp", "neither more nor less"),
         ("motion.pixels.iou", "'iou' is not a measure of motion.pixels; wanted accuracy, "),
-        ("tracking.pixels.f", "no group of measures of tracking; wanted tracks, target_track"),
+        ("tracking.pixels.f", "not a group of measures of tracking; wanted tracks, target_track"),
     ):
         with pytest.raises(InputError, match=message):
             parse_goal(text)

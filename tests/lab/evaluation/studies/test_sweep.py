@@ -67,7 +67,7 @@ MANY = ",".join(str(k) for k in range(50, 250))
         (parse_ranges, ["difference.peak=0:2:log"], "above 0"),
         (parse_ranges, ["difference.blur_px=3:9:log"], "leave out :log"),
         (parse_ranges, ["morphology.erode_px=1.5:9"], "whole numbers, got 1.5"),
-        (parse_ranges, ["difference.kind=1:2"], "no number"),
+        (parse_ranges, ["difference.kind=1:2"], "not a number"),
     ],
 )
 def test_a_bad_axis_is_refused_in_one_line(parse, texts, message) -> None:

@@ -46,14 +46,14 @@ class Folder(Reader):
 class Simulated(Reader):
     """The output of `dddas simulate`: a folder of runs, or one run.
 
-    RUN/frames/000001.jpg the UAV's pictures, or clip.mp4; a dropped one is an empty file
-    RUN/truth/masks/ the targets that move, ground vehicles among them
-    RUN/truth/gt.txt the targets without the ground vehicles, with identities
-    RUN/truth/positions.csv where they are
-    RUN/telemetry.csv, landmarks.csv, colours.toml, camera.toml, dem.tif
-    RUN/run.json frames a second, and whether the run was finished
+        RUN/frames/000001.jpg     the UAV's pictures, or clip.mp4; a dropped picture is an empty file
+        RUN/truth/masks/          the moving targets, including ground vehicles
+        RUN/truth/gt.txt          the targets without the ground vehicles, with identities
+        RUN/truth/positions.csv   the positions of the targets
+        RUN/telemetry.csv, landmarks.csv, colours.toml, camera.toml, dem.tif
+        RUN/run.json              frames per second, and whether the run was finished
 
-    Where masks were not saved, gt.txt has the boxes. The pictures of the ground vehicles, ground/, are not read.
+    If masks were not saved, gt.txt has the boxes. The pictures of the ground vehicles, ground/, are not read.
     """
 
     kind = "simulated"

@@ -135,9 +135,9 @@ class Bms(Reader):
         Trainingset/CLIP/*.jpg             the frames, named by number; BMS-26: moseg_dataset/CLIP/, first as .ppm
         Trainingset/CLIP/GroundTruth/      FBMS-59; in BMS-26 the same files lie in CLIP/
             *Def.dat                       the values of the regions, and which files label which frames
-            *_gt.ppm, *_gt.pgm, *.pgm      the labels: a colour (one number) or a grey value a region
+            *_gt.ppm, *_gt.pgm, *.pgm      the labels: a colour (one number) or a grey value for each region
 
-    The first region is the background, as the makers' own evaluation has it. *PROB_gt files are not read. Clips of
+    The first region is the background, as in the authors' evaluation. *PROB_gt files are not read. Clips of
     `frames/` and `masks/` are read as in `folder`.
     """
 

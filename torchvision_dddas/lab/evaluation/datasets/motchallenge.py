@@ -32,12 +32,12 @@ _MARKS = ("seqinfo.ini", "gt/gt.txt", "det/det.txt")
 class MotChallenge(Reader):
     """MOTChallenge: the folder is a sequence, holds sequences, or holds train/ and test/ with sequences.
 
-    SEQUENCE/seqinfo.ini frameRate, seqLength, imDir
-    SEQUENCE/img1/000001.jpg pictures, from 1; a video in SEQUENCE may stand for them
-    SEQUENCE/gt/gt.txt frame,id,x,y,w,h, then
-    2015: counts (0 or 1), and on the ground, in metres: x,y,z; -1 where unknown
-    2016 and later: counts, class, visibility
-    SEQUENCE/det/det.txt public detections
+        SEQUENCE/seqinfo.ini        frameRate, seqLength, imDir
+        SEQUENCE/img1/000001.jpg    pictures, from 1; a video in SEQUENCE may replace them
+        SEQUENCE/gt/gt.txt          frame,id,x,y,w,h, then
+                                    2015: counts (0 or 1), and on the ground, in metres: x,y,z; -1 if unknown
+                                    2016 and later: counts, class, visibility
+        SEQUENCE/det/det.txt        public detections
 
     The same rows count as in TrackEval. 2015: rows marked 0 are ignored. Later: pedestrians not marked 0 count, and
     found boxes on distractors are removed. Boxes of all classes take part in the matching with distractors.
@@ -111,7 +111,7 @@ def _of_2015(path: Path, has_ground: bool) -> ClipTruth:
     rows = read_columns(path, _GROUND)
     ground = rows.stack(*_GROUND[7:])
     known = ~(ground == -1).all(axis=1) & (ground[:, 2] != -1) & (rows["counts"] != 0)
-    if not ground.any() or not known.any():  # if all are zero, nobody measured
+    if not ground.any() or not known.any():  # all zeros: the ground positions were not measured
         return truth
     frame, identity = (rows[name][known].astype(np.int64) for name in ("frame", "identity"))
     return replace(truth, positions=TruePositions(frame, identity, ground[known, :2]))

@@ -140,7 +140,7 @@ def measures(counts: TrackCounts) -> dict[str, float]:
 
 
 class TargetTrack(NamedTuple):
-    """Counts of one labelled target among unlabelled ones: frames, found, switches, gaps, most under one identity."""
+    """Counts of one labelled target among others: frames, found, switches, gaps, frames under its main identity."""
 
     frames: int = 0
     found: int = 0

@@ -91,7 +91,7 @@ class JobEvent:
 
 OnEvent = Callable[[JobEvent], object]
 Keys = Mapping[Task, Done]
-"""Receives the outcomes of a job's tasks, and of the tasks that they depend on, when all are computed."""
+"""By task, the outcome that a job has when all its tasks are computed. The keys are known beforehand."""
 
 
 def make_keys(job: Job, memory: Path | None = None) -> Keys:

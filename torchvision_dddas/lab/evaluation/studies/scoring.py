@@ -23,7 +23,7 @@ from torchvision_dddas.lab.evaluation.metrics.truth import ClipTruth, TrackTable
 from torchvision_dddas.lab.evaluation.studies.records import Findings, Scored, Task, round_as_written
 
 _NOBODY, _NOT_ASKED = -1, -2
-"""Values in place of a row: no target has the place, or its target does not count."""
+"""Values in place of a row: the place belongs to no target, or to a target that does not count."""
 
 
 def score(clip: Clip, task: Task, found: Findings, interval: int = 1) -> Scored:

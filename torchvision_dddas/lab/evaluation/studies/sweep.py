@@ -33,7 +33,7 @@ AHEAD = 12  # number of grid points whose clips the workers share
 _RANGE = re.compile(r"\s*([^\s:,\[\]]+)\s*:\s*([^\s:,\[\]]+)\s*(?::\s*(\w+)\s*)?")
 
 Measured = tuple[float, str]
-"""The measure, NaN if there is none, and the reason."""
+"""The measure and "", or NaN and the reason."""
 
 Measure = Callable[[Mapping[str, object]], Measured]
 """A function from changed parameters to the measure of a study with them."""
