@@ -158,7 +158,7 @@ def test_an_impossible_plan_is_refused(wrong: dict) -> None:
     ("examples", "line"),
     [
         ([], "no clip has an example to tune motion on"),
-        (pieces(), "two, frame 8, whatever the parameters, before the first step"),
+        (pieces(), "two, frame 8, for any parameters, before the first step"),
     ],
 )
 def test_examples_without_a_loss_are_refused(examples, line) -> None:

@@ -325,7 +325,7 @@ class _Run:
         earlier = [{name: value.new_tensor(of[name]) for name, value in values.items()} for of in known]
         good = next((before for before in earlier if finite([example], before)), None)
         if good is None:
-            return f"{where}, for all earlier parameters"
+            return f"{where}, for any parameters"
         guilty = [name for name in values if finite([example], {**values, name: good[name]})]
         return f"{where}, with {', '.join(f'{name} = {float(values[name].detach()):.6g}' for name in guilty or values)}"
 
