@@ -92,7 +92,7 @@ def test_crowds_that_join_become_the_first():
     )
     assert set(crowds.target) == {1, 2}
     places, events = walk(crowds, 30)
-    assert events == ["crowds 1 and 2 walk to one another", "crowds 1 and 2 are one, crowd 1"]
+    assert events == ["crowds 1 and 2 walk towards each other", "crowds 1 and 2 join into crowd 1"]
     assert set(crowds.target) == {1}
     assert np.linalg.norm(places[-1] - places[-1].mean(axis=0), axis=1).max() < 5.0
     assert places[-1].mean(axis=0) - places[-51].mean(axis=0) == pytest.approx((0.0, 7.0), abs=0.7)
@@ -114,7 +114,7 @@ def test_half_of_a_crowd_that_splits_gets_a_number_and_a_way_of_its_own(plan):
 def test_a_crowd_that_scatters_runs_apart_one_by_one():
     crowds = people(CrowdPlan(people=9, behaviour="stand"), happen=(Happening(time_s=1.0, what="scatter"),), seed=2)
     places, events = walk(crowds, 6)
-    assert events == ["the 9 of crowd 1 scatter"]
+    assert events == ["the 9 people of crowd 1 scatter"]
     assert sorted(crowds.target) == list(range(100, 109))
     assert (np.linalg.norm(places[-1] - places[-11], axis=1) > 1.8).all()
     spread = np.linalg.norm(places - places.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
@@ -292,12 +292,12 @@ def heard(one, planned=False):
     [
         ("ugv_lost", "ugv2 is lost", "ugv2 is back"),
         ("gps_dropout", "ugv2 has no GPS", "ugv2 has GPS again"),
-        ("gps_jump", "the GPS of ugv2 is off by 10 m", "the GPS of ugv2 is as before"),
-        ("frozen", "the UAV's camera repeats a picture", "the UAV's camera sees again"),
-        ("dropped", "pictures of the UAV are missing", "the UAV's pictures come again"),
-        ("gust", "a gust pushes the UAV with 10 m/s", "the gust is over"),
-        ("landmark_hidden", "the marker of ugv2 is covered", "the marker of ugv2 is seen again"),
-        ("telemetry_silent", "the UAV says nothing of itself", "the UAV reports again"),
+        ("gps_jump", "the GPS of ugv2 is off by 10 m", "the GPS of ugv2 is correct again"),
+        ("frozen", "the UAV's camera repeats a picture", "the UAV's camera works again"),
+        ("dropped", "pictures of the UAV are missing", "the UAV's pictures are back"),
+        ("gust", "a gust pushes the UAV at 10 m/s", "the gust is over"),
+        ("landmark_hidden", "the marker of ugv2 is covered", "the marker of ugv2 is visible again"),
+        ("telemetry_silent", "the UAV sends no telemetry", "the UAV sends telemetry again"),
     ],
 )
 def test_a_fault_shows_from_its_first_event_to_its_last(what, begins, ends):

@@ -67,7 +67,7 @@ def test_a_way_below_what_stands_there_is_refused(monkeypatch):
     row, column = (int(v / world.surface_texel_m) for v in (30.0, 35.0))
     world.surface[row - 2 : row + 3, column - 2 : column + 3] = 12.0  # a tower at [5, 0]
     monkeypatch.setattr("torchvision_dddas.lab.simulation.simulator.build_world", lambda *_: world)
-    with pytest.raises(InputError, match=r"uav.altitude_m = 12.5 is too low: 12.0 m stand at \[\d+, 0\]"):
+    with pytest.raises(InputError, match=r"uav.altitude_m = 12.5 is too low: the object at \[\d+, 0\] is 12.0 m high"):
         Simulator(small(uav={"altitude_m": 12.5, "way_m": ((10.0, 0.0),)}))
     Simulator(small(uav={"altitude_m": 13.5, "way_m": ((10.0, 0.0),)}))
     Simulator(small(uav={"altitude_m": 12.5, "way_m": ((-10.0, 0.0),)}))
@@ -78,7 +78,7 @@ def test_an_altitude_below_the_terrain_in_view_is_refused():
     ridge = np.tile(20 * np.exp(-((east / 4) ** 2)) - 20.0, (len(east), 1))
     hills = Elevation(ridge, (-40.0, -40.0), 2.0, 1300.0)
     aslant = {"altitude_m": 10.0, "pitch_deg": 45.0, "heading_deg": 90.0, "start_m": (5.0, 0.0)}
-    with pytest.raises(InputError, match="altitude_m = 10 is below the terrain that it looks over"):
+    with pytest.raises(InputError, match="altitude_m = 10 is too low for the terrain in view"):
         Simulator(small(uav=aslant), elevation=hills)
     Simulator(small(uav={**aslant, "start_m": (-15.0, 0.0)}), elevation=hills)
 
@@ -149,7 +149,7 @@ def test_open_video_takes_a_scenarios_name_or_file(tmp_path):
 @pytest.mark.parametrize(
     ("name", "options", "line"),
     [
-        ("sim:nowhere", {}, "no scenario is named 'nowhere'; there are border100"),
+        ("sim:nowhere", {}, "no scenario is named 'nowhere'; choose from border100"),
         ("sim:{}/tiny.toml", {"rate_hz": 5}, "leave --rate out"),
         ("sim:{}/low.toml", {}, r"low.toml: uav.altitude_m = 2 is too low"),
         ("sim:{}/odd.toml", {}, "hills.tif cannot be read as a raster"),

@@ -54,8 +54,8 @@ def test_an_override_can_bring_a_whole_list_or_parameters_of_the_system():
         ("uav.altitude_m=1", "uav.altitude_m must be between 2 and 2000 m, got 1"),
         ("crowd.1.peple=9", "unknown parameter 'crowd.1.peple'; did you mean crowd.1.people"),
         ("crowd.1.people=0.5", "crowd.1.people must be a whole number between 1 and 5000 people, got 0.5"),
-        ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ..., of which there are 2"),
-        ("crowd.people=2", "'crowd.people' names no parameter; wanted such as crowd.1.people"),
+        ("crowd.3.people=2", "'crowd.3.people' names no crowd; wanted crowd.1, crowd.2, ...; there are 2"),
+        ("crowd.people=2", "'crowd.people' names no parameter; wanted a name such as crowd.1.people"),
         ("weather.rain=3", "unknown parameter 'weather'; its tables are clip, world, uav"),
         ("seed=-1", "seed must be a whole number from 0 to 2147483647, got -1"),
         ("crowd.1.start_m=3", "crowd.1.start_m must be two numbers, [east, north], got 3"),
@@ -68,13 +68,13 @@ def test_an_override_can_bring_a_whole_list_or_parameters_of_the_system():
         ("team.ring_m=119", "team.middle_m = [0, 0] with 119 m about it is outside"),
         ("uav.way_m=[[0, 200]]", "uav.way_m = [0, 200] is outside"),
         ("team.ugvs=3", "team.ugvs must be 4 or more in a clip located by landmarks, got 3"),
-        ("happening.1.crowds=[1, 3]", "happening.1.crowds names crowd 3, of which there are 2"),
+        ("happening.1.crowds=[1, 3]", "happening.1.crowds names crowd 3, but there are 2 crowds"),
         ("happening.1.crowds=[1, 1]", "must name two or more crowds to join"),
         ("happening.1.time_s=40", "happening.1.time_s = 40 is after the end; clip.seconds = 40"),
-        ("fault=[{what='gps_jump', vehicle=5}]", "fault.1.vehicle = 5 is not there; team.ugvs = 4"),
+        ("fault=[{what='gps_jump', vehicle=5}]", "fault.1.vehicle = 5 does not exist; wanted team.ugvs = 4 or less"),
         ("world.elevation=no.tif", "world.elevation: there is no file no.tif"),
         ("happening=[{what='split', crowds=[1, 1]}]", "happening.1.crowds = [1, 1] names a crowd twice"),
-        ("camera.exposure_s=0.2", "is longer than from picture to picture; wanted 0.1 s or less"),
+        ("camera.exposure_s=0.2", "is longer than the time between pictures; wanted 0.1 s or less"),
         ("world.origin_deg=[200, 0]", "world.origin_deg must be a longitude from -180 to 180 and a latitude from -85"),
     ],
 )
@@ -85,7 +85,7 @@ def test_a_wrong_override_is_refused_in_one_line_that_says_what_is_wanted(overri
 
 
 def test_a_person_alone_cannot_split_and_few_vehicles_suffice_where_telemetry_locates():
-    with pytest.raises(InputError, match="crowd 1 is one person, and cannot split"):
+    with pytest.raises(InputError, match="crowd 1 has one person and cannot split"):
         load_scenario("splitting", ["crowd.1.people=1"])
     assert load_scenario("quiet", ["team.ugvs=0", 'clip.located_by="telemetry"']).team.ugvs == 0
     check_scenario(Scenario())
@@ -93,7 +93,7 @@ def test_a_person_alone_cannot_split_and_few_vehicles_suffice_where_telemetry_lo
 
 
 def test_an_unknown_scenario_is_refused():
-    for name, line in (("Joining", "there are border100, .* or give a TOML file"), ("a/gone.toml", "no such scenario")):
+    for name, line in (("Joining", "choose from border100, .* or give a TOML"), ("a/gone.toml", "no such scenario")):
         with pytest.raises(InputError, match=line):
             load_scenario(name)
 

@@ -69,7 +69,7 @@ def test_an_elevation_that_does_not_cover_the_world_is_refused(west_m, hole, sha
 
 
 def test_a_world_of_too_many_pixels_is_refused_with_the_texel_that_is_possible():
-    with pytest.raises(InputError, match=r"40000 of them .* set world.texel_m to 0.334 or more"):
+    with pytest.raises(InputError, match=r"40000 pixels per side; .* set world.texel_m to 0.334 or more"):
         build_world(bare(side_m=4000.0), seed=0)
 
 

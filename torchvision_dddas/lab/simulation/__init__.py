@@ -1,4 +1,4 @@
-"""A simulated team above and on a piece of desert, with known truth: scenarios, the simulator, its recordings."""
+"""Simulate a UAV, ground vehicles and crowds in a desert with known truth: scenarios, simulator, recordings."""
 
 from torchvision_dddas.lab.simulation.recording import RECORDED, film, film_clip, record_scenario
 from torchvision_dddas.lab.simulation.scenario import (

@@ -1,4 +1,4 @@
-"""What the UAV's camera films of a simulated world, and the truth of every pixel."""
+"""Render the pictures of the UAV's camera in a simulated world, with the truth of every pixel."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,25 +19,25 @@ from torchvision_dddas.lab.simulation.sensors import Sensor
 from torchvision_dddas.lab.simulation.world import SHADE_BGR, World, equal_runs, shadow_above_ground
 from torchvision_dddas.types import Camera
 
-_REACH_M = 5.0  # reach of a body with its shadow
+_REACH_M = 5.0  # greatest distance of a body's parts and its shadow from its place
 _TALLEST_M = 2.5
-_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # enlargement of canvases for bodies up to these sizes
-_WIDEST_PX = 400  # canvases of targets whose people are further apart would be large
-_CODES = 254 / _TALLEST_M  # heights are drawn as levels from 1 to 255
-_HIDDEN_M = 0.35  # an object hides a limb if it is higher by this
-_SIGHTS = 12  # places on the line of sight at which a hill may hide a body
-_SHADE_CELLS = 1000  # along the longest side of the map of what lies in shade
+_STEPS, _SIZES_PX = (8, 4, 2), (14, 50)  # factors that enlarge canvases, and the body sizes at which they change
+_WIDEST_PX = 400  # the shadows of a wider target are drawn on one canvas per body
+_CODES = 254 / _TALLEST_M  # heights are stored as levels from 1 to 255
+_HIDDEN_M = 0.35  # an object hides a limb if the object is higher by at least this much
+_SIGHTS = 12  # points on a line of sight at which the code tests whether a hill hides the body
+_SHADE_CELLS = 1000  # cells along the longest side of the shade map, at most
 
-_SKYLIGHT = 0.45  # how bright a face is that the sun does not reach
-_PLAIN_PX_M = 12.0  # where a metre is smaller, a limb has one tone
-_THICK_M = 0.055  # limbs thinner than this cast no shadow there
-_THIN_M = 0.04  # limbs thinner than this are left out there, and out of all shadows
+_SKYLIGHT = 0.45  # brightness of a face in shade
+_PLAIN_PX_M = 12.0  # below this many pixels per metre ("plain" pictures), a limb has one tone
+_THICK_M = 0.055  # thinner limbs cast no shadow in plain pictures
+_THIN_M = 0.04  # thinner limbs are left out of plain pictures and of all shadows
 
 Part = tuple[slice, slice]
 
 
 class AerialCamera:
-    """The UAV's camera above a world. A picture depends on the seed and its moment alone, not on those before it."""
+    """The UAV's camera above a world. A picture depends only on the seed and its moment, not on earlier pictures."""
 
     def __init__(self, world: World, scenario: Scenario) -> None:
         parameters = scenario.camera
@@ -52,9 +52,9 @@ class AerialCamera:
         self._sensor = Sensor(parameters, size, scenario.seed)
 
     def take(self, moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The picture (H, W, 3) uint8 BGR, its targets (H, W) uint16 and its bodies (H, W) uint16; 0: neither."""
-        # Both take about as long, and neither needs the other. A thread for each picture costs little, and none is left
-        # behind in a process that forks.
+        """Return the picture (H, W, 3) uint8 BGR and masks (H, W) uint16 of targets and bodies; 0 is background."""
+        # Drawing bodies and ground take equally long and are independent. Each picture gets its own thread: it costs
+        # little, and no thread stays behind in a process that forks.
         with ThreadPoolExecutor(1) as other:
             drawing = other.submit(self._painter.draw, moment)
             places = self._terrain.places(moment)
@@ -66,7 +66,7 @@ class AerialCamera:
             air[:] = HAZE.astype(np.uint8)
             picture = np.asarray(cv2.blendLinear(picture, air, 1 - places.haze, places.haze))
         if self._exposure_s > 0:
-            # The way of the ground in the picture while it is exposed, at points from corner to corner.
+            # Motion of the ground in the picture during the exposure, on a 3 x 3 grid from corner to corner.
             height, width = places.east_m.shape
             at = np.ix_([0, height // 2, height - 1], [0, width // 2, width - 1])
             place = np.stack([places.east_m[at], places.north_m[at]], axis=-1).reshape(-1, 2).astype(float)
@@ -75,7 +75,7 @@ class AerialCamera:
         return self._sensor.expose(picture, moment.number, moment.time_s), targets, bodies
 
     def _ground(self, places: PixelPlaces, moment: Moment) -> np.ndarray:
-        """(H, W, 3) uint8, the ground and what stands on it, without what moves there."""
+        """Return (H, W, 3) uint8: the ground and the objects that stand on it, without people and vehicles."""
         picture, scenario = self._terrain.picture(places), self._scenario
         if scenario.world.shore_m:
             draw_water(picture, places, scenario.world.shore_m, moment.time_s)
@@ -89,10 +89,10 @@ class AerialCamera:
 
 
 class _Outlines(NamedTuple):
-    """Convex outlines in the order to draw them, one row each.
+    """Convex outlines in drawing order, one row each.
 
-    body: (M,) int, a row of the moment's bodies; those of one body follow each other. points_px: (M, C, 2).
-    colour: (M, 3) BGR. up_m: (M,) above the ground.
+    body: (M,) int, the body's row in the moment's bodies; the outlines of a body are consecutive. points_px: (M, C, 2).
+    colour: (M, 3) BGR. up_m: (M,) height above the ground.
     """
 
     body: np.ndarray
@@ -110,7 +110,7 @@ class _Sheet(NamedTuple):
     step: int
 
     def averaged(self) -> np.ndarray:
-        """The canvas at the picture's own size."""
+        """Return the canvas at the picture's own size."""
         size = self.canvas.shape[1] // self.step, self.canvas.shape[0] // self.step
         return np.asarray(cv2.resize(self.canvas, size, interpolation=cv2.INTER_AREA))
 
@@ -132,13 +132,13 @@ class _Painter:
         middles = (np.arange(cells[0]) + 0.5) * self._cell_m - world.side_m / 2
         east, north = np.meshgrid(middles, -middles)
         ground = world.up_m(np.c_[east.ravel(), north.ravel()]).reshape(surface.shape)
-        # Height to which the shadow of what stands about reaches above each cell.
+        # For each cell, the height up to which nearby objects shade it.
         self._shade_m = shadow_above_ground(np.asarray(surface + ground, np.float32), self._cell_m, world.to_sun)
 
     def draw(self, moment: Moment) -> _Drawn:
-        """All bodies that a picture may show, (h, w, 4: BGR and height), and their shadows, (h, w), on canvases.
+        """Draw the bodies that may be visible on canvases (h, w, 4: BGR and height), and their shadows (h, w).
 
-        Also the ways in pixels, by body, of those that move while they are exposed.
+        Also return {body: motion (2,) px during the exposure} for bodies that move visibly.
         """
         bodies, shape = moment.bodies, self._shutter.camera.size_px[::-1]
         rows, scale = self._in_view(moment)
@@ -149,7 +149,7 @@ class _Painter:
         in_sun = np.ones(len(bodies), bool)
         in_sun[rows] = shaded < 0.5
         kept = in_sun[shade_body] & (not self._is_thermal)
-        # Each body has a canvas of its own, enlarged: the smaller the body the more so.
+        # Each body has its own enlarged canvas. The factor is larger for smaller bodies.
         low, high = _boxes(solids.body, solids.points_px, shape)
         steps = np.array(_STEPS)[np.searchsorted(_SIZES_PX, (high - low).max(axis=1))]
         code = np.clip(1 + solids.up_m * _CODES, 1, 255)
@@ -168,9 +168,9 @@ class _Painter:
     def paint(
         self, moment: Moment, drawn: _Drawn, picture: np.ndarray, rise_m: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Paint the drawn bodies into a picture (H, W, 3) uint8; returns masks (H, W) of their targets and numbers.
+        """Paint the drawn bodies into a picture (H, W, 3) uint8. Return masks (H, W) of their targets and numbers.
 
-        rise_m: (H, W) height above ground of what stands and is seen; it hides what is behind it.
+        rise_m: (H, W) height above ground of the visible standing object; it hides the bodies behind it.
         """
         bodies, (sheets, shades, ways_px) = moment.bodies, drawn
         targets, numbers = (np.zeros(picture.shape[:2], np.uint16) for _ in range(2))
@@ -193,7 +193,7 @@ class _Painter:
         return targets, numbers
 
     def _in_view(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
-        """The rows of the bodies that the picture may show, far ones first, and pixels for each metre there."""
+        """Return the rows of the bodies that may be visible, far ones first, and the pixels per metre at each."""
         bodies, pose = moment.bodies, moment.pose
         size = np.array(self._shutter.camera.size_px)
         middle_px, depth = self._shutter.project(moment, bodies.place_m)
@@ -209,7 +209,7 @@ class _Painter:
         return rows, scale[rows]
 
     def _shaded(self, place: np.ndarray) -> np.ndarray:
-        """(N,) how much of bodies at places (N, 2) float32 lies in the shade of what stands about."""
+        """Return (N,) the share of each body at places (N, 2) float32 that lies in the shade of nearby objects."""
         half = self._world.side_m / 2
         u, v = (place[:, 0] + half) / self._cell_m - 0.5, (half - place[:, 1]) / self._cell_m - 0.5
         above = np.zeros(len(place), np.float32)
@@ -219,7 +219,7 @@ class _Painter:
 
 
 def _draw_shades(body: np.ndarray, points_px: np.ndarray, target: np.ndarray, shape: tuple[int, ...]) -> list[_Sheet]:
-    """The shadows of all of a target on one canvas; target: (N,) of each body."""
+    """Draw the shadows of each target on one canvas. target: (N,) the target of each body."""
     if not len(body):
         return []
     each = _boxes(body, points_px, shape)
@@ -233,7 +233,7 @@ def _draw_shades(body: np.ndarray, points_px: np.ndarray, target: np.ndarray, sh
 
 
 def _boxes(body: np.ndarray, points_px: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(B, 2) column and row of the first pixel of each body, and of the one after its last."""
+    """Return (B, 2) first column and row of each body, and (B, 2) the column and row after its last pixel."""
     first, limit = np.array([begin for begin, _ in equal_runs(body)]), np.array(shape[1::-1])
     low = np.floor(np.minimum.reduceat(points_px.min(axis=1), first)).astype(int) - 1
     high = np.ceil(np.maximum.reduceat(points_px.max(axis=1), first)).astype(int) + 2
@@ -248,7 +248,7 @@ def _fill(
     steps: np.ndarray,
     colours: list[list[float]] | None,
 ) -> list[_Sheet]:
-    """The outlines of each body on its canvas, with colours of four layers, or 255 on one."""
+    """Fill the outlines of each body on its canvas: four channels of colours, or 255 on one channel without colours."""
     runs = list(equal_runs(body))
     each = np.diff([*(begin for begin, _ in runs), len(body)])
     start, step_of = low.repeat(each, axis=0)[:, None], steps.repeat(each)[:, None, None]
@@ -265,7 +265,7 @@ def _fill(
 
 
 def _shade(picture: np.ndarray, shades: list[_Sheet], rise_m: np.ndarray | None) -> None:
-    """Darken a picture where shadows lie; where two lie on each other it is as dark as under one."""
+    """Darken a picture where shadows lie. Overlapping shadows are no darker than one shadow."""
     layer = np.zeros(picture.shape[:2], np.uint8)
     for sheet in shades:
         cover = sheet.averaged()
@@ -275,7 +275,7 @@ def _shade(picture: np.ndarray, shades: list[_Sheet], rise_m: np.ndarray | None)
     share = 1 - np.arange(256)[:, None] / 255 * (1 - SHADE_BGR)
     keep = np.round(255 * share).astype(np.uint8).reshape(1, 256, 3)
     for sheet in shades:
-        # Taken off the layer when done: where boxes overlap nothing is darkened twice.
+        # Clear the layer after use, so that pixels in two overlapping boxes are not darkened twice.
         dark = cv2.LUT(cv2.cvtColor(layer[sheet.at], cv2.COLOR_GRAY2BGR), keep)
         picture[sheet.at] = cv2.multiply(picture[sheet.at], dark, scale=1 / 255)
         layer[sheet.at] = 0
@@ -284,7 +284,7 @@ def _shade(picture: np.ndarray, shades: list[_Sheet], rise_m: np.ndarray | None)
 def _streak(
     at: Part, cover: np.ndarray, paint: np.ndarray, way_px: np.ndarray, shape: tuple[int, ...]
 ) -> tuple[Part, np.ndarray, np.ndarray]:
-    """What covers a part of a picture, blurred along a way; the part grows by what the way needs."""
+    """Blur a body's cover and paint along its motion way_px (2,). The returned part is enlarged to hold the blur."""
     kernel = streak_kernel(way_px)
     reach = kernel.shape[0] // 2
     part = [(min(reach, one.start), min(reach, size - one.stop)) for one, size in zip(at, shape, strict=True)]
@@ -297,7 +297,7 @@ def _streak(
 
 
 class _Shapes:
-    """Gives bodies their shape: limbs or faces, as lit by the sun."""
+    """Computes the outlines of bodies, from limbs or faces lit by the sun."""
 
     def __init__(self, world: World, shutter: Shutter, seed: int) -> None:
         self._world, self._shutter, self._wardrobe = world, shutter, Wardrobe(seed)
@@ -305,9 +305,9 @@ class _Shapes:
     def outlines(
         self, moment: Moment, rows: np.ndarray, scale_px_m: float, shaded: np.ndarray
     ) -> tuple[_Outlines, np.ndarray, np.ndarray]:
-        """The outlines of bodies, in the order of rows (N,), and of their shadows on the ground: body, points_px.
+        """Return the outlines of bodies in the order of rows (N,), and body and points_px of their ground shadows.
 
-        scale_px_m: pixels for each metre at the nearest. shaded: (N,) how much of each stands in other things' shade.
+        scale_px_m: pixels per metre at the nearest body. shaded: (N,) share of each body in the shade of objects.
         """
         bodies, is_plain = moment.bodies, scale_px_m < _PLAIN_PX_M
         rank = np.zeros(len(bodies), np.int64)
@@ -318,7 +318,7 @@ class _Shapes:
         limb_body, ends, radius, limb_colour = self._limbs(moment, rows[is_person], _THIN_M if is_plain else 0.0)
         face_body, corners, face_colour, seen = self._faces(moment, rows[~is_person])
 
-        # One projection for all: limbs' ends, corners, and the shadows of both.
+        # Project the limbs' ends, the faces' corners, and the shadows of both in one call.
         solid = np.concatenate([ends.reshape(-1, 3), corners.reshape(-1, 3)])
         body = np.concatenate([limb_body.repeat(2), face_body.repeat(corners.shape[1])])
         cast = self._cast(solid, bodies.place_m[body, 2])
@@ -355,9 +355,9 @@ class _Shapes:
     def _limbs(
         self, moment: Moment, rows: np.ndarray, thin_m: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The limbs of people, far ones first: body (M,), ends (M, 2, 3), radii (M, 2), colour (M, 3)."""
+        """Return the limbs of people, far ones first: body (M,), ends (M, 2, 3), radii (M, 2), colour (M, 3)."""
         shape = self._wardrobe.figures(moment.bodies, rows)
-        # What is not worn has no size.
+        # Clothes that are not worn have a radius of NaN.
         person, limb = np.nonzero(np.isfinite(shape.radius_m).all(axis=2) & (shape.radius_m.max(axis=2) > thin_m))
         depth = (shape.ends_m[person, limb].mean(axis=1) - moment.pose.place_m) @ moment.pose.axes[:, 2]
         order = np.lexsort((-depth, person))
@@ -365,9 +365,9 @@ class _Shapes:
         return rows[person], shape.ends_m[person, limb], shape.radius_m[person, limb], shape.colour[person, limb]
 
     def _faces(self, moment: Moment, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The faces of vehicles in the order to draw them.
+        """Return the faces of vehicles in drawing order.
 
-        body (M,), corners (M, C, 3), colour (M, 3), and which are turned to the camera (M,).
+        Columns: body (M,), corners (M, C, 3), colour (M, 3), and bool (M,) whether the face looks at the camera.
         """
         bodies, pose, sun = moment.bodies, moment.pose, self._world.to_sun
         parts = [(np.zeros(0, np.int64), np.zeros((0, 1, 3)), np.zeros((0, 3)), np.zeros(0, bool))]
@@ -378,7 +378,7 @@ class _Shapes:
             colour, middle = colour * light[:, None], corners.mean(axis=1)
             order = np.arange(len(corners))
             if bodies.kind[row] != "car":
-                # Far faces first; the marker lies on top of all.
+                # Far faces come first. The marker comes last because it lies on top.
                 order = np.lexsort(((middle - pose.place_m) @ -pose.axes[:, 2], faces.plate))
             seen = np.einsum("fk,fk->f", normal, pose.place_m - middle) > 0
             parts.append((np.full(len(corners), row), corners[order], colour[order], seen[order]))
@@ -386,25 +386,25 @@ class _Shapes:
         return body, corners, colour, seen
 
     def _cast(self, points_m: np.ndarray, feet_up_m: np.ndarray) -> np.ndarray:
-        """Where the shadows of points (N, 3) fall on the ground, (N, 3)."""
+        """Return where the shadows of points (N, 3) fall on the ground, (N, 3)."""
         sun = self._world.to_sun
         place, up = points_m[:, :2], feet_up_m
         for _ in range(2):
-            # Where the ground rises it is met earlier: once more, from the height that was found.
+            # Rising ground is met earlier, so repeat the step with the height that was found.
             place = points_m[:, :2] - (np.maximum(points_m[:, 2] - up, 0) / max(sun[2], 0.1))[:, None] * sun[:2]
             up = self._world.up_m(place)
         return np.c_[place, up]
 
 
 def _join(rank: np.ndarray, *parts: tuple[np.ndarray, ...]) -> list[np.ndarray]:
-    """The columns of all outlines (body, points, ...), the bodies in the order of their rank."""
+    """Concatenate the columns of outlines (body, points, ...) and sort them by the rank of the body."""
     columns = _concatenate(parts)
     order = np.argsort(rank[columns[0]], kind="stable")
     return [column[order] for column in columns]
 
 
 def _concatenate(parts: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
-    """The columns of all outlines (body, points, ...); the last corner is repeated where one has fewer than others."""
+    """Concatenate the columns of outlines (body, points, ...). Outlines with fewer corners repeat their last corner."""
     most = max(part[1].shape[1] for part in parts)
     filled = [
         (body, np.pad(points, ((0, 0), (0, most - points.shape[1]), (0, 0)), mode="edge"), *others)

@@ -1,4 +1,4 @@
-"""The ground of a world seen from above: where each pixel lies, what stands there, and its colour."""
+"""The ground of a world seen from above: the place, height and colour that each pixel shows."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -10,34 +10,34 @@ from torchvision_dddas.lab.simulation.agents import Moment
 from torchvision_dddas.lab.simulation.cameras import Shutter, meet_ground
 from torchvision_dddas.lab.simulation.world import GroundTexture, World, halved_levels
 
-_CELL_M = 0.4  # of the maps of what is highest nearby
+_CELL_M = 0.4  # cell of the maps of the greatest height nearby
 _BLOCK_SLICES = 20  # heights at which a block of pixels is tested
-_LOWEST_M = 0.05  # what is lower lies flat
-_MARCH_STEPS = (3, 6, 12, 24)  # on the way down of a pixel's line of sight
-_STRIDE_PX = 1.5  # that a step should be long in the picture
+_LOWEST_M = 0.05  # lower objects are treated as flat
+_MARCH_STEPS = (3, 6, 12, 24)  # numbers of steps down a pixel's line of sight
+_STRIDE_PX = 1.5  # intended length of a step in the picture
 _HALVINGS = 4
 _HEIGHT_LEVELS = 5
-_STEEP = 3.0  # metres of rise for each metre from which on a surface is a wall
-_BELOW_M = 0.3  # and below whose edge by this it counts as one
+_STEEP = 3.0  # a surface with a steeper slope, rise over run, is a wall
+_BELOW_M = 0.3  # a hit belongs to the wall if it lies at least this far below the wall's edge
 _INSIDE_M = 0.4  # walls take the colour of the roof at this distance from its edge
 _SKYLIGHT = 0.42
-_WIDE = 30_000  # OpenCV remaps no picture wider than 32767
+_WIDE = 30_000  # cv2.remap accepts pictures up to 32767 wide
 
-_STEP_PX = 8  # distance between rays; what lies between them is interpolated
+_STEP_PX = 8  # distance between rays; pixels between them are interpolated
 _LEVELS = 8
-_SLICES = 5  # of the heights between which a block of pixels may meet something, for four of its pixels
-_VISIBILITY_M, _CLEAR = 8000.0, 0.03  # over which all but 1 / e of the contrast is lost; less haze is not drawn
-_HORIZON = 0.005  # rays that sink less for each metre along the axis see the sky
-_GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # what is finer than the texture: its side, its texels, its contrast
+_SLICES = 5  # height slices that are tested for each group of four pixels
+_VISIBILITY_M, _CLEAR = 8000.0, 0.03  # distance at which contrast drops to 1 / e; a smaller share of haze is not drawn
+_HORIZON = 0.005  # rays that sink less than this per metre along the axis see the sky
+_GRAIN_PX, _GRAIN_M, _GRAIN = 512, 0.03, 0.05  # pattern finer than the texture: side in texels, texel size, contrast
 _GRAIN_TILES = 6
 _FLAT_PX, _LOW_M = 0.8, 1.4
-_LEAST_M, _MOST_LEAN = 1.0, 8.0  # least height of the camera; greatest lean
+_LEAST_M, _MOST_LEAN = 1.0, 8.0  # least camera height above ground; greatest lean in metres per metre up
 
 
 class SightLines(NamedTuple):
-    """N lines of sight, float32, and where they meet the bare ground. All (N,).
+    """N lines of sight, all fields (N,) float32. east_m, north_m: where they meet the bare ground.
 
-    lean_east, lean_north: metres for each metre up. pixel_m: size of their pixel on the ground.
+    lean_east, lean_north: metres per metre up. pixel_m: size of the line's pixel on the ground.
     """
 
     east_m: np.ndarray
@@ -48,16 +48,16 @@ class SightLines(NamedTuple):
 
     @property
     def lean(self) -> np.ndarray:
-        """(N,) metres of lean for each metre up, in any direction."""
+        """(N,) length of the lean, metres per metre up."""
         return np.hypot(self.lean_east, self.lean_north)
 
     def of(self, which: np.ndarray) -> "SightLines":
-        """Some of them."""
+        """Return the lines at some indices."""
         return SightLines(*(column.take(which) for column in self))
 
 
 class Hits(NamedTuple):
-    """Where lines of sight meet something: which (M,) of them, how high, of what colour (east, north), how bright."""
+    """Hits of lines of sight on objects, all (M,): line index, place that gives the colour, height, brightness."""
 
     which: np.ndarray
     east_m: np.ndarray
@@ -67,23 +67,23 @@ class Hits(NamedTuple):
 
 
 class StandingSurface:
-    """What stands on a world's ground, prepared for lines of sight from above."""
+    """The objects that stand on a world's ground, prepared for lines of sight from above."""
 
     def __init__(self, world: World) -> None:
         self._side_m, self._to_sun, self._texel_m = world.side_m, world.to_sun, world.surface_texel_m
         self._levels = halved_levels(np.ascontiguousarray(world.surface, np.float32), _HEIGHT_LEVELS)
         cells = max(int(np.ceil(world.side_m / _CELL_M)), 1)
-        # A reach of one cell from wherever in its own cell a place lies, and a texel for what is interpolated.
+        # Reach one cell from any place inside a cell, plus one texel for the interpolation.
         wide = 2 * int(np.ceil(1.5 * _CELL_M / world.surface_texel_m + 1)) + 1
         highest = cv2.dilate(self._levels[0], np.ones((wide, wide), np.uint8), borderType=cv2.BORDER_REFLECT)
         highest = cv2.resize(highest, (cells, cells), interpolation=cv2.INTER_NEAREST)
         self.tallest_m = float(highest.max())
-        # In bytes, which the processor's cache can hold; rounded up.
+        # Store heights as bytes, rounded up, so that the map fits the processor's cache.
         self._code_m = max(self.tallest_m, _LOWEST_M) / 255
         self._highest: list[np.ndarray] = [np.ceil(highest / np.float32(self._code_m)).clip(0, 255).astype(np.uint8)]
 
     def met(self, sights: SightLines, top_m: np.ndarray, bottom_m: np.ndarray) -> Hits | None:
-        """What is met by lines of sight between two heights (N,); None: nothing is."""
+        """Return the hits of lines of sight between two heights (N,), or None without hits."""
         wanted = (top_m - bottom_m) * sights.lean / (_STRIDE_PX * sights.pixel_m)
         steps = np.searchsorted(_MARCH_STEPS[:-1], wanted)
         level = np.clip(np.log2(sights.pixel_m / self._texel_m), 0, len(self._levels) - 1).astype(int)
@@ -112,13 +112,13 @@ class StandingSurface:
         return Hits(which, east, north, up, light)
 
     def between(self, sights: SightLines, reach_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Between which heights (N,) lines of sight can meet something that is at most reach_m (N,) beside them.
+        """Return the heights top, bottom (N,) between which lines of sight can meet objects within reach_m (N,).
 
-        Where nothing is in reach, both are 0.
+        Both are 0 where no object is in reach.
         """
         top, bottom = (np.zeros(len(reach_m), np.float32) for _ in range(2))
         whole = np.full(len(reach_m), self.tallest_m + _LOWEST_M, np.float32)
-        # Most of them have nothing near, which one look-up shows.
+        # One look-up shows that most lines have no object nearby.
         part = np.flatnonzero(self.narrowed(sights, reach_m, whole, top, 1)[0])
         if len(part):
             some = sights.of(part), reach_m[part], whole[part], top[part]
@@ -128,13 +128,13 @@ class StandingSurface:
     def narrowed(
         self, sights: SightLines, reach_m: np.ndarray, top_m: np.ndarray, bottom_m: np.ndarray, slices: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Between which heights (N,) of those given (N,) something is at most reach_m (N,) beside lines of sight.
+        """Narrow the heights top_m, bottom_m (N,) to slices with an object within reach_m (N,) of the line of sight.
 
-        The heights are found to one of `slices` steps. Where nothing is in reach, both are 0.
+        The range is divided into `slices` slices. Both heights are 0 where no object is in reach.
         """
         slice_m = (top_m - bottom_m) / np.float32(slices)
         reach = np.maximum(reach_m + sights.lean * slice_m / 2, _CELL_M)
-        ring = np.ceil(np.log2(reach / _CELL_M)).astype(np.int8)  # each is twice as wide as the one before
+        ring = np.ceil(np.log2(reach / _CELL_M)).astype(np.int8)  # each ring is twice as wide as the last
         top, bottom = (np.zeros(len(ring), np.float32) for _ in range(2))
         below = np.arange(1, slices + 1, dtype=np.float32)[:, None]
         for part in _parts(ring):
@@ -153,11 +153,11 @@ class StandingSurface:
     def _march(
         self, level: int, steps: int, sights: SightLines, top_m: np.ndarray, bottom_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which of N lines of sight meet something, (M,) indices, and how high; they are followed downwards."""
+        """Follow N lines of sight downwards. Return the indices (M,) of lines that hit an object, and heights (M,)."""
         texture = self._levels[level]
         step = (top_m - bottom_m) / np.float32(steps)
         up = top_m - np.arange(1, steps + 1, dtype=np.float32)[:, None] * step
-        # The last step ends a little above the ground, which everything flat is not.
+        # The last step ends a little above the ground, so that flat objects are not hit.
         up[-1] = np.maximum(up[-1], np.minimum(_LOWEST_M, step / 2))
         inside = self._sample(texture, sights, up, cv2.INTER_LINEAR) > np.maximum(up, _LOWEST_M)
         highest = np.full(len(step), -1, np.float32)
@@ -173,7 +173,7 @@ class StandingSurface:
         return hit, low
 
     def _up(self, east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
-        """Heights (N,) of what stands at places."""
+        """Return heights (N,) of the objects at places."""
         up = np.empty_like(east_m)
         for first in range(0, len(up), _WIDE):
             part = slice(first, first + _WIDE)
@@ -183,7 +183,7 @@ class StandingSurface:
         return up
 
     def _sample(self, texture: np.ndarray, sights: SightLines, up_m: np.ndarray, how: int) -> np.ndarray:
-        """(K, N) values of a texture (H, W) of the whole world where N lines of sight pass at heights up_m (K, N)."""
+        """Return (K, N) values of the world's texture (H, W) where N lines of sight pass at heights up_m (K, N)."""
         half = self._side_m / 2
         across, down = (np.float32(n / self._side_m) for n in texture.shape[1::-1])
         u = up_m * (sights.lean_east * across)
@@ -193,7 +193,7 @@ class StandingSurface:
         return np.asarray(cv2.remap(texture, u, v, how, borderMode=cv2.BORDER_REFLECT))
 
     def _nearby(self, ring: int) -> np.ndarray:
-        """(R, C) uint8, the greatest height within 2**ring cells of each cell, in steps of code_m."""
+        """Return (R, C) uint8, the greatest height within 2**ring cells of each cell, in steps of code_m."""
         while len(self._highest) <= ring:
             wide = 2 ** len(self._highest) // 2 * 2 + 1
             last = self._highest[-1]
@@ -202,7 +202,7 @@ class StandingSurface:
 
 
 def _parts(kind: np.ndarray) -> Iterator[np.ndarray]:
-    """The rows of each kind (N,), 0 or more, in lists that are not too long."""
+    """Yield the rows of each kind (N,), in arrays of at most _WIDE rows."""
     for k in np.flatnonzero(np.bincount(kind)):
         rows = np.flatnonzero(kind == k)
         for first in range(0, len(rows), _WIDE):
@@ -210,10 +210,10 @@ def _parts(kind: np.ndarray) -> Iterator[np.ndarray]:
 
 
 class PixelPlaces(NamedTuple):
-    """Where pixels lie: east_m, north_m (H, W) float32; pixel_m (H,) size of a row's pixels on the ground.
+    """Ground places of pixels: east_m, north_m (H, W) float32; pixel_m (H,) size of a row's pixels on the ground.
 
-    rise_m: (H, W) float32, above the ground where something stands that is seen there, None where all is bare.
-    met: the hits on standing objects, or None. haze: (H, W) float32, share of the air's light; None where it is clear.
+    rise_m: (H, W) float32, height of the visible standing object; None without objects. met: the hits on objects, or
+    None. haze: (H, W) float32, share of the light that comes from the air; None in clear air.
     """
 
     east_m: np.ndarray
@@ -239,19 +239,19 @@ class Terrain:
         self._grain = np.tile(rough, (_GRAIN_TILES, _GRAIN_TILES))
         width, height = shutter.camera.size_px
         self._cells = -(-width // _STEP_PX) + 2, -(-height // _STEP_PX) + 2
-        # The middles of blocks of pixels: so that enlarging them by whole blocks puts each where it belongs.
+        # The middles of pixel blocks, so that enlarging by whole blocks keeps each value in its place.
         u, v = ((np.arange(n) - 1) * _STEP_PX + (_STEP_PX - 1) / 2 for n in self._cells)
         self._block_px = np.stack(np.meshgrid(u, v), axis=-1)
         row, column = (np.arange(n) // _STEP_PX + 1 for n in (height, width))
         self._block = (row[:, None] * self._cells[0] + column).ravel().astype(np.int32)
 
     def places(self, moment: Moment) -> PixelPlaces:
-        """Where the pixels of a moment's picture lie."""
+        """Return where the pixels of a moment's picture lie."""
         columns, rows = self._cells
         start, way = self._shutter.rays(moment, self._block_px.reshape(-1, 2))
         far, up = meet_ground(start, way, self._world.up_m)
         place = (start + far[:, None] * way)[:, :2].reshape(rows, columns, 2)
-        # On a plane the inverse of the distance is linear over the picture, and so is the place over the distance.
+        # On a plane, 1 / distance and place / distance are both linear over the picture.
         inverse = (1 / np.maximum(far, 1e-3)).reshape(rows, columns)
         scale = self._enlarge(inverse)
         east, north = (cv2.divide(self._enlarge(place[..., k] * inverse), scale) for k in range(2))
@@ -267,7 +267,7 @@ class Terrain:
         blocks = _lines_of_sight(list(place.reshape(-1, 2).T), list(start.T), up, pixel_m.ravel())
         longest = np.sqrt(np.maximum((along**2).sum(axis=2), (aside**2).sum(axis=2))).ravel()
         top, bottom = self._standing.between(blocks, 0.75 * _STEP_PX * longest)
-        # Low things that lean by less than a pixel may lie flat.
+        # Treat low objects that lean by less than a pixel as flat.
         top[(top * blocks.lean < _FLAT_PX * blocks.pixel_m) & (top < _LOW_M)] = 0
         return self._raise(places, moment, blocks, up, top, bottom, longest) if top.any() else places
 
@@ -281,15 +281,15 @@ class Terrain:
         bottom: np.ndarray,
         longest: np.ndarray,
     ) -> PixelPlaces:
-        """Where pixels lie once lines of sight have met what stands, between the top and bottom of blocks (N,).
+        """Move pixels to the objects that their lines of sight meet between the top and bottom of blocks (N,).
 
-        up: (N,) height of their ground. longest: (N,) metres that a pixel is long on the ground.
+        up: (N,) ground height of the blocks. longest: (N,) length of a pixel on the ground, metres.
         """
         columns, rows = self._cells
         height, width = places.east_m.shape
         hopeful = (top > 0).astype(np.uint8).reshape(rows, columns)[1:-1, 1:-1]
         some = cv2.resize(hopeful, None, fx=_STEP_PX // 2, fy=_STEP_PX // 2, interpolation=cv2.INTER_NEAREST)
-        # Most pixels of such blocks miss it. Pixels are tested by fours: the first of four with a reach about it.
+        # Most pixels of these blocks miss the object. Test groups of four pixels: one pixel, with a reach for all four.
         across = (width + 1) // 2
         four = np.flatnonzero(some[: (height + 1) // 2, :across].ravel()).astype(np.int32)
         row, column = 2 * (four // across), 2 * (four % across)
@@ -301,7 +301,7 @@ class Terrain:
         near = np.flatnonzero(top)
         if not len(near):
             return places
-        # All four of them; at an odd edge some count twice.
+        # Take all four pixels of a group. At an odd edge some pixels occur twice.
         row, column = row.take(near), column.take(near)
         row = np.concatenate([row, row, np.minimum(row + 1, height - 1), np.minimum(row + 1, height - 1)])
         column = np.concatenate([column, np.minimum(column + 1, width - 1)] * 2)
@@ -322,7 +322,7 @@ class Terrain:
         return places._replace(rise_m=rise, met=met)
 
     def _enlarge(self, blocks: np.ndarray) -> np.ndarray:
-        """(H, W) float32, for all pixels, of values at the middles of blocks, (rows, columns)."""
+        """Interpolate values (rows, columns) at the middles of blocks to all pixels, (H, W) float32."""
         columns, rows = self._cells
         width, height = self._shutter.camera.size_px
         size = columns * _STEP_PX, rows * _STEP_PX
@@ -330,16 +330,16 @@ class Terrain:
         return np.asarray(full[_STEP_PX : _STEP_PX + height, _STEP_PX : _STEP_PX + width])
 
     def picture(self, places: PixelPlaces) -> np.ndarray:
-        """(H, W, 3) uint8: the colours where the pixels lie, averaged over as much ground as a pixel covers."""
+        """Return (H, W, 3) uint8: the ground's colours at the pixels' places, averaged over the area of a pixel."""
         picture = self._texture.rows(places.pixel_m, places.east_m, places.north_m)
         if places.met is not None:
             dim = places.met.light != 1
             flat, which = picture.reshape(-1, 3), places.met.which[dim]
             flat[which] = np.clip(flat[which] * places.met.light[dim, None], 0, 255)
-        # Enlarged, a texture is smooth: it gets the grain that it is too coarse to show.
+        # An enlarged texture is smooth, so add the grain that the texture is too coarse to show.
         wanted = float(np.clip(np.log2(self._world.texel_m / np.median(places.pixel_m)), 0, 1))
         if wanted > 0.25:
-            # OpenCV is slow beyond a texture's edge: the pattern is tiled, and moved by whole tiles.
+            # cv2.remap is slow beyond a texture's edge, so tile the pattern and shift it by whole tiles.
             at = []
             for place in (places.east_m, places.north_m):
                 start = float(np.floor(place[::16, ::16].min() / (_GRAIN_PX * _GRAIN_M)))
@@ -353,7 +353,7 @@ class Terrain:
 def _lines_of_sight(
     place_m: Sequence[np.ndarray], eye_m: Sequence[np.ndarray], up_m: np.ndarray, pixel_m: np.ndarray
 ) -> SightLines:
-    """The lines of sight to places (east, north; N each) at heights up_m (N,), from eyes (east, north, up)."""
+    """Return the lines of sight to places (east, north; N each) at heights up_m (N,), from eyes (east, north, up)."""
     east, north = (eye - place for eye, place in zip(eye_m, place_m, strict=False))
     down = np.maximum(eye_m[2] - up_m, np.maximum(np.hypot(east, north) / _MOST_LEAN, _LEAST_M))
     columns = *place_m, east / down, north / down, pixel_m

@@ -1,4 +1,4 @@
-"""All that moves in a simulated world, step by step, and what the vehicles report of it."""
+"""Move the people and vehicles of a simulated world step by step, and collect the vehicles' reports."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,18 +17,18 @@ from torchvision_dddas.types import Bodies, CameraPose, Command, Flight
 
 _TICK_S = 0.1
 _PLANNED_S = 5
-_STRAYS_M = 0.1  # how well a vehicle keeps to what it plans, a second ahead; standard deviation along each axis
+_STRAYS_M = 0.1  # deviation of a vehicle from its plan, per second ahead: standard deviation along each axis
 _UGV_BGR = (70.0, 74.0, 72.0)
 _GUST_S = 1.5
 
 
 @dataclass(frozen=True)
 class Report:
-    """A radio report of a ground vehicle. vehicle: its row in the team, from 0. frame: may be broken.
+    """A radio report of a ground vehicle. vehicle: its row in the team, from 0. frame: may be fractional.
 
-    lonlat_deg: (2,). planned: a waypoint that it means to pass at that frame, not a place where it was; plans are
-    sent each second, and of two waypoints for one frame the later one counts. sigma_m: along each axis, of what the
-    receivers do not share.
+    lonlat_deg: (2,). planned: True for a waypoint that the vehicle plans to pass at that frame. Plans are sent each
+    second, and the newest plan for a frame replaces older plans. sigma_m: standard deviation along each axis of the
+    error, without the part that all receivers share.
     """
 
     vehicle: int
@@ -42,11 +42,11 @@ class Report:
 class Moment:
     """The world at a frame of the aerial camera.
 
-    pose: of the camera in the middle of the exposure of the picture's middle row, true. velocity_m_s, turn_rad_s: (3,)
-    its rates about east, north, up. flight: what the UAV reports of itself, in longitude and latitude; None while it is
-    silent. reports: of the ground vehicles since the frame before. heading_rad (K,): where their own cameras truly
-    point. reported_lonlat_deg (K, 2), NaN where silent, and reported_heading_rad (K,): what they report. Their places
-    are those of the bodies of kind ugv, in the same order. picture: "", frozen or dropped. events: in words.
+    pose: the camera's true pose at mid-exposure of the picture's middle row. velocity_m_s, turn_rad_s: (3,) its rates
+    along and about east, north, up. flight: the UAV's own report, in longitude and latitude; None while it is silent.
+    reports: the ground vehicles' reports since the last frame. heading_rad: (K,) true headings of their cameras.
+    reported_lonlat_deg: (K, 2), NaN while silent. reported_heading_rad: (K,). The vehicles' true places are those of
+    the bodies of kind ugv, in the same order. picture: "", "frozen" or "dropped". events: in words.
     """
 
     number: int
@@ -67,8 +67,8 @@ class Moment:
 class Agents:
     """People, cars, ground vehicles and the UAV of a scenario.
 
-    Each step of a frame is made of equal steps of at most 0.1 s, whether or not anyone looks at the frame: what happens
-    does not depend on that.
+    The step to the next frame consists of equal steps of at most 0.1 s. Events do not depend on which frames are
+    rendered.
     """
 
     def __init__(self, scenario: Scenario, world: World) -> None:
@@ -99,11 +99,11 @@ class Agents:
 
     @property
     def time_s(self) -> float:
-        """Time of the current frame."""
+        """Time of the current frame, seconds."""
         return (self._number - 1) / self._rate
 
     def step(self) -> None:
-        """Advance by a frame."""
+        """Advance by one frame."""
         start, seconds = self.time_s, 1 / self._rate / self._ticks
         for tick in range(self._ticks):
             self._tick(start + tick * seconds, seconds)
@@ -112,19 +112,19 @@ class Agents:
         self._events += fault_events(self._scenario.fault, start, self.time_s)
 
     def steer(self, command: Command) -> None:
-        """Set what the vehicles do from now on; what a command does not name goes on as before."""
+        """Carry out a command. Vehicles that the command does not name continue as before."""
         self._aircraft.steer(self._local(command.fly_to), self._local(command.look_at), command.altitude_m)
         for order in command.orders:
             row, goal, seen = self._names.index(order.vehicle), self._local(order.goal), self._local(order.look_at)
             self._team.order(row, goal, order.speed_m_s, seen)
 
     def moment(self) -> Moment:
-        """The world at the current frame, with all reports and events since the moment before."""
+        """Return the world at the current frame, with all reports and events since the last call."""
         time, team = self.time_s, self._team
         faults = active_faults(self._scenario.fault, time)
         pose, velocity, turn = self._aircraft.pose()
         pose = replace(pose, place_m=pose.place_m + np.array([faults.cut_m, 0.0, 0.0]))
-        # The UAV's place is the last.
+        # The last row is the UAV's place.
         places = np.concatenate([team.place, pose.place_m[None, :2]])
         errors = np.concatenate([self._gps.error_m + self._jumped(faults), self._telemetry_errors[None, 4:]])
         lonlat = self._lonlat(places + errors)
@@ -148,7 +148,7 @@ class Agents:
         )
 
     def _local(self, place_deg: np.ndarray | None) -> np.ndarray | None:
-        """(2,) local metres of longitude and latitude."""
+        """Convert longitude and latitude (2,) to local metres (2,)."""
         if place_deg is None:
             return None
         return geometry.east_north(np.asarray(place_deg, float)[None], self._scenario.world.origin_deg)[0]
@@ -169,7 +169,7 @@ class Agents:
         push = np.zeros(3)
         for row, since, size in faults.gusts:
             if since < _GUST_S:
-                # A spring at rest is by then as fast as the gust.
+                # This push accelerates a damped spring at rest to the gust's speed within _GUST_S.
                 push[:2] += math.e * size / _GUST_S * self._gust[row]
         rougher = 1 + max((size for *_, size in faults.gusts), default=0.0) / 5
         self._aircraft.step(end, seconds, push, rougher)
@@ -178,7 +178,7 @@ class Agents:
             self._plan(end)
 
     def _report(self, before: np.ndarray, begin: float, end: float) -> None:
-        """Collect the receivers' reports between two times; before: (K, 2) the places at the first."""
+        """Collect the receivers' reports between two times. before: (K, 2) places at the first time."""
         rate, after = self._scenario.gps.rate_hz, self._team.place
         while self._reported / rate <= end + 1e-9:
             time = self._reported / rate
@@ -194,19 +194,19 @@ class Agents:
             self._reported += 1
 
     def _jumped(self, faults: ActiveFaults) -> np.ndarray:
-        """(K, 2) by how much the receivers are off."""
+        """Return (K, 2) offsets of the receivers by active faults, metres."""
         off = np.zeros((len(self._team), 2))
         for k, size in faults.jumped.items():
             off[k] = size * self._jump[k]
         return off
 
     def _plan(self, time_s: float) -> None:
-        """Report the waypoints of the coming seconds, this one included; called each second."""
+        """Report the current place and the waypoints of the next seconds. Called once a second."""
         if not self._scenario.team.planned or not len(self._team):
             return
         faults = active_faults(self._scenario.fault, time_s)
         places = self._team.waypoints(time_s, _PLANNED_S, faults.lost)
-        # A vehicle knows where it is no better than its receiver does, and plans from there.
+        # A vehicle plans from its receiver's place, so the plan has the receiver's lasting error.
         reported = self._lonlat((places + self._gps.lasting_m + self._jumped(faults)).reshape(-1, 2))
         for ahead, points in enumerate(reported.reshape(places.shape)):
             frame = round((time_s + ahead) * self._rate + 1, 6)
@@ -216,7 +216,7 @@ class Agents:
             ]
 
     def _flight(self, pose: CameraPose, velocity: np.ndarray, lonlat_deg: np.ndarray) -> Flight:
-        """What the UAV reports of itself. lonlat_deg: (2,) where it reports to be."""
+        """Return the UAV's own report. lonlat_deg: (2,) the reported place."""
         errors, place = self._telemetry_errors, pose.place_m
         ground = float(self._world.up_m(place[None, :2])[0])
         high = (place[2] - ground) * (1 + errors[3])

@@ -1,4 +1,4 @@
-"""The shapes of people and vehicles: limbs with joints, a gait and clothes that differ; faces of cars and UGVs."""
+"""Shapes of people and vehicles: jointed limbs with gait and varied clothes; faces of cars and UGVs."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -14,20 +14,20 @@ _HAIR = ((22, 24, 28), (34, 48, 66), (60, 82, 110), (110, 112, 116))
 _SHOES = np.array([34.0, 36, 42])
 _UP = np.array([0.0, 0.0, 1.0])
 
-# A rover of the size of a small buggy: its plate still has some 20 pixels at 200 m in a picture 640 wide.
+# A rover of the size of a small buggy. Its plate covers about 20 pixels at 200 m in a picture 640 pixels wide.
 UGV_LENGTH_M, UGV_WIDTH_M, UGV_HEIGHT_M = 2.4, 1.7, 0.95
 PLATE_M = (1.9, 1.5)  # the coloured marker on top: along, across
-_COVERED_BGR = np.array([118.0, 122.0, 124.0])  # a marker that is covered
-_WHEEL_M = (0.7, 0.3, 0.33)  # from the middle to a wheel's, its width, its radius
+_COVERED_BGR = np.array([118.0, 122.0, 124.0])  # colour of a covered marker
+_WHEEL_M = (0.7, 0.3, 0.33)  # wheel: distance from the vehicle's middle, width, radius
 _SPOKES = 12
 _GLASS, _DARK = (58.0, 50, 44), (38.0, 38, 38)
-# Between a lower and an upper section (back, front, half width, height): colours of sides and top; none: the paint.
+# Lower and upper section (back, front, half width, height), colours of sides and top; () stands for the paint.
 _PRISMS: tuple = (
     ((-2.0, 2.0, 0.8, 0.12), (-2.0, 2.0, 0.8, 0.4), _DARK, _DARK),
     ((-2.2, 2.2, 0.86, 0.3), (-2.15, 2.1, 0.82, 0.85), (), ()),
     ((-1.7, 1.0, 0.76, 0.85), (-1.25, 0.35, 0.64, 1.42), _GLASS, ()),
 )
-# Panels on a car's flanks: from, to along the car, from, to in height, brightness of the paint, or a lamp's BGR.
+# Panels on a car's flanks: start, end along the car; start, end in height; brightness of the paint or a lamp's BGR.
 _FLANK = (
     (-2.12, 2.05, 0.47, 0.53, 0.45),
     (-1.02, -0.98, 0.36, 0.84, 0.4),
@@ -40,7 +40,7 @@ _FLANK = (
     (1.92, 2.1, 0.58, 0.74, (205.0, 225, 230)),
     (-2.16, -1.98, 0.58, 0.76, (36.0, 30, 150)),
 )
-# Panels seen from above: from, to along the car, half width, height, brightness of the paint.
+# Panels on a car's roof: start, end along the car, half width, height, brightness of the paint.
 _ROOF = (
     (-0.75, -0.1, 0.4, 1.42, 0.3),
     (1.06, 1.1, 0.74, 0.85, 0.5),
@@ -50,11 +50,11 @@ _ROOF = (
 
 
 class Dress(NamedTuple):
-    """What a person wears and how they are built and walk. wide, pace: relative width and swing of the legs.
+    """Clothes, build and gait of a person. wide: relative width of the body. pace: relative swing of the legs.
 
-    colours: (4, 3) BGR of shirt, trousers, skin and hair. loose: how much wider their clothes are than they.
-    elbows_rad: (2,) how far the arms are bent, as of someone who holds something. lean_rad: forward. The other fields
-    say whether they wear it. Those of several people are stacked, (N, ...).
+    colours: (4, 3) BGR of shirt, trousers, skin and hair. loose: width of the clothes relative to the body.
+    elbows_rad: (2,) bend of the arms. lean_rad: forward lean. The other fields are True if the person wears the item.
+    The values of several people are stacked, (N, ...).
     """
 
     colours: np.ndarray
@@ -73,7 +73,7 @@ class Dress(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """Limbs of N people, L each. ends_m: (N, L, 2, 3). radius_m: (N, L, 2), NaN: not worn; colour: (N, L, 3)."""
+    """Limbs of N people, L each. ends_m: (N, L, 2, 3). radius_m: (N, L, 2), NaN if not worn. colour: (N, L, 3)."""
 
     ends_m: np.ndarray
     radius_m: np.ndarray
@@ -81,7 +81,7 @@ class Figures(NamedTuple):
 
 
 def choose_dress(colour: np.ndarray, seed: int, number: int) -> Dress:
-    """What the person of a number wears, in a shirt of that colour; the same at each call."""
+    """Choose the clothes of the person with a number, whose shirt has a colour. Each call gives the same result."""
     rng = np.random.default_rng([seed, 61, number])
     chance = rng.uniform(size=7)
     skin, hair, trousers = (rng.integers(len(choice)) for choice in (_SKIN, _HAIR, _TROUSERS))
@@ -94,14 +94,14 @@ def choose_dress(colour: np.ndarray, seed: int, number: int) -> Dress:
 
 
 class Wardrobe:
-    """What the people of a world wear, chosen when somebody is first seen."""
+    """The clothes of the people of a world, chosen when a person is first seen."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
         self._dress: dict[int, Dress] = {}
 
     def figures(self, bodies: Bodies, rows: np.ndarray) -> Figures:
-        """The limbs of the people in rows of bodies."""
+        """Return the limbs of the people in rows of bodies."""
         numbers = bodies.number[rows].tolist()
         for row, number in zip(rows, numbers, strict=True):
             if number not in self._dress:
@@ -123,7 +123,7 @@ def _pose(
     phase: np.ndarray,
     dress: Dress,
 ) -> Figures:
-    """People who stand at (N, 3) or walk, at a phase of their gait in strides; dress: columns (N, ...)."""
+    """Return the limbs of people at feet_m (N, 3), at a phase of their gait in strides. dress: columns (N, ...)."""
     count = len(feet_m)
     h = height_m[:, None]
     w = h * dress.wide[:, None]
@@ -136,7 +136,7 @@ def _pose(
     rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def along(angle: np.ndarray) -> np.ndarray:
-        """Down, turned forward."""
+        """Return the downward direction, turned forward by an angle."""
         return np.sin(angle)[:, None] * ahead - np.cos(angle)[:, None] * _UP
 
     def limb(start: np.ndarray, end: np.ndarray, first: np.ndarray, last: np.ndarray, colour: np.ndarray) -> None:
@@ -193,7 +193,7 @@ def _pose(
 
 
 def limb_capsules(px: np.ndarray, size: np.ndarray, points: int = 8) -> np.ndarray:
-    """Outlines (L, 2 * points, 2) of limbs with ends (L, 2, 2) and radii (L, 2), px: half a circle about each end."""
+    """Return outlines (L, 2 * points, 2) of limbs, with half circles of radii (L, 2) about the ends (L, 2, 2), px."""
     way = px[:, 1] - px[:, 0]
     length = np.hypot(way[:, 0], way[:, 1])[:, None]
     ahead = np.where(length > 1e-9, way / np.maximum(length, 1e-9), (1.0, 0.0))
@@ -205,11 +205,11 @@ def limb_capsules(px: np.ndarray, size: np.ndarray, points: int = 8) -> np.ndarr
 
 
 class Faces(NamedTuple):
-    """Faces of a vehicle, each a flat convex outline of corners about its middle: ahead, left, up in metres.
+    """Faces of a vehicle: flat convex outlines. Coordinates are metres ahead, left, up of the vehicle's middle.
 
-    corners_m: (F, C, 3), the last corner repeated where there are fewer than C. normal: (F, 3) outwards. colour:
-    (F, 3) BGR where the paint is black; paint, plate: (F,) how much of those colours is added. lit: (F,) bool,
-    whether the sun shades it.
+    corners_m: (F, C, 3); a face with fewer than C corners repeats its last corner. normal: (F, 3) outwards. colour:
+    (F, 3) BGR without paint; paint, plate: (F,) share of the paint's and the plate's colour that is added. lit: (F,)
+    bool, whether the brightness depends on the sun.
     """
 
     corners_m: np.ndarray
@@ -220,7 +220,7 @@ class Faces(NamedTuple):
     lit: np.ndarray
 
     def placed(self, bodies: Bodies, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corners (F, C, 3), normals (F, 3) and colours (F, 3) of the vehicle in a row of bodies."""
+        """Return corners (F, C, 3), normals (F, 3) and colours (F, 3) of the vehicle in a row of bodies."""
         sine, cosine = np.sin(bodies.facing_rad[row]), np.cos(bodies.facing_rad[row])
         local_from_body = np.array([[sine, -cosine, 0.0], [cosine, sine, 0.0], [0.0, 0.0, 1.0]])
         is_bare = not bodies.hidden[row] and np.isfinite(bodies.plate[row]).all()
@@ -244,7 +244,7 @@ class _FaceList:
         plate: float = 0.0,
         is_lit: bool = True,
     ) -> None:
-        """Add a face; colour: BGR or a grey."""
+        """Add a face. colour: BGR or a grey level."""
         bgr = np.broadcast_to(np.array(colour, float), 3)
         self._rows.append((np.array(corners), normal / np.linalg.norm(normal), bgr, paint, plate, is_lit))
 
@@ -266,7 +266,7 @@ class _FaceList:
         self.add(top + UGV_HEIGHT_M * _UP, _UP, plate=1.0)
 
     def faces(self) -> Faces:
-        """All of them, padded to one number of corners."""
+        """Return all faces, padded to the same number of corners."""
         corners, *columns = zip(*self._rows, strict=True)
         most = max(len(outline) for outline in corners)
         padded = [np.pad(outline, ((0, most - len(outline)), (0, 0)), mode="edge") for outline in corners]
@@ -275,14 +275,14 @@ class _FaceList:
 
 @cache
 def vehicle_faces(kind: str, is_near: bool = False) -> Faces:
-    """The faces of a car or ugv. is_near: for a camera on the ground, which sees a UGV's round wheels and its mast."""
+    """Return the faces of a "car" or "ugv". is_near: add the details that a camera on the ground sees."""
     if kind == "car":
         return _car()
     return _rover() if is_near else _ugv()
 
 
 def _car() -> Faces:
-    """A car 4.4 m long, in the order to draw it: the body, then doors, lamps, wheels and roof window."""
+    """Build a car 4.4 m long in drawing order: the body, then doors, lamps, wheels and roof window."""
     faces, middle = _FaceList(), np.array([0, 0, 0.7])
     for low, high, side, top in _PRISMS:
         foot, head = (
@@ -298,7 +298,7 @@ def _car() -> Faces:
     for hand in (1, -1):
         aside = np.array([0.0, hand, 0.0])
         for back, front, low, high, tone in _FLANK:
-            # The flank leans inwards, more above the sill of the windows.
+            # The flank leans inwards, and leans more above the window sill.
             sill, eave = hand * np.interp((low, high), (0.3, 0.85, 0.851, 1.42), (0.865, 0.825, 0.765, 0.645))
             panel = [[back, sill, low], [front, sill, low], [front, eave, high], [back, eave, high]]
             paint, colour = (0.8 * tone, 0.0) if isinstance(tone, float) else (0.0, tone)
@@ -314,7 +314,7 @@ def _car() -> Faces:
 
 
 def _ugv() -> Faces:
-    """A UGV from above: six wheels, a hull, a mast, and the marker on top in its middle."""
+    """Build a UGV for views from above: six wheels, a hull, a mast, and the marker in the middle of the top."""
     faces = _FaceList()
     for along in (-0.82, 0.0, 0.82):
         for aside in (-0.7, 0.7):
@@ -326,7 +326,7 @@ def _ugv() -> Faces:
 
 
 def _rover() -> Faces:
-    """The same seen from near: round wheels behind skirts, and a slender mast."""
+    """Build a UGV for near views: round wheels behind skirts, and a slender mast."""
     faces, ring = _FaceList(), _ring()
     faces.add_hull()
     faces.add_marker()
@@ -355,6 +355,6 @@ def _rover() -> Faces:
 
 
 def _ring() -> np.ndarray:
-    """(_SPOKES, 3) a circle of radius 1 in the plane of a wheel."""
+    """Return (_SPOKES, 3) points on a circle of radius 1 in the plane of a wheel."""
     turn = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
     return np.stack([np.cos(turn), np.zeros(_SPOKES), np.sin(turn)], axis=1)

@@ -1,4 +1,4 @@
-"""The cameras' geometry: a pinhole view, and a rolling shutter, whose rows are read one after the other in flight."""
+"""Camera geometry: a pinhole view, and a rolling shutter that reads its rows one after the other in flight."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,28 +11,28 @@ from torchvision_dddas.lab.simulation.agents import Moment
 from torchvision_dddas.lab.simulation.uav import cross_matrix
 from torchvision_dddas.types import Camera, CameraPose
 
-LEAST_PX = 0.7  # shorter ways during the exposure are lost in the lens's own blur
-_MOST = 40  # pictures that are averaged for one that is blurred
-_LOWEST = 0.004  # least sink of a ray for each metre along the axis: rays above the horizon never meet the ground
+LEAST_PX = 0.7  # shorter motion during the exposure is hidden by the lens's own blur
+_MOST = 40  # most pictures that are averaged for a blurred picture
+_LOWEST = 0.004  # least sink of a ray per metre along the axis, so that rays above the horizon end far away
 _FURTHEST_M = 20_000.0
 _LANDINGS = 8
 _CLOSE_M = 0.004
-_VIBRATION_HZ = 120.0  # of rotors that turn 60 times a second, two blades each
+_VIBRATION_HZ = 120.0  # rotors with two blades that turn 60 times a second
 
 
 @dataclass(frozen=True)
-class View:
-    """One pinhole view. image_from_world is the (3, 4) projection, position_m the (3,) camera centre."""
+class PinholeView:
+    """A pinhole view. image_from_world: (3, 4) projection. position_m: (3,) camera centre."""
 
     image_from_world: np.ndarray
     position_m: np.ndarray
 
     def homogeneous(self, points_m: np.ndarray) -> np.ndarray:
-        """(..., 3) of world points (..., 3): pixels times depth, and depth."""
+        """Return (..., 3) for world points (..., 3): pixels times depth, and depth."""
         return points_m @ self.image_from_world[:, :3].T + self.image_from_world[:, 3]
 
     def project(self, points_m: np.ndarray) -> np.ndarray:
-        """Pixels (..., 2) of world points (..., 3)."""
+        """Return pixels (..., 2) of world points (..., 3)."""
         seen = self.homogeneous(points_m)
         return seen[..., :2] / seen[..., 2:]
 
@@ -43,9 +43,9 @@ class View:
 
 
 def camera_axes(heading_rad: float, pitch_rad: float, roll_rad: float) -> np.ndarray:
-    """(3, 3), the columns a camera's right, down and forward in east, north, up; the angles as in types.Camera.
+    """Return (3, 3): a camera's right, down and forward directions as columns, in east, north, up.
 
-    Straight down the heading is that of the picture's upper edge.
+    The angles are those of types.Camera. In a view straight down, the picture's upper edge points to the heading.
     """
     level, sunk = np.cos(pitch_rad), np.sin(pitch_rad)
     ahead = np.array([np.sin(heading_rad) * level, np.cos(heading_rad) * level, -sunk])
@@ -55,18 +55,18 @@ def camera_axes(heading_rad: float, pitch_rad: float, roll_rad: float) -> np.nda
     return np.stack([*turned, ahead], axis=1)
 
 
-def view_from_pose(pose: CameraPose, camera: Camera) -> View:
-    """The view of a camera without distortion from a pose in local metres."""
+def view_from_pose(pose: CameraPose, camera: Camera) -> PinholeView:
+    """Return the view of a camera without distortion from a pose in local metres."""
     focal = np.array(camera.focal_px) * pose.focal
     inner = np.array([[focal[0], 0, camera.centre_px[0]], [0, focal[1], camera.centre_px[1]], [0, 0, 1.0]])
     rotation = pose.axes.T
-    return View(inner @ np.c_[rotation, -rotation @ pose.place_m], pose.place_m)
+    return PinholeView(inner @ np.c_[rotation, -rotation @ pose.place_m], pose.place_m)
 
 
 class Shutter:
     """A camera without distortion whose last row is read readout_s after its first.
 
-    vibration_px: standard deviation along each axis of how far vibration moves a row aside; seed: of its phase.
+    vibration_px: standard deviation along each axis of a row's shift by vibration. seed: seed of the vibration's phase.
     """
 
     def __init__(self, camera: Camera, readout_s: float, vibration_px: float, seed: int) -> None:
@@ -74,19 +74,19 @@ class Shutter:
         self._vibration_px, self._seed = vibration_px, seed
 
     def lag_s(self, v: np.ndarray) -> np.ndarray:
-        """When a row is read, after the middle one."""
+        """Return the time from reading the middle row to reading row v, seconds."""
         last = self.camera.size_px[1] - 1
         return (np.clip(v, 0, last) / last - 0.5) * self._readout_s
 
     def _aside_px(self, number: int, v: np.ndarray) -> np.ndarray | float:
-        """(N, 2) how far vibration moves rows (N,) of a picture aside."""
+        """Return (N, 2) shifts of rows (N,) of a picture by vibration, pixels."""
         if not self._vibration_px:
             return 0.0
         turns = 2 * np.pi * _VIBRATION_HZ * self.lag_s(v)[:, None]
         return np.sqrt(2) * self._vibration_px * np.sin(turns + _phases(self._seed, number))
 
     def rays(self, moment: Moment, image_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Starts and directions (N, 3) of the rays through pixels (N, 2), a metre long along the axis."""
+        """Return starts and directions (N, 3) of rays through pixels (N, 2). Directions are 1 m long along the axis."""
         pose, row = moment.pose, image_px[:, 1]
         steady_px = image_px - self._aside_px(moment.number, row)
         flat = (steady_px - np.array(self.camera.centre_px)) / (np.array(self.camera.focal_px) * pose.focal)
@@ -95,7 +95,7 @@ class Shutter:
         return pose.place_m + lag * moment.velocity_m_s, way
 
     def ways(self, moment: Moment, places_m: np.ndarray, exposure_s: float) -> np.ndarray:
-        """Pixels (N, 2) that points (N, 3) which stand still move in the picture during an exposure."""
+        """Return the motion (N, 2), pixels, of static points (N, 3) in the picture during an exposure."""
         ends = []
         for lag in (-exposure_s / 2, exposure_s / 2):
             axes = _rotate(moment.pose.axes.T, moment.turn_rad_s, np.full((3, 1), lag)).T
@@ -106,10 +106,10 @@ class Shutter:
     def project(
         self, moment: Moment, points_m: np.ndarray, velocity_m_s: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, 2) of points (N, 3) that move so, and how far along the axis they are (N,)."""
+        """Return pixels (N, 2) and depths (N,) along the axis of points (N, 3) that move at velocity_m_s."""
         pose, centre = moment.pose, np.array(self.camera.centre_px)
         focal = np.array(self.camera.focal_px) * pose.focal
-        # The place relative to the camera is a polynomial of the lag: its terms are found once.
+        # The place relative to the camera is a polynomial of the lag. Compute its terms once.
         once = cross_matrix(-moment.turn_rad_s).T
         away, slide = points_m - pose.place_m, np.asarray(velocity_m_s - moment.velocity_m_s)
         terms = [away @ pose.axes]
@@ -117,7 +117,7 @@ class Shutter:
             terms += [away @ (once @ pose.axes) + slide @ pose.axes]
             terms += [away @ (once @ once @ pose.axes / 2) + slide @ (once @ pose.axes)]
         seen = terms[0]
-        # The row tells the time and the time the row; the shutter is far faster than what moves.
+        # The row gives the time and the time gives the row. Few iterations suffice, because the shutter is fast.
         row = np.zeros(0)
         for again in range(3 if self._readout_s > 0 else 1):
             if again:
@@ -132,12 +132,12 @@ class Shutter:
 
 @lru_cache(maxsize=8)
 def _phases(seed: int, number: int) -> np.ndarray:
-    """(2,) of the vibration in a picture's middle row: independent of the frame rate."""
+    """Return (2,) phases of the vibration in a picture's middle row. They do not depend on the frame rate."""
     return np.random.default_rng([seed, 79, number]).uniform(0, 2 * np.pi, 2)
 
 
 def _rotate(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
-    """Vectors (N, 3) after turning for lag_s (N, 1): Rodrigues to second order, for angles of milliradians."""
+    """Turn vectors (N, 3) for lag_s (N, 1) by Rodrigues' formula to second order, for angles of milliradians."""
     if not np.any(lag_s) or not np.any(turn_rad_s):
         return vectors
     matrix = cross_matrix(turn_rad_s).T
@@ -148,9 +148,9 @@ def _rotate(vectors: np.ndarray, turn_rad_s: np.ndarray, lag_s: np.ndarray) -> n
 def meet_ground(
     start_m: np.ndarray, way: np.ndarray, up_m: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance along rays (N, 3) to the ground (N,), and its height (N,) there; up_m: of places (N, 2).
+    """Return the distances (N,) along rays (N, 3) to the ground, and the ground's heights (N,) there.
 
-    Rays above the horizon land far off.
+    up_m: returns the ground's heights at places (N, 2). Rays above the horizon get a large distance.
     """
     sink = np.maximum(-way[:, 2], _LOWEST)
     up = up_m(start_m[:, :2])
@@ -163,7 +163,7 @@ def meet_ground(
             break
         step = over / sink
         if before is not None:
-            # The secant converges where the ground rises along the ray, which plain stepping does slowly.
+            # Where the ground rises along the ray, secant steps converge faster than plain steps.
             change = over - before[1]
             slope = np.where(np.abs(change) > 1e-9, (far - before[0]) / np.where(change == 0, 1, change), -1 / sink)
             step = np.where((slope < 0) & (slope > -4 / sink), -over * slope, step)
@@ -173,9 +173,9 @@ def meet_ground(
 
 
 def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
-    """A picture (H, W, C) uint8 blurred by the way that its parts moved during the exposure.
+    """Blur a picture (H, W, C) uint8 by the motion of its parts during the exposure.
 
-    way_px: (r, c, 2) float32 from the beginning to the end, at points that span the picture from corner to corner.
+    way_px: (r, c, 2) float32 motion from start to end of the exposure, on a grid from corner to corner of the picture.
     """
     longest = float(np.linalg.norm(way_px, axis=-1).max())
     if longest < LEAST_PX:
@@ -185,7 +185,7 @@ def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
         return np.asarray(cv2.filter2D(picture, -1, kernel, borderType=cv2.BORDER_REPLICATE))
     height, width = picture.shape[:2]
     rows, columns = way_px.shape[:2]
-    # The points are at the corners: pixel 0 is at the first of them and the last pixel at the last.
+    # The first and the last grid point lie on the first and the last pixel.
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     across, down = u * np.float32((columns - 1) / (width - 1)), v * np.float32((rows - 1) / (height - 1))
     way = [cv2.remap(np.ascontiguousarray(way_px[..., k], np.float32), across, down, cv2.INTER_LINEAR) for k in (0, 1)]
@@ -198,7 +198,7 @@ def motion_blur(picture: np.ndarray, way_px: np.ndarray) -> np.ndarray:
 
 
 def streak_kernel(way_px: np.ndarray) -> np.ndarray:
-    """(K, K) float32 kernel of a way (2,) across the picture, its middle in the middle; the sum is 1."""
+    """Return a (K, K) float32 blur kernel along a motion (2,), centred, with sum 1."""
     reach = int(np.ceil(np.abs(way_px).max() / 2)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
     count = 4 * reach + 1

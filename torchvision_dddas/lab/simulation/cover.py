@@ -1,11 +1,11 @@
-"""What stands on the ground: bushes, trees, buildings; their places and heights, and their look from above."""
+"""Objects that stand on the ground: bushes, trees, buildings. Their places, heights and views from above."""
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-# Colours as a photo shows them in full sun, BGR: creosote, saltbush, burroweed, dry; mesquite, palo verde, juniper.
+# BGR colours in a photo in full sun. Bushes: creosote, saltbush, burroweed, dry. Trees: mesquite, palo verde, juniper.
 _TINTS = {
     "bush": np.array([[78, 112, 108], [108, 126, 124], [80, 116, 120], [100, 122, 134]], float),
     "tree": np.array([[72, 110, 106], [84, 126, 120], [62, 94, 88]], float),
@@ -17,10 +17,10 @@ _POLE_M = 0.25  # thickness of a pole
 
 @dataclass(frozen=True)
 class StandingObjects:
-    """What stands in the world. kind: (K,) bush, tree or building. east_north_m: (K, 2) middles.
+    """Objects of the world. kind: (K,) bush, tree or building. east_north_m: (K, 2) middles.
 
-    radius_m: (K,) of the circle about all of it. height_m: (K,). colour: (K, 3) BGR. Buildings are boxes: half_m (K, 2)
-    half their length and width, heading_rad (K,) of the length, clockwise from north; crowns are as long as wide.
+    radius_m: (K,) of the enclosing circle. height_m: (K,). colour: (K, 3) BGR. Buildings are boxes: half_m (K, 2) is
+    half their length and width, heading_rad (K,) the direction of the length, clockwise from north. Crowns are round.
     """
 
     kind: np.ndarray
@@ -43,11 +43,11 @@ def scatter_objects(
     clear: tuple[np.ndarray, float],
     rng: np.random.Generator,
 ) -> StandingObjects:
-    """So many bushes, trees, buildings and poles on free places; a pole is a thin, high building.
+    """Place `counts` bushes, trees, buildings and poles on free ground. A pole is a thin, high building.
 
-    wished, built: (h, w) pictures of the world, row 0 the north edge: how well plants and buildings stand there, from
-    0 to 1. clear: places (N, 2) and how near to them nothing stands. Nothing overlaps a building. What finds no place
-    is left out.
+    wished, built: (h, w) maps of the world, row 0 at the north edge: probability from 0 to 1 that the ground accepts a
+    plant or a building. clear: places (N, 2), and the distance from them within which no object stands. No object
+    overlaps a building. Objects that find no place are left out.
     """
     kind = np.repeat(["building", "building", "tree", "bush"], [counts[2], counts[3], counts[1], counts[0]])
     total, half = len(kind), np.zeros((len(kind), 2))
@@ -69,7 +69,7 @@ def scatter_objects(
     good &= np.abs(places).max(axis=2) + radius[:, None] < side_m / 2
     for place in clear[0]:
         good &= np.hypot(*(places - place).transpose(2, 0, 1)) >= clear[1] + radius[:, None]
-    # Buildings come first, and whatever comes later keeps off them.
+    # Buildings come first. Later objects keep away from them.
     for k in range(counts[2] + counts[3]):
         if good[k].any():
             off = np.hypot(*(places - places[k, np.argmax(good[k])]).transpose(2, 0, 1))
@@ -91,7 +91,7 @@ class Crowns:
         self._which = rng.integers(0, (len(self._moulds), 8), (len(things), 2))
 
     def surface(self, cells: int) -> np.ndarray:
-        """(cells, cells) float32 metres above the ground, row 0 the north edge."""
+        """Return (cells, cells) float32 heights above the ground in metres, row 0 at the north edge."""
         heights = np.zeros((cells, cells), np.float32)
         for k in range(len(self._things)):
             shape, row, column = self._shape(k, self._side_m / cells)
@@ -100,12 +100,12 @@ class Crowns:
         return heights
 
     def paint(self, image: np.ndarray, first_row: int, texel_m: float, to_sun: np.ndarray) -> None:
-        """Draw the crowns and roofs, in the sun, into rows of a picture (3, n, W) float32, from first_row on."""
+        """Draw sunlit crowns and roofs into a picture (3, n, W) float32 of the world's rows from first_row on."""
         things, rows = self._things, image.shape[1]
         middle_row = (self._side_m / 2 - things.east_north_m[:, 1]) / texel_m
         reach = things.radius_m / texel_m + 2
         near = np.flatnonzero((middle_row + reach > first_row) & (middle_row - reach < first_row + rows))
-        # The highest last: a crown hides the lower ones under it.
+        # Draw the highest objects last, because a crown hides lower crowns.
         for k in near[np.argsort(things.height_m[near], kind="stable")].tolist():
             shape, row, column = self._shape(k, texel_m)
             part, cut = _overlap(image, shape.shape[0], row - first_row, column)
@@ -114,7 +114,7 @@ class Crowns:
                 part += seen[cut] * (colour[:, *cut] - part)
 
     def _shape(self, k: int, texel_m: float) -> tuple[np.ndarray, int, int]:
-        """(n, n) float32 heights of one object, and the row and column of its first pixel."""
+        """Return (n, n) float32 heights of one object, and the row and column of its first pixel."""
         things, half = self._things, self._side_m / 2
         east, north = things.east_north_m[k]
         reach = int(np.ceil(things.radius_m[k] / texel_m))
@@ -131,7 +131,7 @@ class Crowns:
         wide = 2 * things.radius_m[k] / texel_m
         if wide < len(shape):
             shape = cv2.resize(shape, (max(round(wide), 3),) * 2, interpolation=cv2.INTER_AREA)
-        # To the very place and size, which are no whole numbers of pixels.
+        # Warp to the exact place and size, which are fractions of pixels.
         scale = len(shape) / wide
         middle = np.array([(east + half) / texel_m - column, (half - north) / texel_m - row])
         matrix = np.c_[scale * np.eye(2), scale * (0.5 - middle) + (len(shape) - 1) / 2]
@@ -141,7 +141,7 @@ class Crowns:
     def _colour(
         self, k: int, shape: np.ndarray, row: int, column: int, texel_m: float, to_sun: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Colours of an object in the sun (3, n, n), and how much of each pixel it hides (n, n)."""
+        """Return the sunlit colours (3, n, n) of an object, and the share (n, n) of each pixel that it covers."""
         things, rng = self._things, np.random.default_rng([self._seed, 22, k])
         colour = things.colour[k].astype(np.float32)[:, None, None]
         spread = rng.standard_normal(shape.shape, np.float32)
@@ -150,7 +150,7 @@ class Crowns:
             ribs = 0.04 * np.sign(np.sin(2 * np.pi * along / 0.9))
             stains = cv2.GaussianBlur(spread, (0, 0), 0.8 / texel_m) * np.float32(0.1 / texel_m)
             return colour * (1 + ribs + 0.025 * spread + stains).astype(np.float32), np.sign(shape)
-        # Twigs half fill a pixel at the rim; clusters of leaves lie higher and are brighter than the gaps between.
+        # Twigs fill half of a pixel at the rim. Clusters of leaves lie higher and are brighter than the gaps.
         leaves = 0.1 * spread + 0.12 * cv2.GaussianBlur(spread, (0, 0), 1.2) * 4
         down, right = np.gradient(shape, texel_m)
         facing = np.clip(down * to_sun[1] - right * to_sun[0], -0.6, 0.6)
@@ -160,7 +160,7 @@ class Crowns:
         return colour * light.astype(np.float32), np.where(shape > 0, seen, 0).astype(np.float32)
 
     def _own_metres(self, k: int, row: int, column: int, size: int, texel_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Metres along and aside of an object's heading from its middle, (n, n) each, for the pixels of a patch."""
+        """Return metres along and across an object's heading from its middle, (n, n) each, for a patch's pixels."""
         east = (column + np.arange(size) + 0.5) * texel_m - self._side_m / 2 - self._things.east_north_m[k, 0]
         north = self._side_m / 2 - (row + np.arange(size)[:, None] + 0.5) * texel_m - self._things.east_north_m[k, 1]
         sine, cosine = np.sin(self._things.heading_rad[k]), np.cos(self._things.heading_rad[k])
@@ -168,7 +168,7 @@ class Crowns:
 
 
 def _overlap(image: np.ndarray, size: int, row: int, column: int) -> tuple[np.ndarray, tuple[slice, slice]]:
-    """The part of a picture (..., H, W) that a patch at (row, column) covers, and which part of it that is."""
+    """Return the part of a picture (..., H, W) that a patch at (row, column) covers, and the covering patch slices."""
     top, bottom = np.clip((row, row + size), 0, image.shape[-2]).tolist()
     left, right = np.clip((column, column + size), 0, image.shape[-1]).tolist()
     cut = slice(top - row, bottom - row), slice(left - column, right - column)
@@ -176,7 +176,7 @@ def _overlap(image: np.ndarray, size: int, row: int, column: int) -> tuple[np.nd
 
 
 def _mould(rng: np.random.Generator, size: int = 96) -> np.ndarray:
-    """(size, size) float32 in [0, 1]: a crown of overlapping domes, with gaps and a ragged rim."""
+    """Draw a crown of overlapping domes with gaps and a ragged rim, (size, size) float32 in [0, 1]."""
     axis = (np.arange(size, dtype=np.float32) + 0.5) / size * 2 - 1
     u, v = np.meshgrid(axis, axis)
     noise = np.zeros((size, size), np.float32)

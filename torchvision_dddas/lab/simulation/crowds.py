@@ -1,7 +1,7 @@
-"""People in crowds: how they hold together, keep apart, walk, join, split and scatter.
+"""People in crowds: they stay together, keep distance, walk, join, split and scatter.
 
-A crowd has a middle that moves along; each member has a slot about that middle, follows it, strays a little, and gives
-way to others. Behaviours and speeds are those of appendix A, section V.
+A crowd has a moving middle. Each member follows its own slot about that middle, strays a little, and gives way to
+others. Behaviours and speeds are those of appendix A, section V.
 """
 
 from dataclasses import dataclass, fields
@@ -11,19 +11,19 @@ import numpy as np
 from torchvision_dddas.lab.simulation.movement import Obstacles, heading_vector, near_pairs, wrap_angle
 from torchvision_dddas.lab.simulation.scenario import CrowdPlan, Happening
 
-# The source's time unit, which it does not give in seconds: with two, 1.11 to 3.34 m a unit is a walker's speed.
+# The source does not state its time unit in seconds. With 2 s, 1.11 to 3.34 m per unit is walking speed.
 UNIT_S = 2.0
-SLOWEST_M, FASTEST_M = 1.11, 3.34  # metres a unit, along east and along north each, of a crowd that moves at random
-BODY_M = 0.5  # middles of two people are no nearer
-_ROUNDS = 8  # how often places are moved apart in a step, at most
+SLOWEST_M, FASTEST_M = 1.11, 3.34  # speed of a random crowd along east and along north, metres per time unit
+BODY_M = 0.5  # least distance between the middles of two people
+_ROUNDS = 8  # most iterations per step that move people apart
 _MARGIN_M = 10.0
 _PERSONAL_M = 0.8
-_WARY_M, _TOUCH_M = 2.0, 0.3  # distances at which people turn away from vehicles, and nearer than which they never are
-_LOOSE_S = 2.5  # time in which somebody returns to the own slot
-# Speed at which one strays, walking and standing, along each axis, and for how long in the same direction.
+_WARY_M, _TOUCH_M = 2.0, 0.3  # distance from vehicles at which people turn away; least distance from vehicles
+_LOOSE_S = 2.5  # time constant with which people return to their slots
+# Straying speed along each axis, walking and standing, and correlation time of its direction.
 _STRAY_M_S, _STRAY_S = (0.2, 0.03), 3.0
 _PATIENCE_S = 120.0
-# Speeds of those who run off, and the time in which they slow down to a walk.
+# Speeds of people who run away, and the time constant with which they slow down to a walk.
 _RUN_M_S, _TIRED_S, _WALK_M_S = (2.5, 4.0), 20.0, 1.4
 _STAND, _HEADING, _WAY, _RANDOM, _MEET = range(5)
 _SHIRTS = np.array(
@@ -37,9 +37,9 @@ _SHIRTS = np.array(
 
 @dataclass
 class _Groups:
-    """One row a crowd. way: (G, W, 2), the first `places` count; at, step: the current waypoint, and the next step.
+    """Crowds, one row each. way: (G, W, 2) waypoints, of which the first `places` are valid. at: current waypoint.
 
-    course: clockwise from north. unit: the time unit for which its velocity was drawn. runs: bool, from all others.
+    step: +1 or -1 along the way. course: clockwise from north. unit: time unit of the last random velocity. runs: bool.
     """
 
     number: np.ndarray
@@ -60,7 +60,7 @@ class _Groups:
 
     @classmethod
     def planned(cls, plans: tuple[CrowdPlan, ...], limit_m: float) -> "_Groups":
-        """The crowds as planned, numbered from 1, within limit_m of the world's middle."""
+        """Return the planned crowds, numbered from 1, with waypoints limited to limit_m from the world's middle."""
         many = len(plans)
         way = np.zeros((many, max([1, *(len(plan.way_m) for plan in plans)]), 2))
         for row, plan in enumerate(plans):
@@ -89,7 +89,7 @@ class _Groups:
         )
 
     def add(self, row: int, count: int) -> np.ndarray:
-        """The rows of new crowds that are copies of one."""
+        """Append copies of a crowd and return their rows."""
         before = len(self.number)
         for one in fields(self):
             values = getattr(self, one.name)
@@ -99,7 +99,7 @@ class _Groups:
 
 @dataclass
 class _Meeting:
-    """Crowds that walk to one place, at the latest until a time, and how the first then continues."""
+    """Crowds that walk to a common place until a time at the latest, and the joined crowd's later behaviour."""
 
     rows: list[int]
     place: np.ndarray
@@ -110,9 +110,9 @@ class _Meeting:
 
 
 class Crowds:
-    """All people of a world, as plain arrays: place, velocity (N, 2), facing (N,), phase (N,), height (N,), colour.
+    """All people of a world as arrays: place, velocity (N, 2), facing, phase, height (N,), colour (N, 3).
 
-    group: (N,) the row of each one's crowd. next_number: of the next crowd that is new.
+    group: (N,) row of each person's crowd. next_number: number of the next new crowd.
     """
 
     def __init__(
@@ -153,13 +153,13 @@ class Crowds:
 
     @property
     def target(self) -> np.ndarray:
-        """(N,) int64, the number of each one's crowd."""
+        """(N,) int64, the number of each person's crowd."""
         return self._groups.number[self.group]
 
     def step(self, time_s: float, seconds: float, vehicles: np.ndarray) -> list[str]:
-        """Advance by `seconds` to time_s; returns what happened, in words.
+        """Advance by `seconds` to time_s. Return the events in words.
 
-        vehicles: (V, 5) that people avoid: east, north, course, half their length and half their width.
+        vehicles: (V, 5) vehicles that people avoid: east, north, course, half the length, half the width.
         """
         events = self._happen(time_s)
         if not len(self):
@@ -169,7 +169,7 @@ class Crowds:
         started = (time_s >= groups.from_s) & (groups.behaviour != _STAND)
         goal = groups.middle[mine] + self._slot
         wanted = groups.velocity[mine] + (goal - self.place) / _LOOSE_S
-        # Those behind are faster, within limits.
+        # People who fall behind walk faster, up to a limit.
         most = np.where(started, 1.5 * groups.speed + 0.4, 0.4)[mine]
         wanted = wanted * np.minimum(1.0, most / np.maximum(np.hypot(*wanted.T), 1e-9))[:, None]
         kept = np.exp(-seconds / _STRAY_S)
@@ -188,7 +188,7 @@ class Crowds:
         place = self._obstacles.outside(place).clip(-self._half + 1, self._half - 1)
         self.velocity = (place - self.place) / seconds
         self.place = place
-        # Legs move with the distance covered, faces turn to the direction of motion.
+        # The gait's phase follows the distance walked. Faces turn to the direction of motion.
         speed = np.hypot(*self.velocity.T)
         stride = 0.8 * self.height * np.sqrt(np.clip(speed / 1.4, 0.25, 4.0))
         self.phase = (self.phase + speed * seconds / stride) % 1.0
@@ -198,14 +198,14 @@ class Crowds:
         return events
 
     def _push_away(self, near: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """(N, 2) velocities away from those who come too near."""
+        """Return (N, 2) velocities away from people who come too near."""
         away = self.place[near[0]] - self.place[near[1]]
         distance = np.maximum(np.hypot(*away.T), 1e-6)
         push = away * (0.8 * (1 - distance / _PERSONAL_M) / distance)[:, None]
         return _sum_pairs(push, near, len(self))
 
     def _push_off_vehicles(self, vehicles: np.ndarray) -> np.ndarray:
-        """(N, 2) velocities away from vehicles that are near."""
+        """Return (N, 2) velocities away from nearby vehicles."""
         push = np.zeros_like(self.place)
         for vehicle in vehicles:
             away, distance, near = _from_box(self.place, vehicle, _WARY_M)
@@ -234,13 +234,13 @@ class Crowds:
         going = (groups.behaviour != _STAND) & (time_s >= groups.from_s)
         speed = np.where(going, groups.speed, 0.0)
         speed = np.where(aimed, np.minimum(speed, distance / max(seconds, 0.1)), speed)
-        # The middle waits for those who fall behind.
+        # The middle waits for people who fall behind.
         late = np.linalg.norm(groups.middle[self.group] + self._slot - self.place, axis=1)
         count = np.maximum(np.bincount(self.group, minlength=len(rows)), 1)
         late = np.bincount(self.group, late, minlength=len(rows)) / count
         speed = speed * np.clip(1 - (late - 1.5) / 3, 0, 1)
         limit = np.maximum(self._half - self._margin - groups.radius, 1.0)[:, None]
-        # Reflected at the edge.
+        # Crowds are reflected at the world's edge.
         out = (np.abs(groups.middle) > limit) & (np.sign(heading) == np.sign(groups.middle)) & ~aimed[:, None]
         heading = np.where(out, -heading, heading)
         groups.course = np.arctan2(heading[:, 0], heading[:, 1])
@@ -276,10 +276,10 @@ class Crowds:
         groups.behaviour[rows] = _MEET
         groups.speed[rows] = np.maximum(groups.speed[rows], 1.0)
         groups.from_s[rows] = np.minimum(groups.from_s[rows], time_s)
-        return [f"crowds {_join_numbers(groups.number[rows])} walk to one another"]
+        return [f"crowds {_join_numbers(groups.number[rows])} walk towards each other"]
 
     def _end_meetings(self, time_s: float) -> list[str]:
-        """Make one crowd of those that have come together."""
+        """Join the crowds that have met into one crowd."""
         groups, events = self._groups, []
         for meeting in list(self._meetings):
             rows, first = meeting.rows, meeting.rows[0]
@@ -295,11 +295,11 @@ class Crowds:
                 groups.behaviour[first], groups.speed[first] = meeting.behaviour, meeting.speed_m_s
                 groups.course[first], groups.unit[first] = meeting.course_rad, -1
                 numbers = groups.number[rows]
-                events.append(f"crowds {_join_numbers(numbers)} are one, crowd {numbers[0]}")
+                events.append(f"crowds {_join_numbers(numbers)} join into crowd {numbers[0]}")
         return events
 
     def _gather(self, row: int) -> None:
-        """Set a crowd's middle and slots from where its people are; those far out come nearer."""
+        """Set a crowd's middle and slots from its people's places. Slots far from the middle move nearer."""
         mine = np.flatnonzero(self.group == row)
         middle = self.place[mine].mean(axis=0)
         away = self.place[mine] - middle
@@ -342,16 +342,16 @@ class Crowds:
         groups.behaviour[new] = _HEADING
         groups.course[new] = np.arctan2(away[:, 0], away[:, 1]) + self._rng.normal(0, 0.4, len(mine))
         groups.speed[new], groups.runs[new] = self._rng.uniform(*_RUN_M_S, len(mine)), True
-        return [f"the {len(mine)} of crowd {number} scatter"]
+        return [f"the {len(mine)} people of crowd {number} scatter"]
 
 
 def _radius(people: int, radius_m: float) -> float:
-    """Radius of a disc with room for a number of people; one alone is its own middle."""
+    """Return the radius of a disc with room for a number of people; 0 for one person."""
     return max(radius_m, 0.36 * float(np.sqrt(people))) if people > 1 else 0.0
 
 
 def _slots(people: int, radius_m: float, rng: np.random.Generator) -> np.ndarray:
-    """(N, 2) places in a disc, apart from one another (sunflower pattern), different for each crowd."""
+    """Return (N, 2) separate places in a disc (sunflower pattern), turned at random for each crowd."""
     reach = _radius(people, radius_m)
     away = reach * np.sqrt((np.arange(people) + 0.5) / people)
     turn = np.arange(people) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
@@ -360,7 +360,7 @@ def _slots(people: int, radius_m: float, rng: np.random.Generator) -> np.ndarray
 
 
 def _move_apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m: float) -> np.ndarray:
-    """(N, 2) places, those of pairs that are too near moved half the distance apart each."""
+    """Move each person of a pair that is too near by half the missing distance. Return the places (N, 2)."""
     for _ in range(_ROUNDS):
         away = place[near[0]] - place[near[1]]
         distance = np.maximum(np.hypot(*away.T), 1e-6)
@@ -374,7 +374,7 @@ def _move_apart(place: np.ndarray, near: tuple[np.ndarray, np.ndarray], least_m:
 def _sum_pairs(
     push: np.ndarray, near: tuple[np.ndarray, np.ndarray], count: int, start: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """(count, 2) sums of what pairs push (P, 2): their first forward, their second back."""
+    """Return (count, 2) sums of the pushes (P, 2) of pairs: added to the first row, subtracted from the second."""
     first, second = (
         np.stack([np.bincount(rows, push[:, axis], minlength=count) for axis in (0, 1)], axis=1) for rows in near
     )
@@ -382,7 +382,7 @@ def _sum_pairs(
 
 
 def _from_box(place: np.ndarray, vehicle: np.ndarray, within_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions away from a vehicle's sides (n, 2), metres to them (n,), negative inside, rows within_m near (n,)."""
+    """Return directions (n, 2) away from a vehicle's sides, metres (n,) to them (negative inside), and rows (n,)."""
     east, north, course, length, width = vehicle
     near = np.flatnonzero(np.abs(place - (east, north)).max(axis=1) < np.hypot(length, width) + within_m)
     ahead = heading_vector(course)
@@ -391,7 +391,7 @@ def _from_box(place: np.ndarray, vehicle: np.ndarray, within_m: float) -> tuple[
     own = np.stack([to @ ahead, to @ right], axis=1)
     beyond = np.abs(own) - (length, width)
     outside = np.maximum(beyond, 0.0)
-    # Inside, out by the nearest side.
+    # People inside the box leave by the nearest side.
     inside = (beyond < 0).all(axis=1)
     outside[inside] = np.where(beyond[inside] == beyond[inside].max(axis=1, keepdims=True), 1e-9, 0.0)
     size = np.maximum(np.hypot(*outside.T), 1e-12)

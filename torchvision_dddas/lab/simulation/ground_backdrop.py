@@ -1,30 +1,30 @@
-"""Sky and ground seen from near the ground: hills hide what lies behind, haze hides what is far."""
+"""Sky and ground seen from near the ground. Hills hide the ground behind them, and haze hides far ground."""
 
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from torchvision_dddas.lab.simulation.cameras import View
+from torchvision_dddas.lab.simulation.cameras import PinholeView
 from torchvision_dddas.lab.simulation.world import GroundTexture, World, equal_runs
 
 HAZE = np.array([214.0, 206, 196], np.float32)  # BGR of the air at the horizon
 _ZENITH = np.array([196.0, 140, 84], np.float32)
-_RIDGE = np.array([150.0, 128, 116], np.float32)  # of far mountains
-VISIBILITY_M = 2500.0  # over which the ground has lost all but 1 / e of its contrast
+_RIDGE = np.array([150.0, 128, 116], np.float32)  # BGR of far mountains
+VISIBILITY_M = 2500.0  # distance at which the ground's contrast has dropped to 1 / e
 _FAR_M = 1500.0
 _COLUMN_PX = 16  # columns between rays
 _STEPS = 110  # places on the ground on each ray
 _LEVELS = 7
-_SHARES = 32  # in which ground and air are mixed
+_SHARES = 32  # steps of the mix of ground and air
 _TILE = 512  # side of the pattern of pebbles, in its own texels
-_GRAIN_M = (0.007, 0.031)  # sizes of its texels: the pattern is used twice
+_GRAIN_M = (0.007, 0.031)  # texel sizes of the pattern, which is applied twice
 
 
 class _Rays(NamedTuple):
-    """Rays through some columns of a picture, all its rows: (H, C) each.
+    """Rays through all rows of some columns of a picture, (H, C) each.
 
-    east, north: of a ray one metre long in depth. level: its length over the ground. rise: metres up a metre ahead.
+    east, north: components of a ray 1 m long in depth. level: its length over the ground. rise: up per metre of level.
     """
 
     east: np.ndarray
@@ -33,7 +33,7 @@ class _Rays(NamedTuple):
     rise: np.ndarray
 
     def rows(self, part: slice) -> "_Rays":
-        """Those of some rows."""
+        """Return the rays of some rows."""
         return _Rays(*(values[part] for values in self))
 
 
@@ -47,23 +47,23 @@ class Backdrop:
         self._maps: dict[tuple[int, ...], list[np.ndarray]] = {}
         self._ridge = rng.uniform(0.3, 1, 6) / np.arange(1, 7), rng.uniform(0, 2 * np.pi, 6)
 
-    def seen(self, view: View, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """The picture (H, W, 3) uint8 BGR, and 1 / the way over the ground to each pixel (H, W) float32; 0: sky."""
+    def seen(self, view: PinholeView, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the picture (H, W, 3) uint8 BGR and 1 / ground distance of each pixel (H, W) float32; 0 is sky."""
         width, height = size
-        matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # of a pixel (u, v, 1)
+        matrix = np.linalg.inv(view.image_from_world[:, :3]).astype(np.float32)  # ray from pixel (u, v, 1)
         u = np.linspace(0, width - 1, (width - 1) // _COLUMN_PX + 2).astype(np.float32)
         v = np.arange(height, dtype=np.float32)[:, None]
         east, north, up = (matrix[i, 0] * u + (matrix[i, 1] * v + matrix[i, 2]) for i in range(3))
         level = cv2.magnitude(east, north)
         rays = _Rays(east, north, level, up / level)
-        # Between the columns everything is linear; cv2.resize would count from the pixels' edges.
+        # Interpolate linearly between columns. cv2.resize does not fit, because it counts from the pixels' edges.
         inverse = self._widen(self._inverse_distance(view, rays), width)
         inverse[inverse < 0.5 / _FAR_M] = 0
         is_ground = inverse > 0
         rows = np.flatnonzero(is_ground.any(axis=1))
         first = int(rows[0]) if len(rows) else height
         image = np.empty((height, width, 3), np.uint8)
-        last = min(first + _COLUMN_PX * 4, height)  # the ground's edge need not be level
+        last = min(first + _COLUMN_PX * 4, height)  # the horizon may slope
         while last < height and not is_ground[last].all():
             last += 1
         image[:last] = self._widen(self._sky(rays.rows(slice(last)), view), width)
@@ -75,7 +75,7 @@ class Backdrop:
         return image, inverse
 
     def _widen(self, image: np.ndarray, width: int) -> np.ndarray:
-        """(H, width) of an image (H, C) of some columns, interpolated between them."""
+        """Interpolate an image (H, C) of some columns to (H, width)."""
         shape = *image.shape[:2], width
         if shape not in self._maps:
             at = np.linspace(0, shape[1] - 1, width, dtype=np.float32)
@@ -84,28 +84,28 @@ class Backdrop:
         u, v = self._maps[shape]
         return cv2.remap(image.astype(np.float32), u, v, cv2.INTER_LINEAR)
 
-    def _inverse_distance(self, view: View, rays: _Rays) -> np.ndarray:
-        """(H, C) on each ray the first place at which the ground reaches it, as 1 / metres; 0: none."""
+    def _inverse_distance(self, view: PinholeView, rays: _Rays) -> np.ndarray:
+        """Return (H, C) 1 / distance in metres at which each ray first meets the ground; 0 without a hit."""
         count = rays.rise.shape[1]
         middle = np.abs(rays.rise).argmin(axis=0), np.arange(count)
         bearing = np.stack([rays.east[middle], rays.north[middle]], axis=1) / rays.level[middle][:, None]
         r = np.geomspace(0.5, _FAR_M, _STEPS)
         places = view.position_m[:2] + (r[:, None, None] * bearing).reshape(-1, 2)
         up = self._world.up_m(places).reshape(_STEPS, -1)
-        # Slopes below the horizontal under which each place is seen over all that is nearer.
+        # Slopes below the horizontal at which each place is visible over all nearer ground.
         slopes = np.minimum.accumulate((view.position_m[2] - up) / r[:, None], axis=0)
         inverse = np.empty(rays.rise.shape, np.float32)
         for k in range(count):
             inverse[:, k] = np.interp(-rays.rise[:, k], slopes[::-1, k], 1 / r[::-1], left=0.0)
         return inverse
 
-    def _ground(self, view: View, inverse: np.ndarray, rays: _Rays) -> np.ndarray:
-        """(H, W, 3) uint8, the rows on which there is ground. rays: those of some columns."""
+    def _ground(self, view: PinholeView, inverse: np.ndarray, rays: _Rays) -> np.ndarray:
+        """Draw the rows that show ground, (H, W, 3) uint8. rays: rays of some columns."""
         inverse = np.maximum(inverse, np.float32(0.5 / _FAR_M))
         width, place = inverse.shape[1], view.position_m[:2]
         x, y = (cv2.divide(self._widen(way / rays.level, width), inverse) for way in (rays.east, rays.north))
         eye = max(float(view.position_m[2] - self._world.up_m(place[None])[0]), 0.2)
-        # A pixel covers far / focal across and far^2 / (focal eye) along the line of sight; alike all along a row.
+        # A pixel covers far / focal across and far^2 / (focal * eye) along the line of sight. A row shares these sizes.
         far = 1 / np.median(inverse[:, ::16], axis=1)
         across, along = far / view.scale_px, far**2 / (view.scale_px * eye)
         image = self._texture.rows(np.sqrt(across * along), x, y, (float(place[0]), float(place[1])))
@@ -119,15 +119,15 @@ class Backdrop:
         return image
 
     def _strew(self, image: np.ndarray, x: np.ndarray, y: np.ndarray, place_m: np.ndarray, along_m: np.ndarray) -> None:
-        """Lay pebbles on the ground of a picture, x east and y north of a place, where it is near enough."""
+        """Draw pebbles on the near ground of a picture. x, y: metres east and north of a place."""
         for grain in _GRAIN_M:
             strength = np.clip(1.3 - along_m / (6 * grain), 0, 1).astype(np.float32)
             if strength.max() > 0:
-                near = slice(int(np.argmax(strength > 0)), None)  # farther rows are above
+                near = slice(int(np.argmax(strength > 0)), None)  # rows above are farther
                 texels = []
                 for way, start in zip((x, y), place_m, strict=True):
                     texel = cv2.addWeighted(way[near], 1 / grain, way[near], 0, float(np.mod(start / grain, _TILE)))
-                    # Beyond 16 bits OpenCV would lose count of the tiles.
+                    # Remove whole tiles, because cv2.remap counts pixels in 16 bits.
                     tiles = np.floor(texel * np.float32(1 / _TILE))
                     texels.append(texel - np.multiply(tiles, np.float32(_TILE), out=tiles))
                 u, v = texels
@@ -136,8 +136,8 @@ class Backdrop:
                 bright = cv2.cvtColor(cv2.convertScaleAbs(bright, alpha=1, beta=64), cv2.COLOR_GRAY2BGR)
                 cv2.multiply(image[near], bright, dst=image[near], scale=1 / 64)
 
-    def _sky(self, rays: _Rays, view: View) -> np.ndarray:
-        """(H, C, 3) float32."""
+    def _sky(self, rays: _Rays, view: PinholeView) -> np.ndarray:
+        """Draw the sky and far mountains, (H, C, 3) float32 BGR."""
         depth = np.exp(-np.maximum(rays.rise, 0) / 0.3)[..., None]
         sky = _ZENITH + (HAZE - _ZENITH) * depth
         share, phase = self._ridge
@@ -149,7 +149,7 @@ class Backdrop:
 
 
 def _pebbles(rng: np.random.Generator) -> np.ndarray:
-    """(_TILE, _TILE) float32, about 0: grit and small stones, each with a dark side, seamless at the border."""
+    """Draw a seamless pattern of grit and stones with dark sides, (_TILE, _TILE) float32 about 0."""
     grit = rng.normal(0, 1, (_TILE, _TILE)).astype(np.float32)
     pattern = np.zeros_like(grit)
     for sigma, share in ((0.7, 0.16), (2.5, 0.6), (9, 1.8)):

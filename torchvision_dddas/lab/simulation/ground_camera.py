@@ -1,4 +1,4 @@
-"""What the camera of a ground vehicle sees: sky, ground, what stands on it, people, cars and the other vehicles."""
+"""Render the camera of a ground vehicle: sky, ground, objects on it, people, cars and other vehicles."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from torchvision_dddas.lab.simulation.agents import Moment
 from torchvision_dddas.lab.simulation.body_shapes import Figures, Wardrobe, limb_capsules, vehicle_faces
-from torchvision_dddas.lab.simulation.cameras import View, camera_axes, view_from_pose
+from torchvision_dddas.lab.simulation.cameras import PinholeView, camera_axes, view_from_pose
 from torchvision_dddas.lab.simulation.ground_backdrop import HAZE, VISIBILITY_M, Backdrop
 from torchvision_dddas.lab.simulation.ground_objects import (
     BITS,
@@ -26,20 +26,20 @@ from torchvision_dddas.lab.simulation.world import World
 from torchvision_dddas.types import Bodies, Camera, CameraPose, GroundPicture
 
 _SHAKE_RAD = float(np.radians(0.3))  # standard deviation of the camera's pitch and roll about level
-_HEADING_SIGMA_RAD = float(np.radians(2.0))  # how well a vehicle knows the heading of its camera
+_HEADING_SIGMA_RAD = float(np.radians(2.0))  # standard deviation of the reported heading of the camera
 _LEAST_SIGMA_M = 0.02
 _SENSOR = CameraParameters(sharpness_px=0.7, shot_noise=0.12, read_noise=1.2, drift=0.03, quality=90)
-_STREAM = 100  # of the sensors' noise, so that no vehicle shares it with the camera in the air
-_SHADE = 0.5  # of the light that is left in a shadow
-_SHADED_M = 120.0  # beyond, no shadow is drawn
-_LEAST_PX = 2.0  # what is lower in the picture is not drawn
-_SLACK_PX = 4.0  # rows by which the ground must be nearer than what it hides
+_STREAM = 100  # first stream of the sensors' noise, so that no vehicle shares the aerial camera's noise
+_SHADE = 0.5  # share of the light that remains in a shadow
+_SHADED_M = 120.0  # largest distance at which shadows are drawn
+_LEAST_PX = 2.0  # objects with a smaller height in the picture are not drawn
+_SLACK_PX = 4.0  # ground hides an object if it is nearer by more than this many rows
 
 
 class GroundCamera:
-    """The cameras of the ground vehicles of a scenario, all alike.
+    """The identical cameras of the ground vehicles of a scenario.
 
-    A picture depends on the scenario's seed, the moment and the vehicle alone, not on which others were taken.
+    A picture depends only on the scenario's seed, the moment and the vehicle, not on other pictures.
     """
 
     def __init__(self, world: World, scenario: Scenario) -> None:
@@ -47,7 +47,7 @@ class GroundCamera:
         self.focal_px = float(team.width_px / 2 / np.tan(np.radians(team.hfov_deg) / 2))
         self._size_px = team.width_px, team.height_px
         self._centre_px = (team.width_px - 1) / 2, (team.height_px - 1) / 2
-        # By how much 1 / distance must differ before the ground hides something.
+        # Difference of 1 / distance above which the ground hides an object.
         self._slack = _SLACK_PX / self.focal_px / team.camera_m
         self._backdrop = Backdrop(world, scenario.seed)
         self._plants = draw_plants(scenario.seed)
@@ -56,9 +56,9 @@ class GroundCamera:
         self._sensors: dict[int, Sensor] = {}
 
     def take(self, moment: Moment, vehicle: int) -> GroundPicture | None:
-        """What a vehicle (its row in the team, from 0) sees, with the place and heading that it reports.
+        """Return the picture of a vehicle (its row in the team, from 0) with the reported place and heading.
 
-        None where the vehicle is silent: nobody would know from where the picture was taken.
+        Return None while the vehicle is silent, because the picture would have no place.
         """
         reported = moment.reported_lonlat_deg[vehicle]
         if not np.isfinite(reported).all():
@@ -77,14 +77,14 @@ class GroundCamera:
         )
         return GroundPicture(camera.name, moment.number, self.look(moment, vehicle)[0], camera)
 
-    def look(self, moment: Moment, vehicle: int) -> tuple[np.ndarray, np.ndarray, View, dict[int, np.ndarray]]:
-        """The picture that `take` takes, (H, W, 3) uint8 BGR, with the truth.
+    def look(self, moment: Moment, vehicle: int) -> tuple[np.ndarray, np.ndarray, PinholeView, dict[int, np.ndarray]]:
+        """Return the picture of `take`, (H, W, 3) uint8 BGR, with the truth.
 
-        Also the mask (H, W) uint16 of the bodies' numbers, the true view, and by number the outlines (L, 16, 2), px, of
-        the limbs of each person before the camera, as if nothing hid them.
+        The truth is the mask (H, W) uint16 of the bodies' numbers, the true view, and {number: outlines (L, 16, 2), px}
+        of the limbs of each person in front of the camera, including hidden parts.
         """
         view = self._view(moment, vehicle)
-        # The ground is looked up while the bodies and their shadows are posed.
+        # Draw the ground in a thread while the bodies and their shadows are posed.
         with ThreadPoolExecutor(1) as other:
             ground = other.submit(self._backdrop.seen, view, self._size_px)
             canvas, whole = self._draw(moment.bodies, vehicle, view, ground)
@@ -93,8 +93,8 @@ class GroundCamera:
         image = self._sensors[vehicle].expose(canvas.picture, moment.number, moment.time_s)
         return image, canvas.mask, view, whole
 
-    def _view(self, moment: Moment, vehicle: int) -> View:
-        """The true view of a vehicle's camera."""
+    def _view(self, moment: Moment, vehicle: int) -> PinholeView:
+        """Return the true view of a vehicle's camera."""
         own = np.flatnonzero(moment.bodies.kind == "ugv")[vehicle]
         rng = np.random.default_rng([self._scenario.seed, 63, vehicle, moment.number])
         pitch, roll = rng.normal(0, _SHAKE_RAD, 2)
@@ -103,7 +103,7 @@ class GroundCamera:
         return view_from_pose(pose, Camera("", self._size_px, (self.focal_px, self.focal_px), self._centre_px))
 
     def _draw(
-        self, bodies: Bodies, vehicle: int, view: View, ground: Future[tuple[np.ndarray, np.ndarray]]
+        self, bodies: Bodies, vehicle: int, view: PinholeView, ground: Future[tuple[np.ndarray, np.ndarray]]
     ) -> tuple[Canvas, dict[int, np.ndarray]]:
         things, eye, to_sun = self._world.things, view.position_m, self._world.to_sun
         far = np.hypot(*(things.east_north_m - eye[:2]).T)
@@ -111,7 +111,7 @@ class GroundCamera:
         least, is_person = _LEAST_PX / self.focal_px, bodies.kind == "person"
         small = least * far / things.height_m
         standing = np.flatnonzero(self._may_show(view, things.east_north_m, 1.2 * things.radius_m, small))
-        reach = np.where(is_person, 3.0, 4.0)  # with the shadow
+        reach = np.where(is_person, 3.0, 4.0)  # including the shadow
         moves = self._may_show(view, bodies.place_m[:, :2], reach, least * away)
         moves[np.flatnonzero(bodies.kind == "ugv")[vehicle]] = False
         moving = np.flatnonzero(moves)
@@ -153,16 +153,18 @@ class GroundCamera:
                     layer[part][nearer] = old[nearer]
         return canvas, whole
 
-    def _boxes(self, feet_m: np.ndarray, size_m: np.ndarray, view: View) -> np.ndarray:
-        """(N, 4) left, top, right, bottom, px, of what stands at (N, 3); size_m: (N, 2) half its width, its height."""
+    def _boxes(self, feet_m: np.ndarray, size_m: np.ndarray, view: PinholeView) -> np.ndarray:
+        """Return boxes (N, 4) left, top, right, bottom, px, of objects at (N, 3). size_m: (N, 2) half width, height."""
         foot, top = (view.homogeneous(feet_m + size_m[:, 1:] * (0.0, 0.0, share)) for share in (0.0, 1.0))
         depth = np.maximum(foot[:, 2], NEAR_M)
         half = size_m[:, 0] * self.focal_px / depth
         u, low = foot[:, 0] / depth, foot[:, 1] / depth
         return np.stack([u - half, top[:, 1] / np.maximum(top[:, 2], NEAR_M), u + half, low], axis=1)
 
-    def _may_show(self, view: View, east_north_m: np.ndarray, reach_m: np.ndarray, small: np.ndarray) -> np.ndarray:
-        """(N,) bool, whether objects with a reach reach_m may be in the picture; those with small > 1 are not."""
+    def _may_show(
+        self, view: PinholeView, east_north_m: np.ndarray, reach_m: np.ndarray, small: np.ndarray
+    ) -> np.ndarray:
+        """Return (N,) bool, whether objects of radius reach_m may be visible. Objects with small >= 1 are not."""
         offset, matrix = east_north_m - view.position_m[:2], view.image_from_world
         ahead = matrix[2, :2]
         right = matrix[0, :2] / self.focal_px - ahead * (self._centre_px[0] / self.focal_px)
@@ -173,7 +175,7 @@ class GroundCamera:
     def _behind_ground(
         self, boxes_px: np.ndarray, distance_m: np.ndarray, inverse_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(N,) bool each: whether hills hide the feet of something, and whether they hide its top as well."""
+        """Return (N,) bool whether hills hide the feet of each object, and (N,) bool whether they hide its top too."""
         height, width = inverse_m.shape
         u = np.clip(np.round(boxes_px[:, [0, 2]].mean(axis=1)), 0, width - 1).astype(np.int64)
         nearer = []
@@ -184,13 +186,13 @@ class GroundCamera:
         return nearer[0], nearer[0] & nearer[1]
 
     def _part(self, box_px: np.ndarray) -> tuple[slice, slice]:
-        """Rows and columns of the picture that a box, a little widened, covers."""
+        """Return the rows and columns of the picture that a slightly widened box covers."""
         left, top, right, bottom = (int(x) for x in np.clip(box_px, -1e6, 1e6))
         rows = np.clip((top - 4, bottom + 8), 0, self._size_px[1]).tolist()
         columns = np.clip((left - 4, right + 6), 0, self._size_px[0]).tolist()
         return slice(*rows), slice(*columns)
 
-    def _draw_thing(self, k: int, box_px: np.ndarray, view: View, canvas: Canvas, haze: float) -> None:
+    def _draw_thing(self, k: int, box_px: np.ndarray, view: PinholeView, canvas: Canvas, haze: float) -> None:
         things, sun = self._world.things, self._world.to_sun
         colour = things.colour[k] + haze * (HAZE - things.colour[k])
         if things.kind[k] == "building":
@@ -198,17 +200,17 @@ class GroundCamera:
             return
         shapes = self._plants[str(things.kind[k])]
         left, top, right, bottom = box_px.tolist()
-        # Drawn with the sun on the right.
+        # The stored plants are lit from the right.
         ahead = view.image_from_world[2]
         is_turned = bool(ahead[1] * sun[0] < ahead[0] * sun[1])
-        # Its foot is not a line on the ground: some of it is nearer.
+        # Extend the foot downwards, because a part of the plant stands nearer than its middle.
         box = left, top, right, bottom + 0.02 * (right - left)
         draw_plant(shapes[k % len(shapes)], canvas, box, colour, is_turned)
 
     def _shadows(
-        self, bodies: Bodies, rows: np.ndarray, limbs: Figures, row_of: dict[int, int], view: View
+        self, bodies: Bodies, rows: np.ndarray, limbs: Figures, row_of: dict[int, int], view: PinholeView
     ) -> np.ndarray:
-        """(H, W) uint8, 255 where bodies cast shadows on the ground."""
+        """Return (H, W) uint8, 255 where bodies cast shadows on the ground."""
         layer, sun = np.zeros(self._size_px[::-1], np.uint8), self._world.to_sun
         for k in rows.tolist():
             up, sink = float(bodies.place_m[k, 2]), max(float(sun[2]), 0.15)
@@ -228,7 +230,7 @@ class GroundCamera:
 
 
 def _darken(image: np.ndarray, layer: np.ndarray) -> None:
-    """Darken a picture where a layer (H, W) uint8 says that there is a shadow."""
+    """Darken a picture in place by a shadow layer (H, W) uint8."""
     rows = np.flatnonzero(layer.any(axis=1))
     if len(rows):
         part = slice(max(int(rows[0]) - 3, 0), int(rows[-1]) + 4)

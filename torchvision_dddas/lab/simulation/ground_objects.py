@@ -1,4 +1,4 @@
-"""Plants as pictures that stand upright, buildings, vehicles and people, as a camera near the ground sees them."""
+"""Draw plants (as upright pictures), buildings, vehicles and people for a camera near the ground."""
 
 from itertools import pairwise
 
@@ -6,37 +6,37 @@ import cv2
 import numpy as np
 
 from torchvision_dddas.lab.simulation.body_shapes import limb_capsules, vehicle_faces
-from torchvision_dddas.lab.simulation.cameras import View
+from torchvision_dddas.lab.simulation.cameras import PinholeView
 from torchvision_dddas.lab.simulation.cover import StandingObjects
 from torchvision_dddas.lab.simulation.ground_backdrop import HAZE
 from torchvision_dddas.types import Bodies
 
-BITS = 4  # OpenCV draws with corners in sixteenths of a pixel
-NEAR_M = 0.4  # what is nearer to a camera on the ground, in depth, is not drawn
+BITS = 4  # fractional bits of corners: OpenCV draws in sixteenths of a pixel
+NEAR_M = 0.4  # least depth that a camera on the ground draws
 _SHAPES = 6  # different bushes, and different trees
 _SIZE_PX = (160, 160)  # width, height of a drawn plant
 _DARK = np.array([52.0, 48, 44])  # BGR of windows and doors
-_CLEAR = np.array([[-1.0, 0, 1]] * 3)  # of what is covered: what is not, three times
+_CLEAR = np.array([[-1.0, 0, 1]] * 3)  # computes 1 - cover for three channels
 _LEAST_WRINKLED_PX = 30
 
 Plant = list[np.ndarray]
-"""A drawn plant, smaller and smaller: (h, w, 2) float32, what it covers, 0 to 1, and its light times that."""
+"""A drawn plant in ever smaller sizes: (h, w, 2) float32, cover from 0 to 1 and brightness times cover."""
 
 
 class Canvas:
-    """A picture (H, W, 3) and a mask (H, W) that are drawn on together, so that the truth is what the eye sees."""
+    """A picture (H, W, 3) and a mask (H, W) that are drawn together, so that the mask matches the picture."""
 
     def __init__(self, picture: np.ndarray) -> None:
         self.picture = picture
         self.mask = np.zeros(picture.shape[:2], np.uint16)
 
     def fill(self, corners: np.ndarray, colour: np.ndarray, value: int) -> None:
-        """Fill a convex outline (N, 2), in fixed point: smooth in the picture, whole pixels of `value` in the mask."""
+        """Fill a convex outline (N, 2) in fixed point, antialiased in the picture and as `value` in the mask."""
         cv2.fillConvexPoly(self.picture, corners, colour.tolist(), cv2.LINE_AA, BITS)
         cv2.fillConvexPoly(self.mask, corners, value, cv2.LINE_8, BITS)
 
-    def fill_in_view(self, points_m: np.ndarray, colour: np.ndarray, value: int, view: View) -> None:
-        """Fill a convex outline (N, 3) of which what is behind the camera is cut off."""
+    def fill_in_view(self, points_m: np.ndarray, colour: np.ndarray, value: int, view: PinholeView) -> None:
+        """Fill a convex outline (N, 3), without the part behind the camera."""
         seen = view.homogeneous(points_m)
         kept = []
         for here, following in pairwise([*seen, seen[0]]):
@@ -54,12 +54,12 @@ class Canvas:
 
 
 def fixed_point(points_px: np.ndarray) -> np.ndarray:
-    """The same in sixteenths of a pixel, int32: OpenCV counts whole pixels in 16 bits there."""
+    """Return points in sixteenths of a pixel, int32, clipped to OpenCV's range of 16 bits for whole pixels."""
     return np.round(np.clip(points_px, -3e4, 3e4) * 2**BITS).astype(np.int32)
 
 
 def draw_plants(seed: int) -> dict[str, list[Plant]]:
-    """Drawn bushes and trees, lit from the upper right."""
+    """Return drawn bushes and trees, lit from the upper right."""
     rng = np.random.default_rng([seed, 62])
     return {"bush": [_bush(rng) for _ in range(_SHAPES)], "tree": [_tree(rng) for _ in range(_SHAPES)]}
 
@@ -67,7 +67,7 @@ def draw_plants(seed: int) -> dict[str, list[Plant]]:
 def draw_plant(
     plant: Plant, canvas: Canvas, box: tuple[float, float, float, float], colour: np.ndarray, is_turned: bool
 ) -> None:
-    """Draw a plant into a box (left, top, right, bottom), px; is_turned: mirrored."""
+    """Draw a plant into a box (left, top, right, bottom), px. is_turned: mirror the plant."""
     left, top, right, bottom = box
     height, width = canvas.picture.shape[:2]
     x0, y0 = max(int(np.floor(left)), 0), max(int(np.floor(top)), 0)
@@ -90,9 +90,15 @@ def draw_plant(
 
 
 def draw_building(
-    things: StandingObjects, k: int, foot_m: float, colour: np.ndarray, view: View, canvas: Canvas, to_sun: np.ndarray
+    things: StandingObjects,
+    k: int,
+    foot_m: float,
+    colour: np.ndarray,
+    view: PinholeView,
+    canvas: Canvas,
+    to_sun: np.ndarray,
 ) -> None:
-    """Draw a building's walls and roof, with a door and windows, that stands at a height."""
+    """Draw a building's walls and roof, with a door and windows. foot_m: height of its foot."""
     along = np.array([np.sin(things.heading_rad[k]), np.cos(things.heading_rad[k])])
     across = np.array([-along[1], along[0]])
     half, top = things.half_m[k], foot_m + float(things.height_m[k])
@@ -104,7 +110,7 @@ def draw_building(
         if normal @ (view.position_m - [*start, foot_m]) <= 0:
             continue
         light = 0.5 + 0.5 * max(float(normal @ to_sun), 0.0)
-        # From, to along the wall, from, to in height, colour: the wall, its eaves, the door and windows.
+        # Panels (start, end along the wall, bottom, top, colour): the wall, its eaves, the door and windows.
         panels = [(0.0, 1.0, foot_m - 0.5, top, light * colour), (0.0, 1.0, top - 0.25, top, 0.8 * light * colour)]
         openings = int(length // 3)
         for n in range(openings):
@@ -121,7 +127,7 @@ def draw_building(
         canvas.fill_in_view(np.c_[outline, np.full(4, top)], roof, 0, view)
 
 
-def draw_vehicle(bodies: Bodies, k: int, haze: float, view: View, canvas: Canvas, to_sun: np.ndarray) -> None:
+def draw_vehicle(bodies: Bodies, k: int, haze: float, view: PinholeView, canvas: Canvas, to_sun: np.ndarray) -> None:
     """Draw the faces of a car or a UGV that look at the camera."""
     faces = vehicle_faces(str(bodies.kind[k]), is_near=True)
     corners, normal, colour = faces.placed(bodies, k)
@@ -130,7 +136,7 @@ def draw_vehicle(bodies: Bodies, k: int, haze: float, view: View, canvas: Canvas
     colour = colour + haze * (HAZE - colour)
     middle = corners.mean(axis=1)
     order = np.flatnonzero(((view.position_m - middle) * normal).sum(axis=1) > 0)
-    if bodies.kind[k] == "ugv":  # a car's faces come in an order of their own: its doors lie on its flanks
+    if bodies.kind[k] == "ugv":  # a car's faces are already in drawing order
         order = order[np.argsort(-np.linalg.norm(middle[order] - view.position_m, axis=1))]
     value, is_cut = int(bodies.number[k]), view.homogeneous(corners)[..., 2].min() < NEAR_M
     px = None if is_cut else fixed_point(view.project(corners))
@@ -145,20 +151,20 @@ def draw_figure(
     ends_m: np.ndarray,
     radius_m: np.ndarray,
     colour: np.ndarray,
-    view: View,
+    view: PinholeView,
     canvas: Canvas,
     value: int,
     to_sun: np.ndarray,
 ) -> np.ndarray:
-    """Draw someone's limbs, far ones first, lit from the sun's side. Returns their outlines (L, 16, 2), px."""
+    """Draw a person's limbs, far limbs first, lit from the sun's side. Return their outlines (L, 16, 2), px."""
     worn = np.isfinite(radius_m).all(axis=1)
     ends_m, radius_m, colour = ends_m[worn], radius_m[worn], colour[worn]
     away = np.linalg.norm(ends_m.mean(axis=1) - view.position_m, axis=1)
     towards = view.position_m - ends_m.mean(axis=(0, 1))
     facing = float(towards @ to_sun / np.linalg.norm(towards))
-    # The third row looks ahead; across it, upright, is the right.
+    # The third row points ahead, so the sign tells whether the sun is on the right or the left.
     side = float(np.sign(view.image_from_world[2, 1] * to_sun[0] - view.image_from_world[2, 0] * to_sun[1]))
-    # Seen from the sun's side all of it is lit, from the other only its edge.
+    # From the sun's side the whole limb is lit. From the other side only its edge is lit.
     front = max(facing, 0.0)
     seen = view.homogeneous(ends_m)
     px, size = seen[..., :2] / seen[..., 2:], radius_m * view.scale_px / seen[..., 2]
@@ -174,14 +180,14 @@ def draw_figure(
 
 
 def _wrinkle(outlines_px: np.ndarray, canvas: Canvas, value: int) -> None:
-    """Give drawn clothes folds and soft borders of light and shade, as cloth has and flat colours have not."""
+    """Give the drawn clothes folds and soft borders between light and shade, so that they look like cloth."""
     low, high = outlines_px.min(axis=(0, 1)), outlines_px.max(axis=(0, 1))
     tall = float(high[1] - low[1])
     (x0, y0), (x1, y1) = np.clip([np.floor(low), np.ceil(high) + 1], 0, canvas.mask.shape[::-1]).astype(int).tolist()
     if tall < _LEAST_WRINKLED_PX or x1 - x0 < 2 or y1 - y0 < 2:
         return
     picture, inside = canvas.picture[y0:y1, x0:x1], (canvas.mask[y0:y1, x0:x1] == value).astype(np.uint8)
-    # Its outline stays sharp.
+    # Keep the figure's outline sharp.
     within = cv2.erode(inside, np.ones((3, 3), np.uint8), iterations=max(1, round(0.01 * tall)), borderValue=1)
     cv2.copyTo(cv2.GaussianBlur(picture, (0, 0), max(0.5, 0.01 * tall)), within, picture)
     scale = tall / _FOLDS.shape[0]
@@ -192,7 +198,7 @@ def _wrinkle(outlines_px: np.ndarray, canvas: Canvas, value: int) -> None:
 
 
 def _draw_folds() -> np.ndarray:
-    """(180, 180) uint8 about 128: a pattern of folds, on a body 180 pixels tall."""
+    """Draw a pattern of folds for a body 180 pixels tall, (180, 180) uint8 about 128."""
     rng = np.random.default_rng(64)
     pattern = np.zeros((180, 180), np.float32)
     for turn in (60.0, 95.0, 130.0):
@@ -203,7 +209,7 @@ def _draw_folds() -> np.ndarray:
 
 
 def _bush(rng: np.random.Generator) -> Plant:
-    """A dome of small leaves with gaps, its foot in the shade, and bare twigs that stick out."""
+    """Draw a bush: a dome of small leaves with gaps, a shaded foot, and bare twigs that stick out."""
     width, height = _SIZE_PX
     plant = np.zeros((height, width, 2), np.float32)
     lobes = [
@@ -221,7 +227,7 @@ def _bush(rng: np.random.Generator) -> Plant:
 
 
 def _tree(rng: np.random.Generator) -> Plant:
-    """Several stems that part, and a wide crown in lumps."""
+    """Draw a tree: several stems that spread, and a wide crown of lumps."""
     width, height = _SIZE_PX
     plant = np.zeros((height, width, 2), np.float32)
     for _ in range(rng.integers(2, 5)):

@@ -1,4 +1,4 @@
-"""The ground vehicles: the team of UGVs with their coloured markers, and cars, which are no landmarks."""
+"""Ground vehicles: the team of UGVs with coloured markers, and cars, which are not landmarks."""
 
 from collections.abc import Collection
 from copy import copy
@@ -19,29 +19,29 @@ from torchvision_dddas.types import Colours
 
 ACCELERATION_M_S2, TURN_RAD_S, PAN_RAD_S = 1.5, float(np.radians(90)), float(np.radians(90))
 UGV_HALF_M, CAR_HALF_M = (UGV_LENGTH_M / 2, UGV_WIDTH_M / 2), (2.2, 0.9)  # half the length and half the width
-_APART_M, _ROOM_M = 2.1, 3.0  # least distance of two vehicles, and that at which they mean to pass, middle to middle
-_KEPT_OFF_M = 6.0  # distance at which they pass people while nobody steers them
-_LOOK_S = 0.25  # time step of their plans
+_APART_M, _ROOM_M = 2.1, 3.0  # least and intended distance between the middles of two vehicles
+_KEPT_OFF_M = 6.0  # distance at which unsteered vehicles pass people
+_LOOK_S = 0.25  # time step of the plans
 _HEADING_SIGMA_RAD = float(np.radians(2.0))
-_STOP_M = UGV_HALF_M[0] + 1.0  # they stop at this distance before others, middle to middle
+_STOP_M = UGV_HALF_M[0] + 1.0  # vehicles stop at this distance from others, middle to middle
 # Patrol "gather": speed factor beyond _NEAR_M from the middle, and radius of the final ring.
 _FAST, _NEAR_M, _GATHERED_M = 3.0, 6.0, 4.0
-# In OpenCV's units; those furthest from sand and scrub come first.
+# Hues in OpenCV's units. The hues that differ most from sand and scrub come first.
 _HUES = (120, 150, 90, 0, 60, 30, 105, 165, 75, 135, 45, 15)
 
 RADIUS_M = 6.0  # least turning radius of a car
 _BRAKE_M_S2 = 4.0
 _ASIDE_M_S2 = 2.5  # greatest lateral acceleration: cars slow down in turns
-# They pass those whom they see at a distance of _WIDE_M, and brake for those less than _NARROW_M aside.
+# Cars see others within _SEEN_M, pass at a distance of _WIDE_M, and brake for others less than _NARROW_M aside.
 _SEEN_M, _WIDE_M, _NARROW_M, _LONG_M, _CREEP_M_S = 25.0, 2.6, 1.5, 2.8, 0.6
-# No paint and no shirt is as bright as a marker: a team chooses colours that nothing around it has.
+# Paints and shirts are duller than the markers, because a team chooses colours that its surroundings lack.
 _PAINTS = np.array([[230, 230, 228], [40, 38, 36], [150, 150, 148], [95, 90, 88], [105, 88, 76], [78, 76, 108]], float)
 
 
 def marker_plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
-    """Names of the UGVs, colours of their markers (K, 3) BGR, and the ranges in which pictures show them; 12 at most.
+    """Return the names of up to 12 UGVs, their markers' colours (K, 3) BGR, and colour ranges for their detection.
 
-    The ranges do not overlap: hues are 15 apart, in steps of two degrees, and have 7 to either side.
+    The ranges do not overlap: hues (in OpenCV's steps of two degrees) are 15 apart, and ranges reach 7 to each side.
     """
     hue = np.array(_HUES[:count], int)
     hsv = np.stack([hue, np.full(count, 235), np.full(count, 225)], axis=1).astype(np.uint8)
@@ -53,7 +53,7 @@ def marker_plates(count: int) -> tuple[tuple[str, ...], np.ndarray, Colours]:
 
 
 class Team:
-    """All UGVs as plain arrays: place (K, 2), course, heading (of the camera), speed (K,)."""
+    """All UGVs as arrays: place (K, 2), course, heading (of the camera) and speed (K,)."""
 
     def __init__(
         self, parameters: TeamParameters, flight: AircraftParameters, side_m: float, obstacles: Obstacles, seed: int
@@ -81,25 +81,25 @@ class Team:
 
     @property
     def velocity(self) -> np.ndarray:
-        """(K, 2)."""
+        """(K, 2) east and north, m/s."""
         return self.speed[:, None] * heading_vector(self.course)
 
     def order(self, row: int, goal_m: np.ndarray | None, speed_m_s: float, look_at_m: np.ndarray | None) -> None:
-        """Send a vehicle to a place, in local metres (None, NaN: as before), and turn its camera to another."""
+        """Send a vehicle to goal_m in local metres (None or NaN: keep the goal), and turn its camera to look_at_m."""
         if goal_m is not None and np.isfinite(goal_m).all():
             self._ordered[row] = self._inside(goal_m)
             self._ordered_speed[row] = max(speed_m_s, 0.0)
         self._look_at[row] = np.nan if look_at_m is None else look_at_m
 
     def step(self, time_s: float, seconds: float, lost: Collection[int], people: np.ndarray) -> None:
-        """Advance by `seconds` to time_s; the lost stand still. They stop for people (M, 2)."""
+        """Advance by `seconds` to time_s. Lost vehicles stand still. Vehicles stop for people (M, 2)."""
         if not len(self):
             return
         goal, most = self._goals(time_s)
         to = goal - self.place
         distance = np.hypot(*to.T)
         arrived = self._is_there(goal, 0.3)
-        # As fast as it can still brake.
+        # The largest speed at which the vehicle can still brake.
         wanted = np.minimum(most, np.sqrt(ACCELERATION_M_S2 * np.maximum(distance - 0.2, 0)))
         direction = to / np.maximum(distance, 1e-9)[:, None] * np.maximum(wanted, 0.3)[:, None]
         direction = self._avoid(self._obstacles.steer(self.place, direction, 1.7), people)
@@ -110,10 +110,10 @@ class Team:
         wanted = np.minimum(wanted, self._free_speed(people))
         hardest = ACCELERATION_M_S2 * seconds
         speed = np.maximum(self.speed + np.clip(wanted - self.speed, -2 * hardest, hardest), 0.0)
-        # A vehicle that is lost stands at once: its place is what the team knew last.
+        # A lost vehicle stops at once, so that its place is the last that the team knew.
         self.speed = np.where(stopped, 0.0, speed)
         place = self.place + (seconds * self.speed)[:, None] * heading_vector(self.course + turn * seconds / 2)
-        # Those that are nearer than two vehicles can be are moved half the distance apart each.
+        # Move each of two vehicles that are too near by half the missing distance.
         away = place[:, None] - place
         distance = np.hypot(away[..., 0], away[..., 1]) + 1e9 * np.eye(len(place))
         short = 0.5 * np.maximum(_APART_M - distance, 0) / np.maximum(distance, 1e-6)
@@ -126,7 +126,7 @@ class Team:
         self.heading = (self.heading + np.where(stopped, 0.0, panned)) % (2 * np.pi)
 
     def waypoints(self, time_s: float, seconds: int, lost: Collection[int]) -> np.ndarray:
-        """(1 + seconds, K, 2) planned places now and each second from now, if nobody stops them."""
+        """Return (1 + seconds, K, 2) planned places now and in each coming second, if no person stops the vehicles."""
         ahead, places = copy(self), [self.place]
         for step in range(1, round(seconds / _LOOK_S) + 1):
             ahead.step(time_s + step * _LOOK_S, _LOOK_S, lost, np.zeros((0, 2)))
@@ -135,7 +135,7 @@ class Team:
         return np.array(places)
 
     def _goals(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """(K, 2) goals and (K,) speeds."""
+        """Return (K, 2) goals and (K,) speeds."""
         parameters, patrol, goal = self._parameters, self._parameters.patrol, self._start
         speed = np.full(len(self), parameters.patrol_m_s)
         if patrol == "random":
@@ -147,7 +147,7 @@ class Team:
             speed = np.where(np.hypot(*(goal - self.place).T) > _NEAR_M, _FAST * speed, speed)
         elif patrol == "along":
             middle, going = self._way.at(time_s)
-            # Who brakes for a goal that moves stays behind it by as much.
+            # Braking keeps a vehicle behind a moving goal, so set the goal ahead by that distance.
             goal = middle + self._start - self._way.at(0.0)[0] + going * np.linalg.norm(going) / ACCELERATION_M_S2
             speed = np.full(len(self), 1.5 * float(np.linalg.norm(going)) + 0.2)
         sent = np.isfinite(self._ordered[:, 0])
@@ -155,14 +155,14 @@ class Team:
         return self._inside(goal), np.where(sent, self._ordered_speed, speed)
 
     def _is_there(self, goal: np.ndarray, within_m: float) -> np.ndarray:
-        """(K,) whether each is at its goal; close behind another that stands there counts."""
+        """Return (K,) bool, whether each vehicle is at its goal, or close behind another vehicle that stands there."""
         distance = np.hypot(*(goal - self.place).T)
         taken = np.linalg.norm(goal[:, None] - self.place, axis=2) < _ROOM_M
         np.fill_diagonal(taken, False)
         return (distance < within_m) | (taken.any(axis=1) & (distance < 1.5 * _ROOM_M))
 
     def _random_place(self, k: int, n: int) -> np.ndarray:
-        """(2,) the n-th place of a vehicle within the ring."""
+        """Return the n-th random place (2,) of vehicle k within the ring."""
         if (k, n) not in self._drawn:
             rng = np.random.default_rng([self._seed, 31, k, n])
             reach, turn = self._parameters.ring_m * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
@@ -170,8 +170,8 @@ class Team:
         return self._drawn[k, n]
 
     def _avoid(self, direction: np.ndarray, people: np.ndarray) -> np.ndarray:
-        """Directions round people and round one another."""
-        # Vehicles without orders keep off people: beside them a vehicle is no landmark, and hides them.
+        """Return directions (K, 2) around people and other vehicles."""
+        # Vehicles without orders keep away from people: nearby, a vehicle is no landmark and hides people.
         free = np.flatnonzero(np.isnan(self._ordered[:, 0]))
         if len(free) and len(people):
             centre = np.broadcast_to(people, (len(free), *people.shape))
@@ -179,11 +179,11 @@ class Team:
             direction = direction.copy()
             direction[free] = steer_round_discs(self.place[free], direction[free], centre, radius)
         radius = np.full((len(self), len(self)), _ROOM_M)
-        np.fill_diagonal(radius, -1.0)  # nobody goes round itself
+        np.fill_diagonal(radius, -1.0)  # a vehicle does not avoid itself
         return steer_round_discs(self.place, direction, np.broadcast_to(self.place, (*radius.shape, 2)), radius)
 
     def _free_speed(self, people: np.ndarray) -> np.ndarray:
-        """(K,) greatest speeds allowed by people ahead, and by vehicles ahead with a lower row."""
+        """Return (K,) greatest speeds that people ahead, and vehicles ahead with a lower row, allow."""
         others, ahead = np.concatenate([people, self.place]), heading_vector(self.course)
         to = others[None] - self.place[:, None]
         along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
@@ -199,9 +199,9 @@ class Team:
 
 
 class Cars:
-    """All cars as plain arrays: place (N, 2), course (N,) clockwise from north, speed (N,), colour (N, 3).
+    """All cars as arrays: place (N, 2), course (N,) clockwise from north, speed (N,), colour (N, 3).
 
-    They follow their way with a least turning radius and brake for those ahead.
+    Cars follow their way with a least turning radius and brake for people and vehicles ahead.
     """
 
     def __init__(self, plans: tuple[CarPlan, ...], side_m: float, obstacles: Obstacles, seed: int) -> None:
@@ -228,21 +228,21 @@ class Cars:
 
     @property
     def velocity(self) -> np.ndarray:
-        """(N, 2)."""
+        """(N, 2) east and north, m/s."""
         return self.speed[:, None] * heading_vector(self.course)
 
     def step(self, time_s: float, seconds: float, others: np.ndarray) -> None:
-        """Advance by `seconds` to time_s; others: (M, 2) people and vehicles that they avoid."""
+        """Advance by `seconds` to time_s. others: (M, 2) people and vehicles that cars avoid."""
         for row in range(len(self)):
             wanted = self._wanted(row)
             self._drive(row, time_s, seconds, wanted, np.concatenate([others, np.delete(self.place, row, axis=0)]))
 
     def _wanted(self, row: int) -> np.ndarray:
-        """(2,) the direction in which a car wants to go."""
+        """Return the direction (2,) in which a car wants to go."""
         place, way = self.place[row], self._ways[row]
         if not len(way):
             ahead = heading_vector(self._straight[row])
-            # At the edge it turns back.
+            # Turn back at the world's edge.
             out = (np.abs(place) > self._half - self._margin - RADIUS_M) & (np.sign(ahead) == np.sign(place))
             if out.any():
                 ahead = np.where(out, -ahead, ahead)
@@ -274,7 +274,7 @@ class Cars:
         if (blocked := along[(along > 0) & (np.abs(aside) < _NARROW_M)]).size:
             room = float(blocked.min()) - _LONG_M
             braked = np.sqrt(2 * 0.6 * _BRAKE_M_S2 * max(room - 1.0, 0.0))
-            # Slowly past who stands, where there is room to turn.
+            # Creep past a standing obstacle if there is room to turn.
             most = min(most, max(float(braked), _CREEP_M_S if room > 0 else 0.0))
         self.speed[row] += np.clip(most - speed, -_BRAKE_M_S2 * seconds, ACCELERATION_M_S2 * seconds)
         gone = self.speed[row] * seconds

@@ -1,4 +1,4 @@
-"""How moving bodies avoid obstacles and one another, and follow waypoints. Directions are clockwise from north."""
+"""Steer moving bodies around obstacles and each other, and along waypoints. Directions are clockwise from north."""
 
 import numpy as np
 
@@ -6,34 +6,34 @@ from torchvision_dddas.lab.simulation.cover import StandingObjects
 
 _CELL_M = 4.0
 _REACH_M = 8.0
-_NEAREST = 6  # objects with the nearest edges that are considered from a cell
-_TOUCHING = 3  # objects of those that somebody may stand in
+_NEAREST = 6  # objects that each cell stores, nearest edges first
+_TOUCHING = 3  # nearest objects of these that are tested for contact
 
 
 def heading_vector(heading_rad: np.ndarray | float) -> np.ndarray:
-    """(..., 2) unit vectors, east and north."""
+    """Return (..., 2) unit vectors, east and north."""
     return np.stack([np.sin(heading_rad), np.cos(heading_rad)], axis=-1)
 
 
 def wrap_angle(angle_rad: np.ndarray) -> np.ndarray:
-    """The same angle within [-pi, pi)."""
+    """Return the angles wrapped to [-pi, pi)."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 class Obstacles:
-    """Discs on the ground, found by grid cell. Trees and buildings block; bushes are avoided where there is room."""
+    """Discs on the ground, stored by grid cell. Trees and buildings block. Bushes are avoided where there is room."""
 
     def __init__(self, things: StandingObjects, side_m: float) -> None:
         place, radius = np.asarray(things.east_north_m, float).reshape(-1, 2), np.asarray(things.radius_m, float)
         self._half, self._across = side_m / 2, max(1, int(np.ceil(side_m / _CELL_M)))
         self._table = self._near_cells(place, radius)
-        # Row -1 of the table stands for nothing: infinitely far.
+        # Entry -1 of the table means no object. It refers to the last row here, which is very far away.
         self._place = np.concatenate([place, [[1e9, 1e9]]])
         self._radius = np.append(radius, 0.0)
         self._blocks = np.array([*(str(kind) != "bush" for kind in things.kind), False])
 
     def _near_cells(self, place: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """(cells, _NEAREST) int64, the objects near each cell, -1 for none."""
+        """Return (cells, _NEAREST) int64 objects near each cell, -1 for no object."""
         table = np.full((self._across**2, _NEAREST), -1, np.int64)
         if not len(place):
             return table
@@ -56,19 +56,19 @@ class Obstacles:
         return table
 
     def _near(self, place: np.ndarray) -> np.ndarray:
-        """(N, _NEAREST) the objects near places, -1 for none."""
+        """Return (N, _NEAREST) objects near places, -1 for no object."""
         index = np.floor((place + self._half) / _CELL_M).astype(int).clip(0, self._across - 1)
         return self._table[index[:, 1] * self._across + index[:, 0]]
 
     def steer(self, place: np.ndarray, velocity: np.ndarray, clear_m: float) -> np.ndarray:
-        """(N, 2) velocities, as fast as those wanted, that pass what is ahead at clear_m from its edge."""
+        """Turn velocities (N, 2) at constant speed so that they pass objects ahead at clear_m from their edge."""
         near = self._near(place)
         if not (near >= 0).any():
             return velocity
         return steer_round_discs(place, velocity, self._place[near], self._radius[near] + clear_m)
 
     def outside(self, place: np.ndarray, clear_m: float = 0.3) -> np.ndarray:
-        """(N, 2) the places, moved out of trees and buildings."""
+        """Return the places (N, 2), moved out of trees and buildings."""
         near = self._near(place)[:, :_TOUCHING]
         away = place[:, None] - self._place[near]
         reach = self._radius[near] + clear_m
@@ -79,13 +79,13 @@ class Obstacles:
         away, reach = away[row, which], reach[row, which]
         distance = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-6)
         moved = place.copy()
-        # Of two objects at one place, the one listed last decides.
+        # If two objects touch a place, the object listed last decides.
         moved[row] = place[row] + ((reach - distance) / distance)[:, None] * away
         return moved
 
 
 def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """(N, 2) velocities that pass the first of (N, M) discs that lie ahead along its tangent.
+    """Turn velocities (N, 2) along the tangent of the first of M discs that lies ahead.
 
     place, velocity: (N, 2). centre: (N, M, 2); radius: (N, M), clearance included.
     """
@@ -93,7 +93,7 @@ def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarra
     ahead = velocity / np.maximum(speed, 1e-9)[:, None]
     to = centre - place[:, None]
     along = to[..., 0] * ahead[:, None, 0] + to[..., 1] * ahead[:, None, 1]
-    # Positive: the disc's middle is to the left.
+    # Positive if the disc's middle is to the left.
     left = ahead[:, None, 0] * to[..., 1] - ahead[:, None, 1] * to[..., 0]
     reach = np.maximum(3.0, 2.0 * speed)[:, None] + radius
     hit = (along > 0) & (along < reach) & (np.abs(left) < radius) & (speed[:, None] > 1e-6)
@@ -103,7 +103,7 @@ def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarra
     first = np.where(hit[row], along[row], np.inf).argmin(axis=1)
     to, left, radius = to[row, first], left[row, first], radius[row, first]
     distance = np.maximum(np.hypot(to[:, 0], to[:, 1]), 1e-6)
-    # Inside the clearance: along the edge, and a little outward.
+    # Inside the clearance, go along the edge and a little outward.
     turn = np.where(distance > radius, np.arcsin(np.minimum(radius / distance, 1.0)), np.pi / 2 + 0.3)
     turn = np.where(left > 0, -turn, turn)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -114,9 +114,9 @@ def steer_round_discs(place: np.ndarray, velocity: np.ndarray, centre: np.ndarra
 
 
 def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """The pairs (P,), (P,) of rows of places (N, 2) that are nearer to one another than reach_m, each once.
+    """Return pairs of rows (P,), (P,) of places (N, 2) that are nearer to each other than reach_m, each pair once.
 
-    They are found by a grid of cells: the time grows with the number of bodies, not with its square.
+    The search uses a grid of cells, so that its time grows with the number of bodies, not with its square.
     """
     if len(place) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -125,7 +125,7 @@ def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarra
     key = cell[:, 1] * across + cell[:, 0]
     order = np.argsort(key, kind="stable")
     ranked = key[order]
-    # Neighbours later in the same row of cells, and in the three cells of the row above, which lie in a row as well.
+    # Neighbours later in the same row of cells, and in the three consecutive cells of the row above.
     rank = np.arange(len(place))
     firsts, seconds = [], []
     for begin, end in (
@@ -141,14 +141,14 @@ def near_pairs(place: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarra
 
 
 class Waypoints:
-    """A point that goes through places (P, 2) one after the other at a constant speed, and back, without end."""
+    """A point that moves through places (P, 2) at a constant speed, forwards and backwards, without end."""
 
     def __init__(self, places_m: np.ndarray, speed_m_s: float) -> None:
         self._places, self._speed = np.asarray(places_m, float).reshape(-1, 2), speed_m_s
         self._at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._places, axis=0), axis=1))])
 
     def at(self, time_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Place (2,) and velocity (2,)."""
+        """Return the place (2,) and velocity (2,) at a time."""
         length = self._at[-1]
         if length <= 0 or self._speed <= 0:
             return self._places[0].copy(), np.zeros(2)
@@ -156,7 +156,7 @@ class Waypoints:
         back = gone >= length
         gone = 2 * length - gone if back else gone
         leg = int(np.clip(np.searchsorted(self._at, gone, side="right") - 1, 0, len(self._at) - 2))
-        # Places twice in a row make legs of no length.
+        # Repeated places make legs of length 0.
         while self._at[leg + 1] <= self._at[leg]:
             leg += 1 if leg + 2 < len(self._at) else -1
         ahead = (self._places[leg + 1] - self._places[leg]) / (self._at[leg + 1] - self._at[leg])

@@ -1,4 +1,4 @@
-"""A simulated run as files that the commands read: pictures, telemetry, reports, poses, the truth; and films of it."""
+"""Write a simulated run as files for other commands: pictures, telemetry, reports, poses, truth. Film scenarios."""
 
 import math
 import time
@@ -25,8 +25,8 @@ from torchvision_dddas.lab.simulation.simulator import Shot, Simulator, name_sce
 from torchvision_dddas.lab.simulation.truth import TruthOutput, moving_mask
 from torchvision_dddas.types import Camera, Flight, GroundPicture
 
-RECORDED = ("frames", "video", "masks", "ground")  # what --save may name. The tables are always written
-_PLAIN = ("frames", "masks", "ground")  # what is saved where --save is not given
+RECORDED = ("frames", "video", "masks", "ground")  # values of --save; the tables are always written
+_PLAIN = ("frames", "masks", "ground")  # saved without --save
 _TELEMETRY = (
     *("time_s", "altitude_m", "speed_m_s", "longitude_deg", "latitude_deg", "above_sea_m"),
     *("heading_deg", "pitch_deg", "roll_deg", "hfov_deg", "vehicle_heading_deg"),
@@ -38,9 +38,9 @@ _QUALITY = 95
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A frame of a recording. shown: its picture, or the one before where the camera dropped it.
+    """A frame of a recording. shown: its picture, or the last picture if the camera dropped the frame.
 
-    ground: the pictures of the ground vehicles. seconds: spent on it, per stage.
+    ground: the pictures of the ground vehicles. seconds: computing time of the frame, per stage.
     """
 
     shot: Shot
@@ -57,10 +57,10 @@ def record_scenario(
     name: str = "simulated",
     progress: Callable[[str, int], AbstractContextManager[Callable[[], None]]] | None = None,
 ) -> RunRecord:
-    """Run a scenario that nobody steers and write the data of all its instruments; returns the record of the run.
+    """Run a scenario without steering, write the data of all its instruments, and return the record of the run.
 
-    save: some of RECORDED. frames: how many at most. name: the scenario's, for messages. progress: given a name and the
-    number of frames, a context with a function that is called for each frame. Raises InputError for bad input.
+    save: some of RECORDED. frames: limit of frames. name: the scenario's name in messages. progress: returns a context
+    for a name and a number of frames, with a function to call for each frame. Raises InputError for bad input.
     """
     with _RecordingOutput(folder, save) as output:
         with name_scenario_in_errors(name):
@@ -75,12 +75,12 @@ def record_scenario(
                 if number == 1:
                     record.notes += _write_elevation(folder / "dem.tif", simulator)
         if "video" in save and record.counts["dropped"]:
-            record.notes.append("where the camera dropped a frame, clip.mp4 shows the one before again")
+            record.notes.append("where the camera dropped a frame, clip.mp4 repeats the last picture")
     return record
 
 
 def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Recorded]:
-    """The frames of a run that nobody steers. has_ground: whether ground vehicles take pictures, all at once."""
+    """Yield the frames of a run without steering. has_ground: whether ground vehicles take pictures."""
     apart = _pictures_apart(simulator.scenario)
     shown = np.zeros((*simulator.camera.size_px[::-1], 3), np.uint8)
     for k in range(count):
@@ -99,24 +99,24 @@ def _run(simulator: Simulator, count: int, has_ground: bool) -> Iterator[_Record
 
 
 def _pictures_apart(scenario: Scenario) -> int:
-    """Frames from one picture of a ground vehicle to its next."""
+    """Return the number of frames between two pictures of a ground vehicle."""
     apart_s = with_parameters(Settings(), scenario_settings(scenario)).steering.picture_s
     return max(1, round(apart_s * scenario.clip.rate_hz))
 
 
 def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
-    """Write the ground's heights above the sea as a GeoTIFF; returns a note if rasterio is missing."""
+    """Write the ground's heights above the sea as a GeoTIFF. Return a note if rasterio is missing."""
     try:
         from rasterio.crs import CRS
         from rasterio.io import MemoryFile
         from rasterio.transform import from_origin
     except ImportError:
-        return ["dem.tif is left out: it needs rasterio, pip install 'torchvision-dddas[elevation]'"]
+        return ["dem.tif is not written because rasterio is missing; pip install 'torchvision-dddas[elevation]'"]
     relief, world = simulator.world.relief, simulator.scenario.world
     heights = (relief.up_m + world.above_sea_m)[::-1].astype(np.float32)
     step = relief.step_m
     top = relief.corner_m[1] + (heights.shape[0] - 0.5) * step
-    # The plane that touches the ellipsoid at the origin, as in `geometry`.
+    # Local metres lie on the plane that touches the ellipsoid at the origin, as in `geometry`.
     lon, lat = world.origin_deg
     profile = {
         "driver": "GTiff",
@@ -141,7 +141,7 @@ def _write_elevation(path: Path, simulator: Simulator) -> list[str]:
 
 
 class _RecordingOutput(RunRecorder[_Recorded]):
-    """Everything that `dddas simulate` writes. Raises InputError as RunRecorder does."""
+    """The output folder of `dddas simulate`. Raises InputError as RunRecorder does."""
 
     files: ClassVar[tuple[str, ...]] = (
         *("clip.mp4", "telemetry.csv", "landmarks.csv", "colours.toml", "camera.toml", "dem.tif", "scenario.toml"),
@@ -151,7 +151,7 @@ class _RecordingOutput(RunRecorder[_Recorded]):
     saved: ClassVar[tuple[str, ...]] = RECORDED
 
     def begin(self, simulator: Simulator, count: int) -> RunRecord:
-        """Start the run of `count` frames."""
+        """Start the record of a run of `count` frames."""
         scenario, camera, colours = simulator.scenario, simulator.camera, simulator.colours
         rate_hz, folder = scenario.clip.rate_hz, self.folder
         facts = {
@@ -184,9 +184,9 @@ class _RecordingOutput(RunRecorder[_Recorded]):
 
 
 class _Tables:
-    """telemetry.csv and landmarks.csv, and with the first frame files whose texts are known from the start.
+    """Writes telemetry.csv and landmarks.csv, and with the first frame the files of fixed text.
 
-    Of a vehicle's plans for a frame the newest counts: plans come at the end.
+    Plans are written at the end, because only a vehicle's newest plan for a frame counts.
     """
 
     def __init__(self, folder: Path, names: Sequence[str], texts: dict[str, str]) -> None:
@@ -219,7 +219,7 @@ class _Tables:
 
 
 class _Frames(Part[_Recorded]):
-    """frames/000001.jpg and so on; a dropped frame is an empty file, so that the others keep their numbers."""
+    """Writes frames/000001.jpg and so on. A dropped frame is an empty file, so that the others keep their numbers."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -231,7 +231,7 @@ class _Frames(Part[_Recorded]):
 
 
 class _Ground:
-    """ground/ugv1/000001.jpg and so on, poses.csv, camera.toml and platform.toml beside them."""
+    """Writes ground/ugv1/000001.jpg and so on, with poses.csv, camera.toml and platform.toml beside them."""
 
     def __init__(self, folder: Path, names: Sequence[str], rate_hz: float) -> None:
         self._rate_hz = rate_hz
@@ -265,9 +265,9 @@ class _Ground:
 def film(
     scenario: Scenario, seed: int | None = None, frames: int | None = None, size_px: tuple[int, int] | None = None
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The images (H, W, 3) uint8 BGR and masks (H, W) uint16 of a scenario; a mask numbers the targets that move.
+    """Yield images (H, W, 3) uint8 BGR and masks (H, W) uint16 of a scenario. Masks number the moving targets.
 
-    seed, frames, size_px (width, height): in place of the scenario's own. A dropped frame is left out.
+    seed, frames, size_px (width, height): replace the scenario's own values. Dropped frames are left out.
     """
     changed: dict[str, Any] = {} if seed is None else {"seed": seed}
     if size_px is not None:
@@ -288,10 +288,10 @@ def film_clip(
     scenario: str = "demo",
     tick: Callable[[], object] = lambda: None,
 ) -> Path:
-    """Film a scenario into frames/000001.jpg ... and masks/000001.png ... of a folder, which is returned.
+    """Film a scenario into frames/000001.jpg ... and masks/000001.png ... of a folder. Return the folder.
 
-    The rest as in `film`; tick is called after each frame. Raises InputError for an unknown scenario or if the disk
-    refuses.
+    The other arguments are those of `film`. tick is called after each frame. Raises InputError for an unknown scenario
+    or if the files cannot be written.
     """
     try:
         with claimed(folder):
@@ -308,7 +308,7 @@ def film_clip(
 
 
 def _encode_jpeg(image: np.ndarray) -> bytes:
-    """A picture as a JPEG of high quality. Raises OSError where it cannot be encoded."""
+    """Encode a picture as a JPEG of high quality. Raises OSError if encoding fails."""
     ok, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not ok:
         raise OSError("a picture could not be encoded")
@@ -316,7 +316,7 @@ def _encode_jpeg(image: np.ndarray) -> bytes:
 
 
 def _camera_toml(camera: Camera, is_standing: bool = False) -> str:
-    """A camera's file. is_standing: on the ground, with height, pitch, roll and the uncertainty of its place."""
+    """Return the text of a camera file. is_standing: add a ground camera's height, angles and uncertainties."""
     keys: dict[str, object] = {
         "name": camera.name,
         "width_px": camera.size_px[0],
@@ -345,7 +345,7 @@ def _rounded(value: float) -> float:
 
 
 def _flight_line(time_s: float, flight: Flight) -> str:
-    """A line of telemetry.csv; a cell is empty where the value is unknown."""
+    """Return a line of telemetry.csv. Cells of unknown values are empty."""
     angles = (flight.heading_rad, flight.pitch_rad, flight.roll_rad, flight.hfov_rad, flight.vehicle_heading_rad)
     cells = [_short(time_s, 6), _short(flight.altitude_m, 4), _short(flight.speed_m_s, 4)]
     cells += [_short(v, 9) for v in flight.place] + [_short(flight.above_sea_m, 4)]

@@ -1,8 +1,8 @@
-"""A scenario: what a simulated world holds and what happens in it; read from TOML files, changed, checked, written.
+"""Scenarios: the contents and events of a simulated world. Read them from TOML files, change, check and write them.
 
 Metres are local: east and north of the world's origin, which is its middle. Speeds, behaviours and heights are those of
-appendix A, section V: a border area near Tucson, 1300 m above the sea, crowds at U(1.11, 3.34) m a time unit along east
-and along north, UGVs that are fast at first and slow near the crowd, a UAV 50 to 200 m above ground.
+appendix A, section V: a border area near Tucson, 1300 m above the sea; crowds at U(1.11, 3.34) m per time unit along
+east and along north; UGVs that are fast at first and slow near the crowd; a UAV 50 to 200 m above ground.
 """
 
 import json
@@ -32,44 +32,44 @@ from torchvision_dddas.config import (
 from torchvision_dddas.errors import InputError
 
 _FEWEST = 4  # landmarks needed to georeference a picture
-_HIGHEST_DEG = 85.0  # near the poles longitudes run together
-_MARGIN_M = 2.0  # least distance of what moves from the edge of the world
+_HIGHEST_DEG = 85.0  # greatest latitude; longitudes converge near the poles
+_MARGIN_M = 2.0  # least distance of moving objects from the edge of the world
 _OF_VEHICLES = ("ugv_lost", "gps_dropout", "gps_jump", "landmark_hidden")  # faults of one ground vehicle
-_FILES = ("elevation", "photo")  # parameters of the world that name files
+_FILES = ("elevation", "photo")  # world parameters that name files
 
 Place = tuple[float, float]
 _PLACES: dict[Any, str] = {Place: "two numbers", tuple[Place, ...]: "a list of pairs of numbers"}
 
 
 class WorldParameters(Group):
-    """The ground and what stands on it."""
+    """The ground and the objects that stand on it."""
 
     origin_deg: Place = parameter((-110.95, 31.6), "longitude and latitude of the world's middle", "deg")
     side_m: float = parameter(400.0, "length of the square world's side", "m", 40, 4000)
     texel_m: float = parameter(0.1, "size of a pixel of the ground's texture", "m", 0.02, 2)
     above_sea_m: float = parameter(1300.0, "height of the middle above the sea", "m", -500, 9000)
-    relief_m: float = parameter(3.0, "from the lowest to the highest ground; 0: level", "m", 0, 1000)
-    elevation: str = parameter("", "a GeoTIFF of heights in place of the synthetic relief")
-    photo: str = parameter("", "an ortho-photo, a GeoTIFF, in place of the synthetic desert scrub")
-    bushes_per_ha: float = parameter(40.0, "bushes on a hectare", "1/ha", 0, 2000)
-    trees_per_ha: float = parameter(3.0, "trees on a hectare", "1/ha", 0, 500)
+    relief_m: float = parameter(3.0, "height from the lowest to the highest ground; 0: level", "m", 0, 1000)
+    elevation: str = parameter("", "GeoTIFF of heights that replaces the synthetic relief")
+    photo: str = parameter("", "GeoTIFF of an orthophoto that replaces the synthetic desert scrub")
+    bushes_per_ha: float = parameter(40.0, "bushes per hectare", "1/ha", 0, 2000)
+    trees_per_ha: float = parameter(3.0, "trees per hectare", "1/ha", 0, 500)
     buildings: int = parameter(2, "buildings in the world", "buildings", 0, 200)
     poles: int = parameter(0, "lamp posts and other poles in the world", "poles", 0, 500)
     shore_m: float = parameter(
-        0.0, "water, seen from the air: how far south of the middle its edge lies; 0: no water", "m", -2000, 2000
+        0.0, "distance of the water's edge south of the middle, in aerial pictures; 0: no water", "m", -2000, 2000
     )
     sun_azimuth_deg: float = parameter(140.0, "direction of the sun, clockwise from north", "deg", 0, 360)
     sun_height_deg: float = parameter(50.0, "elevation of the sun", "deg", 5, 90)
 
 
 class CrowdPlan(Group):
-    """A crowd: people who go together."""
+    """A crowd: people who move together."""
 
     people: int = parameter(10, "number of people in it", "people", 1, 5000)
     start_m: Place = parameter((0.0, 0.0), "their initial centre", "m")
     radius_m: float = parameter(2.0, "their largest distance from the centre", "m", 0, 200)
     behaviour: Literal["walk", "random", "stand"] = parameter(
-        "walk", "walk: along way_m or heading_deg; random: a new velocity each time unit; stand"
+        "walk", "walk: along way_m or heading_deg; random: a new velocity each time unit; stand: stay"
     )
     speed_m_s: float = parameter(1.4, "their walking speed", "m/s", 0, 10)
     heading_deg: float = parameter(90.0, "direction, clockwise from north, without way_m", "deg", -360, 360)
@@ -78,7 +78,7 @@ class CrowdPlan(Group):
 
 
 class CarPlan(Group):
-    """A vehicle that is no landmark: clutter, which no person is."""
+    """A car. Cars are not landmarks."""
 
     start_m: Place = parameter((0.0, 0.0), "its initial position", "m")
     heading_deg: float = parameter(90.0, "direction, clockwise from north, without way_m", "deg", -360, 360)
@@ -88,34 +88,34 @@ class CarPlan(Group):
 
 
 class Happening(Group):
-    """Something that crowds do at a time. Crowds are numbered from 1, in the order of the file."""
+    """An event of crowds. Crowds are numbered from 1, in the order of the file."""
 
-    time_s: float = parameter(10.0, "when", "s", 0, 86400)
+    time_s: float = parameter(10.0, "time of the event", "s", 0, 86400)
     what: Literal["join", "split", "scatter"] = parameter(
         "join",
-        "join: two or more walk to one place and go on as the first; split: one parts in two, whose ways differ "
-        "by turn_deg; scatter: everyone of it runs off on their own",
+        "join: two or more crowds meet and continue as the first; split: a crowd becomes two, whose directions differ "
+        "by turn_deg; scatter: the people of a crowd run off one by one",
     )
     crowds: Annotated[tuple[Annotated[int, Field(ge=1, le=10_000)], ...], Field(min_length=1)] = parameter(
-        (1,), "which crowds"
+        (1,), "numbers of the crowds"
     )
-    turn_deg: float = parameter(60.0, "angle between the ways of the two parts of a split", "deg", 0, 180)
+    turn_deg: float = parameter(60.0, "angle between the directions of the two parts of a split", "deg", 0, 180)
 
 
 class TeamParameters(Group):
-    """The ground vehicles: landmarks for the aerial camera, and eyes on the ground."""
+    """The ground vehicles: landmarks for the aerial camera, with cameras of their own."""
 
     ugvs: int = parameter(4, "number of vehicles; each has its own colour", "vehicles", 0, 12)
-    ring_m: float = parameter(14.0, "radius of the ring about middle_m on which they stand at first", "m", 0, 1000)
-    middle_m: Place = parameter((0.0, 0.0), "middle of that ring", "m")
-    patrol_m_s: float = parameter(1.0, "speed along their planned ways, while nobody steers them", "m/s", 0, 10)
+    ring_m: float = parameter(14.0, "radius of the ring about middle_m on which they start", "m", 0, 1000)
+    middle_m: Place = parameter((0.0, 0.0), "middle of the ring", "m")
+    patrol_m_s: float = parameter(1.0, "speed along their planned ways while they are not steered", "m/s", 0, 10)
     patrol: Literal["stand", "random", "gather", "along"] = parameter(
         "random",
-        "planned ways: none; from place to place within the ring; to its middle, fast and then slow, as the "
-        "source's; with the UAV's own way",
+        "stand: stay; random: go from place to place within the ring; gather: go to the middle, fast and then slow, as "
+        "in the source; along: follow the UAV's way",
     )
-    planned: bool = parameter(True, "they share their planned waypoints, which bridge GPS dropouts")
-    hfov_deg: float = parameter(56.0, "width of the field of view of their cameras", "deg", 10, 120)
+    planned: bool = parameter(True, "whether they share planned waypoints, which bridge GPS dropouts")
+    hfov_deg: float = parameter(56.0, "horizontal field of view of their cameras", "deg", 10, 120)
     width_px: int = parameter(640, "width of their pictures", "px", 64, 3840)
     height_px: int = parameter(480, "height of their pictures", "px", 64, 2160)
     camera_m: float = parameter(1.3, "height of their cameras above ground", "m", 0.1, 20)
@@ -124,30 +124,30 @@ class TeamParameters(Group):
 class GpsParameters(Group):
     """The receivers of the ground vehicles."""
 
-    error95_m: float = parameter(0.0, "95 % of the places are this near the truth; 0: exact", "m", 0, 1000)
+    error95_m: float = parameter(0.0, "95 % of the reported places have at most this error; 0: exact", "m", 0, 1000)
     white_share: float = parameter(0.1, "share of the variance that is new in each report", "-", 0, 1)
-    correlation_s: float = parameter(60.0, "time over which the rest stays alike", "s", 0.1, 1e5)
-    common_m: float = parameter(0.0, "standard deviation, per axis, of what all receivers share", "m", 0, 1000)
-    rate_hz: float = parameter(10.0, "reports a second", "1/s", 0.01, 100)
+    correlation_s: float = parameter(60.0, "time constant of the rest of the error", "s", 0.1, 1e5)
+    common_m: float = parameter(0.0, "standard deviation, per axis, of the error shared by all receivers", "m", 0, 1000)
+    rate_hz: float = parameter(10.0, "reports per second", "1/s", 0.01, 100)
 
 
 class AircraftParameters(Group):
-    """The UAV, what it reports of itself, and how it flies while nobody steers it."""
+    """The UAV, its reports, and its flight while it is not steered."""
 
     altitude_m: float = parameter(50.0, "height above the ground below it", "m", 2, 2000)
-    pitch_deg: float = parameter(90.0, "how far the camera looks below the horizon; 90: down", "deg", 10, 90)
-    heading_deg: float = parameter(0.0, "heading of the picture's upper edge at first", "deg", -360, 360)
-    start_m: Place = parameter((0.0, 0.0), "ground that is in the middle of the picture at first", "m")
-    way_m: tuple[Place, ...] = parameter((), "places that it looks at, one after the other, and back again", "m")
-    size_m: float = parameter(0.0, "size of the UAV, whose shadow falls on the ground; 0: no shadow", "m", 0, 20)
+    pitch_deg: float = parameter(90.0, "angle of the camera below the horizon; 90: straight down", "deg", 10, 90)
+    heading_deg: float = parameter(0.0, "initial heading of the picture's upper edge", "deg", -360, 360)
+    start_m: Place = parameter((0.0, 0.0), "initial ground place in the middle of the picture", "m")
+    way_m: tuple[Place, ...] = parameter((), "ground places that it looks at in turn, there and back", "m")
+    size_m: float = parameter(0.0, "size of the UAV for its shadow on the ground; 0: no shadow", "m", 0, 20)
     speed_m_s: float = parameter(2.0, "speed along its way", "m/s", 0, 40)
-    maximum_m_s: float = parameter(10.0, "fastest that it flies when it is steered", "m/s", 0.1, 60)
-    wind_m_s: float = parameter(1.0, "standard deviation of the gusts that push it about", "m/s", 0, 30)
-    shake_deg: float = parameter(0.15, "standard deviation of the camera's angles about the intended", "deg", 0, 20)
-    place_error95_m: float = parameter(3.5, "of its own GPS, as in gps.error95_m", "m", 0, 1000)
-    angle_error_deg: float = parameter(1.0, "standard deviation of the tilt it reports, lasting", "deg", 0, 90)
-    heading_error_deg: float = parameter(3.0, "of the heading", "deg", 0, 180)
-    altitude_error: float = parameter(0.01, "of the altitude, as a share", "-", 0, 1)
+    maximum_m_s: float = parameter(10.0, "greatest speed when it is steered", "m/s", 0.1, 60)
+    wind_m_s: float = parameter(1.0, "standard deviation of the gusts that move it", "m/s", 0, 30)
+    shake_deg: float = parameter(0.15, "standard deviation of the camera's angles", "deg", 0, 20)
+    place_error95_m: float = parameter(3.5, "error of the UAV's own GPS, as gps.error95_m", "m", 0, 1000)
+    angle_error_deg: float = parameter(1.0, "standard deviation of the reported tilt's lasting error", "deg", 0, 90)
+    heading_error_deg: float = parameter(3.0, "standard deviation of the error of the reported heading", "deg", 0, 180)
+    altitude_error: float = parameter(0.01, "standard deviation of the reported altitude, as a share of it", "-", 0, 1)
 
 
 class CameraParameters(Group):
@@ -155,50 +155,50 @@ class CameraParameters(Group):
 
     width_px: int = parameter(640, "width of the picture", "px", 64, 3840)
     height_px: int = parameter(480, "height of the picture", "px", 64, 2160)
-    hfov_deg: float = parameter(60.0, "width of the field of view", "deg", 5, 120)
-    thermal: bool = parameter(False, "a thermal camera: people bright, the ground and buildings dull, no shadows")
-    exposure_s: float = parameter(0.002, "time of exposure: what moves is blurred along its way", "s", 0, 0.5)
-    readout_s: float = parameter(0.015, "rolling shutter: how much later the last row is read", "s", 0, 0.5)
+    hfov_deg: float = parameter(60.0, "horizontal field of view", "deg", 5, 120)
+    thermal: bool = parameter(False, "thermal camera: people are bright, ground and buildings are dull, no shadows")
+    exposure_s: float = parameter(0.002, "exposure time, which blurs moving objects", "s", 0, 0.5)
+    readout_s: float = parameter(0.015, "rolling shutter: time from the first to the last row", "s", 0, 0.5)
     vibration_px: float = parameter(
-        0.04, "rolling shutter: standard deviation of how far vibration moves rows aside", "px", 0, 10
+        0.04, "rolling shutter: standard deviation of the rows' shift by vibration", "px", 0, 10
     )
     sharpness_px: float = parameter(0.6, "standard deviation of the lens's blur", "px", 0, 10)
-    shot_noise: float = parameter(0.015, "variance of the noise, in grey levels, for each grey level", "-", 0, 10)
+    shot_noise: float = parameter(0.015, "variance of the noise per grey level of brightness", "-", 0, 10)
     read_noise: float = parameter(0.6, "standard deviation of the noise in the dark", "grey levels", 0, 50)
     drift: float = parameter(0.03, "amplitude of slow changes of exposure, as a share", "-", 0, 0.5)
-    quality: int = parameter(75, "of the JPEG compression; 100: none", "-", 10, 100)
+    quality: int = parameter(75, "JPEG quality; 100: no compression", "-", 10, 100)
 
 
 class Fault(Group):
-    """Something that goes wrong for a while."""
+    """A fault that lasts for a while."""
 
     what: Literal[
         "ugv_lost", "gps_dropout", "gps_jump", "frozen", "dropped", "gust", "cut", "landmark_hidden", "telemetry_silent"
     ] = parameter(
         "gps_dropout",
-        "a vehicle stops and is silent; its receiver is silent; its places are off by `size` metres; the camera "
-        "repeats a picture; pictures are missing; the UAV is pushed with `size` m/s; the film goes on `size` metres "
-        "further east; a marker is covered; the UAV says nothing of itself",
+        "ugv_lost: the vehicle stops and is silent; gps_dropout: no GPS; gps_jump: its places are off by `size` m; "
+        "frozen: the camera repeats a picture; dropped: no pictures; gust: `size` m/s; cut: the film jumps `size` m "
+        "east; landmark_hidden: the marker is covered; telemetry_silent: the UAV sends no telemetry",
     )
-    time_s: float = parameter(10.0, "when it begins", "s", 0, 86400)
-    seconds: float = parameter(5.0, "how long it lasts", "s", 0, 86400)
-    vehicle: int = parameter(1, "which ground vehicle, counted from 1", "-", 1, 12)
-    size: float = parameter(10.0, "how far or fast, in metres or metres a second", "-", 0, 1000)
+    time_s: float = parameter(10.0, "start time", "s", 0, 86400)
+    seconds: float = parameter(5.0, "duration", "s", 0, 86400)
+    vehicle: int = parameter(1, "number of the ground vehicle, from 1", "-", 1, 12)
+    size: float = parameter(10.0, "size of the fault, in metres or m/s", "-", 0, 1000)
 
 
 class ClipParameters(Group):
-    """How long the run is, and how it is located."""
+    """Length of the run, and how its pictures are located."""
 
     seconds: float = parameter(30.0, "length of the run", "s", 0.3, 86400)
-    rate_hz: float = parameter(10.0, "pictures a second", "1/s", 1, 120)
+    rate_hz: float = parameter(10.0, "pictures per second", "1/s", 1, 120)
     located_by: Literal["landmarks", "telemetry", "nothing"] = parameter(
         "landmarks",
-        "what lays the UAV's pictures on the ground in `dddas run sim:`; telemetry: markers are not looked for",
+        "how `dddas run sim:` locates the UAV's pictures on the ground; telemetry: without markers",
     )
 
 
 class Scenario(Group):
-    """A whole scenario. seed: of everything that chance decides in it; about: what it shows, in a sentence."""
+    """A whole scenario. seed: seed of all random numbers. about: one sentence about the scenario."""
 
     about: str = ""
     seed: int = Field(default=0, ge=0, le=2**31 - 1)
@@ -216,12 +216,12 @@ class Scenario(Group):
 
 
 def scenario_names() -> list[str]:
-    """The shipped scenarios, by name."""
+    """Return the names of the shipped scenarios."""
     return sorted(path.stem for path in (config_folder() / "scenarios").glob("*.toml"))
 
 
 def scenario_parameters() -> list[Parameter]:
-    """Every parameter of a scenario by the name that changes it: `uav.altitude_m`, `crowd.1.people`."""
+    """Return every parameter of a scenario, named as in overrides: `uav.altitude_m`, `crowd.1.people`."""
     rows = []
     for key, field in Scenario.model_fields.items():
         if group := _group(field):
@@ -235,25 +235,25 @@ def scenario_parameters() -> list[Parameter]:
 TEAM: dict[str, object] = {
     "aerial.shadows": True,  # the simulator's sun is known
     "landmarks.length_m": 2.5,
-    "people.scale_step": 1.1,  # as many people are found from the ground in half the time
+    "people.scale_step": 1.1,  # finds as many people from the ground in half the time
     "crowds.join_m": 3.0,
     "steering.sampling": True,
-    "gates.tiny_px": 1000.0,  # a crowd is one target at any height
+    "gates.tiny_px": 1000.0,  # a crowd stays one target at any height
 }
-"""Parameters that belong to a simulated team which watches crowds."""
+"""Settings for a simulated team that watches crowds."""
 
 
 def scenario_settings(scenario: Scenario, config: str | None = None) -> dict[str, object]:
-    """The parameters of the system that a scenario sets: `{"group.parameter": value}`.
+    """Return the system's parameters that a scenario sets: `{"group.parameter": value}`.
 
-    config: the configuration that is chosen. TEAM holds for the default and for `patrol`, which add nothing to it.
+    config: the chosen configuration. TEAM is added for the default configuration and for `patrol`.
     """
     own = {f"{group}.{key}": value for group, keys in scenario.settings.items() for key, value in keys.items()}
     return TEAM | own if config in (None, "patrol") else own
 
 
 def scenario_toml(scenario: Scenario) -> str:
-    """The whole scenario as a file that `load_scenario` reads."""
+    """Return the whole scenario as the text of a file that `load_scenario` reads."""
     content = scenario.model_dump(mode="json")
     return format_toml({key: value for key, value in content.items() if value not in ([], {})})
 
@@ -263,8 +263,8 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
 
     overrides: changes such as `uav.altitude_m=80` or `crowd.1.people=20`. seed: replaces the scenario's own seed. Files
     that the scenario names are searched for in its folder first, then in the working directory.
-    Raises InputError with one line: no such scenario (with those there are), no TOML, an unknown parameter (with the
-    nearest), a value out of its range, and what `check_scenario` says.
+    Raises InputError for an unknown scenario (lists the known ones), invalid TOML, an unknown parameter (suggests the
+    nearest), a value outside its range, and a scenario that `check_scenario` rejects.
     """
     path = Path(name_or_path)
     if not is_file(path):
@@ -273,7 +273,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
         path = config_folder() / "scenarios" / f"{name_or_path}.toml"
         if not str(name_or_path) or not is_file(path):
             names = ", ".join(scenario_names())
-            raise InputError(f"no scenario is named '{name_or_path}'; there are {names}, or give a TOML file")
+            raise InputError(f"no scenario is named '{name_or_path}'; choose from {names}, or give a TOML file")
     content = read_toml(path)
     origin = str(path) if path == Path(name_or_path) else f"scenario {path.stem}"
     if not content:
@@ -289,7 +289,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
         scenario = scenario.model_copy(update={"world": scenario.world.model_copy(update=beside)})
         check_scenario(scenario)
     except RecursionError:
-        raise InputError(f"{origin}: its tables go too deep; wanted such as [clip] and [[crowd]]") from None
+        raise InputError(f"{origin}: tables are nested too deeply; use tables such as [clip] only") from None
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{origin}: {_explain(first['loc'], first['type'], first['msg'], first['input'])}") from None
@@ -299,14 +299,14 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
 
 
 def _override(content: dict[str, Any], name: str, value: object) -> None:
-    """Set a value by its name. Raises InputError where there is no such place."""
+    """Set a value by its name. Raises InputError if the name does not exist."""
     place: Any = content
     *parts, last = name.split(".")
     for k, part in enumerate(parts):
         if isinstance(place, list):
             if not part.isdecimal() or len(part) > 6 or not 1 <= int(part) <= len(place):
                 kind, count = parts[k - 1], "is 1" if len(place) == 1 else f"are {len(place)}"
-                raise InputError(f"'{name}' names no {kind}; wanted {kind}.1, {kind}.2, ..., of which there {count}")
+                raise InputError(f"'{name}' names no {kind}; wanted {kind}.1, {kind}.2, ...; there {count}")
             place = place[int(part) - 1]
         else:
             place = place.setdefault(part, {})
@@ -316,19 +316,19 @@ def _override(content: dict[str, Any], name: str, value: object) -> None:
         kind = parts[-1]
         group = _group(Scenario.model_fields[kind]) if kind in Scenario.model_fields else None
         example = next(iter(group.model_fields)) if group else "value"
-        raise InputError(f"'{name}' names no parameter; wanted such as {kind}.1.{example}=...")
+        raise InputError(f"'{name}' names no parameter; wanted a name such as {kind}.1.{example}=...")
     place[last] = value
 
 
 def _with_tuples(value: Any) -> Any:
-    """TOML has lists where scenarios have tuples."""
+    """Replace the lists of TOML by the tuples of scenarios."""
     if isinstance(value, dict):
         return {key: _with_tuples(entry) for key, entry in value.items()}
     return tuple(_with_tuples(entry) for entry in value) if isinstance(value, list) else value
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Raises InputError with one line for an impossible scenario: places outside the world, no such crowd, ..."""
+    """Raise InputError for an impossible scenario: places outside the world, unknown crowds and so on."""
     clip, camera, team = scenario.clip, scenario.camera, scenario.team
     longitude, latitude = scenario.world.origin_deg
     if abs(longitude) > 180 or abs(latitude) > _HIGHEST_DEG:
@@ -345,7 +345,7 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if camera.exposure_s * clip.rate_hz > 1:
         raise InputError(
-            f"camera.exposure_s = {camera.exposure_s:g} is longer than from picture to picture; wanted "
+            f"camera.exposure_s = {camera.exposure_s:g} is longer than the time between pictures; wanted "
             f"{1 / clip.rate_hz:g} s or less at clip.rate_hz = {clip.rate_hz:g}"
         )
     for key in _FILES:
@@ -355,7 +355,7 @@ def check_scenario(scenario: Scenario) -> None:
 
 
 def _check_places(scenario: Scenario) -> None:
-    """Everything that has a place is inside the world."""
+    """Raise InputError if a place lies outside the world."""
     team, uav, reach = scenario.team, scenario.uav, scenario.world.side_m / 2 - _MARGIN_M
     places: list[tuple[str, Place, float]] = []
     plans: dict[str, Sequence[CrowdPlan | CarPlan]] = {"crowd": scenario.crowd, "car": scenario.car}
@@ -376,7 +376,7 @@ def _check_places(scenario: Scenario) -> None:
 
 
 def _check_events(scenario: Scenario) -> None:
-    """What happens, happens during the clip, to something that is there."""
+    """Raise InputError if an event or fault is after the clip's end, or concerns a missing crowd or vehicle."""
     ugvs, end, count = scenario.team.ugvs, scenario.clip.seconds, len(scenario.crowd)
 
     def check_time(name: str, time_s: float) -> None:
@@ -387,30 +387,30 @@ def _check_events(scenario: Scenario) -> None:
         name, crowds = f"happening.{k}", happening.crowds
         for which in crowds:
             if which > count:
-                there = f"there {'is' if count == 1 else 'are'} {count or 'none'}"
-                raise InputError(f"{name}.crowds names crowd {which}, of which {there}")
+                there = "is 1 crowd" if count == 1 else f"are {count or 'no'} crowds"
+                raise InputError(f"{name}.crowds names crowd {which}, but there {there}")
         if happening.what == "join" and len(set(crowds)) < 2:
             raise InputError(f"{name}.crowds must name two or more crowds to join, got {list(crowds)}")
         if len(set(crowds)) < len(crowds):
             raise InputError(f"{name}.crowds = {list(crowds)} names a crowd twice")
         for which in crowds:
             if happening.what == "split" and scenario.crowd[which - 1].people < 2:
-                raise InputError(f"{name}: crowd {which} is one person, and cannot split")
+                raise InputError(f"{name}: crowd {which} has one person and cannot split")
         check_time(name, happening.time_s)
     for k, fault in enumerate(scenario.fault, 1):
         check_time(f"fault.{k}", fault.time_s)
         if fault.what in _OF_VEHICLES and fault.vehicle > ugvs:
-            raise InputError(f"fault.{k}.vehicle = {fault.vehicle} is not there; team.ugvs = {ugvs} counts them")
+            raise InputError(f"fault.{k}.vehicle = {fault.vehicle} does not exist; wanted team.ugvs = {ugvs} or less")
 
 
 def _explain(loc: tuple[int | str, ...], kind: str, message: str, value: object) -> str:
-    """One line of what pydantic found first: the parameter by its name, what came, what was wanted."""
+    """Return a line about pydantic's first error: the parameter's name, the value, and the wanted values."""
     fields, name, field, is_list = Scenario.model_fields, "", None, False
     for part in loc:
         if is_list:
             name, is_list = f"{name}.{int(part) + 1}", False
             continue
-        if part not in fields:  # inside a parameter: a place in a list
+        if part not in fields:  # a list index inside a parameter
             break
         name = f"{name}.{part}".lstrip(".")
         field = fields[str(part)]
@@ -437,13 +437,13 @@ def _explain(loc: tuple[int | str, ...], kind: str, message: str, value: object)
 
 
 def _nearest_parameter(name: str) -> str:
-    """Names that look like it, or the tables that there are."""
+    """Suggest the parameters with similar names, or list the tables."""
     known = ["about", "seed", *(row.name for row in scenario_parameters())]
     tables = ", ".join(key for key in Scenario.model_fields if key not in ("about", "seed"))
     return nearest(name, known, f"its tables are {tables}")
 
 
 def _group(field: FieldInfo) -> type[Group] | None:
-    """The group that a field holds, or that the entries of its list are."""
+    """Return the group class of a field or of its list's entries, or None."""
     kind = get_args(field.annotation)[0] if get_origin(field.annotation) is tuple else field.annotation
     return kind if isinstance(kind, type) and issubclass(kind, Group) else None

@@ -8,15 +8,15 @@ import numpy as np
 
 from torchvision_dddas.lab.simulation.scenario import CameraParameters, Fault
 
-SIGMAS_95 = 2.4477  # radius that holds 95 % of a circular normal distribution, in standard deviations along each axis
+SIGMAS_95 = 2.4477  # 95 % radius of a circular normal distribution, in standard deviations along an axis
 _BAND, _BLOCK = 32, 16  # rows
-_SPARE_PX = 192  # margin of the tile of noise, so that its start can vary
+_SPARE_PX = 192  # margin of the noise tile, so that the start of the crop can vary
 
 
 class Sensor:
-    """The sensor of a camera. stream distinguishes cameras of one seed.
+    """The sensor of a camera. stream: distinguishes cameras with the same seed.
 
-    What happens to a picture depends on the seed, the stream and the picture's number alone.
+    The changes to a picture depend only on the seed, the stream, and the picture's number and time.
     """
 
     def __init__(self, parameters: CameraParameters, size_px: tuple[int, int], seed: int, stream: int = 0) -> None:
@@ -28,12 +28,12 @@ class Sensor:
         self._tile = rng.standard_normal(shape, np.float32) if is_noisy else None
 
     def gain(self, time_s: float) -> float:
-        """The exposure relative to its middle: slow, of a few periods, within 1 - drift to 1 + drift."""
+        """Return the relative exposure: a sum of slow waves, from 1 - drift to 1 + drift."""
         waves = np.sin(2 * np.pi * time_s / np.array([11.0, 4.3, 27.0]) + self._phase)
         return 1 + self.parameters.drift * float(waves @ (0.5, 0.2, 0.3))
 
     def expose(self, picture: np.ndarray, number: int, time_s: float) -> np.ndarray:
-        """The file's picture, (H, W, 3) uint8, of what the lens looks at, the same; number: of the picture."""
+        """Return the camera's picture of a scene, both (H, W, 3) uint8. number: number of the picture."""
         parameters = self.parameters
         levels = np.asarray(np.arange(256) * self.gain(time_s), np.float32)
         sigma = np.asarray(np.sqrt(parameters.shot_noise * levels + parameters.read_noise**2), np.float32)
@@ -42,7 +42,7 @@ class Sensor:
             rng = np.random.default_rng([*self._key, number])
             y, x = rng.integers(0, _SPARE_PX, 2)
             grain = self._tile[y : y + picture.shape[0], x : x + picture.shape[1]]
-            # Mirrored and the sign changed, so that no two pictures show the same pattern moved aside.
+            # Mirror the noise and change its sign at random, so that no pattern reappears in a shifted place.
             flip = int(rng.integers(0, 4))
             grain = grain[::-1] if flip in (0, 1) else grain
             turned = flip in (0, 2)
@@ -55,7 +55,7 @@ class Sensor:
             if grain is None:
                 cv2.LUT(picture[part], np.asarray(np.clip(np.round(levels), 0, 255), np.uint8), dst=developed[part])
             else:
-                # Bands of rows that the processor's cache holds.
+                # Process bands of rows that fit the processor's cache.
                 for first in range(part.start, part.stop, _BAND):
                     rows = slice(first, min(first + _BAND, part.stop))
                     noise = cv2.LUT(picture[rows], sigma)
@@ -66,7 +66,7 @@ class Sensor:
                 _, file = cv2.imencode(".jpg", developed[part], [cv2.IMWRITE_JPEG_QUALITY, parameters.quality])
                 developed[part] = cv2.imdecode(file, cv2.IMREAD_COLOR)
 
-        # Two halves at a time: they share no block of the compression.
+        # Develop two halves in parallel. They share no block of the compression.
         middle, height = len(picture) // 2 // _BLOCK * _BLOCK, len(picture)
         with ThreadPoolExecutor(1) as other:
             upper = other.submit(develop, slice(0, middle)) if middle else None
@@ -77,10 +77,10 @@ class Sensor:
 
 
 class Receivers:
-    """The errors of K receivers, from one report to the next.
+    """The errors of K receivers, report by report.
 
-    Of the variance, white_share is new in each report. The rest is a stationary Gauss-Markov process of time constant
-    correlation_s. On top of that all share another, of standard deviation common_m.
+    A share white_share of the variance is new in each report. The rest is a stationary Gauss-Markov process with time
+    constant correlation_s. All receivers share a further process with standard deviation common_m.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Receivers:
         self._white = self.sigma_m * np.sqrt(white_share)
         self._slow = self.sigma_m * np.sqrt(1 - white_share)
         self._correlation_s, self._common, self._rng = correlation_s, common_m, rng
-        # The last row is what all share.
+        # The last row is the shared error.
         self._state = rng.standard_normal((count + 1, 2))
         self._new = rng.standard_normal((count, 2))
 
@@ -108,7 +108,7 @@ class Receivers:
 
     @property
     def lasting_m(self) -> np.ndarray:
-        """(K, 2) east, north: the part of the errors that lasts, the shared one included."""
+        """(K, 2) east, north: the lasting part of the errors, including the shared part."""
         return self._slow * self._state[:-1] + self._common * self._state[-1]
 
     @property
@@ -120,23 +120,23 @@ class Receivers:
 _EVENTS = {
     "ugv_lost": ("{who} is lost", "{who} is back"),
     "gps_dropout": ("{who} has no GPS", "{who} has GPS again"),
-    "gps_jump": ("the GPS of {who} is off by {size:g} m", "the GPS of {who} is as before"),
-    "frozen": ("the UAV's camera repeats a picture", "the UAV's camera sees again"),
-    "dropped": ("pictures of the UAV are missing", "the UAV's pictures come again"),
-    "gust": ("a gust pushes the UAV with {size:g} m/s", "the gust is over"),
-    "cut": ("the film goes on elsewhere", "the film goes back"),
-    "landmark_hidden": ("the marker of {who} is covered", "the marker of {who} is seen again"),
-    "telemetry_silent": ("the UAV says nothing of itself", "the UAV reports again"),
+    "gps_jump": ("the GPS of {who} is off by {size:g} m", "the GPS of {who} is correct again"),
+    "frozen": ("the UAV's camera repeats a picture", "the UAV's camera works again"),
+    "dropped": ("pictures of the UAV are missing", "the UAV's pictures are back"),
+    "gust": ("a gust pushes the UAV at {size:g} m/s", "the gust is over"),
+    "cut": ("the film jumps to another place", "the film jumps back"),
+    "landmark_hidden": ("the marker of {who} is covered", "the marker of {who} is visible again"),
+    "telemetry_silent": ("the UAV sends no telemetry", "the UAV sends telemetry again"),
 }
-_EARLY_S = 1e-9  # times of frames are rounded; a fault begins at the frame of its time, not one later
+_EARLY_S = 1e-9  # tolerance for rounded frame times, so that a fault begins at the frame of its time
 
 
 @dataclass(frozen=True)
 class ActiveFaults:
-    """The faults at a moment; vehicles by their rows, from 0.
+    """The faults at a moment. Vehicles are given by their rows, from 0.
 
-    jumped: metres, by vehicle. gusts: (row of the fault, seconds since it began, size). cut_m: how far
-    east the film is taken up. picture: "", frozen or dropped.
+    jumped: metres, by vehicle. gusts: (row of the fault, seconds since its start, size). cut_m: shift of the
+    camera to the east. picture: "", "frozen" or "dropped".
     """
 
     lost: frozenset[int]
@@ -150,7 +150,7 @@ class ActiveFaults:
 
 
 def active_faults(faults: tuple[Fault, ...], time_s: float) -> ActiveFaults:
-    """Those of a time; a fault lasts from its time until, but not at, its end."""
+    """Return the faults that are active at a time. The end of a fault is excluded."""
     now = [
         (row, fault)
         for row, fault in enumerate(faults)
@@ -174,7 +174,7 @@ def active_faults(faults: tuple[Fault, ...], time_s: float) -> ActiveFaults:
 
 
 def fault_events(faults: tuple[Fault, ...], before_s: float, now_s: float) -> list[str]:
-    """What began or ended after the one time, and until the other, in words."""
+    """Return the starts and ends of faults after before_s and until now_s, in words."""
     events = []
     for fault in faults:
         for words, time_s in zip(_EVENTS[fault.what], (fault.time_s, fault.time_s + fault.seconds), strict=True):

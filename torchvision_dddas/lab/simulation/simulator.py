@@ -1,4 +1,4 @@
-"""A scenario that runs: world, agents and cameras in one, steered on the way; alone, or as a source of frames."""
+"""Run a scenario: world, agents and cameras, with steering. Use it alone or as a source of frames."""
 
 import math
 from collections import deque
@@ -36,20 +36,20 @@ from torchvision_dddas.types import (
     is_sampled,
 )
 
-KEPT = 100  # pictures and truths kept until they are fetched: a megabyte each
-_CLEAR_M = 4.0  # nothing stands nearer to where something that moves begins
-# The first fields of Flight, from the altitude to the heading of the nose, are what a vehicle reports.
+KEPT = 100  # most pictures and truths that wait to be fetched, about 1 MB each
+_CLEAR_M = 4.0  # least distance of standing objects from the start of moving objects
+# A UAV reports the first fields of Flight, from the altitude to the heading of the nose.
 _SAID = 9
-_FLIGHT_CLEAR_M = 1.0  # nothing that stands below it comes nearer: gusts push it about by less
+_FLIGHT_CLEAR_M = 1.0  # least height of the UAV over standing objects; gusts move it by less
 _STEP_M = 1.0
 _PARTS = 64
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What one frame of a run gives. frame: None where the camera dropped it.
+    """The data of a frame of a run. frame: None if the camera dropped it.
 
-    moments: of all frames of the world since the shot before it; the last is this shot's own.
+    moments: the moments of all frames of the world since the last shot. The last moment belongs to this shot.
     """
 
     frame: Frame | None
@@ -58,20 +58,20 @@ class Shot:
 
 
 class Simulator:
-    """A run of a scenario from its first frame on. Everything in it follows from the scenario, its seed and commands.
+    """A run of a scenario from its first frame. The scenario, its seed and the commands determine it completely.
 
-    camera: the aerial one. colours: of the landmarks. names: of the ground vehicles. frames: of the whole run.
+    camera: the aerial camera. colours: of the landmarks. names: of the ground vehicles. frames: number of frames.
     """
 
     def __init__(self, scenario: Scenario, elevation: Elevation | None = None, photo: Ortho | None = None) -> None:
-        """elevation, photo: in place of the synthetic ground, about the scenario's world.origin_deg.
+        """elevation, photo: replace the synthetic ground, in metres about the scenario's world.origin_deg.
 
         Raises InputError for an impossible scenario.
         """
         check_scenario(scenario)
         self.scenario = scenario
         clear = _start_places_m(scenario), _CLEAR_M
-        # Heat has no shadows: light from straight above casts none.
+        # Thermal pictures have no shadows, so put the sun straight above.
         light = {"sun_height_deg": 90.0} if scenario.camera.thermal else {}
         ground = scenario.world.model_copy(update=light)
         self.world: World = build_world(ground, scenario.seed, elevation, photo, clear)
@@ -84,7 +84,7 @@ class Simulator:
         self.restart()
 
     def restart(self) -> None:
-        """Begin again: the same world, and the same events in it."""
+        """Start the run again, with the same world and the same events."""
         self._agents = Agents(self.scenario, self.world)
         self._every, self._number, self._skipped = 1, 0, 0
         self._before: np.ndarray | None = None
@@ -99,7 +99,7 @@ class Simulator:
         self._agents.steer(command)
 
     def next(self) -> Shot | None:
-        """The next frame that is wanted; None after the last."""
+        """Return the next frame at the commanded interval, or None after the last."""
         ahead = self._every if self._number else 1
         if self._number + ahead > self.frames:
             return None
@@ -124,12 +124,12 @@ class Simulator:
         return Shot(frame, truth, tuple(moments))
 
     def picture(self, vehicle: str) -> GroundPicture | None:
-        """What a ground vehicle sees at the frame taken last; None while it is silent."""
+        """Return a ground vehicle's picture at the last frame, or None while it is silent."""
         return None if self._now is None else self._ground.take(self._now, self.names.index(vehicle))
 
 
 def _start_places_m(scenario: Scenario) -> np.ndarray:
-    """(N, 2) places about which moving objects begin: crowds and their surroundings, cars, the ring of UGVs."""
+    """Return (N, 2) places near which moving objects start: crowds with their surroundings, cars, the ring of UGVs."""
     about = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
     places = [np.zeros((0, 2)), *(np.array([car.start_m]) for car in scenario.car)]
     places += [np.array(crowd.start_m) + about * min(crowd.radius_m, 2 * _CLEAR_M) for crowd in scenario.crowd]
@@ -140,7 +140,7 @@ def _start_places_m(scenario: Scenario) -> np.ndarray:
 
 
 def _check_flight(parameters: AircraftParameters, world: World) -> None:
-    """Raises InputError where what stands there reaches up to the UAV's way, or the ground hides what it looks at."""
+    """Raise InputError if objects reach up to the UAV's way, or if the ground hides the place that it looks at."""
     corners = np.array([parameters.start_m, *parameters.way_m], float)
     legs = [corners[:1]]
     for begin, end in pairwise(corners):
@@ -150,7 +150,7 @@ def _check_flight(parameters: AircraftParameters, world: World) -> None:
     altitude, pitch = parameters.altitude_m, np.radians(parameters.pitch_deg)
     back = altitude / np.tan(pitch) if parameters.pitch_deg < 90 else 0.0
     flown = aimed - back * heading_vector(np.radians(parameters.heading_deg))
-    # Heights of what stands there; beyond its edges the world is mirrored.
+    # Heights of objects below the way. The world is mirrored beyond its edges.
     side, half = world.surface.shape[0], world.side_m / 2
     at = np.stack([half - flown[:, 1], flown[:, 0] + half]) / world.surface_texel_m
     at = np.floor(at).astype(int) % (2 * side)
@@ -159,8 +159,8 @@ def _check_flight(parameters: AircraftParameters, world: World) -> None:
     if (low := tall + _FLIGHT_CLEAR_M > altitude).any():
         k = int(np.where(low, tall, -1).argmax())
         raise InputError(
-            f"uav.altitude_m = {altitude:g} is too low: {tall[k]:.1f} m stand at [{flown[k, 0]:.0f}, "
-            f"{flown[k, 1]:.0f}]; fly {np.ceil(tall[k] + _FLIGHT_CLEAR_M):g} m high or more"
+            f"uav.altitude_m = {altitude:g} is too low: the object at [{flown[k, 0]:.0f}, {flown[k, 1]:.0f}] is "
+            f"{tall[k]:.1f} m high; fly {np.ceil(tall[k] + _FLIGHT_CLEAR_M):g} m high or more"
         )
     aimed_up, flown_up = world.up_m(aimed), altitude + world.up_m(flown)
     share = np.linspace(0, 1, _PARTS, endpoint=False)[:, None]
@@ -171,25 +171,25 @@ def _check_flight(parameters: AircraftParameters, world: World) -> None:
         worst = np.unravel_index(over.argmin(), over.shape)
         east, north = rays[worst]
         raise InputError(
-            f"uav.altitude_m = {altitude:g} is below the terrain that it looks over: at [{east:.0f}, {north:.0f}] the "
-            f"ground is {-over[worst]:.1f} m above its line of sight; fly higher, or look down more steeply than "
+            f"uav.altitude_m = {altitude:g} is too low for the terrain in view: at [{east:.0f}, {north:.0f}] the "
+            f"ground is {-over[worst]:.1f} m above the line of sight; fly higher, or look down more steeply than "
             f"uav.pitch_deg = {parameters.pitch_deg:g}"
         )
 
 
 class SimulatorSource:
-    """A scenario as a Source, its frames rendered on demand.
+    """A scenario as a Source that renders its frames on demand.
 
-    Beside what every source offers: scenario; camera, the aerial one; colours of the landmarks; elevation, of the
-    ground about origin_deg; steer; and the data of the run until now: landmarks, telemetry, pictures, truths.
-    Every iteration starts the run again. Frames that a command leaves out are not drawn; those that the camera
-    drops are missing numbers.
+    Beyond the members of every source: scenario; camera, the aerial camera; colours, the landmarks' colours; elevation
+    of the ground about origin_deg; steer; and the data of the run until now: landmarks, telemetry, pictures, truths.
+    Every iteration starts the run again. Frames that a command skips are not drawn. The numbers of dropped frames are
+    missing.
     """
 
     exact = True
 
     def __init__(self, scenario: Scenario, name: str = "simulation") -> None:
-        """Raises InputError for an impossible scenario, or where a raster that it names cannot be read."""
+        """Raises InputError for an impossible scenario, or if one of its rasters cannot be read."""
         self.scenario, self.name = scenario, name
         self._simulator = simulator = open_simulator(scenario)
         self.camera: Camera = simulator.camera
@@ -224,11 +224,11 @@ class SimulatorSource:
                     row = (r.frame, r.vehicle, *r.lonlat_deg.tolist(), r.sigma_m, r.planned)
                     self._reports.add(row, (r.vehicle, round(r.frame, 6), r.planned))
                 if moment.flight is not None:
-                    # Its errors are not reported.
+                    # The fields after the first _SAID are uncertainties, which the UAV does not report.
                     said = astuple(moment.flight)[:_SAID]
                     self._flown.add(np.hstack([moment.time_s, *said]).tolist())
             self._truths.append(shot.truth)
-            # Vehicles look when the picture from the air is taken, dropped or not: each order is for one look.
+            # Ground pictures are taken with the aerial picture, dropped or not. An order asks for one picture.
             pictures = [self.picture(name) for name in self._wanted]
             self._pictures.extend(picture for picture in pictures if picture is not None)
             self._wanted.clear()
@@ -238,18 +238,18 @@ class SimulatorSource:
             yield shot.frame
 
     def every(self, interval: int) -> Iterator[Frame]:
-        """Frames 1, 1 + interval, ...: the others are drawn as well, so that the pictures stay the same."""
+        """Yield frames 1, 1 + interval, ... The others are drawn too, so that the pictures stay the same."""
         return (frame for frame in self if is_sampled(frame.number, interval))
 
     def steer(self, command: Command) -> None:
-        """Carry out a command from the next frame on; places in longitude and latitude. Raises as `Simulator.steer`."""
+        """Carry out a command, with places in longitude and latitude, from the next frame. See `Simulator.steer`."""
         self._simulator.steer(command)
-        # A later command before the next frame takes no request for a picture back.
+        # A later command before the next frame does not cancel requests for pictures.
         asked = [order.vehicle for order in command.orders if order.picture]
         self._wanted += [name for name in asked if name not in self._wanted]
 
     def landmarks(self) -> Landmarks:
-        """All reports of the ground vehicles until now, in longitude and latitude; of plans for a frame the newest."""
+        """Return the ground vehicles' reports until now, in longitude and latitude, with the newest plan per frame."""
         rows = self._reports.rows
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         count = len(rows)
@@ -267,7 +267,7 @@ class SimulatorSource:
         )
 
     def telemetry(self) -> Telemetry:
-        """All telemetry of the UAV until now, in longitude and latitude."""
+        """Return the UAV's telemetry until now, in longitude and latitude."""
         rows = self._flown.rows
         time_s, altitude, speed = rows[:, :3].T
         above_sea, heading, pitch, roll, hfov, nose = rows[:, 5:].T
@@ -275,15 +275,15 @@ class SimulatorSource:
         return Telemetry(time_s, altitude, speed, rows[:, 3:5], True, above_sea, *angles, origin=self.name)
 
     def pictures(self) -> list[GroundPicture]:
-        """The pictures of ground vehicles since this was last called; the last KEPT at most."""
+        """Return the ground vehicles' pictures since the last call, at most the last KEPT."""
         return _take_all(self._pictures)
 
     def truths(self) -> list[Truth]:
-        """The truth of the frames since this was last called, dropped ones among them; the last KEPT at most."""
+        """Return the truth of frames since the last call, including dropped frames, at most the last KEPT."""
         return _take_all(self._truths)
 
     def picture(self, vehicle: str) -> GroundPicture | None:
-        """What a ground vehicle sees at the frame yielded last; None while it is silent."""
+        """Return a ground vehicle's picture at the last frame, or None while it is silent."""
         return self._simulator.picture(vehicle)
 
 
@@ -294,14 +294,14 @@ def _take_all(kept: deque[Any]) -> list[Any]:
 
 
 class _Rows:
-    """A table that grows: (N, columns) float64, in the order in which its rows came."""
+    """A growing table (N, columns) float64, in the order of arrival."""
 
     def __init__(self, columns: int) -> None:
         self._table, self._count = np.zeros((256, columns)), 0
         self._place: dict[Hashable, int] = {}
 
     def add(self, row: Sequence[float], key: Hashable = None) -> None:
-        """Add a row, or replace the one that has its key already."""
+        """Add a row, or replace the row with the same key."""
         place = self._count if key is None else self._place.setdefault(key, self._count)
         if place == self._count:
             if self._count == len(self._table):
@@ -311,25 +311,25 @@ class _Rows:
 
     @property
     def rows(self) -> np.ndarray:
-        """All rows; not to be written to."""
+        """All rows, as a view that must not be changed."""
         return self._table[: self._count]
 
 
 def open_simulator(scenario: Scenario) -> Simulator:
-    """A run of a scenario, with the rasters of the ground that it names. Raises InputError."""
+    """Open a run of a scenario and read its ground rasters. Raises InputError."""
     world = scenario.world
     ends = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]) * world.side_m / 2
     try:
         elevation = read_elevation(world.elevation, ends, world.origin_deg, margin_m=10.0) if world.elevation else None
         photo = read_ortho(world.photo, ends, world.origin_deg, margin_m=0.0) if world.photo else None
     except InputError as error:
-        # The reader knows of landmarks alone.
+        # The reader's message is about landmarks, so replace its subject.
         raise InputError(str(error).replace("the landmarks lie", "the world lies")) from None
     return Simulator(scenario, elevation, photo)
 
 
 def open_scenario(spec: str, overrides: Sequence[str] = (), seed: int | None = None) -> SimulatorSource:
-    """A scenario by its name or file, as `load_scenario` takes it. Raises InputError with one line."""
+    """Open a scenario by its name or file, as in `load_scenario`. Raises InputError with one line."""
     scenario = load_scenario(spec, overrides, seed)
     with name_scenario_in_errors(spec):
         return SimulatorSource(scenario, Path(spec).stem)
@@ -337,7 +337,7 @@ def open_scenario(spec: str, overrides: Sequence[str] = (), seed: int | None = N
 
 @contextmanager
 def name_scenario_in_errors(spec: str) -> Iterator[None]:
-    """Put the name of a scenario before each InputError."""
+    """Prefix the message of an InputError with the name of a scenario."""
     try:
         yield
     except InputError as error:

@@ -1,7 +1,7 @@
 """Bare ground of a desert in southern Arizona: soils, dry creek beds, a dirt road, trails, grass, stones.
 
-Colours are BGR as a photo shows them in full sun. Broad patterns lie on a grid 8 times coarser than the texture
-and enlarged; what is finer is added band by band, so that a large world needs little memory.
+Colours are BGR as in a photo in full sun. Broad patterns are computed on a grid 8 times coarser than the texture and
+enlarged. Finer patterns are added band by band, so that a large world needs little memory.
 """
 
 from typing import Any
@@ -9,12 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-COARSE = 8  # pixels of the texture to a cell of the broad patterns
+COARSE = 8  # texture pixels per cell of the broad patterns
 
-_TILE = 512  # columns that are coloured at once
+_TILE = 512  # columns per coloured tile
 _BLOCK = 64  # rows of noise that share a seed
-_FIRST = 1_000_000  # seeds are not negative, and a margin has rows above the first
-_SPREAD = 1.35  # makes up for what interpolation between independent numbers takes from their spread, and more
+_FIRST = 1_000_000  # offset of block seeds, because a margin has negative rows but seeds cannot be negative
+_SPREAD = 1.35  # corrects (slightly over-corrects) the loss of spread when independent numbers are interpolated
 
 
 def _bgr(*values: float) -> np.ndarray:
@@ -25,19 +25,19 @@ _TAN, _RED, _PALE, _DARK = _bgr(112, 144, 172), _bgr(94, 126, 168), _bgr(150, 17
 _SAND, _ROAD = _bgr(146, 172, 194), _bgr(138, 164, 186)
 _STRAW, _GREEN = _bgr(86, 124, 144), _bgr(58, 82, 78)
 
-# Stones, from gravel to boulders, and single tufts: how many a square metre, their radius in metres, and how much
-# brighter than the soil the stones are, how dense the tufts.
+# Stones, from gravel to boulders, and single tufts: number per square metre, radius in metres, and extra brightness of
+# the stones or density of the tufts.
 _STONES = ((4.0, 0.05, 30.0), (0.5, 0.1, 40.0), (0.03, 0.22, 28.0))
 _TUFTS = ((2.5, 0.12, 0.9), (0.35, 0.28, 1.0))
 
 
 def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """Broad patterns of a world's ground, each (h, w) float32 on a coarse grid, row 0 the north edge.
+    """Draw broad patterns of a world's ground, each (h, w) float32 on a coarse grid, row 0 at the north edge.
 
-    tone: (3, h, w) BGR of the soil. grass: how much of it grows, 0 to 1; green: how much of that is green, not dry.
-    gravel: how rough the soil is, about 1. light: as given, on its slopes, as a share of that on level ground. wash,
-    road, trail: metres from the middle of the nearest creek bed, road, trail, the last two with a sign for the side;
-    wash_half: half the creek's width there, metres.
+    tone: (3, h, w) BGR of the soil. grass: density of grass, 0 to 1. green: share of the grass that is green, not dry.
+    gravel: roughness of the soil, about 1. light: the argument, light on the slopes relative to level ground. wash,
+    road, trail: metres from the middle of the nearest creek bed, road, trail; the last two are negative on one side.
+    wash_half: half the width of that creek, metres.
     """
     cells = len(light)
     rng = np.random.default_rng([seed, 11])
@@ -46,7 +46,7 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.n
     east, north = np.meshgrid(middle.astype(np.float32), -middle.astype(np.float32))
 
     def patches(widest_m: float, fall: float = 0.6) -> np.ndarray:
-        """Noise of spread about 1: bumps of halving widths, each octave `fall` times the one before."""
+        """Return noise of spread about 1: octaves of half the width and `fall` times the amplitude each."""
         total, power, height, width = np.zeros(shape, np.float32), 0.0, 1.0, max(widest_m / cell, 1)
         while width >= 1:
             total += np.float32(height) * _noise_bumps(rng, shape, width)
@@ -61,7 +61,7 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.n
     ripple = 1.5 * patches(30, 0.5)
 
     def course(swing_m: float, winding_m: float) -> np.ndarray:
-        """Signed distance to a winding line across the world."""
+        """Return the signed distance to a winding line across the world."""
         turn, off = rng.uniform(0, 2 * np.pi), rng.uniform(-0.3, 0.3) * side_m
         along, aside = np.cos(turn) * east + np.sin(turn) * north, -np.sin(turn) * east + np.cos(turn) * north
         swing, slope = np.full_like(along, off), np.zeros_like(along)
@@ -93,14 +93,14 @@ def draw_patterns(side_m: float, light: np.ndarray, seed: int) -> dict[str, np.n
 def soil_rows(
     ground: dict[str, np.ndarray], rows: tuple[int, int], texel_m: float, seed: int, to_sun: np.ndarray
 ) -> np.ndarray:
-    """Rows [first, last) of the ground's colours, (3, n, W) float32 BGR, in the sun; ground: of `draw_patterns`."""
+    """Return rows [first, last) of the sunlit ground, (3, n, W) float32 BGR. ground: result of `draw_patterns`."""
     columns = ground["grass"].shape[1] * COARSE
-    # Light and shade of a pixel depend on its neighbours: these extra rows are cut off at the end.
+    # Light and shade of a pixel depend on its neighbours. These extra rows are cut off at the end.
     edge = max(int(np.ceil(0.3 / texel_m)), 1)
     wide = rows[0] - edge, rows[1] + edge
 
     def fine(key: int, width_m: float) -> np.ndarray:
-        """Noise with bumps of a width; those within a pixel even out."""
+        """Return noise with bumps of a width. Bumps narrower than a pixel average out."""
         noise = _noise_band((seed, 12, key), wide, columns, max(round(width_m / texel_m), 1))
         return noise if width_m >= texel_m else noise * np.float32(width_m / texel_m)
 
@@ -108,14 +108,14 @@ def soil_rows(
         spread = max(0.6 * radius_m / texel_m, 0.4)
         reach = int(3 * spread) + 2
         drawn = _noise_sparks((seed, 13, key), (wide[0] - reach, wide[1] + reach), columns, each_m2 * texel_m**2)
-        full = min(7 * spread**2, (radius_m / texel_m) ** 2 * 6)  # what is smaller than a pixel fills it in part
+        full = min(7 * spread**2, (radius_m / texel_m) ** 2 * 6)  # small objects fill a part of a pixel
         return np.minimum(cv2.GaussianBlur(drawn, (0, 0), spread)[reach:-reach] * np.float32(full), 1)
 
-    # Where the nearest trail changes, its side may too: no trail is there.
+    # The sign may change where the nearest trail changes. Do not draw a trail there.
     trail = np.abs(enlarge_rows(ground["trail"], wide, COARSE, smooth=True))
     trail = np.maximum(trail, enlarge_rows(np.abs(ground["trail"]), wide, COARSE) - 0.5 * COARSE * texel_m)
     grain = fine(3, 0.1)
-    # A camera near the ground sees what is finer, too.
+    # Finer grain is visible to cameras near the ground.
     for key, width_m in ((5, 0.05), (6, 0.025)):
         if texel_m <= 1.2 * width_m:
             grain += 0.7 * fine(key, width_m)
@@ -136,7 +136,7 @@ def soil_rows(
     }
     tone = [enlarge_rows(plane, wide, COARSE) for plane in ground["tone"]]
     image = np.empty((3, rows[1] - rows[0], columns), np.float32)
-    # Tiles that fit the processor's cache, most of which hold no creek, road or trail: thrice as fast as whole rows.
+    # Tiles fit the processor's cache, and most hold no creek, road or trail. They are 3 times as fast as whole rows.
     for left in range(0, columns, _TILE):
         right = min(left + _TILE, columns)
         first, last = max(left - edge, 0), min(right + edge, columns)
@@ -150,7 +150,7 @@ def soil_rows(
 def _coloured(
     of: dict[str, np.ndarray], tone: list[np.ndarray], texel_m: float, to_sun: np.ndarray
 ) -> list[np.ndarray]:
-    """Blue, green and red of a tile. of: its layers by name; tone: of its soil."""
+    """Return the blue, green and red planes of a tile. of: its layers by name. tone: planes of its soil."""
     large, middle, small, grain = of["large"], of["middle"], of["small"], of["grain"]
     ragged = 0.25 * large + 0.2 * middle
     dull = 1 + 0.05 * of["broad"] + 0.2 * ragged + 0.045 * small + 0.05 * grain
@@ -190,7 +190,7 @@ def _coloured(
     light = np.clip(1 + light / np.float32(2 * step * texel_m), 0.45, 1.4)
     east, north = np.round(-0.2 * slant / np.maximum(np.hypot(*slant), 0.2) / texel_m).astype(int)
     light *= 1 - 0.55 * np.clip(np.roll(clumps, (-north, east), (0, 1)) - clumps, 0, 1)
-    # Leaves and stalks, bright and dark beside each other.
+    # Add bright and dark leaves and stalks.
     light *= 1 + clumps * (0.14 * small + 0.14 * grain)
     light *= dull * of["light"]
 
@@ -206,19 +206,19 @@ def _coloured(
 
 
 def _noise_bumps(rng: np.random.Generator, shape: tuple[int, int], width_px: float) -> np.ndarray:
-    """(H, W) float32 of mean 0 and standard deviation about 1: smooth noise whose bumps are about width_px wide."""
+    """Return smooth noise (H, W) float32 of mean 0 and spread about 1, with bumps about width_px wide."""
     if width_px <= 1:
         return rng.standard_normal(shape, np.float32)
     cells = [int(np.ceil(n / width_px)) + 3 for n in shape]
     small = rng.standard_normal(cells, np.float32)
     large = cv2.resize(small, None, fx=width_px, fy=width_px, interpolation=cv2.INTER_CUBIC)
-    # A cell is left out at the edges, where the enlargement repeats the outermost value.
+    # Cut off a cell at the edges, where the enlargement repeats the outermost value.
     first = int(width_px)
     return large[first : first + shape[0], first : first + shape[1]] * np.float32(_SPREAD)
 
 
 def _noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, width_px: int) -> np.ndarray:
-    """Rows [first, last) of an endless (_, columns) noise with spread about 1 whose bumps are width_px wide."""
+    """Return rows [first, last) of endless noise (_, columns) with spread about 1 and bumps width_px wide."""
     first, last = rows[0] // width_px - 2, -(-rows[1] // width_px) + 2
     cells = -(-columns // width_px) + 4
     small = _white(seed, first, last, cells)
@@ -230,7 +230,7 @@ def _noise_band(seed: tuple[int, ...], rows: tuple[int, int], columns: int, widt
 
 
 def _noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, share: float) -> np.ndarray:
-    """Rows [first, last) of an endless picture. A share of its pixels lies in (0.3, 1], the others are 0."""
+    """Return rows [first, last) of an endless picture. A share of its pixels is in (0.3, 1], the others are 0."""
     first = rows[0] // _BLOCK
     drawn = np.zeros((((rows[1] - 1) // _BLOCK + 1 - first) * _BLOCK, columns), np.float32)
     for block in range(first, first + len(drawn) // _BLOCK):
@@ -242,9 +242,9 @@ def _noise_sparks(seed: tuple[int, ...], rows: tuple[int, int], columns: int, sh
 
 
 def enlarge_rows(coarse: np.ndarray, rows: tuple[int, int], factor: int, smooth: bool = False) -> np.ndarray:
-    """Rows [first, last) of a coarse field (h, w) enlarged `factor` times, the same however it is cut.
+    """Return rows [first, last) of a coarse field (h, w) enlarged `factor` times. Results do not depend on the cut.
 
-    smooth: without creases, and three times as slow.
+    smooth: cubic interpolation, which has no creases and takes three times as long.
     """
     first, last = rows[0] // factor - 3, -(-rows[1] // factor) + 3
     at = np.clip(np.arange(first, last), 0, len(coarse) - 1)
@@ -255,10 +255,10 @@ def enlarge_rows(coarse: np.ndarray, rows: tuple[int, int], factor: int, smooth:
 
 
 def _white(seed: tuple[int, ...], first: int, last: int, columns: int) -> np.ndarray:
-    """Rows [first, last) of an endless (_, columns) picture of independent numbers, even in +-1.73: spread 1."""
+    """Return rows [first, last) of endless noise (_, columns), independent and uniform within +-1.73 (spread 1)."""
     parts = []
     for block in range(first // _BLOCK, (last - 1) // _BLOCK + 1):
         part = np.random.default_rng([*seed, block + _FIRST]).integers(0, 256, (_BLOCK, columns), np.uint8)
         parts.append(part[max(first - block * _BLOCK, 0) : last - block * _BLOCK])
-    # Bytes are drawn ten times as fast as normal numbers; their spread is 256 / sqrt(12).
+    # Drawing bytes is ten times as fast as drawing normal numbers. Their spread is 256 / sqrt(12).
     return (np.concatenate(parts) - np.float32(127.5)) * np.float32(12**0.5 / 256)

@@ -1,4 +1,4 @@
-"""What is true of a simulated run, in the formats of `dddas evaluate`: masks, boxes, identities, places."""
+"""Write the truth of a simulated run in the formats of `dddas evaluate`: masks, boxes, identities, places."""
 
 import math
 from collections import deque
@@ -22,25 +22,25 @@ COLUMNS = (
     *("frame", "target", "kind", "people", "east_m", "north_m", "longitude_deg", "latitude_deg"),
     *("east_m_s", "north_m_s", "visible_px"),
 )
-_STANDS_M_S = 0.1  # what is slower stands: nothing shows that it could move
-_FEWEST_PX = 6  # boxes of targets of which fewer pixels show do not count
+_STANDS_M_S = 0.1  # slower targets count as standing
+_FEWEST_PX = 6  # boxes of targets with fewer visible pixels do not count
 
 LonLat = Callable[[np.ndarray], np.ndarray]
 
 
 class TruthOutput:
-    """truth/: masks/000001.png ..., gt.txt, people.txt, positions.csv, tracks.geojson. Takes a Truth a frame.
+    """Writes truth/: masks/000001.png ..., gt.txt, people.txt, positions.csv, tracks.geojson. Takes a Truth per frame.
 
-    The masks hold the numbers of the targets that move, ground vehicles among them. gt.txt is MOTChallenge text of the
-    targets without the landmarks; boxes of what stands, or of which fewer than 6 pixels show, are marked 0: they do not
-    count. people.txt: the same of every person, by their own numbers. positions.csv has all targets, in the picture
-    or not: of a crowd the middle of its people on the ground.
+    The masks hold the numbers of the moving targets, including ground vehicles. gt.txt lists the targets without the
+    landmarks in MOTChallenge format. Boxes of standing targets and of targets with fewer than 6 visible pixels are
+    marked 0 (do not count). people.txt lists every person in the same format, by person numbers. positions.csv has all
+    targets, visible or not; the place of a crowd is the mean of its people's places on the ground.
     """
 
     files = tuple(f"truth/{name}" for name in ("gt.txt", "people.txt", "positions.csv", "tracks.geojson"))
 
     def __init__(self, folder: Path, lonlat: LonLat, masks: bool = True) -> None:
-        """lonlat: (N, 2) longitudes and latitudes of (N, 2) local metres. masks: whether to write them."""
+        """lonlat: converts local metres (N, 2) to longitudes and latitudes (N, 2). masks: whether to write masks."""
         self._folder, self._lonlat = folder / "truth", lonlat
         content = {"gt.txt": "", "people.txt": "", "positions.csv": ",".join(COLUMNS) + "\n"}
         self._files = TextFiles({self._folder / name: first for name, first in content.items()})
@@ -48,7 +48,7 @@ class TruthOutput:
         self._targets, self._landmarks = Gathered(), Gathered()
 
     def write(self, truth: Truth) -> None:
-        """Add a frame. Raises OSError if the disk refuses."""
+        """Add a frame. Raises OSError if the files cannot be written."""
         self._folder.mkdir(parents=True, exist_ok=True)
         all_, shown, people = _gather_targets(truth.bodies), _label_boxes(truth.mask), _label_boxes(truth.people)
         lonlat, is_landmark = self._lonlat(all_.east_north_m), all_.kind == "ugv"
@@ -86,22 +86,22 @@ class TruthOutput:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._files.close()
         targets, landmarks = self._targets.tracks(True), self._landmarks.tracks(True)
-        # Landmarks by their row in the team in place of their targets' numbers.
+        # Replace the landmarks' target numbers by their rows in the team.
         numbers, row = np.unique(landmarks.target, return_inverse=True)
         names = tuple(f"ugv{k + 1}" for k in range(len(numbers)))
         content = encode_geojson(geojson(targets, landmarks=replace(landmarks, target=row), names=names))
         write_whole(self._folder / "tracks.geojson", content)
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove the unfinished files."""
         self._files.discard()
 
 
 class _Targets(NamedTuple):
-    """The targets of a moment, one row a target, by number.
+    """The targets of a moment, one row per target, sorted by number.
 
-    kind: (N,) of str. people: (N,) number of its bodies. east_north_m, velocity_m_s: (N, 2) their mean.
-    fastest_m_s: (N,) of any of them.
+    kind: (N,) str. people: (N,) number of people. east_north_m, velocity_m_s: (N, 2) means over the target's bodies.
+    fastest_m_s: (N,) greatest speed of its bodies.
     """
 
     target: np.ndarray
@@ -124,14 +124,14 @@ def _gather_targets(bodies: Bodies) -> _Targets:
 
 
 def moving_mask(truth: Truth) -> np.ndarray:
-    """(H, W) uint16, the mask of a frame without the targets that stand."""
+    """Return the mask (H, W) uint16 of a frame without standing targets."""
     all_ = _gather_targets(truth.bodies)
     still = all_.target[all_.fastest_m_s < _STANDS_M_S]
     return np.where(np.isin(truth.mask, still), 0, truth.mask) if len(still) else truth.mask
 
 
 def _label_boxes(labels: np.ndarray) -> dict[int, tuple[int, int, int, int, int]]:
-    """Number -> x, y of the top left pixel, width, height of the box about its pixels, and their number."""
+    """Return {label: (x and y of the top left pixel, width, height, number of pixels)}."""
     count = np.bincount(labels.ravel()).tolist()
     return {
         number: (box[1].start, box[0].start, box[1].stop - box[1].start, box[0].stop - box[0].start, count[number])
@@ -145,26 +145,26 @@ def _mot_line(frame: int, identity: int, box: Sequence[int], counts: bool) -> st
 
 
 class SimulatedRunRecorder(PipelineRecorder):
-    """The folder of a run in a simulated world: what `dddas run` writes, and truth/ for `dddas evaluate`."""
+    """The output folder of a run in a simulated world: the files of `dddas run`, and truth/ for `dddas evaluate`."""
 
     files: ClassVar[tuple[str, ...]] = (*PipelineRecorder.files, *TruthOutput.files)
     saved: ClassVar[tuple[str, ...]] = (*PipelineRecorder.saved, "truth")
     _truth: "_TruthUntil | None" = None
 
     def record_truth(self, lonlat: LonLat) -> None:
-        """Call after `begin`. lonlat: (N, 2) longitudes and latitudes of (N, 2) metres of the world."""
+        """Write the truth too. Call after `begin`. lonlat: converts world metres (N, 2) to longitude and latitude."""
         if "truth" in self.save:
             self._truth = _TruthUntil(TruthOutput(self.folder, lonlat, masks=False))
             self._parts.append(self._truth)
 
     def add_truth(self, truth: Truth) -> None:
-        """Add the truth of a frame before its result; both are written together, so that both end at one frame."""
+        """Add the truth of a frame before its result. Both are written together, so that both end at the same frame."""
         if self._truth is not None:
             self._truth.ahead.append(truth)
 
 
 class _TruthUntil:
-    """A part that writes the truth that is ahead with the result of its frame."""
+    """A part that writes the queued truth of a frame together with the frame's result."""
 
     def __init__(self, output: TruthOutput) -> None:
         self.ahead: deque[Truth] = deque()

@@ -1,4 +1,4 @@
-"""The UAV: its flight, its camera's pose, how gusts move both, and the errors of its telemetry."""
+"""The UAV: its flight, its camera's pose, the effect of gusts on both, and the errors of its telemetry."""
 
 from collections.abc import Callable
 
@@ -10,19 +10,19 @@ from torchvision_dddas.lab.simulation.sensors import Receivers
 from torchvision_dddas.types import CameraPose
 
 ACCELERATION_M_S2 = 3.0
-# Rates at which the gimbal moves the middle of the picture, and turns the picture. With the flight below 60 deg/s.
+# Greatest rates of the picture's middle and of the picture's rotation by the gimbal. The total stays below 60 deg/s.
 _AIM_RAD_S, _TURN_RAD_S = np.radians(35.0), np.radians(15.0)
-# Where the camera looks further from below it than this share of its height, the picture's upper edge turns away.
+# The upper edge turns to the view if the camera looks further aside than this share of its height.
 _SLANTED = 0.35
 _GUST_S, _SHAKE_S = 1.5, 0.5  # time constants of the place and of the angles
-_HELD = 0.3  # share of a gust's speed with which a vehicle moves that holds its place
+_HELD = 0.3  # speed of a UAV that holds its place, as a share of the gust's speed
 _NEW = 0.1  # share of the telemetry's errors that is new in each report
 
 
 class Swaying:
-    """Values that sway about 0 smoothly: a critically damped spring that is pushed at random (Matern 3/2).
+    """Values (n,) that sway smoothly about 0: a critically damped spring with random pushes (Matern 3/2 process).
 
-    Its rate is its true derivative. Standard deviation sigma, (n,), time constant in seconds; stationary.
+    rate is the true derivative of value. sigma: (n,) stationary standard deviations. constant_s: time constant.
     """
 
     def __init__(self, sigma: np.ndarray, constant_s: float, rng: np.random.Generator) -> None:
@@ -32,14 +32,14 @@ class Swaying:
         self.value, self.rate = self._sigma * drawn[0], self._sigma * self._rate * drawn[1]
 
     def step(self, seconds: float, push: np.ndarray | float = 0.0, rougher: float = 1.0) -> None:
-        """Advance by `seconds`, exactly; push: a constant acceleration; rougher: factor of the random pushes."""
+        """Advance exactly by `seconds`. push: constant acceleration. rougher: factor of the random pushes."""
         if seconds not in self._steps:
             k, t = self._rate, seconds
             step = np.exp(-k * t) * np.array([[1 + k * t, t], [-(k**2) * t, 1 - k * t]])
             lasting = np.diag([1.0, k**2])
             self._steps[seconds] = step, np.linalg.cholesky(lasting - step @ lasting @ step.T + 1e-15 * np.eye(2))
         step, factor = self._steps[seconds]
-        rest = np.asarray(push) / self._rate**2  # where it would come to rest under that push
+        rest = np.asarray(push) / self._rate**2  # place of rest under the push
         moved = step @ np.stack([self.value - rest, self.rate])
         noise = factor @ self._rng.standard_normal((2, len(self._sigma))) * self._sigma * rougher
         self.value, self.rate = moved[0] + noise[0] + rest, moved[1] + noise[1]
@@ -52,10 +52,10 @@ class _Pursuer:
         self.place, self.velocity = place, velocity
 
     def step(self, goal: np.ndarray, going: np.ndarray, fastest: float, hardest: float, seconds: float) -> None:
-        """Towards a goal that moves with a velocity `going`; the acceleration is constant over the step."""
+        """Step towards a goal that moves at velocity `going`, with constant acceleration over the step."""
         gap = goal - self.place
         distance = float(np.linalg.norm(gap))
-        # No faster than it can brake, and gently at the end.
+        # Move no faster than it can brake, and slow down gently at the end.
         closing = min(np.sqrt(hardest * distance), distance / 0.8)
         wanted = going + gap / max(distance, 1e-9) * closing
         wanted *= min(1.0, fastest / max(float(np.linalg.norm(wanted)), 1e-9))
@@ -66,9 +66,9 @@ class _Pursuer:
 
 
 class Aircraft:
-    """Flies along its way, or where it is steered; pose and rates are those of its camera.
+    """A UAV that flies along its way or follows commands. Pose and rates are those of its camera.
 
-    Unsteered it looks at a point that moves along the way, always from the same side and at the same angle.
+    Without commands it looks at a point that moves along the way, always from the same side and at the same angle.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Aircraft:
         point, going = self._way.at(0.0)
         ahead, level = heading_vector(self._heading), self._altitude * self._cotangent
         back = level
-        for _ in range(8):  # as far back as the ground's heights require
+        for _ in range(8):  # iterate, because the distance depends on the ground's heights
             rise = self._altitude + self._ground(point - back * ahead) - self._ground(point)
             back = max(rise, 1.0) * self._cotangent
         self._relief_m = back - level
@@ -101,7 +101,7 @@ class Aircraft:
         return float(self._up(place_m[None, :2])[0])
 
     def steer(self, fly_to: np.ndarray | None, look_at: np.ndarray | None, altitude_m: float | None) -> None:
-        """What is None stays as it is. Places in local metres, (2,), clipped to the world."""
+        """Change the goals that are not None. Places (2,) are in local metres and are clipped to the world."""
         if fly_to is not None:
             self._fly_to = np.clip(fly_to, -self._half, self._half)
         if look_at is not None:
@@ -110,7 +110,7 @@ class Aircraft:
             self._altitude = float(np.clip(altitude_m, 2.0, 2000.0))
 
     def step(self, time_s: float, seconds: float, push: np.ndarray | float = 0.0, rougher: float = 1.0) -> None:
-        """Advance by `seconds` to time_s. push: acceleration by a gust, (3,) m/s2; rougher: factor of all shaking."""
+        """Advance by `seconds` to time_s. push: (3,) acceleration by gusts, m/s2. rougher: factor of the shaking."""
         point, going = self._way.at(time_s - seconds)
         back_m = self._altitude * self._cotangent + self._relief_m * (self._cotangent > 0)
         back = back_m * heading_vector(self._heading)
@@ -125,12 +125,12 @@ class Aircraft:
         craft.step(goal, goal_going, fastest, ACCELERATION_M_S2, seconds)
         aim_up = self._ground(aim.place)
         if self._look_at is None:
-            # Hangs as before: the middle of the picture moves with the vehicle.
+            # The view angle stays, so the middle of the picture moves with the UAV.
             aim.step(np.append(point, aim_up), goal_going, fastest, ACCELERATION_M_S2, seconds)
         else:
             swift = _AIM_RAD_S * max(craft.place[2] - aim.place[2], 1.0)
             aim.step(np.append(self._look_at, aim_up), still, swift, 3 * swift, seconds)
-        # The picture's upper edge turns to where the camera looks, if that is oblique and was ordered.
+        # Turn the picture's upper edge to the view's direction if the view is oblique and was commanded.
         to, error = aim.place - craft.place, 0.0
         if self._look_at is not None and np.hypot(to[0], to[1]) > _SLANTED * abs(to[2]):
             error = float(wrap_angle(np.arctan2(to[0], to[1]) - self._heading))
@@ -142,7 +142,7 @@ class Aircraft:
         self._shaken.step(seconds, 0.0, rougher)
 
     def _pose(self, ahead_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Place and axes, extrapolated by the rates for a moment."""
+        """Return the camera's place and axes, extrapolated by ahead_s seconds."""
         craft = self._craft.place + ahead_s * self._craft.velocity
         aim = self._aim.place + ahead_s * self._aim.velocity
         heading = self._heading + ahead_s * self._turning
@@ -154,7 +154,7 @@ class Aircraft:
         return craft + self._blown.value + ahead_s * self._blown.rate, hung @ shaken
 
     def pose(self) -> tuple[CameraPose, np.ndarray, np.ndarray]:
-        """The pose, velocity (3,) m/s and turn (3,) rad/s about east, north, up."""
+        """Return the pose, the velocity (3,) m/s and the rotation rates (3,) rad/s about east, north, up."""
         place, hung = self._pose(0.0)
         tiny = 1e-5
         change = (self._pose(tiny)[1] - self._pose(-tiny)[1]) / (2 * tiny) @ hung.T
@@ -163,9 +163,9 @@ class Aircraft:
 
 
 class ReportedPose:
-    """The UAV's report of itself: lasting errors with the parameters' standard deviations, and a tenth new each time.
+    """Errors of the UAV's telemetry: lasting errors with the parameters' sigmas, and new errors a tenth as large.
 
-    Angles near straight down are what they are: a heading that swings with a tiny tilt, and a roll that undoes it.
+    In a view straight down, a tiny tilt changes the reported heading much, and the roll compensates for it.
     """
 
     def __init__(self, parameters: AircraftParameters, seed: int) -> None:
@@ -176,20 +176,20 @@ class ReportedPose:
         self._receiver = Receivers(1, parameters.place_error95_m, 0.02, 60.0, 0.0, self._rng)
 
     def errors(self, seconds: float) -> np.ndarray:
-        """(6,) rotation about east, north and up, rad; share of the altitude; metres east, north; `seconds` later."""
+        """Return errors (6,) `seconds` later: rotation about east, north, up (rad); altitude share; east, north (m)."""
         self._receiver.advance(seconds)
         wrong = self._lasting + _NEW * self._sigma * self._rng.standard_normal(4)
         return np.array([wrong[0], wrong[1], -wrong[2], wrong[3], *self._receiver.error_m[0]])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two (3,); np.cross takes ten times as long for one pair."""
+    """Return the cross product of two vectors (3,). np.cross takes ten times as long for one pair."""
     (x, y, z), (u, v, w) = a.tolist(), b.tolist()
     return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def rotation_matrix(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) that turns by the length of a vector (3,), in radians, about it (Rodrigues)."""
+    """Return the rotation (3, 3) about a vector (3,) by its length in radians (Rodrigues)."""
     angle = float(np.linalg.norm(vector))
     if angle < 1e-12:
         return np.eye(3)
@@ -198,6 +198,6 @@ def rotation_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) by which column vectors are multiplied for the cross product of a vector (3,) with them."""
+    """Return the matrix M (3, 3) for which M @ w is the cross product of a vector (3,) with w."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -1,4 +1,4 @@
-"""A piece of ground with everything that stands on it, as the sun lights it: what the simulated cameras look at."""
+"""The world of the simulated cameras: a piece of sunlit ground with the objects that stand on it."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -13,27 +13,27 @@ from torchvision_dddas.lab.simulation.scenario import WorldParameters
 from torchvision_dddas.lab.simulation.soil import COARSE, draw_patterns, enlarge_rows, soil_rows
 from torchvision_dddas.types import Elevation, Ortho
 
-SHADE_BGR = np.array([0.46, 0.39, 0.35], np.float32)  # what is left of a colour where only the blue sky lights it
+SHADE_BGR = np.array([0.46, 0.39, 0.35], np.float32)  # share of a colour that remains in light of the blue sky alone
 _MOST_TEXELS = 12_000  # pixels along a side of the largest texture
-_AT_ONCE = 1 << 20  # pixels of the texture that are made at once, in whole rows
+_AT_ONCE = 1 << 20  # texture pixels per band of whole rows
 _ROWS_OF_SURFACE = 6000
 _COARSEST_M = 2.0  # step of the grid of heights
-_MOST_STEPS = 1000  # along a side of it
+_MOST_STEPS = 1000  # most steps of that grid along a side
 _HILLS_M = (60.0, 200.0)  # wavelengths of the synthetic relief
-_EMPTY_SHARE = 1e-3  # a white or black area of less of the photo, inside it, is a thing in it and no hole
-_DRY_M = 3.0  # from the water's edge to what stands
-_BETWEEN = 32  # shares in which two levels of a texture are mixed
+_EMPTY_SHARE = 1e-3  # smaller white or black areas inside a photo are objects, not holes (share of its area)
+_DRY_M = 3.0  # least distance of objects from the water's edge
+_BETWEEN = 32  # steps of the mix of two texture levels
 _WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 
 @dataclass(frozen=True)
 class World:
-    """The ground and what stands on it, all for a square of side_m about the origin; local metres, z up.
+    """The ground and the objects on it, for a square of side_m about the origin, in local metres, z up.
 
-    albedo: (H, W, 3) uint8 BGR, seen from above, with light and cast shadows, row 0 the north edge; the first pixel's
-    centre is at (-side_m / 2 + texel_m / 2, side_m / 2 - texel_m / 2). surface: (H2, W2) float32 metres above the
-    ground of what stands there, on pixels of surface_texel_m over the same square. relief: heights of the bare ground.
-    to_sun: (3,) unit vector. Beyond its edges the world is mirrored, as by cv2.BORDER_REFLECT.
+    albedo: (H, W, 3) uint8 BGR from above, with light and cast shadows, row 0 at the north edge; the first pixel's
+    centre is at (-side_m / 2 + texel_m / 2, side_m / 2 - texel_m / 2). surface: (H2, W2) float32 heights of objects
+    above the ground, metres, on pixels of surface_texel_m over the same square. relief: heights of the bare ground.
+    to_sun: (3,) unit vector. The world is mirrored beyond its edges, as by cv2.BORDER_REFLECT.
     """
 
     side_m: float
@@ -46,7 +46,7 @@ class World:
     to_sun: np.ndarray
 
     def up_m(self, east_north_m: np.ndarray) -> np.ndarray:
-        """(N,) height of the bare ground at places (N, 2), bilinear; 0 at the origin."""
+        """Return heights (N,) of the bare ground at places (N, 2), bilinear. The origin has height 0."""
         return height_at(self.relief, east_north_m)
 
 
@@ -57,18 +57,18 @@ def build_world(
     photo: Ortho | None = None,
     keep_clear: tuple[np.ndarray, float] | None = None,
 ) -> World:
-    """The world of a scenario; the same arguments always give the same world.
+    """Build the world of a scenario. The same arguments always give the same world.
 
-    elevation: in place of the synthetic relief; photo: in place of the synthetic soil. keep_clear: places (N, 2) in
-    local metres and how many metres about them nothing may stand.
-    Raises InputError where the texture would be too large, or the elevation does not cover the world.
+    elevation: replaces the synthetic relief. photo: replaces the synthetic soil. keep_clear: places (N, 2) in local
+    metres, and the distance from them within which no object may stand.
+    Raises InputError if the texture would be too large, or if the elevation does not cover the world.
     """
     cells = max(round(parameters.side_m / parameters.texel_m / COARSE), 2)
     side_px, side_m = cells * COARSE, parameters.side_m
     if side_px > _MOST_TEXELS:
         least = np.ceil(1000 * side_m / _MOST_TEXELS) / 1000
         raise InputError(
-            f"a world of {side_m:g} m in pixels of {parameters.texel_m:g} m has {side_px} of them a side; at most "
+            f"a world of {side_m:g} m with pixels of {parameters.texel_m:g} m has {side_px} pixels per side; at most "
             f"{_MOST_TEXELS} are possible; set world.texel_m to {least:g} or more"
         )
     texel = side_m / side_px
@@ -112,7 +112,7 @@ def build_world(
         image = bare(rows)
         crowns.paint(image, first, texel, to_sun)
         shade = np.clip(enlarge_rows(over, rows, factor) / 0.25 - 0.2, 0, 1)
-        # Ground that lies away from the sun has less to lose to a shadow.
+        # A shadow darkens slopes that face away from the sun less.
         slopes = enlarge_rows(light, rows, COARSE) if photo is None else np.float32(1)
         for k in range(3):
             lit = image[k] * (1 - shade * np.clip(1 - SHADE_BGR[k] / slopes, 0, 1))
@@ -121,25 +121,25 @@ def build_world(
 
 
 def shore_north_m(east_m: np.ndarray, shore_m: float) -> np.ndarray:
-    """How far north the water reaches at each place; shore_m: distance of its edge south of the middle, on average."""
+    """Return the north coordinate of the water's edge. shore_m: mean distance of the edge south of the middle."""
     return np.asarray(-shore_m + 3 * np.sin(east_m / 14) + 1.2 * np.sin(east_m / 4.3 + 1))
 
 
 def _on_texels(field: np.ndarray, cells: int) -> np.ndarray:
-    """A field (R, C) whose rows go north from edge to edge, at the middles of (cells, cells) pixels from the north."""
+    """Resample a field (R, C), rows from south to north edge, to the middles of (cells, cells) pixels, north first."""
     step = (np.asarray(field.shape) - 1) / cells
     matrix = np.array([[step[1], 0, 0.5 * step[1]], [0, step[0], 0.5 * step[0]]])
     field = np.ascontiguousarray(field, np.float32)
     return cv2.warpAffine(field, matrix, (cells, cells), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)[::-1].copy()
 
 
-# The relief: smooth hills, or those of an elevation raster, on one grid that spans the world.
+# The relief: synthetic hills or an elevation raster, on a grid over the whole world.
 
 
 def _make_hills(side_m: float, relief_m: float, above_sea_m: float, rng: np.random.Generator) -> Elevation:
-    """Synthetic hills, relief_m from the lowest to the highest place, 0 at the origin.
+    """Make synthetic hills with relief_m from the lowest to the highest place, 0 at the origin.
 
-    Waves of 60 to 200 m from all directions, none longer than the world; the longer, the higher.
+    The hills are waves of 60 to 200 m from all directions, no longer than the world. Longer waves are higher.
     """
     metres, step = _grid(side_m)
     east, north = np.meshgrid(metres, metres)
@@ -151,9 +151,9 @@ def _make_hills(side_m: float, relief_m: float, above_sea_m: float, rng: np.rand
 
 
 def _resample_raster(given: Elevation, side_m: float) -> Elevation:
-    """Heights of an elevation raster on the world's grid, 0 at the origin.
+    """Resample an elevation raster to the world's grid, with height 0 at the origin.
 
-    Raises InputError where it does not cover the whole world: says which part of it does.
+    Raises InputError, with the covered part, if the raster does not cover the whole world.
     """
     metres, step = _grid(side_m)
     heights = np.asarray(given.up_m, np.float64)
@@ -177,7 +177,7 @@ def _resample_raster(given: Elevation, side_m: float) -> Elevation:
 
 
 def height_at(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
-    """(N,) metres of height at places (N, 2), bilinear; beyond the grid as if mirrored at its edges."""
+    """Return heights (N,) in metres at places (N, 2), bilinear. The grid is mirrored beyond its edges."""
     places = np.asarray(east_north_m, float).reshape(-1, 2)
     width, flat = relief.up_m.shape[1], relief.up_m.ravel()
     cells, shares = [], []
@@ -195,7 +195,7 @@ def height_at(relief: Elevation, east_north_m: np.ndarray) -> np.ndarray:
 
 
 def _node_weights(at: np.ndarray, count: int, order: int) -> np.ndarray:
-    """(N, count) weights of the nodes 0, 1, .. for places between them: linear (1), or cubic (3) through the nodes.
+    """Return weights (N, count) of the nodes 0, 1, ... for places between them, of order 1 (linear) or 3 (cubic).
 
     Rows of places beyond the nodes are 0.
     """
@@ -204,7 +204,7 @@ def _node_weights(at: np.ndarray, count: int, order: int) -> np.ndarray:
     at = np.clip(at, 0, count - 1)
     first = np.minimum(at.astype(int), max(count - 2, 0))
     t = at - first
-    # Catmull and Rom's cubic: the slope at a node is that between its neighbours.
+    # Catmull-Rom cubic: the slope at a node is the slope between its neighbours.
     cubic = {
         -1: -t / 2 + t**2 - t**3 / 2,
         0: 1 - 5 / 2 * t**2 + 3 / 2 * t**3,
@@ -218,7 +218,7 @@ def _node_weights(at: np.ndarray, count: int, order: int) -> np.ndarray:
 
 
 def _grid(side_m: float) -> tuple[np.ndarray, float]:
-    """Metres along a side, at an even number of steps so that the origin lies on the grid, and their length."""
+    """Return the grid's places along a side, metres, and their step. An even number of steps includes the origin."""
     steps = 2 * int(np.ceil(min(side_m / _COARSEST_M, _MOST_STEPS) / 2))
     return np.linspace(-side_m / 2, side_m / 2, steps + 1), side_m / steps
 
@@ -228,17 +228,17 @@ def _about_origin(up_m: np.ndarray, side_m: float, step_m: float, base_m: float)
     return Elevation(up_m - at_origin, (-side_m / 2, -side_m / 2), step_m, base_m + at_origin)
 
 
-# The sun's light: slopes towards it and away from it, and the shadows of all that stands.
+# Sunlight: slopes that face the sun or face away from it, and shadows of objects.
 
 
 def sun_direction(azimuth_deg: float, height_deg: float) -> np.ndarray:
-    """(3,) unit vector to the sun, east, north, up; the azimuth clockwise from north."""
+    """Return the unit vector (3,) to the sun in east, north, up. The azimuth is clockwise from north."""
     azimuth, height = np.radians([azimuth_deg, height_deg])
     return np.array([np.sin(azimuth) * np.cos(height), np.cos(azimuth) * np.cos(height), np.sin(height)])
 
 
 def _light_on_slopes(relief: Elevation, to_sun: np.ndarray) -> np.ndarray:
-    """(R, C) light on the relief, whose rows go north, as a share of that on level ground."""
+    """Return light (R, C) on the relief, whose rows go north, relative to level ground."""
     north, east = np.gradient(relief.up_m, relief.step_m)
     facing = (to_sun[2] - east * to_sun[0] - north * to_sun[1]) / np.sqrt(1 + east**2 + north**2)
     direct = 1 - float(SHADE_BGR.mean())
@@ -246,17 +246,17 @@ def _light_on_slopes(relief: Elevation, to_sun: np.ndarray) -> np.ndarray:
 
 
 def shadow_above_ground(heights_m: np.ndarray, texel_m: float, to_sun: np.ndarray) -> np.ndarray:
-    """(H, W) float32: by how many metres the edge of the shadow passes above the surface; below 0 it is in the sun.
+    """Return (H, W) float32 heights of the shadow's edge above the surface, metres; negative values are sunlit.
 
-    heights_m: (H, W) of the surface, row 0 the north edge. The picture is turned so that the sun stands above its first
-    row; then the shadow sinks from row to row and each row is a maximum.
+    heights_m: (H, W) of the surface, row 0 at the north edge. The map is turned so that the sun is above its first row.
+    Then the shadow's edge sinks from row to row, and each row takes the maximum of edge and surface.
     """
     rows, columns = heights_m.shape
     level = float(np.hypot(*to_sun[:2]))
     if level < 1e-3:
         return np.full(heights_m.shape, -1, np.float32)
     sink = texel_m * to_sun[2] / level
-    # Rows of the turned picture go away from the sun: (column, row) of the world per turned column and row.
+    # Rows of the turned map go away from the sun. Columns of matrix: world (column, row) per turned column and row.
     away = np.array([-to_sun[0], to_sun[1]]) / level
     aside = np.array([away[1], -away[0]])
     size = int(np.ceil(np.hypot(rows, columns))) + 2
@@ -272,14 +272,14 @@ def shadow_above_ground(heights_m: np.ndarray, texel_m: float, to_sun: np.ndarra
     return cv2.warpAffine(turned, cv2.invertAffineTransform(matrix), (columns, rows), flags=_WARP, borderValue=-1)
 
 
-# An ortho-photo on the world's ground in place of the synthetic soil.
+# An orthophoto that replaces the synthetic soil.
 
 
 class PhotographedGround:
-    """The ground as a photo shows it, row by row, and synthetic soil where it shows none.
+    """The ground of a photo, row by row, with synthetic soil where the photo is empty.
 
-    synthetic: gives rows [first, last) of the soil, (3, n, W) float32. It takes the photo's colours, and lends its fine
-    structure to a photo that is coarser than the world's grid. Raises InputError where the photo shows nothing of it.
+    synthetic: returns rows [first, last) of the soil, (3, n, W) float32. The soil is tinted like the photo. Its fine
+    structure is added to a photo coarser than the world's grid. Raises InputError if the photo misses the world.
     """
 
     def __init__(
@@ -292,11 +292,11 @@ class PhotographedGround:
         middle = side_px // 2
         sample = synthetic((middle, min(middle + 64, side_px)))
         self._tint = (shown.mean(0) / sample.mean((1, 2)))[:, None, None].astype(np.float32)
-        # The seam between photo and soil is soft.
+        # Blend photo and soil softly at the seam.
         self._share = cv2.blur(cv2.erode(sure, np.ones((9, 9), np.uint8)), (9, 9)) if not sure.all() else sure
 
     def rows(self, rows: tuple[int, int]) -> np.ndarray:
-        """Rows [first, last), (3, n, W) float32 BGR."""
+        """Return rows [first, last), (3, n, W) float32 BGR."""
         first, last = rows
         share = self._share[first:last].astype(np.float32) / 255
         image = np.ascontiguousarray(self._image[first:last].transpose(2, 0, 1), np.float32)
@@ -314,9 +314,9 @@ class PhotographedGround:
 
 
 def _place_photo(photo: Ortho, side_m: float, side_px: int) -> tuple[np.ndarray, np.ndarray]:
-    """The photo on the world's grid: (side_px, side_px, 3) uint8, and which of its pixels are known, uint8 0 or 255.
+    """Resample the photo to the world's grid: (side_px, side_px, 3) uint8, and a mask of known pixels, 0 or 255.
 
-    Unknown is what the photo does not cover, and its white or black margins and holes. A finer photo is averaged.
+    Pixels outside the photo and in its white or black margins and holes are unknown. A finer photo is averaged.
     """
     texel, half = side_m / side_px, side_m / 2
     metres_from_pixel = np.asarray(photo.east_north_from_pixel, float)
@@ -331,7 +331,7 @@ def _place_photo(photo: Ortho, side_m: float, side_px: int) -> tuple[np.ndarray,
         pixel_from_metres = pixel_from_metres + np.c_[np.zeros((2, 2)), 0.5 * shrunk - 0.5]
     metres_from_texel = np.array([[texel, 0, -half + texel / 2], [0, -texel, half - texel / 2], [0, 0, 1]])
     matrix, size = pixel_from_metres @ metres_from_texel, (side_px, side_px)
-    # The outermost pixels are known to their edges.
+    # The outermost pixels are known up to their outer edges.
     wider, moved = cv2.copyMakeBorder(known, 1, 1, 1, 1, cv2.BORDER_REPLICATE), matrix + np.array([0.0, 0, 1])
     sure = cv2.warpAffine(wider, moved, size, flags=_WARP, borderValue=0)
     sure = cv2.threshold(sure, 250, 255, cv2.THRESH_BINARY)[1]
@@ -349,12 +349,12 @@ def _place_photo(photo: Ortho, side_m: float, side_px: int) -> tuple[np.ndarray,
 
 
 def _pixel_m(photo: Ortho) -> float:
-    """Length of a pixel of a photo on the ground."""
+    """Return the length of a photo's pixel on the ground, metres."""
     return float(np.sqrt(np.abs(np.linalg.det(np.asarray(photo.east_north_from_pixel, float)[:, :2]))))
 
 
 def _known_pixels(image: np.ndarray) -> np.ndarray:
-    """(H, W) uint8, 255 where a photo shows something, 0 in its white or black margins and holes."""
+    """Return (H, W) uint8: 0 in the white or black margins and holes of a photo, 255 elsewhere."""
     low, high = image.min(axis=2), image.max(axis=2)
     known = np.full(low.shape, 255, np.uint8)
     for empty in (low >= 252, high <= 3):
@@ -364,20 +364,20 @@ def _known_pixels(image: np.ndarray) -> np.ndarray:
         is_hole = (area >= _EMPTY_SHARE * low.size) | (at_edge & (area >= _EMPTY_SHARE / 20 * low.size))
         is_hole[0] = False
         known[is_hole[label]] = 0
-    # A lossy photo smears its margins over a pixel or two.
+    # Lossy compression smears the margins over one or two pixels.
     return cv2.erode(known, np.ones((5, 5), np.uint8)) if not known.all() else known
 
 
-# The texture as cameras sample it.
+# The texture that cameras sample.
 
 
 def equal_runs(values: np.ndarray) -> Iterable[tuple[int, int]]:
-    """The first row of each run of equal values (N,), and the one after its last."""
+    """Return the first row and the row after the last of each run of equal values (N,)."""
     return pairwise([0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)])
 
 
 def halved_levels(texture: np.ndarray, most: int) -> list[np.ndarray]:
-    """A texture (H, W, ...) and its reductions, each half as large as the one before, `most` at most."""
+    """Return a texture (H, W, ...) and its reductions by factors of 2, at most `most` levels."""
     levels = [texture]
     while len(levels) < most and min(levels[-1].shape[:2]) >= 4:
         size = (levels[-1].shape[1] + 1) // 2, (levels[-1].shape[0] + 1) // 2
@@ -386,7 +386,7 @@ def halved_levels(texture: np.ndarray, most: int) -> list[np.ndarray]:
 
 
 class GroundTexture:
-    """The colours of a world's ground, averaged over as much of it as a pixel covers."""
+    """The colours of a world's ground, averaged over the area of a pixel."""
 
     def __init__(self, world: World, most: int) -> None:
         self._world, self._levels = world, halved_levels(world.albedo, most)
@@ -394,7 +394,7 @@ class GroundTexture:
     def rows(
         self, pixel_m: np.ndarray, east_m: np.ndarray, north_m: np.ndarray, origin_m: tuple[float, float] = (0.0, 0.0)
     ) -> np.ndarray:
-        """(H, W, 3) uint8 at places (H, W) float32 about origin_m; pixel_m: (H,) size of a row's pixels there."""
+        """Return (H, W, 3) uint8 at places (H, W) float32 about origin_m. pixel_m: (H,) size of a row's pixels."""
         level = np.clip(np.log2(pixel_m / self._world.texel_m), 0, len(self._levels) - 1)
         level = np.round(level * _BETWEEN).astype(int)
         picture = np.empty((*east_m.shape, 3), np.uint8)
