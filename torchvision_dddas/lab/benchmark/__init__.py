@@ -1,4 +1,4 @@
-"""How fast the package is on this machine: detection chains, operations, and a plain OpenCV chain beside them."""
+"""Measure the package's speed on this machine: detection chains and operations, beside a plain OpenCV chain."""
 
 from torchvision_dddas.lab.benchmark.chains import CHAINS, STAGES, ChainFigures, draw_frame, measure_chains
 from torchvision_dddas.lab.benchmark.machine import describe_machine, format_table, machine_words

@@ -1,4 +1,4 @@
-"""Frames per second, memory and stages of the detection chain, by engine and configuration, beside plain OpenCV."""
+"""Measure frame rate, memory and stages of the detection chain by engine and configuration, beside plain OpenCV."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +18,7 @@ Size = tuple[int, int]
 """Width and height in pixels."""
 
 CHAINS = ("onboard fast", "onboard half", "onboard patrol", "onboard default", "torch fast", "torch default")
-"""Engine and configuration, roughly the quick ones first."""
+"""Engine and configuration, roughly from fast to slow."""
 
 STAGES = ("prepare", "register", "foreground", "targets")
 _LEAST_FRAMES, _MOST_TURNS, _RATE_HZ = 4, 10, 10.0
@@ -27,10 +27,10 @@ _PERIOD = 60  # frames after which the camera turns back
 
 @dataclass(frozen=True)
 class ChainFigures:
-    """Medians over turns in which chain and plain chain process the same frames.
+    """Medians over turns. In each turn the chain and the plain chain process the same frames.
 
-    rate_hz, plain_hz: frames per second. ratio: time of the chain by that of the plain chain in the same turn.
-    peak_mb: memory of the whole process. stages_ms: milliseconds a frame, as STAGES.
+    rate_hz, plain_hz: frames per second. ratio: time of the chain divided by that of the plain chain in the same turn.
+    peak_mb: memory of the whole process. stages_ms: milliseconds per frame, in the order of STAGES.
     """
 
     chain: str
@@ -45,13 +45,13 @@ class ChainFigures:
 def measure_chains(
     chains: Sequence[str], sizes: Sequence[Size], seconds: float, tell: Callable[[str], None] = lambda text: None
 ) -> Iterator[ChainFigures]:
-    """Yield the figures of each chain at each size, as far as the time allows.
+    """Yield the figures of each chain at each size until the time is over.
 
-    A cell has a share of the time that is left, by its pixels. Ten turns are enough, so quick cells leave time to the
-    others. tell: called with the name of each cell before it is measured.
+    A cell is a chain at a size. It gets a share of the remaining time by its pixels, but takes ten turns at most, so
+    that fast cells leave time for others. tell: called with the name of each cell before its measurement.
     """
     cells = [(chain, size) for size in sorted(sizes) for chain in chains]
-    cells.sort(key=lambda cell: cell[0].startswith("torch"))  # once torch is loaded, the memory of all contains it
+    cells.sort(key=lambda cell: cell[0].startswith("torch"))  # last, because torch adds to the memory afterwards
     weights, deadline = [width * height for _, (width, height) in cells], time.perf_counter() + seconds
     for k, (chain, size) in enumerate(cells):
         if (left := deadline - time.perf_counter()) <= 0:
@@ -64,9 +64,9 @@ def measure_chains(
 
 
 def measure_chain(chain: str, size: Size, share: float, deadline: float) -> ChainFigures | None:
-    """Measure one chain until `share` by the clock, for one turn at least; None if no turn ends before `deadline`.
+    """Measure a chain for at least one turn, until the clock shows `share`. Return None without a turn by `deadline`.
 
-    The turns before the first scene warm the chain up.
+    The turns before the first scene warm up the chain.
     """
     engine, config = chain.split()
     reset_peak_memory()
@@ -103,7 +103,7 @@ def _stages_ms(scene: Scene) -> list[float]:
 
 
 def draw_frame(size: Size, number: int) -> np.ndarray:
-    """Draw a frame (H, W, 3): a camera drifts and rolls over textured ground on which six bodies move."""
+    """Draw a frame (H, W, 3) of a camera that drifts and rolls over textured ground with six moving bodies."""
     (width, height), scene = size, _ground(size).copy()
     step = abs(number % (2 * _PERIOD) - _PERIOD)
     for k in range(6):
@@ -120,7 +120,7 @@ def draw_frame(size: Size, number: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _ground(size: Size) -> np.ndarray:
-    """Noise of five scales, a quarter larger than the pictures."""
+    """Return a ground of noise at five scales, a quarter larger than the pictures."""
     rng, (width, height) = np.random.default_rng(0), size
     full = np.full((height * 5 // 4, width * 5 // 4), 120.0, np.float32)
     for scale in (2, 6, 20, 60, 180):

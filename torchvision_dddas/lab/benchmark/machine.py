@@ -1,4 +1,4 @@
-"""The machine on which something was measured, and tables of what was measured there."""
+"""Describe the machine of a measurement, and format tables of results."""
 
 import functools
 import os
@@ -38,6 +38,6 @@ def machine_words() -> str:
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> str:
-    """Return a Markdown table; the first `words` columns are text, the others numbers set to the right."""
+    """Return a Markdown table. The first `words` columns are text; the others are right-aligned numbers."""
     align = ["---"] * words + ["---:"] * (len(head) - words)
     return "\n".join("| " + " | ".join(map(str, cells)) + " |" for cells in (head, align, *rows))

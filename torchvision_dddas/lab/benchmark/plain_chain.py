@@ -1,4 +1,4 @@
-"""The plain OpenCV chain that speed is measured against: every three-frame window computed from nothing."""
+"""The plain OpenCV chain for speed comparisons. It computes every three-frame window from scratch."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,18 +10,18 @@ KEYPOINTS, THRESHOLD, LEAST_AREA_PX, RANSAC_PX = 500, 20, 100, 2.0
 
 
 def ellipse(side: int) -> np.ndarray:
-    """A morphological kernel."""
+    """Return a morphological kernel."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
 
 
 def keypoints(grey: np.ndarray) -> np.ndarray:
-    """(N, 1, 2) float32 good features to track."""
+    """Return (N, 1, 2) float32 good features to track."""
     found = cv2.goodFeaturesToTrack(grey, KEYPOINTS, qualityLevel=0.01, minDistance=8)
     return np.zeros((0, 1, 2), np.float32) if found is None else found
 
 
 def register(grey: np.ndarray, later: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """(3, 3) grey_from_later by pyramidal Lucas-Kanade and RANSAC; the identity where too few points are found."""
+    """Return grey_from_later (3, 3) by pyramidal Lucas-Kanade and RANSAC, or the identity with too few points."""
     if not len(start):
         return np.eye(3)
     nothing: Any = None
@@ -36,9 +36,9 @@ def register(grey: np.ndarray, later: np.ndarray, start: np.ndarray) -> np.ndarr
 def plain_window(
     first: np.ndarray, second: np.ndarray, third: np.ndarray, lap: Callable[[str], None] = lambda stage: None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) uint8 mask of what moves in the first of three BGR frames, and its (N, 4) boxes x, y, width, height.
+    """Return the mask (H, W) uint8 of motion in the first of three BGR frames, and boxes (N, 4) x, y, width, height.
 
-    lap: called with the name of each stage when it is over.
+    lap: called with the name of each stage at its end.
     """
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (first, second, third)]
     lap("prepare")

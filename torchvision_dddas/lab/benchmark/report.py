@@ -1,4 +1,4 @@
-"""The figures of a benchmark as Markdown tables."""
+"""Format the figures of a benchmark as Markdown tables."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,9 +9,9 @@ from torchvision_dddas.lab.benchmark.machine import format_table
 
 
 def format_chains(figures: Sequence[ChainFigures], chains: Sequence[str], sizes: Sequence[Size]) -> str:
-    """Return the table of frames per second and memory, and that of the stages at the middle size.
+    """Return a table of frames per second and memory, and a table of the stages at the middle size.
 
-    A cell that was not measured is a dash.
+    Cells without a measurement hold a dash.
     """
     cells = {(each.chain, each.size): each for each in figures}
     ordered = sorted(sizes)

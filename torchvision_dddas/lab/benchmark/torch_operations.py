@@ -1,4 +1,4 @@
-"""Batched operations of `functional` that Kornia has too, each beside Kornia's for the same work."""
+"""Measure batched operations of `functional` beside Kornia's operations for the same work."""
 
 import time
 from collections.abc import Callable
@@ -14,28 +14,28 @@ Call = Callable[[], object]
 Size = tuple[int, int]
 
 MATRIX = np.array([[1.01, 0.02, -7.3], [-0.015, 0.99, 4.2], [2e-5, -3e-5, 1]])
-"""The homography by which pictures are warped."""
+"""The homography that warps the pictures."""
 
 
 def random_pictures(size: Size, batch: int) -> np.ndarray:
-    """(B, H, W, 3) uint8 smoothed noise."""
+    """Return (B, H, W, 3) uint8 smoothed noise."""
     random = np.random.default_rng(0)
     coloured = random.integers(0, 256, (batch, size[1], size[0], 3), np.uint8)
     return np.stack([cv2.GaussianBlur(picture, (0, 0), 2) for picture in coloured])
 
 
 def to_grey(coloured: np.ndarray) -> np.ndarray:
-    """(B, H, W) uint8 grey levels of BGR pictures."""
+    """Return (B, H, W) uint8 grey levels of BGR pictures."""
     return np.stack([cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in coloured])
 
 
 def brightest(grey: np.ndarray) -> np.ndarray:
-    """(B, H, W) uint8, 1 in the brightest tenth of the pictures."""
+    """Return (B, H, W) uint8, 1 in the brightest tenth of the pictures."""
     return (grey > np.percentile(grey, 90)).astype(np.uint8)
 
 
 def kornia_pairs(coloured: np.ndarray, device: str) -> dict[str, tuple[Call, Call]]:
-    """{operation: (ours, Kornia's)}, calls that do the work of a batch (B, H, W, 3) of BGR pictures on a device."""
+    """Return {operation: (our call, Kornia's call)} for a batch (B, H, W, 3) of BGR pictures on a device."""
     height, width = coloured.shape[1:3]
     grey = to_grey(coloured)
     bytes_ = torch.from_numpy(grey)[:, None].to(device)
@@ -90,7 +90,7 @@ def kornia_pairs(coloured: np.ndarray, device: str) -> dict[str, tuple[Call, Cal
 
 
 def measure_operations(size: Size, batch: int, seconds: float, device: str) -> dict[str, tuple[float, float]]:
-    """{operation: milliseconds a picture of ours and of Kornia's}, medians of alternating calls."""
+    """Return {operation: (our milliseconds per picture, Kornia's)}, medians of alternating calls."""
     pairs = kornia_pairs(random_pictures(size, batch), device)
     found = {}
     for name, calls in pairs.items():

@@ -1,8 +1,8 @@
-"""ONNX graphs of our functions, each compared with torch before it is written: `dddas export`. Needs torch and onnx.
+"""Export ONNX graphs (`dddas export`). Each graph is compared with torch before it is written. Needs torch and onnx.
 
-The graphs of people are built node by node (people_graphs.py), as ONNX Runtime runs them on a small CPU. The others are
-traced from `nn` by torch's exporter (traced_graphs.py). The package ships those of people and of homographies.
-The same versions write the same bytes.
+The graphs for people are built node by node (people_graphs.py), so that they are fast on a small CPU. The others are
+traced from `nn` by torch's exporter (traced_graphs.py). The package ships the graphs for people and homographies.
+The same versions of the libraries write the same bytes.
 """
 
 import os
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 __all__ = ["GRAPHS", "export_graphs"]
 
 GRAPHS = {
-    "people": "HOG and a linear SVM for people, of the layout of people.*; shipped for the default one",
+    "people": "HOG and a linear SVM for people, in the layout of people.*; the default layout is shipped",
     "homography": "plane homographies from landmarks; shipped",
-    "warp_difference": "warp, three-frame difference, threshold and morphology, for one size of picture",
+    "warp_difference": "warp, three-frame difference, threshold and morphology, for one picture size",
     "step": "the whole step from three pictures to the mask: keypoints, flow, RANSAC, refits, warp, difference",
 }
 
@@ -28,13 +28,13 @@ GRAPHS = {
 def export_graphs(
     names: Sequence[str], settings: Settings, sizes_px: Sequence[tuple[int, int]]
 ) -> "Iterator[tuple[str, dict[str, ExportedGraph]]]":
-    """Make the files of each graph in turn and compare them with torch; nothing is written. sizes_px: (width, height).
+    """Make the files of each graph in turn and compare them with torch, without writing. sizes_px: (width, height).
 
-    Raises InputError for an unknown graph, and for settings that a graph cannot hold.
+    Raises InputError for an unknown graph, and for settings that a graph does not support.
     """
     if unknown := [name for name in names if name not in GRAPHS]:
-        raise InputError(f"no graph is named '{unknown[0]}'; there are {', '.join(GRAPHS)}")
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads that spin take the cores from the others
+        raise InputError(f"no graph is named '{unknown[0]}'; choose from {', '.join(GRAPHS)}")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # spinning threads would take cores from other threads
     from torchvision_dddas.lab.export.people_graphs import export_people
     from torchvision_dddas.lab.export.traced_graphs import export_homographies, export_segmentation
 

@@ -1,8 +1,8 @@
-"""From a torch module to an ONNX file of standard operations, and the folder that holds such files under one manifest.
+"""Export a torch module to an ONNX file of standard operations. Write such files into a folder with a manifest.
 
-Uses torch's older exporter, which traces: on the whole step the newer one takes minutes and this one 20 seconds. It has
-no `.mT`, which is added here, and it counts a negative dimension of `unfold` wrongly without an error, so every graph
-must be compared with torch.
+The code uses torch's older, tracing exporter. It takes 20 seconds for the whole step; the newer exporter takes minutes.
+The older exporter lacks `.mT`, which is added here. It also miscounts negative dimensions of `unfold` without an error,
+so every graph must be compared with torch.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ OPSET = 20
 
 @dataclass(frozen=True)
 class Check:
-    """How far a graph's results are from torch's, over its examples: `off` in `unit`, at most `limit` of it."""
+    """Largest difference `off` of a graph's results from torch's over its examples, in `unit`; at most `limit`."""
 
     unit: str
     off: float
@@ -40,13 +40,13 @@ class Check:
 
     @property
     def is_passed(self) -> bool:
-        """False also where the difference is not a number."""
+        """Whether the difference is within the limit. NaN fails."""
         return self.off <= self.limit
 
 
 @dataclass(frozen=True)
 class ExportedGraph:
-    """One file: its content, what it is for, the function it was compared with, and the parameters baked into it."""
+    """A file: content, purpose (about), function for comparison (source), and the parameters built into it."""
 
     content: bytes
     about: str
@@ -56,10 +56,10 @@ class ExportedGraph:
 
 
 def write_graphs(folder: Path, files: dict[str, ExportedGraph]) -> None:
-    """Write graphs and their manifest, whole or not at all.
+    """Write graphs and their manifest, either all files or none.
 
-    Graphs that the folder holds already stay listed if its manifest can be trusted. Raises InputError if a graph
-    failed its checks, or if the disk refuses.
+    Graphs that are already in the folder stay listed if its manifest is valid. Raises InputError if a graph failed its
+    checks, or if the files cannot be written.
     """
     refuse_failed(files)
     try:
@@ -69,7 +69,7 @@ def write_graphs(folder: Path, files: dict[str, ExportedGraph]) -> None:
     contents = {name: graph.content for name, graph in files.items()}
     entries = kept | {name: _manifest_entry(graph) for name, graph in files.items()}
     listed: dict[str, Any] = {"package": VERSION, "graphs": dict(sorted(entries.items()))}
-    # The last to take its place.
+    # The manifest takes its place last.
     contents[MANIFEST] = (json.dumps({**listed, "seal": seal(listed)}, indent=1) + "\n").encode()
     parts: list[PartFile] = []
     try:
@@ -87,7 +87,7 @@ def write_graphs(folder: Path, files: dict[str, ExportedGraph]) -> None:
 
 
 def refuse_failed(files: dict[str, ExportedGraph]) -> None:
-    """Raises InputError if a graph does not compute what torch computes, or was not compared at all."""
+    """Raise InputError if a graph's results differ from torch's, or if the graph was not compared."""
     for name, graph in files.items():
         failed = [check for check in graph.checks if not check.is_passed]
         if failed or not graph.checks:
@@ -122,7 +122,7 @@ def _type_and_shape(value: onnx.ValueInfoProto) -> dict[str, Any]:
     kind = value.type.tensor_type
     return {
         "type": onnx.TensorProto.DataType.Name(kind.elem_type).lower(),
-        "shape": [d.dim_param or d.dim_value for d in kind.shape.dim],  # sizes that are free have names
+        "shape": [d.dim_param or d.dim_value for d in kind.shape.dim],  # free sizes have names
     }
 
 
@@ -133,9 +133,9 @@ def trace_graph(
     outputs: Sequence[str],
     free_axes: Mapping[str, Mapping[int, str]] | None = None,
 ) -> bytes:
-    """The ONNX file of a module, traced on the tensors given; the same versions give the same bytes.
+    """Trace a module on input tensors and return its ONNX file. The same library versions give the same bytes.
 
-    free_axes: names of axes of any length, by input or output. Raises InputError if the result is not of standard
+    free_axes: names of axes of free length, by input or output. Raises InputError if the result contains non-standard
     operations.
     """
     file = io.BytesIO()
@@ -143,25 +143,25 @@ def trace_graph(
         torch.onnx.export(
             module,
             tuple(inputs.values()),
-            file,  # type: ignore[arg-type]  # the older exporter takes it
+            file,  # type: ignore[arg-type]  # the older exporter accepts it
             dynamo=False,
             opset_version=OPSET,
             input_names=list(inputs),
             output_names=list(outputs),
             dynamic_axes=free_axes,
         )
-    # Without nodes that do not depend on the inputs, nearly two of three, the graph opens sooner.
+    # Fold the nodes that do not depend on the inputs (nearly two of three), so that the graph opens faster.
     with tempfile.TemporaryDirectory() as folder:
         options = _options()
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC  # standard operations
-        options.log_severity_level = 3  # "the model may only work here" is true of the levels above
+        options.log_severity_level = 3  # hide a warning that concerns higher levels only
         options.optimized_model_filepath = str(Path(folder) / "folded.onnx")
         onnxruntime.InferenceSession(file.getvalue(), options, providers=["CPUExecutionProvider"])
         return _strip(onnx.load(options.optimized_model_filepath), name)
 
 
 def open_session(content: bytes) -> onnxruntime.InferenceSession:
-    """A session of a graph on one thread."""
+    """Open a session of a graph on one thread."""
     return onnxruntime.InferenceSession(content, _options(), providers=["CPUExecutionProvider"])
 
 
@@ -172,7 +172,7 @@ def _options() -> onnxruntime.SessionOptions:
 
 
 def _strip(model: onnx.ModelProto, name: str) -> bytes:
-    """The model without records of where and how it was made."""
+    """Return the model without records of its origin."""
     graph = model.graph
     graph.name, model.doc_string, model.producer_name, model.producer_version = name, "", "", ""
     del model.metadata_props[:], graph.value_info[:], model.functions[:]
@@ -181,7 +181,7 @@ def _strip(model: onnx.ModelProto, name: str) -> bytes:
         del held.metadata_props[:]
     if strange := {node.domain for node in graph.node} - {""}:
         raise InputError(
-            f"torch's exporter made {name} of operations of {', '.join(strange)}, wanted standard ones; "
+            f"torch's exporter used operations of {', '.join(strange)} in {name}; wanted standard operations; "
             "try another version of torch"
         )
     opsets = [held for held in model.opset_import if held.domain == ""]
@@ -206,7 +206,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _transpose_known() -> Iterator[None]:
-    """Teach the exporter `.mT` meanwhile."""
+    """Register `.mT` with the exporter inside the context."""
 
     def last_two_swapped(context: Any, matrix: Any) -> Any:
         rank = symbolic_helper._get_tensor_rank(matrix)

@@ -1,16 +1,16 @@
-"""The graphs that score windows for people, built node by node from the constants of `functional.hog`.
+"""Build the graphs that score windows for people, node by node, from the constants of `functional.hog`.
 
     people.onnx             uint8 picture (H + 2, W + 2, 3 or 1) with a border of one pixel -> `scores` (ny, nx)
-    people_histograms.onnx  `polar` (1, 2, H, W), magnitude and magnitude x direction in radians, -> `histograms`
-                            (F, ny, nx) of all blocks, not yet normalised
+    people_histograms.onnx  `polar` (1, 2, H, W), magnitude and magnitude x direction in radians -> `histograms`
+                            (F, ny, nx) of all blocks, before normalisation
     people_scores.onnx      `histograms` -> `scores`
 
-The first is the whole score map for any ONNX runtime. The onboard back end runs the two others, between which it puts
-tiles together, and has OpenCV take the gradient, which makes it several times quicker (`eval/speed.py people`). Any SVM
-of the same cells, blocks and bins runs on them, with windows of any size: `functional.arrange_weights` gives `weights`.
+people.onnx computes the whole score map in any ONNX runtime. The onboard back end runs the other two graphs and joins
+tiles between them. OpenCV computes its gradient, which makes it several times faster (`eval/speed.py people`). An SVM
+with the same cells, blocks and bins runs on them with any window size. `functional.arrange_weights` gives `weights`.
 
-Traced graphs of `functional.hog` are right too, but take 160 ns a pixel on one core at 640x480 where people.onnx takes
-110 and people_histograms.onnx 14 (cv2.HOGDescriptor in all 54): ONNX Runtime has quick convolutions and slow copies.
+Traced graphs of `functional.hog` are correct but take 160 ns per pixel on one core at 640x480. people.onnx takes 110,
+people_histograms.onnx 14 and cv2.HOGDescriptor 54 in all, because ONNX Runtime has fast convolutions and slow copies.
 """
 
 import math
@@ -28,9 +28,9 @@ from torchvision_dddas.people.onnx_scorer import BAKED
 from torchvision_dddas.people.torch_scorer import layout
 
 IR_VERSION = 10
-FAR = 2**31 - 1  # an end of a slice: the last
+FAR = 2**31 - 1  # slice end that means the end of the axis
 TOLERANCE = 5e-5
-CHANNELS = 16  # ONNX Runtime's quick convolutions take channels by 16, on smaller vectors by 8 or 4
+CHANNELS = 16  # ONNX Runtime's fast convolutions process channels in groups of 16, 8 or 4
 ABOUT = {
     "people.onnx": "scores of all windows of a picture for people (HOG and a linear SVM), for any runtime",
     "people_histograms.onnx": "the same, first half as the onboard back end runs it: histograms of all blocks",
@@ -39,7 +39,7 @@ ABOUT = {
 
 
 def export_people(parameters: PeopleParameters) -> dict[str, ExportedGraph]:
-    """The files by their names, compared with torch."""
+    """Return {file name: graph}, compared with torch."""
     wanted = layout(parameters)
     files = build_graphs(wanted)
     check = Check("score", largest_difference(files, wanted), TOLERANCE)
@@ -48,38 +48,38 @@ def export_people(parameters: PeopleParameters) -> dict[str, ExportedGraph]:
 
 
 class GraphBuilder:
-    """Builds a graph: a call adds a node and returns its output's name."""
+    """Builds a graph. A call adds a node and returns its output's name."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[bytes, onnx.TensorProto] = {}
 
     def __call__(self, operation: str, *inputs: str, out: str = "", **attributes: Any) -> str:
-        """A node of one output; out: its name, if it matters."""
+        """Add a node with one output and return the output's name. out: name to use."""
         out = out or f"{operation.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operation, list(inputs), [out], name=out, **attributes))
         return out
 
     def number(self, *values: float) -> str:
-        """A float32 constant: a number, or a vector."""
+        """Return the name of a float32 constant, a number or a vector."""
         return self.constant(np.array(values if len(values) > 1 else values[0], np.float32))
 
     def whole(self, *values: int) -> str:
-        """A vector of int64."""
+        """Return the name of a constant int64 vector."""
         return self.constant(np.array(values, np.int64))
 
     def constant(self, array: np.ndarray) -> str:
-        """An array, once however often it is asked for."""
+        """Return the name of a constant array. Equal arrays share one constant."""
         key = str(array.dtype).encode() + str(array.shape).encode() + array.tobytes()
         name = f"constant_{len(self.constants)}"
         return self.constants.setdefault(key, numpy_helper.from_array(array, name)).name
 
     def cut(self, name: str, axis: int, begin: int, end: int) -> str:
-        """A stretch of one axis."""
+        """Slice an axis from begin to end."""
         return self("Slice", name, self.whole(begin), self.whole(end), self.whole(axis))
 
     def model(self, inputs: dict, outputs: dict, properties: dict[str, str], name: str = "people") -> bytes:
-        """The file's content. inputs, outputs: {name: (type, shape)}."""
+        """Return the content of the ONNX file. inputs, outputs: {name: (type, shape)}."""
         given, found = (
             [helper.make_tensor_value_info(value, kind, shape) for value, (kind, shape) in held.items()]
             for held in (inputs, outputs)
@@ -92,7 +92,7 @@ class GraphBuilder:
 
 
 def polar(graph: GraphBuilder, image: str, layout: hog_svm.Layout) -> str:
-    """`functional.hog_svm.gradient` and `angle`: (1, 2, H, W)."""
+    """Add `functional.hog_svm.gradient` and `angle`, (1, 2, H, W)."""
     levels = graph("Transpose", graph("Expand", image, graph.whole(1, 1, 3)), perm=[2, 0, 1])
     levels = graph("Cast", levels, to=TensorProto.FLOAT)
     if layout.gamma:
@@ -131,11 +131,11 @@ def polar(graph: GraphBuilder, image: str, layout: hog_svm.Layout) -> str:
 
 
 def histograms(graph: GraphBuilder, polar: str, layout: hog_svm.Layout, out: str = "") -> str:
-    """From `functional.hog_svm.hats` to the middle of `blocks`: (F, ny, nx), not yet normalised.
+    """Add the steps from `functional.hog_svm.hats` to the middle of `blocks`: (F, ny, nx), before normalisation.
 
-    The hats are sums of ramps relu(m (angle - k)): these are a convolution of one pixel with the rectifier that follows
-    it, which costs a digit of accuracy. Pooling is a convolution of each channel by itself, over rows, then over
-    columns; the hats and the order of a block's numbers are one of one pixel again.
+    The hats are sums of ramps relu(m (angle - k)). A 1x1 convolution with a rectifier computes the ramps, which costs a
+    digit of accuracy. A depthwise convolution pools over rows, then over columns. A further 1x1 convolution sums the
+    ramps to hats and orders a block's numbers.
     """
     at = hog_svm.knots(layout.bins)[:-1]
     used = len(at) + 1
@@ -160,25 +160,25 @@ def histograms(graph: GraphBuilder, polar: str, layout: hog_svm.Layout, out: str
 
 
 def _hats_of_ramps(bins: int) -> np.ndarray:
-    """(bins, K): each bin's hat as a sum of ramps, the second difference at its knots; the first column is m itself."""
+    """Return (bins, K) weights of ramps that sum to each bin's hat: second differences at knots. Column 0 is m."""
     rows = np.zeros((bins, bins + 4))
     for place, knot in enumerate(hog_svm.knots(bins)):
-        # Left of its knot the first hat is 1 - (t - k), plus what bends it to zero.
+        # The first hat starts as 1 - (t - k), and the next ramp bends it to zero.
         rows[knot % bins, place : place + 3] += [1.0, -2.0 if place else -1.0, 1.0]
     return rows[:, : bins + 2]
 
 
 def pool(graph: GraphBuilder, maps: str, weights: np.ndarray, channels: int, stride: tuple[int, int]) -> str:
-    """Weighted sums of each channel by itself."""
+    """Add weighted sums of each channel (depthwise convolution)."""
     kernel = graph.constant(np.ascontiguousarray(np.broadcast_to(weights, (channels, 1, *weights.shape))))
     return graph("Conv", maps, kernel, kernel_shape=list(weights.shape), strides=list(stride), group=channels)
 
 
 def scores(graph: GraphBuilder, histograms: str, layout: hog_svm.Layout, out: str) -> str:
-    """The end of `functional.hog`, and `scores`: (ny - down + 1, nx - across + 1)."""
+    """Add the end of `functional.hog` and the scores, (ny - down + 1, nx - across + 1)."""
     size = layout.bins * layout.cells**2
     flat = graph("Reshape", histograms, graph.whole(size, -1))
-    # Sums over a block's numbers as products with ones: ONNX Runtime is slow at sums over the first axis.
+    # Sum a block's numbers by a product with ones, because ONNX Runtime is slow at sums over the first axis.
     ones = graph.constant(np.ones((1, size), np.float32))
 
     def norm(numbers: str, soft: float) -> str:
@@ -199,7 +199,7 @@ def scores(graph: GraphBuilder, histograms: str, layout: hog_svm.Layout, out: st
     places = graph("Mul", ny, nx)
     weights = graph("Reshape", "weights", graph.whole(-1, size))
     part = graph("MatMul", weights, blocks)
-    # Sums over a window's blocks: see `functional.svm_scores`.
+    # Sum over a window's blocks as in `functional.svm_scores`.
     part = graph("Pad", graph("Reshape", part, joined(down, rest)), joined(graph.whole(0, 0, 0), across))
     part = graph("ReduceSum", graph("Reshape", part, joined(down, across, rest)), one, keepdims=0)
     more = graph("Mul", down, nx)
@@ -211,7 +211,7 @@ def scores(graph: GraphBuilder, histograms: str, layout: hog_svm.Layout, out: st
 
 
 def build_graphs(layout: hog_svm.Layout) -> dict[str, bytes]:
-    """Files by their names."""
+    """Return {file name: content}."""
     size = layout.bins * layout.cells**2
     number: tuple[int, list] = (TensorProto.FLOAT, [])
     svm = {"weights": (TensorProto.FLOAT, ["down", "across", size]), "bias": number, "clip": number}
@@ -232,13 +232,13 @@ def build_graphs(layout: hog_svm.Layout) -> dict[str, bytes]:
 
 
 def baked(layout: hog_svm.Layout) -> dict[str, int]:
-    """The parameters that a graph is made for."""
+    """Return the layout parameters that are built into a graph."""
     values = layout.cell, layout.block, layout.stride, layout.bins, int(layout.signed), int(layout.gamma)
     return dict(zip(BAKED, values, strict=True))
 
 
 def example(layout: hog_svm.Layout, spare: tuple[int, int], channels: int, seed: int) -> dict[str, np.ndarray]:
-    """Inputs of a picture that is so many pixels larger than the window: patches with noise."""
+    """Return example inputs: a picture of noisy patches, `spare` pixels larger than the window, and an SVM."""
     rng = np.random.default_rng(seed)
     width, height = (length + more + 2 for length, more in zip(layout.window, spare, strict=True))
     patches = rng.integers(0, 256, (height // 4 + 1, width // 4 + 1, channels))
@@ -254,7 +254,7 @@ def example(layout: hog_svm.Layout, spare: tuple[int, int], channels: int, seed:
 
 
 def largest_difference(files: dict[str, bytes], layout: hog_svm.Layout) -> float:
-    """Between the graphs' scores and torch's, over pictures and windows of several sizes."""
+    """Return the largest difference of the graphs' scores from torch's, over several picture and window sizes."""
     sessions = {name: open_session(content) for name, content in files.items()}
 
     def run(name: str, given: dict[str, np.ndarray]) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Graphs traced from `nn`: plane homographies from landmarks, and motion segmentation for one picture size.
+"""Trace graphs from `nn`: plane homographies from landmarks, and motion segmentation for one picture size.
 
 homography.onnx      ground (B, n, 2), image (B, n, 2), weight (B, n) -> matrix (B, 3, 3), valid (B,); float64
 homography_raw.onnx  ground, image -> matrix, valid: the source's system as printed
-warp_difference      difference and mask of a picture and two neighbours of known motion
+warp_difference      difference and mask of a picture and two neighbours with known motion
 step                 the whole step from a picture and its two neighbours to motions, difference and mask
 """
 
@@ -20,10 +20,10 @@ from torchvision_dddas.nn import GRAPH_EFFORT, FrameRegistration, MotionSegmente
 
 
 class RawPlaneHomography(nn.Module):
-    """`functional.find_homography_raw`, which solves four landmarks in another way than more."""
+    """`functional.find_homography_raw`, which solves four landmarks in another way than more landmarks."""
 
     def forward(self, ground: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Matrix (B, 3, 3), valid (B,) of ground and image (B, n, 2). A trace has no branches: both ways are taken."""
+        """Return matrix (B, 3, 3), valid (B,) of ground and image (B, n, 2). A trace has no branches, so solve both."""
         exact, exact_valid = F.find_homography_raw(ground[:, :4], image[:, :4])
         least, least_valid = F.find_homography_raw(ground, image)
         is_exact = torch.ones_like(ground[:1, :, 0]).sum(1) == 4
@@ -32,7 +32,7 @@ class RawPlaneHomography(nn.Module):
 
 
 class WarpDifference(nn.Module):
-    """The detection chain on a picture and two neighbours; the threshold is an input, sizes are baked in."""
+    """The detection chain on a picture and two neighbours. The threshold is an input. The picture size is fixed."""
 
     def __init__(self, settings: Settings) -> None:
         super().__init__()
@@ -41,10 +41,10 @@ class WarpDifference(nn.Module):
     def forward(
         self, reference: Tensor, neighbours: Tensor, neighbour_from_reference: Tensor, threshold: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Difference and mask (255 where something moves), both uint8 (H, W).
+        """Return the difference and the mask (255 where something moves), both uint8 (H, W).
 
         reference: uint8 (H, W). neighbours: uint8 (2, H, W). neighbour_from_reference: float64 (2, 3, 3), px.
-        threshold: uint8 (), grey levels; a larger difference is foreground.
+        threshold: uint8 (), grey levels. Larger differences are foreground.
         """
         pictures = neighbours.float()[:, None, None].unbind(0)
         window = Window(reference.float()[None, None], pictures, neighbour_from_reference[None], (-1, 1), ((0, 1),))
@@ -52,7 +52,7 @@ class WarpDifference(nn.Module):
         return found.evidence[0, 0], found.core[0, 0]
 
 
-class Step(nn.Module):
+class SegmentationStep(nn.Module):
     """`nn.FrameRegistration` without branches, and `WarpDifference`."""
 
     def __init__(self, size: tuple[int, int], settings: Settings) -> None:
@@ -65,10 +65,10 @@ class Step(nn.Module):
     def forward(
         self, reference: Tensor, neighbours: Tensor, samples: Tensor, tolerance_px: Tensor, threshold: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """neighbour_from_reference float64 (2, 3, 3), its inliers and keypoints followed, int64 (2,); then as above.
+        """Return neighbour_from_reference float64 (2, 3, 3), inliers and tracked int64 (2,), difference and mask.
 
-        samples: int64 (S, 4), numbers of keypoints from which the hypotheses are drawn. tolerance_px: float64 ().
-        Where nothing agrees: the identity, with 0 inliers.
+        samples: int64 (S, 4), keypoint numbers of the hypotheses. tolerance_px: float64 (). If no keypoints agree,
+        neighbour_from_reference is the identity with 0 inliers.
         """
         levels, pairs = reference[None, None].float(), len(neighbours)
         points, valid = (
@@ -84,7 +84,7 @@ class Step(nn.Module):
 
 TOLERANCE_PX = 1e-6
 HYPOTHESES = 128
-# Ties between keypoints and hypotheses fall differently in torch and in the runtime: places agree, not numbers.
+# Torch and ONNX Runtime resolve ties of keypoints and hypotheses differently, so compare places, not numbers.
 CORNER_PX, MASK_OFF, LEVELS_OFF = 0.1, 0.02, 1e-3
 LEAST_KEYPOINTS = 48
 EXAMPLES = 2
@@ -92,7 +92,7 @@ PLANES: dict[str, tuple[str, nn.Module]] = {
     "homography.onnx": ("weighted least-squares homographies of sets of landmarks", PlaneHomography()),
     "homography_raw.onnx": ("the same as the source prints it: no weights, no normalisation", RawPlaneHomography()),
 }
-# All parameters of the chain but the threshold, which is an input.
+# All parameters of the chain except the threshold, which is an input.
 _CHAIN = tuple(
     f"{group}.{name}"
     for group in ("difference", "morphology")
@@ -100,7 +100,7 @@ _CHAIN = tuple(
     if name != "threshold"
 )
 _REGISTRATION = ("model", "keypoints", "cell_px", "quality", "block_px", "window_px", "levels", "epsilon_px")
-# What a graph is for, its outputs, and the parameters that are baked in.
+# Purpose of a graph, its outputs, and the parameters that are built in.
 SEGMENTATION: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "warp_difference": (
         "difference and mask of a picture and two neighbours of known motion",
@@ -116,7 +116,7 @@ SEGMENTATION: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 
 
 def export_homographies() -> dict[str, ExportedGraph]:
-    """homography.onnx and homography_raw.onnx, compared with torch."""
+    """Return homography.onnx and homography_raw.onnx, compared with torch."""
     files, given = {}, example_landmarks(6, 3, 0)
     for name, (_, module) in PLANES.items():
         inputs = ("ground", "image", "weight")[: 3 if isinstance(module, PlaneHomography) else 2]
@@ -129,9 +129,9 @@ def export_homographies() -> dict[str, ExportedGraph]:
 
 
 def export_segmentation(name: str, settings: Settings, size: tuple[int, int]) -> dict[str, ExportedGraph]:
-    """The file of one graph for one size (width, height), compared with torch.
+    """Return the file of a graph for a size (width, height), compared with torch.
 
-    Raises InputError where the settings ask for what the graph does not hold, or the size for too few keypoints.
+    Raises InputError if the graph does not support the settings, or if the size has room for too few keypoints.
     """
     about, outputs, baked = SEGMENTATION[name]
     graph = build_module(name, settings, size)
@@ -143,28 +143,28 @@ def export_segmentation(name: str, settings: Settings, size: tuple[int, int]) ->
 
 
 def build_module(name: str, settings: Settings, size: tuple[int, int]) -> nn.Module:
-    """What is traced. Raises InputError as `export_segmentation` does."""
+    """Return the module to trace. Raises InputError as `export_segmentation` does."""
     kind, pairs = settings.difference.kind, settings.difference.near_frames
     if kind != "to_reference" or len(pairs) != 1:
         raise InputError(
-            f"the graph {name} holds difference.kind = to_reference with one pair of neighbours; got {kind} with "
-            f"{len(pairs)}. Give --config fast, or change both"
+            f"the graph {name} needs difference.kind = to_reference with one pair of neighbours, got {kind} with "
+            f"{len(pairs)}; give --config fast, or change both settings"
         )
     if name == "warp_difference":
         return WarpDifference(settings).eval()
     if settings.registration.corners != "cells":
-        raise InputError("the graph step holds registration.corners = cells; got frame. Change it")
-    step = Step(size, settings).eval()
+        raise InputError("the graph step needs registration.corners = cells, got frame; change the setting")
+    step = SegmentationStep(size, settings).eval()
     if step.count < LEAST_KEYPOINTS:
         raise InputError(
-            f"the graph step has room for {step.count} keypoints at {size[0]}x{size[1]}; wanted "
+            f"the graph step has room for {step.count} keypoints at {size[0]}x{size[1]}; wanted at least "
             f"{LEAST_KEYPOINTS}. Give a larger --size, or a smaller registration.cell_px"
         )
     return step
 
 
 def compare(content: bytes, graph: nn.Module, name: str, examples: list[dict[str, Tensor]]) -> tuple[Check, ...]:
-    """The largest differences between the runtime's results and torch's."""
+    """Return the largest differences between the runtime's results and torch's."""
     session, outputs = open_session(content), SEGMENTATION[name][1]
     corner = mask = levels = 0.0
     for given in examples:
@@ -177,7 +177,7 @@ def compare(content: bytes, graph: nn.Module, name: str, examples: list[dict[str
         if name == "step":
             pairs = (found["neighbour_from_reference"], wanted["neighbour_from_reference"])
             corner = max(corner, corner_error(*pairs, wanted["mask"].shape))
-            if not wanted["inliers"].all():  # then there is nothing to compare
+            if not wanted["inliers"].all():  # the identity cannot be compared
                 corner = float("inf")
     if name == "warp_difference":
         return Check("of pixels, difference", levels, LEVELS_OFF), Check("1 - IoU, mask", mask, LEVELS_OFF)
@@ -185,7 +185,7 @@ def compare(content: bytes, graph: nn.Module, name: str, examples: list[dict[str
 
 
 def example_landmarks(count: int, sets: int, seed: int, noise_px: float = 1.0) -> dict[str, np.ndarray]:
-    """Landmarks about places some km from the origin, as cameras 50 to 200 m away see them, tilted up to 50 degrees."""
+    """Return landmarks some km from the origin, seen by cameras 50 to 200 m away and tilted by up to 50 degrees."""
     rng = np.random.default_rng(seed)
     turn, tilt = rng.uniform(0, 2 * np.pi, sets), rng.uniform(0, np.radians(50), sets)
     sin, cos = np.sin(turn), np.cos(turn)
@@ -203,12 +203,12 @@ def example_landmarks(count: int, sets: int, seed: int, noise_px: float = 1.0) -
 
 
 def homography_difference_px(files: dict[str, bytes]) -> float:
-    """Between the places in the picture by the graphs and by torch, over sets of landmarks of all sizes, in px."""
+    """Return the largest distance, px, between places by the graphs and by torch, over sets of 4 to 16 landmarks."""
     sessions = [open_session(files[name]) for name in PLANES]
     worst = 0.0
     for count in range(4, 17):
         given = example_landmarks(count, 50, count)
-        # The source's own system is compared where it has digits to compare: about the origin, in units of 10 m.
+        # Compare the source's system near the origin in units of 10 m, where it is accurate.
         near = {"ground": (given["ground"] - given["ground"][:, :1]) / 10, "image": given["image"] / 500 - 1}
         fit, fit_raw = ([torch.from_numpy(array) for array in held.values()] for held in (given, near))
         results = F.find_homography(*fit), F.find_homography_raw(*fit_raw)
@@ -223,13 +223,13 @@ def homography_difference_px(files: dict[str, bytes]) -> float:
 
 
 def overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Return the intersection over union of two masks, or 1 if both are empty."""
     either = np.count_nonzero(one | other)
     return np.count_nonzero(one & other) / either if either else 1.0
 
 
 def corner_error(found: np.ndarray, wanted: np.ndarray, shape: tuple[int, ...]) -> float:
-    """The largest distance, over matrices (K, 3, 3), between where the corners of a picture (height, width) go."""
+    """Return the largest distance between a picture's corners mapped by found and by wanted matrices (K, 3, 3)."""
     bottom, right = shape[0] - 1.0, shape[1] - 1.0
     corners = torch.tensor([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]], dtype=torch.float64)
     one, other = (
@@ -239,7 +239,7 @@ def corner_error(found: np.ndarray, wanted: np.ndarray, shape: tuple[int, ...]) 
 
 
 def example_pictures(name: str, settings: Settings, size: tuple[int, int], seed: int) -> dict[str, Tensor]:
-    """A textured plane from three places, on which two squares move."""
+    """Draw three pictures of a textured plane with two moving squares, from three places. Return a graph's inputs."""
     width, height = size
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 256, (height // 4, width // 4)).astype(np.float32)
