@@ -1,13 +1,13 @@
-"""Accuracy of moving targets beside the plain OpenCV chain: `python eval/accuracy.py DATA`.
+"""Measure the accuracy of moving targets beside the plain OpenCV chain: `python eval/accuracy.py DATA`.
 
-DATA holds clips: folders with frames/ and masks/ (PNG, 0 background, each other value one mover, any subset of the
-frames), or boxes_xywh.txt (one target a frame, other movers unlabelled), or neither (nothing moves: every blob is
-false). Pixel counts are pooled over a clip, boxes match at an IoU of 0.5. Of one labelled target: a hit is a frame in
-which more than a tenth of its box is foreground, an other blob one whose box meets the target's at an IoU below 0.05.
-The figures are the same in every run on one machine.
+DATA holds clips: folders with frames/ and masks/ (PNG, 0 is background, every other value is one mover, for any subset
+of the frames), or with boxes_xywh.txt (one target per frame, other movers unlabelled), or with neither (nothing moves,
+so every blob is false). Pixel counts are pooled over a clip. Boxes match at an IoU of 0.5. For one labelled target, a
+hit is a frame in which more than a tenth of its box is foreground. An other blob has an IoU below 0.05 with the
+target's box. The figures are the same in every run on one machine.
 
-The source's difference shows a mover where it stands in the middle one of three frames. The column of a configuration
-followed by "at t + Δt" scores its masks there: moved from frame t to frame t + Δt by the registration.
+The source's difference shows a mover at its place in the middle of three frames. The columns "at t + Δt" score the
+masks there: the registration moves them from frame t to frame t + Δt.
 
 --six adds the source's six measures of each clip (appendix B, Table 1 and Fig. 7a).
 """
@@ -34,7 +34,7 @@ from torchvision_dddas.lab.evaluation.metrics.pixels import Pixels, add_counts
 from torchvision_dddas.types import Scene
 
 Found = tuple[np.ndarray, np.ndarray]
-"""(H, W) mask and (N, 4) boxes of a frame."""
+"""Mask (H, W) and boxes (N, 4) of a frame."""
 Chain = Callable[[Path], Iterator[Found | None]]
 Figures = dict[str, float]
 MEASURES = {"precision": "precision", "recall": "recall", "f": "F", "gmean": "Gmean", "box_f1": "box F1"}
@@ -57,7 +57,7 @@ def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, F
     chains |= {f"{name} at t + Δt": partial(run_moved, config=name, backend=options.backend) for name in later}
     scores: dict[str, dict[str, Figures]] = {}
     for place in clips_in(options.data, options.only):
-        if (place / "truth.json").exists():  # all boxes are labelled: `tracklets.py` scores those
+        if (place / "truth.json").exists():  # all boxes are labelled, so `tracklets.py` scores the clip
             continue
         scores[place.name] = {}
         for name, run in chains.items():
@@ -68,26 +68,26 @@ def measure_accuracy(options: bench.Options) -> tuple[str, dict[str, dict[str, F
 
 
 def run_ours(place: Path, config: str, backend: str) -> Iterator[Found]:
-    """Mask and boxes of every frame by this package under a configuration."""
+    """Yield the mask and boxes of every frame by this package with a configuration."""
     settings = load_config(None if config == "default" else config)
     for scene in detect_motion(open_source(place / "frames"), settings, backend):
         yield scene.mask, scene.detections.box_px
 
 
 def is_drawn_later(settings: Settings) -> bool:
-    """Whether masks show the movers of a later frame than their own."""
+    """Return whether masks show the movers at their places in a later frame."""
     return settings.difference.kind == "between_later"
 
 
 def run_moved(place: Path, config: str, backend: str) -> Iterator[Found | None]:
-    """Mask and boxes of every frame where the source draws them; None where there are none."""
+    """Yield the mask and boxes of every frame at the places where the source draws them, or None."""
     scenes = list(detect_motion(open_source(place / "frames"), load_config(config), backend))
     moved = move_later(scenes)
     yield from (moved.get(at) for at in range(len(scenes)))
 
 
 def move_later(scenes: Sequence[Scene]) -> dict[int, Found]:
-    """By index of a frame the mask and boxes of the reference one interval earlier, moved to it, where there is one."""
+    """Return {frame index: mask and boxes of the reference one interval earlier, moved to the frame}."""
     moved: dict[int, Found] = {}
     for at, scene in enumerate(scenes):
         middle, last = at + scene.interval_frames, at + 2 * scene.interval_frames
@@ -102,7 +102,7 @@ def move_later(scenes: Sequence[Scene]) -> dict[int, Found]:
 
 
 def run_plain(place: Path) -> Iterator[Found]:
-    """The same by the plain chain on each frame and its next two; the last two frames look back."""
+    """Yield the plain chain's mask and boxes of each frame and its next two. The last two frames look back."""
     images = [cv2.imread(str(file)) for file in sorted((place / "frames").iterdir())]
     for i in range(len(images)):
         step = 1 if i + 2 < len(images) else -1
@@ -110,7 +110,7 @@ def run_plain(place: Path) -> Iterator[Found]:
 
 
 def score(place: Path, run: Chain) -> Figures:
-    """The figures of one clip: of masks, of one labelled target, or of a clip where nothing moves."""
+    """Score a clip with masks, with one labelled target, or without movers."""
     truth = truths.load_truth(place) if truths.find_truth(place) else None
     pixels, boxes, target, blobs, frames = Pixels(), BoxCounts(), OneTarget(), 0, 0
     of_frames = []
@@ -140,7 +140,7 @@ def score(place: Path, run: Chain) -> Figures:
 
 
 def format_tables(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> str:
-    """F and box F1 of each clip with masks, the means over clips of a set, and the other clips."""
+    """Format F and box F1 of each clip with masks, their means over the clips of a set, and the other clips."""
     masked = {clip: by for clip, by in scores.items() if "f" in by[chains[0]]}
     others = {clip: by for clip, by in scores.items() if clip not in masked}
     parts = []
@@ -165,7 +165,7 @@ def format_tables(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) 
 
 
 def format_six(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> str:
-    """The six measures of each clip with masks, pooled over its labelled frames, and their spread over these."""
+    """Format the six measures of each clip with masks, pooled over labelled frames, and their spread over frames."""
     rows = []
     for clip, by in scores.items():
         for name in chains:
@@ -181,7 +181,7 @@ def format_six(scores: dict[str, dict[str, Figures]], chains: Sequence[str]) -> 
 
 
 def format_figures(figures: Figures) -> str:
-    """A clip's figures in a cell."""
+    """Format a clip's figures for a table cell."""
     if "still" in figures:
         return f"– / – / {figures['still']:.1f}"
     if "hit" in figures:
@@ -190,7 +190,7 @@ def format_figures(figures: Figures) -> str:
 
 
 def two(value: float) -> str:
-    """Two digits; a dash where there is no value."""
+    """Format a value with two digits, or a dash for a missing value."""
     return "–" if np.isnan(value) else f"{value:.2f}"
 
 

@@ -1,18 +1,18 @@
-"""The source's association of targets, and our tracker, on true boxes without identities.
+"""Measure the source's association of targets, and our tracker, on true boxes without identities.
 
 python eval/association.py ratio DATA        accuracy ratio of whole tracks over all windows: the source's, ours, plain
 python eval/association.py clusters DATA     the clusters of the frame with the most targets (appendix C, Fig. 2)
-python eval/association.py examples DATA     windows such as those of Fig. 3, 4b and 5: dispersions, AR_3 by weight
+python eval/association.py examples DATA     windows like those of Fig. 3, 4b and 5: dispersions, AR_3 by weight
 python eval/association.py weight DATA       AR_K against the weight of location (Fig. 4a)
 python eval/association.py threshold DATA    AR_2 against threshold × weight (Fig. 6)
-python eval/association.py dispersion DATA   the dispersions of all windows and the weight that they choose
+python eval/association.py dispersion DATA   the dispersions of all windows and the resulting weight
 python eval/association.py scale DATA        AR_2 and AR_3 by the scale of the histograms' dissimilarity
-python eval/association.py readings DATA     AR_3 by the reading of the dummy: the rule, fixed weights, the dispersions
-python eval/association.py cuts DATA         AR_2 by the dispersions, with clusters that end earlier or later
+python eval/association.py readings DATA     AR_3 by the meaning of the dummy: the rule, fixed weights, the dispersions
+python eval/association.py cuts DATA         AR_2 by the dispersions, with lower and higher cuts of the clusters
 
-DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. Except for `ratio` and `clusters`,
-identities are found again in single windows of two or three frames, `--interval` frames apart; figures are mean /
-standard deviation over the windows in percent.
+DATA holds sequences: folders with gt/gt.txt (MOTChallenge text) and a video. `ratio` and `clusters` use whole tracks
+and frames. The other studies associate targets in single windows of two or three frames, `--interval` frames apart.
+Their figures are mean / standard deviation over the windows in percent.
 """
 
 from collections.abc import Iterable
@@ -72,25 +72,25 @@ TRACKERS: dict[str, tuple[bool, tuple[str, ...]]] = {
         (*PAPER, "paper.dummy=real_pair", "paper.histogram_scale=1", "paper.appearance_cut=0.25"),
     ),
 }
-"""Whether the tracker has the clip's pictures, and its settings."""
+"""Whether the tracker gets the clip's pictures, and its settings."""
 WEIGHTS = [round(0.1 * n, 1) for n in range(11)]
 LOCATION_CUTS, APPEARANCE_CUTS = (0.05, 0.1, 0.15, 0.25), (0.125, 0.17, 0.25, 0.296, 0.375)
-"""About the shipped ones, `paper.location_cut` and `paper.appearance_cut`."""
+"""Values around the shipped `paper.location_cut` and `paper.appearance_cut`."""
 SCALES = (1.0, 0.75, 0.57, 0.5, 0.4, 0.33)
 """Values of `paper.histogram_scale`; 1 is the source's formula as printed."""
 READINGS = (("formula", 0.4, 0.296), ("formula", 1.0, 0.25), ("real_pair", 1.0, 0.25), ("real_pair", 0.4, 0.296))
-"""Of a dummy's entry: `paper.dummy`, `paper.histogram_scale`, `paper.appearance_cut`; the first is shipped."""
+"""`paper.dummy`, `paper.histogram_scale` and `paper.appearance_cut` of each reading; the first is shipped."""
 SMOOTHED = 4
-"""So many looks a dispersion is smoothed over."""
+"""Looks over which a dispersion is smoothed."""
 SHOWN = (0.0, 0.3, 0.5, 0.7, 1.0)
 """The weights in the table of examples."""
 WORST = 9
-"""So many windows of TUD-Stadtmitte are in the source's Fig. 4b."""
+"""Number of windows of TUD-Stadtmitte in the source's Fig. 4b."""
 
 
 @dataclass(frozen=True)
 class Quoted:
-    """What the source says of a window in Fig. 5, oldest frame first; NaN where it gives no value."""
+    """The source's figures of a window in Fig. 5, oldest frame first; NaN without a value."""
 
     figure: str
     sequence: str
@@ -106,18 +106,18 @@ QUOTED = (
     Quoted("5c", "TUD-Stadtmitte", (6, 7, 7), np.nan, 0.59, 0.5),
     Quoted("5d", "PETS09-S2L2", (15, 15, 16), 0.78, np.nan, 1.0),
 )
-"""Appendix C, section IV, the paragraph on Fig. 5 and its caption: targets, dispersions and the weight that follows."""
+"""Appendix C, section IV, paragraph on Fig. 5 and its caption: targets, dispersions and the resulting weight."""
 
 
 # -- whole tracks ----------------------------------------------------------------------------------------------------
 
 
 def measure_ratio(options: bench.Options) -> tuple[str, Any]:
-    """AR_2 and AR_3 of whole tracks over all windows of all phases of an interval.
+    """Measure AR_2 and AR_3 of whole tracks over all windows of all phases of an interval.
 
-    An interval of D has D phases: frames 1, 1 + D, ...; 2, 2 + D, ... Each is tracked by itself. Switches and IDF1 (in
-    percent, matched at an IoU of 0.9) are the mean over the phases and the worst. plain: each box goes on as the box of
-    the look before with the nearest centre, by the least sum of distances, none further than its height.
+    An interval of D has D phases: frames 1, 1 + D, ...; 2, 2 + D, ... Each phase is tracked separately. Switches and
+    IDF1 (in percent, matched at an IoU of 0.9) are the mean and the worst value over the phases. plain: boxes continue
+    boxes of the last look by the least sum of distances of centres; no distance exceeds the height of the box.
     """
     cv2.setNumThreads(1)
     head = [f"interval {options.interval}", "tracker", "windows of 3", "AR_2", "AR_3", "switches", "IDF1"]
@@ -142,7 +142,7 @@ def measure_ratio(options: bench.Options) -> tuple[str, Any]:
 
 
 def score_phases(truth: TrackTable, tracks: list[TrackTable], interval: int) -> list[str]:
-    """The cells of a row."""
+    """Return the table cells of scores over all phases."""
     links, switches, idf1 = [tracking.Windows(), tracking.Windows()], [], []
     for phase, found in enumerate(tracks):
         both = pair(truth.at((truth.frame - 1) % interval == phase), found)
@@ -158,7 +158,7 @@ def score_phases(truth: TrackTable, tracks: list[TrackTable], interval: int) -> 
 
 
 def track_phases(truth: TrackTable, film: Path | None, interval: int, settings: Settings) -> list[TrackTable]:
-    """The tracks of each phase, all fed in one run through the clip; rows are shuffled within a frame."""
+    """Track all phases in one run through the clip and return their tracks. Rows are shuffled within a frame."""
     order = np.random.default_rng(7).permutation(len(truth.frame))
     truth = truth.at(order[np.argsort(truth.frame[order], kind="stable")])
     last, source = int(truth.frame.max()), open_source(str(film)) if film else None
@@ -181,7 +181,7 @@ def track_phases(truth: TrackTable, film: Path | None, interval: int, settings: 
 
 
 def track_nearest(truth: TrackTable, interval: int) -> list[TrackTable]:
-    """The tracks of each phase by the nearest centres of two successive looks."""
+    """Return the tracks of each phase by nearest centres in successive looks."""
     found = []
     for phase in range(interval):
         of_phase, before, following = [], (np.zeros((0, 4)), np.zeros(0, np.int64)), 1
@@ -202,14 +202,14 @@ def track_nearest(truth: TrackTable, interval: int) -> list[TrackTable]:
 
 
 def true_detections(truth: TrackTable, frame: int) -> Detections:
-    """The true boxes of a frame, each certain."""
+    """Return the true boxes of a frame with probability 1."""
     box_px = truth.box_px[slice(*np.searchsorted(truth.frame, [frame, frame + 1]))]
     unknown = np.full(len(box_px), np.nan)
     return Detections(box_px, np.ones(len(box_px)), box_px[:, 2] * box_px[:, 3], unknown, unknown, kind="given")
 
 
 def join_tracks(frames: Iterable[Tracks]) -> TrackTable:
-    """One table of the tracks of all frames."""
+    """Join the tracks of all frames into one table."""
     frames = list(frames)
     number = np.concatenate([np.full(len(t), t.frame) for t in frames])
     return TrackTable(number, np.concatenate([t.identity for t in frames]), np.concatenate([t.box_px for t in frames]))
@@ -219,7 +219,7 @@ def join_tracks(frames: Iterable[Tracks]) -> TrackTable:
 
 
 def measure_weight(options: bench.Options) -> tuple[str, Any]:
-    """AR_K against the weight of location, with a gate and without, and by the source's rule."""
+    """Measure AR_K against the weight of location, with and without a gate, and by the source's rule."""
     rows, found, panels = [], {}, []
     for name, sequence in open_sequences(options):
         lines = {}
@@ -239,7 +239,7 @@ def measure_weight(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_threshold(options: bench.Options) -> tuple[str, Any]:
-    """Mean AR_2 in percent against threshold (rows) × weight of location (columns)."""
+    """Measure mean AR_2 in percent against threshold (rows) × weight of location (columns)."""
     parts, found, panels = [], {}, []
     for name, sequence in open_sequences(options):
         windows, rows = build_windows(sequence, 2, options.interval), []
@@ -257,14 +257,14 @@ def measure_threshold(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_examples(options: bench.Options) -> tuple[str, Any]:
-    """Windows of three frames such as those that the source shows: their dispersions, their weight, AR_3 by weight.
+    """Show windows of three frames like those in the source: dispersions, weight, AR_3 by weight.
 
-    3a, 3b: of the windows of four targets the one with the least dispersion of locations, and the one with the
-    greatest; of several that whose histograms are furthest apart, and nearest. 4b: the windows of the lowest AR_3, on
-    average over the weights, whose AR_3 depends on the weight. 5: the windows with as many targets as the source's, the
-    one nearest to the dispersions that it quotes; the range is that of all those windows. By the shipped scale of the
-    histograms' dissimilarity and by 1, as printed. Where a window's frames have the same number of targets, the
-    dispersions are those of its newest frame.
+    3a, 3b: among windows of four targets, the window with the least and the greatest dispersion of locations. Ties go
+    to the histograms that are furthest apart (3a) and nearest (3b). 4b: the windows with the lowest mean AR_3 over the
+    weights, if AR_3 depends on the weight. 5: among windows with as many targets as in the source, the window nearest
+    to the quoted dispersions, with the range over all these windows. The study uses the shipped scale of the
+    histograms' dissimilarity and the printed scale 1. If a window's frames have the same number of targets, its
+    dispersions are those of the newest frame.
     """
     rows, quoted, panels, figures = [], [], [], []
     sequences = dict(open_sequences(options))
@@ -305,7 +305,7 @@ def measure_examples(options: bench.Options) -> tuple[str, Any]:
 def choose_examples(
     name: str, windows: Windows, known: np.ndarray, parameters: PaperParameters
 ) -> list[tuple[str, int]]:
-    """Figure and row of the windows to show. known: (W, 2) the dispersions by which the rule decides."""
+    """Return figure and row of each window to show. known: (W, 2) dispersions that the rule uses."""
     chosen = []
     four = _as_many(windows, (4, 4, 4))
     if len(four):
@@ -326,7 +326,7 @@ def choose_examples(
 
 
 def _as_many(windows: Windows, targets: tuple[int, ...]) -> np.ndarray:
-    """The windows of so many targets, oldest frame first."""
+    """Return the windows with these numbers of targets, oldest frame first."""
     counts = np.array([[len(known) for known in of] for of in windows.identities])
     return np.flatnonzero((counts == targets[::-1]).all(axis=1))
 
@@ -342,10 +342,10 @@ def _two(value: float) -> str:
 
 
 def measure_clusters(options: bench.Options) -> tuple[str, Any]:
-    """The clusters of the targets in the frame of a sequence that has the most, by locations and by histograms.
+    """Show the clusters of targets by location and by histogram, in the frame of a sequence with the most targets.
 
-    Average linkage on the dissimilarity, that of histograms scaled by `paper.histogram_scale`; the trees end at the
-    cuts. --plot draws the trees.
+    Clustering is average linkage on the dissimilarity. `paper.histogram_scale` scales that of histograms. The trees
+    end at the cuts. --plot draws the trees.
     """
     parameters, rows, trees = PaperParameters(), [], []
     for name, sequence in open_sequences(options):
@@ -394,10 +394,10 @@ def draw_trees(path: str, trees: list[tuple[str, np.ndarray, float, np.ndarray]]
 
 
 def measure_scale(options: bench.Options) -> tuple[str, Any]:
-    """AR_2 and AR_3 by the rule and by the best fixed weight, for each scale of the histograms' dissimilarity.
+    """Measure AR_2 and AR_3 by the rule and by the best fixed weight, for each scale of the histograms' dissimilarity.
 
-    Of true links: how many are more dissimilar than the threshold. The last row of a sequence is its figures at the
-    scale that is best by the rule on the other sequences.
+    A further column gives the share of true links that are more dissimilar than the threshold. The last row of a
+    sequence holds its figures at the scale that is best by the rule on the other sequences.
     """
     found: dict[str, dict[float, list[float]]] = {}
     cells: dict[str, dict[float, list[str]]] = {}
@@ -429,11 +429,11 @@ def measure_scale(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_readings(options: bench.Options) -> tuple[str, Any]:
-    """AR_3 by how a dummy's entry is read: by the rule and by fixed weights, with what the rule decides by.
+    """Measure AR_3 for each reading of a dummy's entry, by the rule and by fixed weights, with the dispersions.
 
-    formula: the gate raises an entry with one dummy where no real alternative passes. real_pair: only where its two
-    real targets are alike enough themselves. By the shipped scale and cut of the histograms, and as printed (scale 1,
-    cut 0.25). smoothed: the rule decides by means of a frame's dispersions and those of the three looks before it.
+    formula: the gate raises an entry with one dummy if no real alternative passes. real_pair: only if its two real
+    targets are similar enough. The study uses the shipped scale and cut of the histograms, and the printed ones (scale
+    1, cut 0.25). smoothed: the rule uses the mean of a frame's dispersions and those of the three looks before it.
     """
     rows, quoted, found = [], [], {}
     for name, sequence in open_sequences(options):
@@ -469,7 +469,7 @@ def measure_readings(options: bench.Options) -> tuple[str, Any]:
 def smooth_dispersions(
     sequence: Sequence, frames: np.ndarray, interval: int, looks: int, parameters: PaperParameters
 ) -> np.ndarray:
-    """(W, K, 2) means of the dispersions of each frame of the windows and of the looks before it, if there are any."""
+    """Return (W, K, 2) means of the dispersions of each frame of the windows and of the available looks before it."""
     before = np.maximum(frames[:, :, None] - interval * np.arange(looks), (frames - 1)[:, :, None] % interval + 1)
     flat = before.reshape(len(frames), -1)
     spread = measure_dispersions(sequence, flat, parameters.location_cut, histogram_cut(parameters))
@@ -477,7 +477,7 @@ def smooth_dispersions(
 
 
 def _cut_links(windows: Windows, scale: float) -> float:
-    """The share of true links whose histograms are more dissimilar than the threshold."""
+    """Return the share of true links whose histograms are more dissimilar than the threshold."""
     threshold, apart = PaperParameters().threshold, []
     for affinity, (newer, older) in zip(windows.appearance, windows.identities, strict=True):
         apart.append(scale * (1 - affinity[1:, 1:][newer[:, None] == older[None]]))
@@ -485,7 +485,7 @@ def _cut_links(windows: Windows, scale: float) -> float:
 
 
 def measure_dispersion(options: bench.Options) -> tuple[str, Any]:
-    """The dispersions of windows of two frames, the weight that follows, and AR_2 by that and by fixed weights."""
+    """Measure the dispersions of windows of two frames, the resulting weight, and AR_2 by it and by fixed weights."""
     rows, panels = [], []
     parameters = PaperParameters.model_validate({"window": 2})
     for name, sequence in open_sequences(options):
@@ -508,7 +508,7 @@ def measure_dispersion(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_cuts(options: bench.Options) -> tuple[str, Any]:
-    """AR_2 by the rule for cuts of the clusters of locations (rows) and of histograms (columns)."""
+    """Measure AR_2 by the rule for cuts of the clusters of locations (rows) and histograms (columns)."""
     parts = []
     parameters = PaperParameters.model_validate({"window": 2})
     for name, sequence in open_sequences(options):

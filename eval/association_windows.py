@@ -1,4 +1,4 @@
-"""Windows of two or three frames of a sequence, and how the source's association links their targets."""
+"""Windows of two or three frames of a sequence, and the links of their targets by the source's association."""
 
 import sys
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ ZERO = PaperParameters(dummy="zero")
 
 @dataclass(frozen=True)
 class Sequence:
-    """True boxes (pixels from 1) with identities and histograms (R, 768), a row a box, and the frames with pictures."""
+    """True boxes (pixels from 1) with identities and histograms (R, 768), one row per box; the frames with pictures."""
 
     frame: np.ndarray
     identity: np.ndarray
@@ -40,16 +40,16 @@ class Sequence:
     seen: frozenset[int]
 
     def rows(self, frame: int) -> np.ndarray:
-        """Where the boxes of a frame are."""
+        """Return the rows of the boxes of a frame."""
         return np.flatnonzero(self.frame == frame)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """All windows of a sequence: frames (W, K), newest first, and per window what the association needs.
+    """All windows of a sequence: frames (W, K), newest first, and the association's inputs for each window.
 
     location, appearance: affinities with a dummy at index 0. dispersions: (W, K, 2), of locations and histograms.
-    pairs: what `assign` asks for with `paper.dummy` = real_pair; empty by feature for others.
+    pairs: argument of `assign` for `paper.dummy` = real_pair; empty for each feature with other readings.
     """
 
     frames: np.ndarray
@@ -61,7 +61,7 @@ class Windows:
 
 
 def read_sequence(place: Path) -> Sequence:
-    """Read the true boxes of a sequence and their histograms, each channel's sum 1."""
+    """Read the true boxes of a sequence and their histograms. Each channel sums to 1."""
     table = clips.truth_of(place).tracks
     histogram, seen = np.zeros((len(table.frame), 768)), set()
     for number, image in clips.frames_of(place, "video"):
@@ -74,9 +74,9 @@ def read_sequence(place: Path) -> Sequence:
 def build_windows(
     sequence: Sequence, count: int, interval: int, every: int = 1, readings: PaperParameters = ZERO
 ) -> Windows:
-    """The windows of `count` frames, one ending at each frame that has its older ones; one window in `every`.
+    """Build the windows of `count` frames. A window ends at each frame with enough older frames; keep 1 in `every`.
 
-    readings: of what a dummy is worth; the affinities of real targets are the same by all.
+    readings: values of dummies. They do not change the affinities of real targets.
     """
     last = int(sequence.frame.max())
     rows = {number: sequence.rows(number) for number in range(1, last + 1)}
@@ -97,9 +97,9 @@ def build_windows(
 def measure_dispersions(
     sequence: Sequence, frames: np.ndarray, location_cut: float, histogram_cut: float
 ) -> np.ndarray:
-    """(W, K, 2) of the locations and histograms of each frame of the windows, for clusters that end at these cuts.
+    """Return (W, K, 2) dispersions of locations and histograms in each frame of the windows, for cuts of the clusters.
 
-    histogram_cut: of dissimilarities as printed.
+    histogram_cut: cut of the dissimilarities as printed.
     """
     centre, found = centres(sequence.box_px), {}
     for t in np.unique(frames).tolist():
@@ -109,7 +109,7 @@ def measure_dispersions(
 
 
 def window_ratios(windows: Windows, parameters: PaperParameters, weight: float | None) -> np.ndarray:
-    """AR_K of every window; weight None: as the dispersions choose it."""
+    """Return AR_K of every window. weight: None to choose it by the dispersions."""
     chosen = choose_weights(windows, parameters) if weight is None else np.full(len(windows.frames), weight)
     parts = zip(windows.location, windows.appearance, windows.pairs, windows.identities, chosen, strict=True)
     found = []
@@ -120,7 +120,7 @@ def window_ratios(windows: Windows, parameters: PaperParameters, weight: float |
 
 
 def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
-    """The weight of location that the source's rule gives each window."""
+    """Return the weight of location by the source's rule for each window."""
     found = []
     for row in range(len(windows.frames)):
         location, appearance = considered_dispersions(windows, row, parameters)
@@ -129,21 +129,21 @@ def choose_weights(windows: Windows, parameters: PaperParameters) -> np.ndarray:
 
 
 def considered_dispersions(windows: Windows, row: int, parameters: PaperParameters) -> tuple[float, float]:
-    """The dispersions of locations and of histograms by which the rule decides in a window."""
+    """Return the dispersions of locations and of histograms that the rule uses in a window."""
     counts = [len(known) for known in windows.identities[row]]
     location, appearance = windows.dispersions[row, : frames_considered(counts, parameters)].min(axis=0).tolist()
     return location, appearance
 
 
 def select_windows(windows: Windows, rows: list[int]) -> Windows:
-    """Some of the windows."""
+    """Return the windows of some rows."""
     lists = (windows.identities, windows.location, windows.appearance, windows.pairs)
     identities, location, appearance, pairs = ([of[row] for row in rows] for of in lists)
     return Windows(windows.frames[rows], identities, location, appearance, windows.dispersions[rows], pairs)
 
 
 def open_sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
-    """The sequences of the data whose names hold `--only` and that have pictures."""
+    """Return the sequences of the data that have pictures and `--only` in their names."""
     cv2.setNumThreads(1)
     places = [place for place in clips.sequences(options.data) if options.only in place.name]
     places = [place for place in places if clips.has_pictures(place, "video")]
@@ -155,5 +155,5 @@ def open_sequences(options: bench.Options) -> Iterable[tuple[str, Sequence]]:
 
 
 def mean_sd(values: np.ndarray) -> str:
-    """Mean / standard deviation in percent."""
+    """Format mean / standard deviation in percent."""
     return f"{100 * values.mean():.1f}/{100 * values.std(ddof=1):.1f}"

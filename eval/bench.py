@@ -1,7 +1,7 @@
-"""What all studies share: options, results as JSON, tables, timing in turns, the machine and its load.
+"""Shared parts of the studies: options, results as JSON, tables, timing in turns, the machine and its load.
 
-A study is a function that takes its options and returns Markdown text and figures. `main` runs one from the command
-line: it prints the text, and with `--write eval/results/NAME.json` keeps text and figures with the command, the date,
+A study is a function that takes its options and returns Markdown text and figures. `main` runs a study from the command
+line and prints the text. With `--write eval/results/NAME.json` it stores text and figures with the command, the date,
 the revision and the machine. `eval/figures.py` puts the text between the marks NAME of the documents.
 """
 
@@ -39,9 +39,9 @@ Study = Callable[[Options], tuple[str, Any]]
 def main(description: str | None, studies: Mapping[str, tuple[Study, Mapping[str, Any]]]) -> None:
     """Run the study that the command line names, print its text and write its result.
 
-    studies: by sub-command the function and its options. One study under "" needs no sub-command. An option is a flag
-    (or the name of a positional folder) with its default: None for a text that may be left out, a list for several
-    values, False for a switch, `Path` for a required path, else a value whose type is kept.
+    studies: {sub-command: (function, options)}. A single study under "" needs no sub-command. An option is a flag (or
+    the name of a positional folder) with its default: None for an optional text, a list for several values, False for
+    a switch, `Path` for a required path, else a value that sets the type.
     """
     parser = _parser(description)
     if "" in studies:
@@ -86,7 +86,7 @@ def _add_options(parser: argparse.ArgumentParser, options: Mapping[str, Any]) ->
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height in pixels from text such as 640x480."""
+    """Parse text such as 640x480 to width and height in pixels."""
     width, height = (int(side) for side in text.split("x"))
     return width, height
 
@@ -100,7 +100,7 @@ def log(*words: object) -> None:
 
 
 def write_result(path: Path, text: str, figures: Any) -> None:
-    """Write a result: Markdown blocks, figures, and how they were measured."""
+    """Write a result: Markdown blocks, figures, and the conditions of the measurement."""
     content = {
         "command": command_line(),
         "date": date.today().isoformat(),
@@ -118,18 +118,18 @@ def _plain(value: Any) -> Any:
 
 
 def read_result(name: str) -> dict[str, Any]:
-    """Content of eval/results/NAME.json."""
+    """Read eval/results/NAME.json."""
     content: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return content
 
 
 def result_text(result: Mapping[str, Any]) -> str:
-    """Markdown of a result's blocks."""
+    """Return the Markdown of a result's blocks."""
     return "\n\n".join(block if isinstance(block, str) else _join_table(block) for block in result["blocks"])
 
 
 def split_blocks(text: str) -> list[str | dict[str, Any]]:
-    """Paragraphs, and tables as head, alignment and rows; `result_text` joins them to the same Markdown."""
+    """Split Markdown into paragraphs, and tables of head, alignment and rows. `result_text` is the inverse."""
     return [_split_block(part) for part in text.strip().split("\n\n")]
 
 
@@ -147,7 +147,7 @@ def _join_table(block: Mapping[str, Any]) -> str:
 
 
 def command_line() -> str:
-    """This program as it was called, with DATA for folders of data and without paths outside the project."""
+    """Return this program's command line, with DATA for data folders and without paths outside the project."""
     script = Path(sys.argv[0]).resolve()
     program = script.relative_to(ROOT).as_posix() if script.is_relative_to(ROOT) else script.name
     return " ".join(["python", program, *(_anonymous(word) for word in sys.argv[1:])])
@@ -163,7 +163,7 @@ def _anonymous(word: str) -> str:
 
 
 def revision() -> str:
-    """The revision of the checkout, with + where files differ from it; empty where git does not know."""
+    """Return the checkout's git revision, with + if files differ from it, or an empty text without git."""
     try:
         short, dirty = (
             subprocess.run(["git", "-C", str(ROOT), *words], capture_output=True, text=True, check=True).stdout.strip()
@@ -187,7 +187,7 @@ class Spread:
         self.error = float("nan") if few else float(self.values.std(ddof=1) / np.sqrt(len(self.values)))
 
     def text(self, digits: int = 2, factor: float = 1.0, spread: bool = True) -> str:
-        """For a table's cell; a dash where there is no value."""
+        """Format the figure for a table cell, or a dash for a missing value."""
         if not len(self.values):
             return "–"
         mean, low, high = (f"{factor * v:.{digits}f}" for v in (self.mean, self.values.min(), self.values.max()))
@@ -195,16 +195,16 @@ class Spread:
 
 
 def format_gain(gains: Sequence[float] | np.ndarray, digits: int = 2) -> str:
-    """The mean gain, and the interval that holds 95 % of bootstrap means over its parts (sequences, scenes)."""
+    """Format the mean gain with its 95 % interval by a bootstrap over its parts (sequences, scenes)."""
     drawn = np.random.default_rng(0).choice(gains, (10_000, len(gains))).mean(axis=1)
     low, high = np.percentile(drawn, [2.5, 97.5])
     return f"{np.mean(gains):+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
 
 
 def run_cases(cases: Sequence[Any], work: Callable[[Any], Any], jobs: int = 1, cache: str | None = None) -> list[Any]:
-    """Results of `work` for all cases in order, by `jobs` processes.
+    """Return the results of `work` for all cases in order, computed by `jobs` processes.
 
-    cache: a file of finished cases (JSON lines) that is read first and added to.
+    cache: a file of finished cases (JSON lines), which is read first and extended.
     """
     keys = [json.dumps(case, sort_keys=True, default=str) for case in cases]
     found: dict[str, Any] = {}
@@ -228,20 +228,20 @@ def run_cases(cases: Sequence[Any], work: Callable[[Any], Any], jobs: int = 1, c
 
 
 def now() -> np.ndarray:
-    """(2,) seconds by the clock, and of the processor over all threads."""
+    """Return (2,) seconds of the clock, and processor seconds over all threads."""
     return np.array([time.perf_counter(), time.process_time()])
 
 
 def children_s() -> np.ndarray:
-    """(2,) seconds by the clock, and of the processor over all programs that this one has started and that ended."""
+    """Return (2,) seconds of the clock, and processor seconds of all child programs that have ended."""
     use = resource.getrusage(resource.RUSAGE_CHILDREN)
     return np.array([time.perf_counter(), use.ru_utime + use.ru_stime])
 
 
 def time_in_turns(calls: Mapping[str, Callable[[int], object]], rounds: int, warm_up: int = 1) -> dict[str, np.ndarray]:
-    """Seconds of each call by clock and processor, (rounds, 2), all calls once a round, so that load meets them alike.
+    """Return seconds (rounds, 2) of clock and processor for each call. Each round runs all calls under similar load.
 
-    A call is given the number of the round, counted from the warm-up on. Garbage is collected between calls.
+    A call gets the number of the round, counted from the warm-up. Garbage is collected between calls.
     """
     spent: dict[str, list[np.ndarray]] = {name: [] for name in calls}
     for turn in range(rounds + warm_up):
@@ -255,13 +255,13 @@ def time_in_turns(calls: Mapping[str, Callable[[int], object]], rounds: int, war
 
 
 def quartiles(name: str, values: np.ndarray) -> dict[str, float]:
-    """{name: median, name_25, name_75}."""
+    """Return {name: median, name_25: lower quartile, name_75: upper quartile}."""
     low, middle, high = np.percentile(values, [25, 50, 75]).tolist()
     return {name: middle, f"{name}_25": low, f"{name}_75": high}
 
 
 def compare_turns(spent_s: np.ndarray, reference_s: np.ndarray) -> dict[str, float]:
-    """Milliseconds by clock and processor, and ratios to the reference in the same turn; (rounds, 2) each."""
+    """Return clock and processor milliseconds, and ratios to the reference in the same turn, from (rounds, 2) each."""
     found = {}
     for k, name in enumerate(("clock", "processor")):
         found |= quartiles(f"{name}_ms", 1e3 * spent_s[:, k])
@@ -270,12 +270,12 @@ def compare_turns(spent_s: np.ndarray, reference_s: np.ndarray) -> dict[str, flo
 
 
 def format_ratio(row: Mapping[str, float], name: str = "processor") -> str:
-    """Median ratio and quartiles for a table's cell."""
+    """Format the median ratio and its quartiles for a table cell."""
     return f"{row[f'{name}_ratio']:.2f} ({row[f'{name}_ratio_25']:.2f}–{row[f'{name}_ratio_75']:.2f})"
 
 
 def measure_memory(command: Sequence[str]) -> dict[str, float]:
-    """Peak and late growth of the resident memory of a command in MB, and its seconds; /proc is read every 50 ms."""
+    """Measure a command's seconds, and the peak and late growth of its resident memory in MB, from /proc each 50 ms."""
     start, held, peak = time.perf_counter(), [0.0], [0.0]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     while process.poll() is None:
@@ -291,7 +291,7 @@ def measure_memory(command: Sequence[str]) -> dict[str, float]:
 
 
 def read_memory(pid: int) -> tuple[float, float] | None:
-    """Resident memory of a process now and at most, MB; None once it has ended."""
+    """Return a process's current and peak resident memory in MB, or None if it has ended."""
     try:
         lines = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
         return int(lines["VmRSS"].split()[0]) / 1024, int(lines["VmHWM"].split()[0]) / 1024
@@ -303,18 +303,18 @@ def read_memory(pid: int) -> tuple[float, float] | None:
 
 
 class OtherLoad:
-    """How many cores other programs kept busy since this was made: what the machine did less what this process did."""
+    """Cores that other programs kept busy since creation: the machine's load minus this process's load."""
 
     def __init__(self) -> None:
         self._start = time.monotonic(), _busy_s(), _own_s()
 
     def cores(self) -> float:
-        """Average number of cores; 0 on a quiet machine."""
+        """Return the average number of cores, 0 on a quiet machine."""
         start, busy, own = self._start
         return max((_busy_s() - busy - _own_s() + own) / max(time.monotonic() - start, 1e-3), 0.0)
 
     def words(self) -> str:
-        """For the text beside a table."""
+        """Return a sentence for the text beside a table."""
         return f"other programs took {self.cores():.1f} of {len(os.sched_getaffinity(0))} cores meanwhile"
 
 
@@ -335,10 +335,10 @@ def _own_s() -> float:
 
 
 def draw(path: str | None, panels: Sequence[Mapping[str, Any]], columns: int = 0) -> None:
-    """Draw panels of lines into a PNG; nothing where path is None.
+    """Draw panels of lines into a PNG. Do nothing if path is None.
 
-    A panel: title, xlabel, ylabel, xscale, yscale as matplotlib has them, and lines: by label a dict of x, y and
-    optionally error (of y) and style (a format such as "o-").
+    A panel has title, xlabel, ylabel, xscale, yscale as in matplotlib, and lines: {label: dict of x, y and optionally
+    error (of y) and style (a format such as "o-")}.
     """
     if path is None:
         return

@@ -1,4 +1,4 @@
-"""What the studies look at: real clips, MOTChallenge sequences, and the tests' synthetic scene."""
+"""Data of the studies: real clips, MOTChallenge sequences, and the tests' synthetic scene."""
 
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -31,12 +31,12 @@ Size = tuple[int, int]
 
 
 def scene(size: Size, frames: int) -> list[np.ndarray]:
-    """BGR frames of the synthetic scene at a size."""
+    """Return BGR frames of the synthetic scene at a size."""
     return render(seed=0, frames=frames, size=size).images
 
 
 def read_frames(path: Path, most: int = 100) -> list[np.ndarray]:
-    """Up to `most` BGR frames of a video or a folder of pictures."""
+    """Read up to `most` BGR frames of a video or a folder of pictures."""
     found = []
     for frame in open_source(str(path)):
         image = frame.image
@@ -47,7 +47,7 @@ def read_frames(path: Path, most: int = 100) -> list[np.ndarray]:
 
 
 def clips_in(folder: Path | None, only: str = "") -> list[Path]:
-    """Folders with frames/ inside a folder; ends the program with one line where there are none."""
+    """Return the folders with frames/ inside a folder. End the program with one line if there are none."""
     places = sorted(p for p in folder.iterdir() if (p / "frames").is_dir()) if folder and folder.is_dir() else []
     places = [place for place in places if only in place.name]
     if not places:
@@ -56,7 +56,7 @@ def clips_in(folder: Path | None, only: str = "") -> list[Path]:
 
 
 def resize(image: np.ndarray, size: Size) -> np.ndarray:
-    """The largest middle part of a picture with the sides' ratio of a size, made as large as that size."""
+    """Crop the largest middle part of a picture with the aspect ratio of a size, and resize it to that size."""
     height, width = image.shape[:2]
     rows, columns = min(height, round(width * size[1] / size[0])), min(width, round(height * size[0] / size[1]))
     top, left = (height - rows) // 2, (width - columns) // 2
@@ -65,7 +65,7 @@ def resize(image: np.ndarray, size: Size) -> np.ndarray:
 
 
 def there_and_back(frames: Sequence[np.ndarray], count: int) -> list[np.ndarray]:
-    """The clip forwards and backwards until there are `count` frames, so that there are no cuts."""
+    """Repeat a clip forwards and backwards to `count` frames, so that there are no cuts."""
     period = max(2 * len(frames) - 2, 1)
     return [frames[min(i % period, period - i % period)] for i in range(count)]
 
@@ -84,40 +84,40 @@ def write_video(path: Path, images: Sequence[np.ndarray], count: int, rate_hz: f
 
 
 def sequences(folder: Path) -> list[Path]:
-    """The folders with gt/gt.txt, by name; ends the program with one line where there are none."""
+    """Return the folders with gt/gt.txt, by name. End the program with one line if there are none."""
     places = motchallenge.sequences(folder)
     found = [places[name] for name in sorted(places) if (places[name] / "gt/gt.txt").is_file()]
     return found or sys.exit(f"{folder} holds no sequences with gt/gt.txt; nothing was measured")
 
 
 def truth_of(place: Path) -> ClipTruth:
-    """The truth of a sequence, with its tracks."""
+    """Return the truth of a sequence, with its tracks."""
     truth = motchallenge.sequence(place).truth
     assert truth is not None and truth.tracks is not None
     return truth
 
 
 def film_of(place: Path) -> Path | None:
-    """The video of a sequence, if it has one."""
+    """Return the video of a sequence, if it has one."""
     pictures = motchallenge.sequence(place).pictures
     return pictures[0] if len(pictures) == 1 else None
 
 
 def single_pictures(place: Path) -> dict[int, Path]:
-    """The pictures of a sequence by frame, where not all of them need be there: those of its folders img1*."""
+    """Return {frame: picture} of a sequence's folders img1*. Frames may be missing."""
     folders = [place / name for name in folders_in(place) if name.startswith("img1")]
     paths = [path for folder in folders for path in images_in(folder)]
     return {number: path for path in paths if (number := number_of(path)) is not None}
 
 
 def has_pictures(place: Path, pictures: str) -> bool:
-    """Whether there is a video of all frames ("video"), or single pictures in folders img1* ("images")."""
+    """Return whether there is a video of all frames ("video"), or single pictures in folders img1* ("images")."""
     single = pictures != "video"
     return bool(single_pictures(place) if single else motchallenge.sequence(place).pictures)
 
 
 def frames_of(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
-    """Number and picture of each frame."""
+    """Yield the number and picture of each frame."""
     if pictures != "video":
         for number, path in sorted(single_pictures(place).items()):
             image = read_image(path)
@@ -130,9 +130,9 @@ def frames_of(place: Path, pictures: str) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def identified_clips(data: Path, kinds: Iterable[str]) -> list[Clip]:
-    """Clips with true identities of several targets, each name once, of the kind that is named first."""
+    """Return clips with true identities of several targets. A name in several kinds is taken from the first kind."""
     found: dict[str, Clip] = {}
-    data = data.resolve()  # a relative path would be read as one inside itself
+    data = data.resolve()  # a relative path would be resolved inside itself
     for kind in kinds:
         for clip in read(DatasetSource(kind, data), data).clips:
             if clip.truth is not None and clip.truth.tracks is not None:
@@ -141,6 +141,6 @@ def identified_clips(data: Path, kinds: Iterable[str]) -> list[Clip]:
 
 
 def measure_idf1(clip: Clip, task: Task, settings: Settings, interval: int) -> float:
-    """IDF1 of the tracker as it runs on a clip."""
+    """Return IDF1 of the tracker on a clip."""
     found = find(clip, task, settings, "onboard", interval)
     return float(measures([score(clip, task, found, interval)])["tracks"]["idf1"])

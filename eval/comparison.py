@@ -1,8 +1,8 @@
-"""One table of the source, plain chains and ours: `python eval/comparison.py`; reads eval/results, measures nothing.
+"""Make a table of the source, plain chains and ours from eval/results, without measuring: `python eval/comparison.py`.
 
-source: our reading of the source's text, on the same data as the others. plain: the tuned OpenCV chain
-(`plain_chain.py`), nearest centres, OpenCV's findHomography in metres. published: the source's own figures, on data of
-its own.
+source: our implementation of the source's text, on the same data as the others. plain: the tuned OpenCV chain
+(`plain_chain.py`), nearest centres, and OpenCV's findHomography in metres. published: the source's own figures, on its
+own data.
 """
 
 from typing import Any
@@ -16,14 +16,14 @@ NONE = "–"
 
 
 class Tables:
-    """The tables of a kept result."""
+    """The tables of a stored result."""
 
     def __init__(self, name: str) -> None:
         self._blocks = [block for block in bench.read_result(name)["blocks"] if isinstance(block, dict)]
         self.name = name
 
     def cell(self, column: str, *words: str) -> str:
-        """The cell of a column in the row that begins with these words. Ends the program where there is none."""
+        """Return the cell of a column in the row that begins with some words. End the program if there is none."""
         for block in self._blocks:
             for row in block["rows"]:
                 if column in block["head"] and tuple(row[: len(words)]) == words:
@@ -32,7 +32,7 @@ class Tables:
 
 
 def mean_of(cell: str) -> str:
-    """The mean of a cell such as `0.32 ± 0.02 (0.2–0.4)`."""
+    """Return the mean of a cell such as `0.32 ± 0.02 (0.2–0.4)`."""
     return cell.split(" ")[0]
 
 

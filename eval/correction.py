@@ -1,8 +1,8 @@
-"""What the network of docs/network.py gains: `python eval/correction.py [DATA]`.
+"""Measure the gain by the network of docs/network.py: `python eval/correction.py [DATA]`.
 
-It learns from simulated scenes and is scored on others and, where DATA holds clips with frames/ and masks/ as for
-eval/accuracy.py, on these at half their size. What is learned or chosen on real clips leaves the clip that is scored
-out. The figures are the same in every run on one machine.
+The network learns from simulated scenes and is scored on other scenes. If DATA holds clips with frames/ and masks/ as
+for eval/accuracy.py, it is also scored on these at half their size. Training and choices on real clips leave out the
+scored clip. The figures are the same in every run on one machine.
 """
 
 import copy
@@ -36,7 +36,7 @@ COLUMNS = {
     "real": "network, the others",
     "both": "network, simulation, then the others",
 }
-_EVERY = 5  # of dense masks
+_EVERY = 5  # every fifth dense mask is used
 
 
 class Labelled(NamedTuple):
@@ -48,7 +48,7 @@ class Labelled(NamedTuple):
 
 
 def measure_correction(options: bench.Options) -> tuple[str, dict[str, Any]]:
-    """Learn from simulated scenes; score on others, and on real clips left out in turn."""
+    """Learn from simulated scenes. Score on other scenes, and on real clips left out in turn."""
     scenes = [film_scene(seed, size_px=bench.parse_size(options.size)) for seed in range(options.scenes + options.held)]
     bench.log(f"{len(scenes)} scenes are filmed")
     model, correction = learn(scenes[: options.scenes], options.steps)
@@ -91,10 +91,10 @@ def measure_real(options: bench.Options, model: MotionSegmenter, correction: Cor
 
 
 def read_clip(place: Path, frames: int) -> tuple[Tensor, Tensor, list[int]]:
-    """The first frames of a clip at half their size, masks of labelled ones, and which these are."""
+    """Return the first frames of a clip at half size, the masks of labelled frames, and their indices."""
     images = [cv2.imread(str(path)) for path in sorted((place / "frames").iterdir())[:frames]]
     height, width = images[0].shape[:2]
-    size = width // 8 * 4, height // 8 * 4  # the network takes a quarter of it
+    size = width // 8 * 4, height // 8 * 4  # the network works at a quarter of the size
     files = load_truth(place).masks
     at = sorted(n - 1 for n in files if n <= len(images))
     at = at[::_EVERY] if len(at) == len(images) else at
@@ -120,13 +120,13 @@ def score(name: str, clip: Tensor, at: list[int], found: Labelled, correction: C
 
 
 def detect(clip: Tensor) -> Tensor:
-    """(T, 1, H, W) masks of `dddas detect` with its defaults."""
+    """Return masks (T, 1, H, W) of `dddas detect` with its defaults."""
     images = np.ascontiguousarray((255 * clip).round().byte().permute(0, 2, 3, 1).numpy()[..., ::-1])
     return torch.from_numpy(np.stack([scene.mask > 0 for scene in detect_motion(list(images))]))[:, None].float()
 
 
 def fine_tune(start: Correction, clips: Sequence[tuple[Tensor, Tensor]], steps: int) -> tuple[Correction, int]:
-    """The network after the number of steps, of five, that serves best on every third clip; the others teach it."""
+    """Train on two thirds of the clips. Return the network and step number, of five, that are best on the others."""
     torch.manual_seed(0)
     watched, taught = clips[::3], [clip for k, clip in enumerate(clips) if k % 3]
     side = min(min(maps.shape[-2:]) for maps, _ in taught)
@@ -157,13 +157,13 @@ def mean_f(correction: Correction, clips: Sequence[tuple[Tensor, Tensor]]) -> fl
 
 
 def best_offset(clips: Sequence[tuple[Tensor, Tensor]]) -> float:
-    """The change of the threshold, in noise units, that serves these clips best."""
+    """Return the change of the threshold, in noise units, that is best on these clips."""
     offsets = np.arange(-2.5, 6.01, 0.5).tolist()
     return max(offsets, key=lambda offset: np.mean([f_of(maps[:, :1] - offset, truth) for maps, truth in clips]))
 
 
 def format_rows(title: str, rows: Sequence[Row]) -> str:
-    """F of each clip, and the gains over the segmenter alone."""
+    """Format F of each clip, and the gains over the segmenter alone."""
     names = [name for name in COLUMNS if name in rows[0]]
     table = [[row["clip"], *(f"{row[name]:.3f}" for name in names)] for row in rows]
     table.append(["mean", *(f"{np.mean([row[name] for row in rows]):.3f}" for name in names)])
@@ -173,7 +173,7 @@ def format_rows(title: str, rows: Sequence[Row]) -> str:
 
 
 def draw_figure(path: str, clip: Tensor, found: Labelled, correction: Correction) -> None:
-    """The middle frame of a clip, with its true mask, the segmenter's, and the corrected one."""
+    """Draw the middle frame of a clip with its true mask, the segmenter's mask and the corrected mask."""
     k = len(clip) // 2
     image = np.ascontiguousarray((255 * clip[k]).round().byte().permute(1, 2, 0).numpy()[..., ::-1])
     with torch.no_grad():

@@ -1,11 +1,11 @@
-"""How right the events of crowds are, from rendered video with known truth; no data needed.
+"""Measure the accuracy of crowd events, from rendered video with known truth. Needs no data.
 
 python eval/crowd_events.py     precision and recall of joining, splitting, gathering and scattering, by scenario
 
-Crowds truly join or split in the moment in which their people are told so; they may still stand or go side by side for
-long. So a found event is right if a true one of the same kind is within 12 s; each counts once. Crowds that the picture
-does not show within these 12 s do not count. Three or more that join or split within 5 s gather or scatter as well.
---cache FILE keeps finished cases.
+The true time of joining or splitting is the time of the simulator's event. The crowds may stand or walk side by side
+long before or after it. A found event is therefore right if a true event of its kind is within 12 s. Each event counts
+once. Crowds that are not in the picture within these 12 s do not count. Three or more crowds that join or split within
+5 s also gather or scatter. --cache FILE keeps finished cases.
 """
 
 from collections import defaultdict
@@ -21,7 +21,7 @@ WITHIN_S, AT_ONCE_S = 12.0, 5.0
 
 
 def measure(options: bench.Options) -> tuple[str, Any]:
-    """Precision and recall of the events of crowds, by scenario."""
+    """Measure precision and recall of the events of crowds, by scenario."""
     seeds = range(options.first, options.first + options.seeds)
     cases = [{"scenario": name, "seed": seed} for name in options.scenarios for seed in seeds]
     results = bench.run_cases(cases, watch, options.jobs, options.cache)
@@ -41,7 +41,7 @@ def measure(options: bench.Options) -> tuple[str, Any]:
 
 
 def watch(case: Case) -> Case:
-    """Of each kind of event how many are right, found and true."""
+    """Return, for each kind of event, the numbers of right, found and true events."""
     results, ways, _, crowds = fly(case)
     found = [(event.kind, event.time_s) for result in results for event in result.events]
     true = true_events(crowds, ways)
@@ -59,7 +59,7 @@ def watch(case: Case) -> Case:
 
 
 def true_events(crowds: Crowds, ways: Ways) -> list[tuple[str, float]]:
-    """Kind and time of what crowds do that the picture shows."""
+    """Return the kind and time of true events of crowds that are in the picture."""
     events, many = [], defaultdict(list)
     for (_, before), (time_s, now) in pairwise(crowds):
         moved = {(before[n], crowd) for n, crowd in now.items() if before.get(n, crowd) != crowd}

@@ -1,14 +1,14 @@
-"""Whether ellipses hold what they say, in simulated worlds, over seeds; no data needed.
+"""Test whether error ellipses have their stated coverage, in simulated worlds, over seeds. Needs no data.
 
 python eval/ellipses.py boxes        the errors of located targets from rendered video, by the side of their boxes
 python eval/ellipses.py centres DATA the centres of found boxes in real clips, as shares of their sides
-python eval/ellipses.py landmarks    landmarks whose stated errors are right, and 3 and 10 times too small
-python eval/ellipses.py scales       two landmarks, with a prior on how many times too small their stated errors are
-python eval/ellipses.py heading      the offsets of a log's headings and of its clock, by what the pictures show
-python eval/ellipses.py flight       the errors of a log, by points of known place in single pictures
+python eval/ellipses.py landmarks    landmarks with stated errors that are right, and 3 and 10 times too small
+python eval/ellipses.py scales       two landmarks, with a prior on the scale of their stated errors
+python eval/ellipses.py heading      the offsets of a log's headings and of its clock, estimated from pictures
+python eval/ellipses.py flight       the errors of a log, estimated from known points in single pictures
 
-An error that all frames of a run share is drawn once a run, so that one run alone may hold all or nothing. Shares are
-means over runs, with 90 % intervals of a bootstrap by run. --cache FILE keeps finished cases.
+An error that all frames of a run share is drawn once per run, so coverage in a single run may be 0 % or 100 %. Shares
+are means over runs, with 90 % intervals of a bootstrap by run. --cache FILE keeps finished cases.
 """
 
 import json
@@ -54,7 +54,7 @@ Case = dict[str, Any]
 
 
 def share_of(inside: np.ndarray, groups: np.ndarray, seed: int = 0) -> str:
-    """A share in percent, with its 90 % interval by a bootstrap by group: errors within a group have common causes."""
+    """Format a share in percent with its 90 % interval by a bootstrap over groups, whose errors share causes."""
     rng, names = np.random.default_rng(seed), np.unique(groups)
     counts = np.array([[inside[groups == name].sum(), (groups == name).sum()] for name in names])
     drawn = counts[rng.integers(0, len(names), (RESAMPLES, len(names)))].sum(axis=1)
@@ -66,7 +66,7 @@ def share_of(inside: np.ndarray, groups: np.ndarray, seed: int = 0) -> str:
 
 
 class _Watching(CrowdScorer):
-    """Keeps of each located target: people in its box, side of the box in px, error (2,) and covariance (2, 2)."""
+    """Records for each located target: people in its box, side of the box in px, error (2,), covariance (2, 2)."""
 
     def _judge_places(
         self, truth: TrueFrame, targets: FoundTargets, found: list[Crowd], people_in: np.ndarray, covers: np.ndarray
@@ -83,7 +83,7 @@ class _Watching(CrowdScorer):
 
 
 def fly(case: Case) -> list[list[float]]:
-    """A run of a shipped scenario as `dddas run sim:NAME` does it."""
+    """Run a shipped scenario as `dddas run sim:NAME` does. Return the records of its located targets."""
     cv2.setNumThreads(1)
     scenario = load_scenario(case["scenario"], (), case["seed"])
     own = scenario_settings(scenario)
@@ -102,9 +102,9 @@ def fly(case: Case) -> list[list[float]]:
 
 
 def measure_boxes(options: bench.Options) -> tuple[str, Any]:
-    """Errors of the targets found in rendered video, as shares of the side of the box, and how many ellipses hold them.
+    """Measure errors of targets found in rendered video, relative to the side of the box, and the ellipses' coverage.
 
-    Metres are made pixels at the middle of the box's covariance: what remains of an error is not the box's alone.
+    Errors in metres are converted to pixels at the box's middle. They contain other errors than the box's.
     """
     cases = [{"scenario": name, "seed": seed} for name in options.scenarios for seed in range(41, 41 + options.seeds)]
     results = bench.run_cases(cases, fly, options.jobs, options.cache)
@@ -134,9 +134,9 @@ CLIPS = (
 
 
 def measure_centres(options: bench.Options) -> tuple[str, Any]:
-    """Boxes of `dddas detect` beside the labelled ones that they overlap most, at an IoU of 0.1 or more.
+    """Compare boxes of `dddas detect` with the labelled boxes that they overlap most, at an IoU of 0.1 or more.
 
-    rms: of the offsets along u and v, in sides of the found box; robust: the same by their median.
+    rms: root mean square of the offsets along u and v, in sides of the found box. robust: estimate by the median.
     """
     rows = []
     for clip in CLIPS:
@@ -162,7 +162,7 @@ def measure_centres(options: bench.Options) -> tuple[str, Any]:
 
 @cache
 def labels_of(place: Path) -> list[np.ndarray]:
-    """(N, 4) the labelled boxes of each frame."""
+    """Return the labelled boxes (N, 4) of each frame."""
     if (place / "truth.json").exists():
         frames = json.loads((place / "truth.json").read_text(encoding="utf-8"))
         return [np.reshape([one["box"] for one in frame], (-1, 4)) for frame in frames]
@@ -174,7 +174,7 @@ def labels_of(place: Path) -> list[np.ndarray]:
 
 
 def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
-    """Single pictures from 100 m, receivers of 3.5 m in 95 %, targets all over the landmarks' disc (geo_scene.py)."""
+    """Simulate pictures from 100 m, receivers with 3.5 m in 95 %, targets in the landmarks' disc (geo_scene.py)."""
     rows, settings, solver = [], geo_error.settings_for("pose"), load_solver("onboard")
     for n in options.landmarks:
         for tilt in (0.0, 45.0):
@@ -202,12 +202,12 @@ def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
 
 SCALES = np.array([1, 1.5, 2, 3, 4, 6, 8, 12, 16])
 RULES = {"80 % right": (0.8, 1.0), "80 % right, where the picture makes it less": (0.8, 0.8)}
-"""Probability before the picture that errors are as stated, the other scales alike; and after it, above which they are
-taken as stated."""
+"""Prior probability that errors are as stated (other scales share the rest), and the posterior probability above which
+they are taken as stated."""
 
 
 def locate_by_scale(case: geo_scene.Case, too_small: float, count: int) -> dict[str, np.ndarray]:
-    """Squares of errors in sigmas by each rule: places and covariances are those of the mixture over SCALES."""
+    """Return squared errors in sigmas by each rule. Places and covariances are those of the mixture over SCALES."""
     batch, plain = geo_scene.scenes(case, count, 20), geo_error.settings_for("pose").aerial
     squares: dict[str, list[np.ndarray]] = {name: [] for name in RULES}
     for s, (flight, marks) in enumerate(geo_error.georeferencer_inputs(batch)):
@@ -236,7 +236,7 @@ def locate_by_scale(case: geo_scene.Case, too_small: float, count: int) -> dict[
 
 
 def measure_scales(options: bench.Options) -> tuple[str, Any]:
-    """The scenes of `landmarks`, with two of them."""
+    """Simulate the scenes of `landmarks` with two landmarks."""
     rows = []
     for tilt in (0.0, 45.0):
         for too_small in (1.0, 3.0, 10.0):
@@ -252,14 +252,14 @@ def measure_scales(options: bench.Options) -> tuple[str, Any]:
 
 SPEED_M_S = 8.0
 GRADES = {"exact": 0.0, "consumer": 1.0, "twice": 2.0}
-"""Errors of the log as shares of the defaults: tilt 1°, height 2 %, both lasting; receiver 1.43 m over 20 s; a tenth of
-each is new in every sample. Registrations err by 0.1 px in every frame."""
+"""Errors of the log relative to the defaults: lasting tilt 1° and height 2 %, receiver 1.43 m over 20 s. A tenth of
+each error is new in every sample. Registrations have an error of 0.1 px in every frame."""
 
 
 def fly_heading(case: Case) -> list[float]:
-    """Error and standard deviation of the estimated heading offset, degrees, and error of the clock's offset, s.
+    """Return error and standard deviation of the estimated heading offset, degrees, and error of the clock offset, s.
 
-    NaN where there is none. The clock's offset is that of the note, of 0.5 to 3 s.
+    Values without an estimate are NaN. The clock offset, 0.5 to 3 s, is taken from the note.
     """
     rng, camera, grade = np.random.default_rng(case["seed"]), geo_scene.CAMERA, case["grade"]
     time_s, height = np.arange(0, 60, 0.1), case["altitude_m"]
@@ -290,7 +290,7 @@ def fly_heading(case: Case) -> list[float]:
         pitch_rad=pitch + grade * tilt[0] + angle[1], roll_rad=grade * tilt[1] + angle[2],
     )  # fmt: skip
     found = find_heading_offset(AerialLocator(camera, telemetry), seen)
-    # A roll about an axis that looks down turns the heading, too.
+    # A roll about a camera axis that points down changes the heading too.
     true = offset - grade * tilt[1] * np.sin(pitch[0])
     late_s = rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 3.0)
     note = describe_clock_offset(AerialLocator(camera, replace(telemetry, time_s=time_s - late_s)), seen)
@@ -300,7 +300,7 @@ def fly_heading(case: Case) -> list[float]:
 
 
 def measure_heading(options: bench.Options) -> tuple[str, Any]:
-    """Flights of 60 s at SPEED_M_S, 10 pictures a second; offsets are drawn with a sigma of 5°."""
+    """Simulate flights of 60 s at SPEED_M_S and 10 pictures per second. Offsets are drawn with a sigma of 5°."""
     rows = []
     for turns in (True,) if options.turning else (True, False):
         for pitch in options.pitches:
@@ -332,7 +332,7 @@ def measure_heading(options: bench.Options) -> tuple[str, Any]:
 
 TRUE = {"aerial.heading_offset_deg": 4.0, "aerial.pitch_offset_deg": 1.0, "aerial.heading_sigma_deg": 1.5,
         "aerial.tilt_sigma_deg": 0.5, "aerial.position_sigma_m": 0.8, "aerial.altitude_sigma": 0.01}  # fmt: skip
-"""The errors of the simulated logs: nine tenths of the variance last for 20 s, a tenth is new in each picture."""
+"""Errors of the simulated logs: 90 % of the variance lasts for 20 s, and 10 % is new in each picture."""
 FLIGHTS = {
     "all ways, three heights": {},
     "5 % of the points wrong": {"wrong": 0.05},
@@ -343,7 +343,7 @@ FLIGHTS = {
 
 
 def look_at_points(case: Case) -> list[Look]:
-    """Pictures of 1 to 4 points of known place (0.1 m) from 30 to 120 m and with a pitch of 30° to 90°."""
+    """Simulate pictures of 1 to 4 known points (0.1 m) from 30 to 120 m with a pitch of 30° to 90°."""
     rng, camera, looks = np.random.default_rng(case["seed"]), geo_scene.CAMERA, []
     offset_deg = case.get("offset_deg", TRUE["aerial.heading_offset_deg"])
     interval_s, slow = case.get("interval_s", 60.0), rng.normal(0, 1, 6)
@@ -374,7 +374,7 @@ def look_at_points(case: Case) -> list[Look]:
 
 
 def measure_flights(options: bench.Options) -> tuple[str, Any]:
-    """What `dddas calibrate-flight` writes, beside the true errors: the median and the range of 90 % of the flights."""
+    """Compare the output of `dddas calibrate-flight` with the true errors: median and 90 % range over flights."""
     rows = []
     for flight, what in FLIGHTS.items():
         for pictures in options.pictures:

@@ -1,8 +1,8 @@
 """Put the results of eval/results into the documents: `python eval/figures.py [--check]`, or `make figures`.
 
-Text between `<!-- NAME -->` and `<!-- /NAME -->` in README.md and docs/*.md is replaced by the Markdown of
-eval/results/NAME.json (with - for _), so that no measured table is typed by hand. --check changes nothing and ends with
-exit code 1 where a text differs from its result.
+The Markdown of eval/results/NAME.json (with - for _) replaces the text between `<!-- NAME -->` and `<!-- /NAME -->` in
+README.md and docs/*.md, so that no measured table is typed by hand. --check changes nothing and ends with exit code 1
+if a text differs from its result.
 """
 
 import re
@@ -16,12 +16,12 @@ MARKED = re.compile(r"<!-- (?P<name>[\w-]+) -->(?P<text>.*?)<!-- /(?P=name) -->"
 
 
 def documents(root: Path = bench.ROOT) -> list[Path]:
-    """The texts that quote results."""
+    """Return the documents that quote results."""
     return [root / "README.md", *sorted((root / "docs").glob("*.md"))]
 
 
 def fill(text: str) -> str:
-    """The text with the results between its marks. Ends the program with one line for a mark without a result."""
+    """Return the text with the results between its marks. End the program with one line for an unknown mark."""
 
     def replace(found: re.Match[str]) -> str:
         name = found["name"]
@@ -35,7 +35,7 @@ def fill(text: str) -> str:
 
 
 def outdated(root: Path = bench.ROOT) -> Iterator[tuple[Path, str]]:
-    """Documents that differ from their results, and what they should say."""
+    """Yield the documents that differ from their results, with the correct text."""
     for path in documents(root):
         text = path.read_text(encoding="utf-8")
         if (filled := fill(text)) != text:
@@ -43,7 +43,7 @@ def outdated(root: Path = bench.ROOT) -> Iterator[tuple[Path, str]]:
 
 
 def update(options: bench.Options) -> tuple[str, None]:
-    """Write the documents, or name those that differ."""
+    """Write the documents, or with --check name the documents that differ."""
     changed = list(outdated())
     if options.check and changed:
         sys.exit(

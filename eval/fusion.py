@@ -1,20 +1,19 @@
-"""How much a UAV and two ground vehicles gain by each other, over time, and two UAVs; no data needed.
+"""Measure the gain by fusion over time, for a UAV with two ground vehicles and for two UAVs. Needs no data.
 
 python eval/fusion.py vehicles   errors of single platforms and of all together, with a biased receiver, delays, losses
 python eval/fusion.py uavs       identities that two UAVs share, and those that targets keep from one view to the other
 
-People of a simulated scenario walk on level ground. Their true places become boxes with noise in the pictures of the
-UAV (50 m high, looking down) and of two ground vehicles, which stand 14 m from the middle and look at where
-most people are. Everything
-else is what the vehicles report, with the errors of the simulator: receivers of 3.5 m in 95 % with a time constant of
-60 s, UAV tilt 1 degree, UAV heading 3 degrees, vehicles' headings 2 degrees. Boxes: 1 px from the air; 3 % and 5 % of
-the body's height from the ground. AerialLocator and GroundLocator make records of them, and TargetFusion fuses these.
-Only the UAV gives identities. No picture is drawn, and nobody hides anybody.
+People of a simulated scenario walk on level ground. Their true places become noisy boxes in the pictures of a UAV (50 m
+high, looking down) and of two ground vehicles. These stand 14 m from the middle and look at the place with most people.
+All other inputs are the vehicles' reports with the simulator's errors: receivers with 3.5 m in 95 % and a time constant
+of 60 s, UAV tilt 1 degree, UAV heading 3 degrees, vehicles' headings 2 degrees. Boxes have errors of 1 px from the air,
+and of 3 % and 5 % of the body's height from the ground. AerialLocator and GroundLocator turn boxes into records, which
+TargetFusion fuses. Only the UAV gives identities. No picture is drawn, and people do not hide each other.
 
-The two UAVs hover 16 m west and 16 m east of the middle, at 50 m looking down and at 60 m with a pitch of 65 degrees
-and any heading, each with the errors above. Views overlap in a part. 5 % of boxes are missed, and a person who was out
-of a view for 0.5 s returns there under a new number. handed over: people whom one UAV no longer sees for a second,
-while the other does, and who keep the identity by which the first one knew them.
+The two UAVs hover 16 m west and 16 m east of the middle. One looks down from 50 m. The other looks from 60 m with a
+pitch of 65 degrees and a random heading. Both have the errors above. The views overlap partly. 5 % of boxes are missed,
+and a person who was out of a view for 0.5 s returns with a new number. handed over: people whom a UAV has not seen for
+a second while the other UAV sees them, and who keep the identity that the first UAV gave them.
 """
 
 import math
@@ -48,7 +47,7 @@ Way = dict[tuple[float, int], np.ndarray]
 
 
 def measure(options: bench.Options) -> tuple[str, Any]:
-    """Errors, coverage and consistency by platform and case."""
+    """Measure errors, coverage and consistency by platform and case."""
     seeds = range(1, options.seeds + 1)
     results = bench.run_cases([{"seed": seed} for seed in seeds], fly, options.jobs, options.cache)
     rows = []
@@ -73,7 +72,7 @@ ALONE = ("UAV alone", "ugv1 alone", "ugv2 alone")
 
 
 def fly(case: dict[str, Any]) -> dict[str, Any]:
-    """The figures of one seed."""
+    """Return the figures of a seed."""
     settings = load_config(None, ())
     air, ground, truth = record(case["seed"], settings)
     figures = {"UAV, frame by frame": score(_single_frames(air), truth)}
@@ -95,9 +94,9 @@ def _links(options: dict[str, Any]) -> dict[str, float]:
 
 
 def record(seed: int, settings: Settings, jump_m: float = 0.0) -> tuple[list, list, Way]:
-    """Records from the air and from the ground, as (time, platform, locations), and true places and velocities.
+    """Return records from air and ground, as (time, platform, locations), and the true places and velocities.
 
-    The truth is in the metres of the UAV's records.
+    The truth is in the local metres of the UAV's records.
     """
     fault = (f"fault=[{{what='gps_jump',vehicle=2,time_s=0,seconds={2 * SECONDS},size={jump_m}}}]",) if jump_m else ()
     scenario = load_scenario(SCENARIOS[seed % len(SCENARIOS)], (*SCENE, *fault), seed)
@@ -149,7 +148,7 @@ def record(seed: int, settings: Settings, jump_m: float = 0.0) -> tuple[list, li
 
 
 def look(simulator: Any, moment: Any, k: int, feet: np.ndarray, tall: np.ndarray, number: np.ndarray, rng: Any) -> Any:
-    """A vehicle's camera as it reports its pose, the people in its picture, and their numbers."""
+    """Return a vehicle's camera with its reported pose, the people in its picture, and their numbers."""
     view, ground = simulator._ground._view(moment, k), simulator._ground
     width, height = ground._size_px
     foot, head = view.homogeneous(feet), view.homogeneous(feet + np.c_[np.zeros((len(feet), 2)), tall])
@@ -181,7 +180,7 @@ def fuse(
     delay_s: float = 0.0,
     loss: float = 0.0,
 ) -> tuple[list, list]:
-    """Final results and those at once, as (time, number of the person or 0, state, covariance), at each aerial frame.
+    """Return final and immediate results at each aerial frame: (time, number of the person or 0, state, covariance).
 
     known: ground vehicles know the identities of people.
     """
@@ -227,7 +226,7 @@ def _single_frames(air: list) -> list:
 
 
 def score(rows: list, truth: Way) -> dict[str, float]:
-    """Errors in metres, shares inside the ellipses, NEES of four states, shares of speeds within 1 and 1.96 sigma."""
+    """Return errors in metres, ellipse coverage, NEES of four states, shares of speeds within 1 and 1.96 sigma."""
     apart, inside, nees, speed = [], [], [], []
     for time_s, number, state, spread in rows:
         true = truth.get((round(time_s, 3), number))
@@ -262,7 +261,7 @@ UAVS = "uav", "uav2"
 
 
 def measure_uavs(options: bench.Options) -> tuple[str, Any]:
-    """Hand-overs and shared identities by scenario."""
+    """Measure hand-overs and shared identities by scenario."""
     results = bench.run_cases(
         [{"seed": seed} for seed in range(1, options.seeds + 1)], hover, options.jobs, options.cache
     )
@@ -282,13 +281,13 @@ def measure_uavs(options: bench.Options) -> tuple[str, Any]:
 
 
 def hover(case: dict[str, Any]) -> dict[str, int]:
-    """What became of the identities of one seed."""
+    """Return counts about the identities of a seed."""
     settings, fusion = load_config(None, ()), TargetFusion(delay_s=0.0)
     records, who = record_uavs(case["seed"], settings)
     counts = dict.fromkeys(("kept", "left", "told", "both", "right"), 0)
     names: dict[int, set[int]] = {}  # the identities of each person
-    last: dict[tuple[str, int], float] = {}  # when a UAV saw a person last
-    leaving: dict[tuple[str, int], int] = {}  # as what, while both saw him
+    last: dict[tuple[str, int], float] = {}  # time at which a UAV last saw a person
+    leaving: dict[tuple[str, int], int] = {}  # identity from a UAV while both saw the person
     for time_s, name, located in records:
         fused = fusion.update(located, name, time_s=time_s)[-1]
         last |= {(name, who[name][n]): time_s for n in located.positions.target.tolist()}
@@ -313,7 +312,7 @@ def hover(case: dict[str, Any]) -> dict[str, int]:
 
 
 def record_uavs(seed: int, settings: Settings) -> tuple[list, dict[str, dict[int, int]]]:
-    """Records of both UAVs in order, and whom each of their numbers is."""
+    """Return the records of both UAVs in order, and the person behind each of their numbers."""
     scenario = load_scenario(SCENARIOS[seed % len(SCENARIOS)], (*SCENE, "clip.seconds=45"), seed)
     simulator, rate, origin = open_simulator(scenario), scenario.clip.rate_hz, scenario.world.origin_deg
     agents, rng, moments = simulator._agents, np.random.default_rng([seed, 3]), []
@@ -361,7 +360,7 @@ def record_uavs(seed: int, settings: Settings) -> tuple[list, dict[str, dict[int
 
 
 def tilted(pose: CameraPose, turn: np.ndarray) -> CameraPose:
-    """The pose of the other UAV, which looks at the same point, as unsteadily."""
+    """Return the pose of the other UAV, which looks at the same point with the same shaking."""
     axes = turn @ pose.axes
     axes = rotation_matrix(axes[:, 0] * math.radians(90 - OTHER_PITCH_DEG)) @ axes
     middle = np.r_[pose.place_m[:2], 0.0]

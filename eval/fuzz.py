@@ -1,10 +1,10 @@
-"""Damaged inputs for every reader: does one crash or hang? `python eval/fuzz.py run [--inputs 100000] [--workers 2]`.
+"""Test every reader with damaged inputs: `python eval/fuzz.py run [--inputs 100000] [--workers 2]`.
 
-Each input is a whole file with something wrong with it, made from the reader, the seed and a number, so that it can be
-made again. Readers run in processes of their own, a few hundred inputs each: where one dies (a crash of a decoder) or
-takes longer than the limit for an input, that is said with its number, and the next process goes on behind it. A reader
-may take an input or refuse it with an InputError of one line; anything else, a warning too, is a defect. Ends with exit
-code 1 where there are defects.
+Each input is a complete file with damage. The reader, the seed and a number determine it, so that it can be made again.
+Readers run in separate processes, a few hundred inputs each. If a process dies (a decoder crashes) or takes longer than
+the limit for an input, the number is reported, and the next process continues after it. A reader may accept an input or
+refuse it with an InputError of one line. Everything else, including a warning, is a defect. The exit code is 1 if there
+are defects.
 """
 
 import math
@@ -29,11 +29,11 @@ from tests.fuzz.parsers import PARSERS
 
 CHUNK = 250
 MEMORY_BYTES = 6 << 30
-"""Address space of a reader: an input of kilobytes that asks for more is a defect."""
+"""Address space of a reader. A small input that needs more memory is a defect."""
 
 
 def run_readers(options: bench.Options) -> tuple[str, Any]:
-    """Try all readers, or those whose name holds one of --only."""
+    """Try all readers, or the readers with one of --only in their names."""
     parsers = [p for p in PARSERS if p.there and any(word in p.name for word in options.only)]
     share = options.inputs / sum(p.share for p in parsers)
     wanted = {p.name: math.ceil(p.share * share) for p in parsers}
@@ -57,7 +57,7 @@ def run_readers(options: bench.Options) -> tuple[str, Any]:
 
 
 def try_chunk(name: str, first: int, end: int, options: bench.Options) -> Iterator[tuple[int, str, str]]:
-    """Number, kind and words of each input of a chunk."""
+    """Yield the number, kind and message of each input of a chunk."""
     while first < end:
         command = [sys.executable, __file__, "chunk", "--reader", name, "--first", str(first), "--end", str(end)]
         process = subprocess.Popen(
@@ -65,7 +65,7 @@ def try_chunk(name: str, first: int, end: int, options: bench.Options) -> Iterat
         )
         assert process.stdout is not None
         is_hung = threading.Event()
-        timer = _start_timer(process, 60 + options.limit_s, is_hung)  # the imports come first
+        timer = _start_timer(process, 60 + options.limit_s, is_hung)  # extra time for the imports
         for line in process.stdout:
             timer.cancel()
             timer = _start_timer(process, options.limit_s, is_hung)
@@ -98,7 +98,7 @@ def read_chunk(options: bench.Options) -> tuple[str, Any]:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("error")
-        for outdated in (DeprecationWarning, PendingDeprecationWarning):  # of libraries
+        for outdated in (DeprecationWarning, PendingDeprecationWarning):  # warnings of libraries
             warnings.simplefilter("ignore", outdated)
         path = parser.prepare(Path(folder) / "input")
         for number in range(options.first, options.end):

@@ -1,15 +1,15 @@
-"""Errors of targets located from the air by landmarks, beside the Cramér-Rao bound; simulated, no data needed.
+"""Measure errors of targets located from the air by landmarks, beside the Cramér-Rao bound. Simulated; needs no data.
 
 python eval/geo_error.py [--seeds 200] [--quick] [--methods]
 
-1080p, a lens of 70 degrees; telemetry with errors of 1 % in the focal length, 1° of tilt, 5° of heading, 2 % of the
-altitude and a GPS of 3.5 m in 95 %. Landmarks stand in a disc of 25 m radius (geo_scene.py), targets within 10 m of its
-middle (crowd) or all over it (disc). Every frame stands alone.
+The camera has 1080p and a lens of 70 degrees. Telemetry has errors of 1 % in the focal length, 1° of tilt, 5° of
+heading, 2 % of the altitude, and a GPS with 3.5 m in 95 %. Landmarks stand in a disc of 25 m radius (geo_scene.py),
+targets within 10 m of its middle (crowd) or in the whole disc (disc). Every frame is located by itself.
 
-pose: the camera's, by landmarks and telemetry; homography: by landmarks alone, weighted, in metres; paper: the source's
-normal equations in raw degrees; findHomography, solvePnP: OpenCV's on the landmarks alone, in metres, the latter with
-the lens as the telemetry has it. Ellipses are those of 95 %. An error is that of the place relative to the team; an
-error that all receivers share comes on top. --methods: only the table of methods (appendix A, Tables I and II).
+pose: camera pose by landmarks and telemetry. homography: by landmarks alone, weighted, in metres. paper: the source's
+normal equations in raw degrees. findHomography, solvePnP: OpenCV's functions on the landmarks alone, in metres;
+solvePnP uses the lens of the telemetry. Ellipses are for 95 %. Errors are relative to the team, without the error that
+all receivers share. --methods: only the table of methods (appendix A, Tables I and II).
 """
 
 from dataclasses import asdict, replace
@@ -45,24 +45,24 @@ NEEDS = {
     "homography": ("ours, `aerial.mode=homography`", "4", "no", "no"),
     "pose": ("ours, default: the camera's pose", "0", "yes", "yes"),
 }
-"""By method: its name, how many landmarks it needs, whether the lens and telemetry."""
+"""{method: (name, number of landmarks that it needs, whether it needs the lens, whether it needs telemetry)}."""
 PUBLISHED_M = {50.0: 1.3, 200.0: 3.5}
 """The source's mean errors with four landmarks of exact places (appendix A, Fig. 7), from video with found targets."""
 ORIGIN = (-110.9, 32.2)
 CHI2_95 = 5.991
-"""Of chi2 with two degrees of freedom."""
+"""95 % quantile of chi2 with two degrees of freedom."""
 TARGETS = 20
 PARTS = {"crowd": slice(0, TARGETS // 2), "disc": slice(TARGETS // 2, TARGETS)}
 Row = dict[str, Any]
 
 
 def settings_for(method: str) -> Settings:
-    """The defaults, which the simulated telemetry keeps to, with frames that stand alone."""
+    """Return the default settings, whose errors the simulated telemetry has, with independent frames."""
     return with_parameters(Settings(), {"aerial.mode": method, "aerial.correlation_s": 0.0})
 
 
 def landmarks_of(batch: Scenes, s: int) -> LandmarkObservations:
-    """The landmarks of one scene as the package takes them."""
+    """Return the landmarks of a scene in the package's record."""
     n = batch.case.landmarks
     sigma_px = np.full(n, batch.case.pixel_sigma)
     return LandmarkObservations(
@@ -71,7 +71,7 @@ def landmarks_of(batch: Scenes, s: int) -> LandmarkObservations:
 
 
 def flight_of(axes: np.ndarray, place: np.ndarray) -> Flight:
-    """Telemetry of a camera with these axes at this place."""
+    """Return the telemetry of a camera with some axes at a place."""
     right, down, forward = axes.T
     return Flight(
         altitude_m=place[2],
@@ -83,12 +83,12 @@ def flight_of(axes: np.ndarray, place: np.ndarray) -> Flight:
 
 
 def georeferencer_inputs(batch: Scenes) -> list[tuple[Flight, LandmarkObservations]]:
-    """Telemetry and landmarks of each scene."""
+    """Return the telemetry and landmarks of each scene."""
     return [(flight_of(batch.axes[s], batch.place[s]), landmarks_of(batch, s)) for s in range(len(batch))]
 
 
 def locate(batch: Scenes, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """(S, T) errors of the targets of every scene in metres, NaN where there is no place, and whether ellipses hold."""
+    """Return target errors (S, T) in metres, NaN without a place, and (S, T) whether the ellipses hold them."""
     off, inside, solver = [], [], load_solver("onboard")
     for s, (flight, landmarks) in enumerate(georeferencer_inputs(batch)):
         degrees = (lonlat(landmarks.east_north_m, ORIGIN), ORIGIN) if method == "paper" else None
@@ -101,7 +101,7 @@ def locate(batch: Scenes, method: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def locate_by_opencv(batch: Scenes, method: str) -> np.ndarray:
-    """(S, T) errors of the targets in metres by an OpenCV function, NaN where it finds nothing."""
+    """Return target errors (S, T) in metres by an OpenCV function, NaN without a solution."""
     errors = np.full(batch.targets_px.shape[:2], np.nan)
     inverse_lens = np.array([[1 / FOCAL_PX, 0, -CAMERA.centre_px[0] / FOCAL_PX], [0, 1 / FOCAL_PX, 0], [0, 0, 1]])
     inverse_lens[1, 2] = -CAMERA.centre_px[1] / FOCAL_PX
@@ -124,7 +124,7 @@ def locate_by_opencv(batch: Scenes, method: str) -> np.ndarray:
 
 
 def judge(fix: Fix, targets_px: np.ndarray, true_m: np.ndarray, pixel_sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """Error of each target, (T, 2), and whether its ellipse holds that, (T,); NaN where there is no place."""
+    """Return the error (T, 2) of each target, and (T,) whether its ellipse holds the error; NaN without a place."""
     if fix.by == "":
         return np.full(targets_px.shape, np.nan), np.full(len(targets_px), np.nan)
     found, covariance = locate_pixels(fix, CAMERA, targets_px, pixel_sigma)
@@ -133,7 +133,7 @@ def judge(fix: Fix, targets_px: np.ndarray, true_m: np.ndarray, pixel_sigma: flo
 
 
 def inside_ellipses(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """(T,) whether errors lie within 95 % ellipses; NaN where either is not finite."""
+    """Return (T,) whether errors lie within 95 % ellipses; NaN if an error or covariance is not finite."""
     known = np.isfinite(off).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     inside = np.full(len(off), np.nan)
     inside[known] = np.einsum("ti,tij,tj->t", off[known], np.linalg.inv(covariance[known]), off[known]) < CHI2_95
@@ -144,7 +144,7 @@ def inside_ellipses(off: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def compare_methods(case: Case, seeds: int) -> Row:
-    """For each method, and for crowd and disc: errors, coverage of the ellipses and the bound."""
+    """Return errors, coverage of the ellipses and the bound for each method, for crowd and disc."""
     batch, row = scenes(case, seeds, TARGETS), asdict(case)
     plain = case.layout == "ring" and case.gps in ("exact", "3.5 m") and (case.tilt_deg, case.pixel_sigma) == (0, 1)
     for method in METHODS if plain else METHODS[:2]:
@@ -158,7 +158,7 @@ def compare_methods(case: Case, seeds: int) -> Row:
 
 
 def summarize(far: np.ndarray, inside: np.ndarray, bound: np.ndarray | float = np.nan) -> dict[str, float]:
-    """Mean and median error, mean bound, share within ellipses, and share of targets with a place."""
+    """Return mean and median error, mean bound, share within ellipses, and share of targets with a place."""
     known = far[np.isfinite(far)]
     return {
         "mean": float(known.mean()) if len(known) else np.nan,
@@ -170,12 +170,12 @@ def summarize(far: np.ndarray, inside: np.ndarray, bound: np.ndarray | float = n
 
 
 def list_methods() -> list[Case]:
-    """The cases of the table of methods."""
+    """Return the cases of the table of methods."""
     return [Case(gps=g, landmarks=n, altitude_m=h) for g in ("exact", "3.5 m") for n in (4, 6) for h in PUBLISHED_M]
 
 
 def list_cases(quick: bool) -> list[Case]:
-    """The cases of the main table, each once."""
+    """Return the distinct cases of the main table."""
     plain, heights = Case(), (50.0, 200.0) if quick else (50.0, 100.0, 200.0)
     some = ("exact", "1.5 m", "3.5 m")
     rows = [replace(plain, gps=g, landmarks=n, altitude_m=h) for g in GPS for n in (4, 6) for h in heights]
@@ -193,7 +193,7 @@ def list_cases(quick: bool) -> list[Case]:
 
 
 def format_main(rows: list[Row]) -> str:
-    """A row a case."""
+    """Format the main table, one row per case."""
     head = ["layout", "GPS", "n", "AGL m", "pixels", "tilt"]
     for method in METHODS[:2]:
         head += [f"{method}: crowd (bound)", "disc (bound)", "median", "in ellipses"]
@@ -219,7 +219,7 @@ def format_main(rows: list[Row]) -> str:
 
 
 def format_methods(rows: list[Row]) -> str:
-    """A row a method; mean and median errors all over the disc at the two altitudes of the source."""
+    """Format a row per method: mean and median errors in the disc at the two altitudes of the source."""
     cases, lines = [(g, n) for g in ("exact", "3.5 m") for n in (4, 6)], []
     at = {(row["gps"], row["landmarks"], row["altitude_m"]): row for row in rows if "paper" in row}
     for method, needs in NEEDS.items():
@@ -237,19 +237,19 @@ def format_methods(rows: list[Row]) -> str:
 
 
 def percent(share: float) -> str:
-    """With a digit."""
+    """Format a share in percent with a digit."""
     return "–" if np.isnan(share) else f"{100 * share:.1f} %"
 
 
 def metres(value: float) -> str:
-    """With no more digits than are significant."""
+    """Format metres with the significant digits."""
     if not np.isfinite(value):
         return "–"
     return f"{value:.3f}" if value < 0.3 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
 def panels(rows: list[Row]) -> list[dict[str, Any]]:
-    """Errors of a crowd by altitude and by number of landmarks, beside the bounds."""
+    """Return plots of a crowd's errors by altitude and by number of landmarks, beside the bounds."""
     usual = {"layout": "ring", "pixel_sigma": 1.0, "tilt_deg": 0.0, "common_m": 0.0}
     plain = [row for row in rows if all(row[k] == v for k, v in usual.items())]
     found = []
@@ -267,7 +267,7 @@ def panels(rows: list[Row]) -> list[dict[str, Any]]:
 
 
 def measure_errors(options: bench.Options) -> tuple[str, Any]:
-    """Simulate all cases."""
+    """Simulate all cases and format their errors."""
     cv2.setNumThreads(1)
     work = partial(compare_methods, seeds=options.seeds)
     cases = list_methods() if options.methods else list_cases(options.quick)

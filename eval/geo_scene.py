@@ -1,12 +1,12 @@
-"""Simulated flights over landmarks, many at once: the truth, the measurements, and how accurate these allow to be.
+"""Simulate many flights over landmarks at once: truth, measurements, and the attainable accuracy.
 
-A scene is one frame: landmarks in a disc of 25 m radius; targets, half of them within 10 m of its middle (crowd), half
-all over it; a camera that looks at the middle. Measured are pixels and GPS of the landmarks, pixels of the targets and
-telemetry, all with Gaussian errors. The picture's borders are ignored: from 50 m the disc is higher than the picture.
-The geometry is written out here and not taken from the package, so that an error there cannot hide.
+A scene is one frame. Landmarks stand in a disc of 25 m radius. Half of the targets are within 10 m of its middle, half
+in the whole disc. The camera looks at the middle. Measurements are pixels and GPS of the landmarks, pixels of targets,
+and telemetry, all with Gaussian errors. The picture's borders are ignored: from 50 m the disc is higher than the
+picture. The geometry is not taken from the package, so that errors in the package cannot hide.
 
 `pose_bound` and `homography_bound` are Cramér-Rao bounds: no unbiased estimate of a target's place from the same
-measurements has a smaller covariance, that of the pose with the priors counted as measurements.
+measurements has a smaller covariance. The bound of the pose counts the priors as measurements.
 """
 
 from collections.abc import Callable
@@ -18,16 +18,16 @@ from scipy.special import ellipe
 from torchvision_dddas.types import Camera
 
 RADIUS_M, CROWD_M, MOST = 25.0, 10.0, 8
-"""Of the landmarks' and of the crowd's disc, and how many landmarks there can be."""
+"""Radius of the landmarks' disc and of the crowd's disc, and the largest number of landmarks."""
 SIZE_PX = (1920, 1080)
 FOCAL_PX = SIZE_PX[0] / 2 / np.tan(np.radians(35))
 CAMERA = Camera("aerial", SIZE_PX, (FOCAL_PX, FOCAL_PX), ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2))
 """1080p, a lens of 70 degrees."""
 SIGMA_OF = 1 / np.sqrt(-2 * np.log(0.05))
-"""Standard deviation along each axis of a GPS that is so many metres off in 95 %, as a share of those."""
+"""Standard deviation along each axis of a GPS error, as a share of its 95 % radius."""
 FOCAL_SIGMA, TILT_SIGMA, HEADING_SIGMA = 0.01, np.radians(1.0), np.radians(5.0)
 ALTITUDE_SIGMA, POSITION_SIGMA_M = 0.02, 3.5 * SIGMA_OF
-"""Of the telemetry, one standard deviation."""
+"""Standard deviations of the telemetry."""
 GPS = {
     "exact": 0.0,
     "2 cm RTK": 0.02,
@@ -36,15 +36,15 @@ GPS = {
     "two RTK": np.nan,
     "opposite RTK": np.nan,
 }
-"""Standard deviation of a landmark's place along each axis. RTK: of two landmarks, any or opposite; others 3.5 m."""
+"""Standard deviations of landmarks along each axis. RTK: two landmarks, any or opposite, have RTK; others 3.5 m."""
 LAYOUTS = ("ring", "small ring", "disc", "row", "corner", "L")
 
 
 @dataclass(frozen=True)
 class Case:
-    """What a batch of scenes has in common. common_m: sigma of the error that all receivers share, along each axis.
+    """Parameters of a batch of scenes. common_m: sigma along each axis of the error that all receivers share.
 
-    grade: errors of telemetry and receivers as a share of the usual ones. landmarks = 0: telemetry alone.
+    grade: errors of telemetry and receivers relative to the usual errors. landmarks = 0: telemetry alone.
     """
 
     altitude_m: float = 50.0
@@ -59,11 +59,11 @@ class Case:
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of S scenes with n landmarks and T targets; the true_* are hidden from the estimates.
+    """A batch of S scenes with n landmarks and T targets. Estimates must not use the fields true_*.
 
-    true_axes: (S, 3, 3) camera's right, down, forward. true_place: (S, 3). true_focal: (S,) share of the camera's.
-    axes, place: the telemetry's. true_marks, marks: (S, n, 2) east, north. sigma_m: (S, n). common_m: (S, 2) of all
-    reported places. marks_px, targets_px: (S, n or T, 2). true_targets: (S, T, 2).
+    true_axes: (S, 3, 3) camera's right, down, forward. true_place: (S, 3). true_focal: (S,) relative to the camera's.
+    axes, place: by telemetry. true_marks, marks: (S, n, 2) east, north. sigma_m: (S, n). common_m: (S, 2) error that
+    all reported places share. marks_px, targets_px: (S, n or T, 2). true_targets: (S, T, 2).
     """
 
     case: Case
@@ -85,12 +85,12 @@ class Scenes:
 
 
 def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
-    """Draw them. Batches of the same seed have camera, telemetry, targets and their pixels in common."""
+    """Draw a batch of scenes. Batches with the same seed share camera, telemetry, targets and their pixels."""
     flight, crowd, team = (np.random.default_rng([seed, n]) for n in range(3))
     heading = flight.uniform(-np.pi, np.pi, count)
     tilt = np.radians(case.tilt_deg)
     nominal = looking(heading, np.full(count, np.pi / 2 - tilt), np.zeros(count))
-    # A gimbal does not hold exactly: a degree of tilt, and the middle is missed by some metres.
+    # A gimbal is not exact: the tilt is off by a degree, and the view misses the middle by some metres.
     true_axes = turned(flight.normal(0, TILT_SIGMA, (count, 3)) * (1, 1, 0)) @ nominal
     back = case.altitude_m * np.tan(tilt) * np.stack([np.sin(heading), np.cos(heading)], axis=1)
     true_place = np.concatenate([flight.normal(0, 2, (count, 2)) - back, np.full((count, 1), case.altitude_m)], axis=1)
@@ -98,7 +98,7 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     away = case.grade * flight.normal(0, (TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA), (count, 3))
     axes = turned(away) @ true_axes
     shift = (POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * case.altitude_m)
-    # All receivers share an error, the aircraft's too.
+    # All receivers, including the aircraft's, share an error.
     common = flight.normal(0, 1, (count, 2)) * case.common_m
     place = true_place + case.grade * flight.normal(0, shift, (count, 3)) + np.pad(common, ((0, 0), (0, 1)))
 
@@ -107,7 +107,7 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
     noise = crowd.normal(0, case.pixel_sigma, (count, targets, 2))
     targets_px = pixels(true_targets, true_axes, true_place, true_focal) + noise
 
-    # Drawn for the most there can be: what has fewer landmarks has the errors of the first of them.
+    # Draw errors for the most landmarks, so that scenes with fewer landmarks have the same first errors.
     n, shape = case.landmarks, (count, MOST, 2)
     place_noise, pixel_noise = team.normal(0, 1, shape)[:, :n], team.normal(0, case.pixel_sigma, shape)[:, :n]
     true_marks = np.stack([layout(case.layout, n, np.random.default_rng([seed, 3, s])) for s in range(count)])
@@ -126,17 +126,17 @@ def scenes(case: Case, count: int, targets: int = 20, seed: int = 0) -> Scenes:
 
 
 def disc(rng: np.random.Generator, shape: tuple[int, ...], radius_m: float = RADIUS_M) -> np.ndarray:
-    """Points all over a disc, (*shape, 2)."""
+    """Return points in a disc, (*shape, 2)."""
     far, turn = radius_m * np.sqrt(rng.uniform(0, 1, shape)), rng.uniform(-np.pi, np.pi, shape)
     return np.stack([far * np.cos(turn), far * np.sin(turn)], axis=-1)
 
 
 def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Where n landmarks stand, (n, 2), turned at random.
+    """Return places (n, 2) of landmarks, turned at random.
 
-    ring: evenly about the disc's rim, each up to 10 degrees off; small ring: at half its radius. disc: anywhere. row:
-    all along a diameter, the row's width 2 to 4 % of its length. corner: within 6 m near the rim. L: evenly along two
-    legs of 25 m.
+    ring: evenly spaced on the disc's rim, each up to 10 degrees off. small ring: at half the radius. disc: anywhere.
+    row: along a diameter, with a width of 2 to 4 % of the length. corner: within 6 m near the rim. L: evenly spaced
+    along two legs of 25 m.
     """
     turn = rng.uniform(-np.pi, np.pi)
     if name in ("ring", "small ring"):
@@ -146,7 +146,7 @@ def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
         return disc(rng, (MOST,))[:n]
     if name == "row":
         along = np.linspace(-RADIUS_M, RADIUS_M, n)
-        shares = rng.uniform(0, 1, MOST)[:n]  # stretched below to reach both edges of the row
+        shares = rng.uniform(0, 1, MOST)[:n]  # stretched below to both edges of the row
         aside = 2 * RADIUS_M * rng.uniform(0.02, 0.04) * ((shares - shares.min()) / np.ptp(shares) - 0.5)
         points = np.stack([along, aside], axis=1)
     elif name == "corner":
@@ -164,7 +164,7 @@ def layout(name: str, n: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def looking(heading: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
-    """(S, 3, 3) axes, columns right, down, forward in east, north, up."""
+    """Return axes (S, 3, 3) with columns right, down, forward in east, north, up."""
     zero = np.zeros_like(heading)
     right = np.stack([np.cos(heading), -np.sin(heading), zero], axis=-1)
     forward = np.stack([np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), -np.sin(pitch)], axis=-1)
@@ -174,7 +174,7 @@ def looking(heading: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndar
 
 
 def turned(vector: np.ndarray) -> np.ndarray:
-    """(S, 3, 3) rotations about (S, 3) vectors by their lengths in radians."""
+    """Return rotations (S, 3, 3) about vectors (S, 3) by their lengths in radians."""
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     x, y, z = np.moveaxis(vector, -1, 0)
     zero = np.zeros_like(x)
@@ -183,7 +183,7 @@ def turned(vector: np.ndarray) -> np.ndarray:
 
 
 def pixels(ground: np.ndarray, axes: np.ndarray, place: np.ndarray, focal: np.ndarray) -> np.ndarray:
-    """(S, n, 2) u, v of points (S, n, 2) on the plane."""
+    """Return pixels u, v (S, n, 2) of points (S, n, 2) on the ground plane."""
     away = np.concatenate([ground, np.zeros_like(ground[..., :1])], axis=-1) - place[:, None]
     seen = away @ axes
     return np.array(CAMERA.centre_px) + FOCAL_PX * focal[:, None, None] * seen[..., :2] / seen[..., 2:]
@@ -193,10 +193,10 @@ def pixels(ground: np.ndarray, axes: np.ndarray, place: np.ndarray, focal: np.nd
 
 
 def pose_bound(batch: Scenes) -> np.ndarray:
-    """(S, T, 2, 2) the smallest covariance of the targets' places, by telemetry and landmarks together.
+    """Return the smallest covariance (S, T, 2, 2) of the targets' places by telemetry and landmarks together.
 
-    The pose's information is the telemetry's, and of each landmark what its pixels say, blurred by its GPS. A target's
-    place then errs by its own pixels and by the pose.
+    The information about the pose comes from telemetry, and from each landmark's pixels and GPS. The error of a
+    target's place comes from its own pixels and from the pose.
     """
     case = batch.case
     sigma = np.array(
@@ -210,15 +210,15 @@ def pose_bound(batch: Scenes) -> np.ndarray:
 
 
 def homography_bound(batch: Scenes) -> np.ndarray:
-    """(S, T, 2, 2) the same by the landmarks alone, for the eight parameters of a homography."""
+    """Return the bound (S, T, 2, 2) by landmarks alone, for the eight parameters of a homography."""
     case, turn = batch.case, np.swapaxes(batch.true_axes, 1, 2)
     matrix = np.concatenate([turn[..., :2], -turn @ batch.true_place[..., None]], axis=-1)
-    matrix[:, :2] *= batch.true_focal[:, None, None]  # pixels about the middle, in focal lengths
+    matrix[:, :2] *= batch.true_focal[:, None, None]  # pixels from the middle, in focal lengths
     matrix = matrix @ np.diag([RADIUS_M, RADIUS_M, 1.0])
     matrix = matrix / matrix[:, 2:, 2:]
 
     def slopes(ground: np.ndarray) -> np.ndarray:
-        """(S, n, 2, 8) of pixels by the elements; u = (a x + b y + r) / (p x + q y + 1)."""
+        """Return derivatives (S, n, 2, 8) of pixels by the elements in u = (a x + b y + r) / (p x + q y + 1)."""
         x, y = np.moveaxis(ground / RADIUS_M, -1, 0)
         one, zero = np.ones_like(x), np.zeros_like(x)
         point = np.stack([x, y, one], axis=-1) @ np.swapaxes(matrix, 1, 2)
@@ -234,13 +234,13 @@ def homography_bound(batch: Scenes) -> np.ndarray:
 
 
 def mean_length(covariance: np.ndarray) -> np.ndarray:
-    """Mean distance from the middle of a normal distribution in the plane, of (..., 2, 2)."""
+    """Return the mean distance from the middle of plane normal distributions with covariances (..., 2, 2)."""
     small, large = np.moveaxis(np.linalg.eigvalsh(covariance), -1, 0)
     return np.sqrt(2 * large / np.pi) * ellipe(1 - small / large)
 
 
 def _slopes(batch: Scenes, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of pixels, (S, n, 2, 7) by rotation, place and log focal length, and (S, n, 2, 2) by the points, numerically."""
+    """Return numerical derivatives of pixels, (S, n, 2, 7) by pose and log focal length, (S, n, 2, 2) by point."""
     axes, place, focal = batch.true_axes, batch.true_place, batch.true_focal
     count = len(focal)
 
@@ -257,13 +257,13 @@ def _slopes(batch: Scenes, ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _gathered(by_state: np.ndarray, by_place: np.ndarray, sigma_m: np.ndarray, pixel_sigma: float) -> np.ndarray:
-    """(S, k, k) the landmarks' information about the state."""
+    """Return the landmarks' information (S, k, k) about the state."""
     blur = pixel_sigma**2 * np.eye(2) + sigma_m[..., None, None] ** 2 * by_place @ np.swapaxes(by_place, -1, -2)
     return np.einsum("snia,snij,snjb->sab", by_state, np.linalg.inv(blur), by_state)
 
 
 def _carried(by_state: np.ndarray, by_place: np.ndarray, information: np.ndarray, pixel_sigma: float) -> np.ndarray:
-    """(S, T, 2, 2) of places whose pixels depend on the state and on the place itself."""
+    """Return covariances (S, T, 2, 2) of places whose pixels depend on the state and on the place."""
     back = np.linalg.inv(by_place)
     scale = 1 / np.sqrt(np.einsum("saa->sa", information))
     covariance = np.linalg.inv(information * scale[:, :, None] * scale[:, None])

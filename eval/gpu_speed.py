@@ -1,4 +1,4 @@
-"""The detection chain and the tensor operations on an accelerator, beside the OpenCV engine on the same machine."""
+"""Time the detection chain and tensor operations on an accelerator, beside the OpenCV engine on the same machine."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,12 +15,12 @@ from torchvision_dddas.detection import MotionDetector, load_engine
 from torchvision_dddas.nn import MotionSegmenter
 from torchvision_dddas.types import Frame
 
-# Frames of a turn: a whole number of batches of each size.
+# Frames per turn, a multiple of each batch size.
 _TURN_FRAMES = 32
 
 
 def measure_gpu(options: bench.Options) -> tuple[str, Any]:
-    """Frames a second, the model eager and as a CUDA graph, and each operation's forms; the clock's time throughout."""
+    """Measure frames per second, the model eager and as a CUDA graph, and the forms of operations, by wall clock."""
     device, load = options.device, bench.OtherLoad()
     name = torch.cuda.get_device_name() if device == "cuda" else device
     figures: dict[str, Any] = {"device": name, "chains": {}, "model": {}}
@@ -49,7 +49,7 @@ def measure_gpu(options: bench.Options) -> tuple[str, Any]:
 
 
 def _time_detectors(frames: Sequence[np.ndarray], options: bench.Options) -> dict[str, float]:
-    """Frames a second of each engine, configuration and batch size, in turns of _TURN_FRAMES frames."""
+    """Return frames per second by engine, configuration and batch size, in turns of _TURN_FRAMES frames."""
     shown = there_and_back(frames, (options.rounds + 1) * _TURN_FRAMES)
 
     def make(engine: str, config: str | None, batch: int) -> Callable[[int], object]:
@@ -83,9 +83,9 @@ def _torch_engine(settings: Any, device: str) -> Any:
 
 
 def _time_model(frames: Sequence[np.ndarray], options: bench.Options) -> dict[str, str]:
-    """Milliseconds a frame of the model as it is, and replayed as a CUDA graph.
+    """Return milliseconds per frame of the eager model, and of its replay as a CUDA graph.
 
-    torch.compile is left out: on an H200 it had not ended after three minutes.
+    torch.compile is left out, because it took more than three minutes on an H200.
     """
     clip = torch.from_numpy(np.stack(frames[: options.batch])[..., ::-1].copy()).to(options.device)
     clip = clip.permute(0, 3, 1, 2)[None].float().div(255).contiguous()
@@ -128,14 +128,14 @@ _FORMS = {"eager": _eager, "CUDA graph": _graph}
 
 
 def _finish(result: object, device: str) -> object:
-    """Wait until the device has computed."""
+    """Wait until the device has finished."""
     if device == "cuda":
         torch.cuda.synchronize()
     return result
 
 
 def _time_operations(options: bench.Options) -> dict[str, dict[str, str]]:
-    """Milliseconds a picture of each operation in its three forms."""
+    """Return milliseconds per picture of each operation in its three forms."""
     cv2.setNumThreads(1)
     table = {}
     for row, made in operations(bench.parse_size(options.size), options.batch, options.device).items():

@@ -1,8 +1,8 @@
-"""What the detection interval buys (appendix B, eq. 2), on rendered flights with known truth; no data needed.
+"""Measure the benefit of detection intervals (appendix B, eq. 2) on rendered flights with truth. Needs no data.
 
-python eval/intervals.py fixed     its rules beside fixed intervals: accuracy against time, by altitude and speed
-python eval/intervals.py search    the constants that choose the frames looked at, with flights left out
-python eval/intervals.py small     how far a walker moves between frames that show small targets, with flights left out
+python eval/intervals.py fixed     rules beside fixed intervals: accuracy against time, by altitude and speed
+python eval/intervals.py search    the constants that choose the processed frames, with flights left out
+python eval/intervals.py small     a walker's motion between the frames that show small targets, with flights left out
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ FLIGHTS = tuple(product((50.0, 100.0, 200.0), (2.0, 5.0, 10.0)))
 """Altitude in m and speed in m/s of each flight."""
 INTERVALS = (1, 2, 3, 5, 8)
 LOOP: Case = {"steering.follow": False, "steering.look": False}
-"""The closed loop chooses the frames; the vehicles fly as planned."""
+"""The closed loop chooses the frames. The vehicles fly as planned."""
 LOOKED: dict[str, Case] = {
     "closed loop": LOOP,
     **{str(every): {"steering.on": False, "interval.rule": False, "every": every} for every in INTERVALS},
@@ -40,17 +40,17 @@ COMPARED: dict[str, Case] = {
     **{str(frames): {"interval.rule": False, "interval.frames": frames} for frames in INTERVALS},
 }
 MEASURED = {"default": ("F1 of boxes", "box_f1")}
-"""What is measured of a configuration, else F of pixels: the default finds crowds here, which boxes show better."""
+"""Measure of a configuration, else F of pixels. The default finds crowds, for which boxes are a better measure."""
 
 
 def measure_fixed(options: bench.Options) -> tuple[str, Any]:
-    """Accuracy against processor time by detection interval: its rules beside fixed ones, by altitude and speed.
+    """Measure accuracy against processor time by detection interval: rules beside fixed intervals.
 
-    First table: one of so many frames is looked at; to how many metres every crowd is known at every moment (10 m where
-    nothing is known), and processor time a second of clip. The closed loop chooses the frames; vehicles fly as planned,
-    with exact instruments, so that the error is that of detection and of the time between looks. Other tables: every
-    frame is looked at, and the interval says how far apart the frames are that are compared; ms of processor a frame.
-    Masks that show the movers of a later frame are measured there.
+    First table: only every N-th frame is processed. The figures are the error of each crowd's known place at each
+    moment (10 m for unknown crowds) and processor time per second of clip. The closed loop chooses the frames. Vehicles
+    fly as planned with exact instruments, so that errors come from detection and the time between looks. Other tables:
+    every frame is processed, and the interval is the distance of compared frames. The figures include processor ms per
+    frame. Masks that show the movers of a later frame are scored at that frame.
     """
     studies = {"looked": [[way] for way in LOOKED], **{config: [list(COMPARED)] for config in options.configs}}
     cases = [
@@ -84,7 +84,7 @@ def measure_fixed(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_case(case: Case) -> Case:
-    """[accuracy, time] in some ways to choose the interval, on one flight to and fro over two crowds."""
+    """Return {way to choose the interval: [accuracy, time]} on a flight to and fro over two crowds."""
     source = flight(case["altitude_m"], case["speed_m_s"], case["seed"], case["seconds"])
     if case["study"] == "looked":
         (way,) = case["ways"]
@@ -94,7 +94,7 @@ def fly_case(case: Case) -> Case:
 
 
 def detect_in_ways(source: SimulatorSource, config: str, ways: dict[str, Case]) -> Case:
-    """[accuracy, ms a frame] of a configuration with the settings of each way, every frame looked at."""
+    """Return {way: [accuracy, ms per frame]} of a configuration with each way's settings on every frame."""
     cv2.setNumThreads(1)
     frames, truths, found = list(source), source.truths(), {}
     for way, changed in ways.items():
@@ -108,7 +108,7 @@ def detect_in_ways(source: SimulatorSource, config: str, ways: dict[str, Case]) 
 
 
 def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float, rate_hz: float = 10.0) -> SimulatorSource:
-    """To and fro over two crowds, with exact instruments and without ground vehicles."""
+    """Return a flight to and fro over two crowds, with exact instruments and without ground vehicles."""
     uav = {"altitude_m": altitude_m, "speed_m_s": speed_m_s, "start_m": (-15.0, 0.0), "way_m": ((15.0, 0.0),)}
     uav |= {"place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0, "altitude_error": 0.0}
     clip = {"seconds": seconds, "located_by": "telemetry", "rate_hz": rate_hz}
@@ -116,7 +116,7 @@ def flight(altitude_m: float, speed_m_s: float, seed: int, seconds: float, rate_
 
 
 def score_scenes(scenes: Sequence[Scene], truths: Sequence[Truth], is_later: bool) -> dict[str, float]:
-    """Measures of masks, and the F1 of boxes at an IoU of 0.5. is_later: masks show the movers of a later frame."""
+    """Return measures of masks and F1 of boxes at an IoU of 0.5. is_later: masks show movers of a later frame."""
     found = dict(enumerate((scene.mask, scene.detections.box_px) for scene in scenes))
     pixels, boxes = pixel_metrics.Pixels(), box_metrics.BoxCounts()
     for at, (mask, box_px) in (move_later(scenes) if is_later else found).items():
@@ -145,15 +145,15 @@ GRID: dict[str, Sequence[float]] = {
     "steering.sampling_share": (0.5, 1.0),
 }
 SAME_M = 0.02
-"""Settings whose errors differ by less are as good; the quickest of them is taken."""
+"""Settings whose errors differ by less are equally good. The fastest of them is chosen."""
 SEARCH_SEED = 100
-"""The flights of the search are others than those of `fixed`."""
+"""The flights of the search differ from those of `fixed`."""
 
 
 def measure_search(options: bench.Options) -> tuple[str, Any]:
-    """The error of the known places of crowds by the constants that choose the frames which are looked at.
+    """Measure the error of the known places of crowds by the constants that choose the processed frames.
 
-    Left out: the constants for a flight are the best on all the others. Where several are as good, the quickest.
+    Left out: the constants for a flight are the best on all other flights, and the fastest of equally good ones.
     """
     points = list(product(*GRID.values()))
     cases = [
@@ -187,7 +187,7 @@ def measure_search(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_point(case: Case) -> list[float]:
-    """Error and time of one flight."""
+    """Return the error and time of a flight."""
     source = flight(case["altitude_m"], case["speed_m_s"], case["seed"], case["seconds"])
     run = fly(source, {**LOOP, **dict(zip(GRID, case["point"], strict=True))})
     return [run["score"]["knowledge_m"], run["cpu"]]
@@ -196,16 +196,16 @@ def fly_point(case: Case) -> list[float]:
 # -- how far apart the frames are that show small targets ------------------------------------------------------------
 
 MOVES_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 3.0)
-"""Of `small.gap_move_px`; 0: always `small.gap_frames`."""
+"""Values of `small.gap_move_px`; 0: always `small.gap_frames`."""
 RATES_HZ = (10.0, 25.0)
-"""Pictures a second: the same distance takes more frames at more of them."""
+"""Pictures per second. At a higher rate, the same motion takes more frames."""
 
 
 def measure_small(options: bench.Options) -> tuple[str, Any]:
-    """Accuracy by `small.gap_move_px`, the way of a walker between the frames that show small targets.
+    """Measure accuracy by `small.gap_move_px`, a walker's motion between the frames that show small targets.
 
-    Every frame is looked at. Figures are the mean of F1 of boxes in the default. Left out:
-    the value for the flights of an altitude and rate is the best on all the others.
+    Every frame is processed. Figures are the mean F1 of boxes in the default. Left out: the value for the flights of an
+    altitude and rate is the best on all other flights.
     """
     scenes = list(product(RATES_HZ, sorted({a for a, _ in FLIGHTS})))
     cases = [
@@ -231,7 +231,7 @@ def measure_small(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_small(case: Case) -> list[list[float]]:
-    """Of each way of a walker, the accuracy in the default on one flight."""
+    """Return the accuracy of the default on a flight for each value of `small.gap_move_px`."""
     arguments = [case[name] for name in ("altitude_m", "speed_m_s", "seed", "seconds", "rate_hz")]
     ways = {f"{move}": {"small.gap_move_px": move} for move in MOVES_PX}
     found = [detect_in_ways(flight(*arguments), config, ways) for config in MEASURED]

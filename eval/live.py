@@ -1,10 +1,10 @@
-"""The live run: how late its results are, and whether its memory stays flat over a long run.
+"""Measure the latency of live runs, and test whether memory stays constant over a long run.
 
 python eval/live.py latency [--rates 10 25 30] [--cores 1 2] [--seconds 30] [--rounds 3]
 python eval/live.py soak [--minutes 30] [--pace 20]
 
-The video is the tests' synthetic scene, played forwards and backwards. Latency is measured on a quiet machine; how much
-other programs took is said beside the table.
+The video is the tests' synthetic scene, played forwards and backwards. Measure latency on a quiet machine. The text
+beside the table gives the load by other programs.
 """
 
 import json
@@ -34,11 +34,11 @@ FIGURES = (
 
 
 def measure_latency(options: bench.Options) -> tuple[str, Any]:
-    """Latency, age, drops and cost of `dddas run --live`, each run a process held to so many cores.
+    """Measure latency, age, drops and cost of `dddas run --live`. Each run is a process with a number of cores.
 
-    latency: from the capture of the newest picture to the results that it settles. age: from the capture of a picture
-    to its own results. growth: how much later results come after a minute, by a line through the ages. Settings take
-    turns over the rounds; figures are medians over the rounds (99 %: lowest to highest).
+    latency: time from the capture of the newest picture to the results that it completes. age: time from the capture of
+    a picture to its own results. growth: growth of the age in a minute, by a line through the ages. Settings take turns
+    over the rounds. Figures are medians over the rounds (99 %: lowest to highest).
     """
     load, cores = bench.OtherLoad(), [n for n in options.cores if n <= len(os.sched_getaffinity(0))]
     size = bench.parse_size(options.size)
@@ -71,7 +71,7 @@ def measure_latency(options: bench.Options) -> tuple[str, Any]:
 
 
 def run_live(video: Path, config: str, cores: int, seconds: float, people: bool) -> dict[str, float]:
-    """The figures of one run."""
+    """Return the figures of a run."""
     with tempfile.TemporaryDirectory() as out, (Path(out) / "errors.txt").open("w+") as errors:
         command = [*PROGRAM, str(video), "--live", "--emit", "json:-", "--out", out, "--quiet", "--backend", "onboard"]
         command += ([] if config == "default" else ["--config", config]) + ["--people"] * people
@@ -121,7 +121,7 @@ def _processor_s(pid: int) -> float:
 
 
 def measure_ages(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Ages and their growth, from lines of results, without the first and last second; NaN where too few have one."""
+    """Return ages and their growth from lines of results, without the first and last second; NaN for too few ages."""
     known = np.array([(row["time_s"], row["age_s"]) for row in rows if row.get("age_s") is not None]).reshape(-1, 2)
     times, ages = known.T
     settled = (times > times.min(initial=math.inf) + SETTLED_S) & (times < times.max(initial=0) - SETTLED_S)
@@ -137,11 +137,11 @@ def measure_ages(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def measure_soak(options: bench.Options) -> tuple[str, Any]:
-    """Memory of a long run at a high pace, and whether every line of its results is whole.
+    """Measure the memory of a long run at a high pace, and check that every line of its results is complete.
 
-    Ends with exit code 1 where the memory grows by more than --growth-mb from the second quarter of the run to the
-    last, apart from at most three steps (libraries that are loaded when first needed), or where a line is not whole.
-    At pace 0 each picture waits for the run.
+    The exit code is 1 if memory grows by more than --growth-mb from the second quarter of the run to the last (without
+    up to three steps by libraries that are loaded at first use), or if a line is incomplete. At pace 0 each picture
+    waits for the run.
     """
     frames = round(60 * options.minutes * options.rate)
     with tempfile.TemporaryDirectory() as folder:
@@ -149,7 +149,7 @@ def measure_soak(options: bench.Options) -> tuple[str, Any]:
         write_video(clip, scene(bench.parse_size(options.size), 40), frames, options.rate)
         command = [*PROGRAM, str(clip), "--live", "--out", str(out), "--config", options.config, "--quiet"]
         command += ["--set", f"live.pace={options.pace:g}", "--emit", f"json:{second}"] + ["--people"] * options.people
-        command += ["--set", "live.watchdog_s=0"]  # a busy machine is no hung run
+        command += ["--set", "live.watchdog_s=0"]  # a busy machine does not mean a hung run
         began, samples = time.monotonic(), []
         with subprocess.Popen(command) as process:
             while process.poll() is None:
@@ -180,7 +180,7 @@ def measure_soak(options: bench.Options) -> tuple[str, Any]:
 
 
 def remove_steps(held: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """(N,) memory less the steps before, and the steps in MB."""
+    """Return the memory (N,) minus earlier steps, and the steps in MB."""
     left, steps, k = held.copy(), [], 1
     while k < len(left):
         ahead = min(k + STEP_SAMPLES - 1, len(left) - 1)

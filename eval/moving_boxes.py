@@ -1,10 +1,10 @@
-"""How right the motion of a detector's boxes is (`dddas run --detector MODEL --movers`), on rendered video with truth.
+"""Measure the motion of a detector's boxes (`dddas run --detector MODEL --movers`), on rendered video with truth.
 
-python eval/moving_boxes.py      boxes that move and boxes that stand still, told right, and the error of their speeds
+python eval/moving_boxes.py      correct decisions on moving and standing boxes, and the error of their speeds
 
-The detector is perfect: the true boxes of people and cars that show FEWEST_PX or more, and as many boxes of the same
-sizes at random places that show nobody (parked cars, say). A body moves if it moves by MOVING_PX a frame or more over
-the ground, and stands if by STILL_PX or less; others do not count.
+The detector is perfect. It returns the true boxes of people and cars with at least FEWEST_PX visible pixels, and as
+many boxes of the same sizes at random places without bodies (parked cars, for example). A body moves if its speed over
+the ground is at least MOVING_PX per frame, and stands at STILL_PX or less. Other bodies do not count.
 """
 
 from collections import defaultdict
@@ -24,7 +24,7 @@ FEWEST_PX, MOVING_PX, STILL_PX = 12, 0.3, 0.05
 
 
 def measure(options: bench.Options) -> tuple[str, Any]:
-    """Shares of boxes told right, by scenario; movers without a box; the error of speeds."""
+    """Measure, by scenario, the shares of correct boxes, movers without a box, and the error of speeds."""
     figures = {}
     for name in options.scenarios:
         told: dict[str, list[float]] = defaultdict(list)
@@ -49,7 +49,7 @@ KINDS = ("moving", "standing", "of nobody")
 
 
 def watch(name: str, seed: int, seconds: float) -> dict[str, list[float]]:
-    """Whether each box is told right, by kind; errors of speeds, px a frame; movers without a box, by frame."""
+    """Return whether each box is correct, by kind; errors of speeds, px per frame; movers without a box, by frame."""
     cv2.setNumThreads(1)
     source = SimulatorSource(load_scenario(name, (f"clip.seconds={seconds}",), seed), name)
     rng, truths, speeds = np.random.default_rng(seed), dict[int, Truth](), dict[int, np.ndarray]()
@@ -80,7 +80,7 @@ def watch(name: str, seed: int, seconds: float) -> dict[str, list[float]]:
 
 
 def find_bodies(truth: Truth, source: SimulatorSource) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4) boxes of the bodies in a picture, and (N,) their speeds over the ground in its pixels a frame."""
+    """Return boxes (N, 4) of the bodies in a picture, and speeds (N,) over the ground in pixels per frame."""
     bodies = truth.bodies
     ahead = bodies.place_m + np.c_[bodies.velocity_m_s / source.rate_hz, np.zeros(len(bodies))]
     step = project(ahead, truth.pose, source.camera) - project(bodies.place_m, truth.pose, source.camera)

@@ -1,12 +1,12 @@
-"""The person detector: recall, parity with OpenCV, and search regions.
+"""Measure the person detector: recall, parity with OpenCV, and search regions.
 
-python eval/people.py miss-rate DATA    recall against false boxes an image, beside OpenCV at its best setting
+python eval/people.py miss-rate DATA    recall against false boxes per image, beside OpenCV at its best setting
 python eval/people.py parity PICTURES   scores and boxes beside cv2.HOGDescriptor's, for every engine
-python eval/people.py regions DATA      what the search in regions saves and loses
+python eval/people.py regions DATA      time saved and people missed by the search in regions
 
 DATA holds PETS09-S2L1 and TUD-Stadtmitte: gt/gt.txt (MOTChallenge text, pixels from 1) and folders img1* of single
-pictures, or a video. A box is right at an IoU of 0.5, each true box once. People who are mostly hidden stay in the
-truth; so do people whom the truth leaves out, whose boxes are false.
+pictures, or a video. A box is right at an IoU of 0.5, and each true box counts once. Mostly hidden people stay in the
+truth. Boxes of people who are missing in the truth count as false.
 """
 
 import sys
@@ -35,7 +35,7 @@ from torchvision_dddas.types import DetectionTable
 CLIPS = ("PETS09-S2L1", "TUD-Stadtmitte")
 SAME_IOU = 0.5
 Found = tuple[np.ndarray, np.ndarray]
-"""box_px (N, 4) and score (N,) of a frame."""
+"""Boxes box_px (N, 4) and scores (N,) of a frame."""
 
 
 # -- clips and curves ------------------------------------------------------------------------------------------------
@@ -43,7 +43,7 @@ Found = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Clip:
-    """frames: number and picture. truth: (N, 4) boxes of each frame, from pixel 0."""
+    """A clip. frames: numbers and pictures. truth: boxes (N, 4) of each frame, from pixel 0."""
 
     name: str
     frames: dict[int, np.ndarray]
@@ -51,17 +51,17 @@ class Clip:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height)."""
+        """(width, height) of the pictures."""
         height, width = next(iter(self.frames.values())).shape[:2]
         return width, height
 
     def thin(self, step: int) -> "Clip":
-        """Every step-th of its frames."""
+        """Return a clip with every step-th frame."""
         return Clip(self.name, dict(list(self.frames.items())[::step]), self.truth)
 
 
 def read_clips(data: Path, every: int, only: str = "") -> Iterator[Clip]:
-    """The clips that are there, every so many of their frames; ends the program with one line where there are none."""
+    """Yield the available clips with every N-th frame. End the program with one line if there are none."""
     places = [data / name for name in CLIPS if (data / name / "gt/gt.txt").is_file() and only in name]
     if not places:
         sys.exit(f"{data} holds neither {' nor '.join(CLIPS)}; nothing was measured")
@@ -73,7 +73,7 @@ def read_clips(data: Path, every: int, only: str = "") -> Iterator[Clip]:
 
 
 def match(found: Found, truth: np.ndarray) -> np.ndarray:
-    """(N,) the true box of each found one, -1 for none: the best score first takes the best true box that is left."""
+    """Return the true box (N,) of each found box, or -1. In order of score, each takes the best remaining true box."""
     box_px, score = found
     which = np.full(len(box_px), -1)
     if len(box_px) and len(truth):
@@ -88,31 +88,31 @@ def match(found: Found, truth: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Curve:
-    """false: (K,) false positives an image, rising. recall: (K,). score: (K,) the threshold that gives them."""
+    """A recall curve. false: (K,) rising false positives per image. recall: (K,). score: (K,) thresholds."""
 
     false: np.ndarray
     recall: np.ndarray
     score: np.ndarray
 
     def recall_at(self, false: float) -> float:
-        """The best recall with no more false positives an image."""
+        """Return the best recall with at most `false` false positives per image."""
         return float(self.recall[self.false <= false].max(initial=0.0))
 
     @property
     def log_average_miss_rate(self) -> float:
-        """Geometric mean of the miss rate at nine rates of false positives, evenly in the logarithm from 0.01 to 1."""
+        """Return the geometric mean miss rate at nine rates of false positives, log-spaced from 0.01 to 1."""
         miss = [1 - self.recall_at(rate) for rate in np.logspace(-2, 0, 9)]
         return float(np.exp(np.mean(np.log(np.maximum(miss, 1e-10)))))
 
 
 def curve(found: dict[int, Found], clip: Clip) -> Curve:
-    """Over all thresholds of the score. found: by frame, for every frame that was searched."""
+    """Return the curve over all score thresholds. found: found boxes by frame, for every searched frame."""
     score = np.concatenate([scores for _, scores in found.values()])
     hit = np.concatenate([match(here, clip.truth[n]) >= 0 for n, here in found.items()])
     people = sum(len(clip.truth[n]) for n in found)
     order = np.argsort(-score, kind="stable")
     score, hit = score[order], hit[order]
-    last = np.append(score[1:] != score[:-1], True)[: len(score)]  # boxes of one score come together
+    last = np.append(score[1:] != score[:-1], True)[: len(score)]  # boxes with equal scores count together
     return Curve((np.cumsum(~hit) / len(found))[last], (np.cumsum(hit) / people)[last], score[last])
 
 
@@ -120,7 +120,7 @@ def curve(found: dict[int, Found], clip: Clip) -> Curve:
 
 
 class Setting(NamedTuple):
-    """Of OpenCV's detector. enlarge: of the picture beforehand. hit: hitThreshold. groups: groupThreshold."""
+    """A setting of OpenCV's detector. enlarge: factor of the picture. hit: hitThreshold. groups: groupThreshold."""
 
     enlarge: float
     scale: float
@@ -134,14 +134,14 @@ OPENCV_DEFAULTS = Setting(1.0, 1.05, 8, 0, 2, 0.0)
 ENLARGE, SCALES = (1.0, 1.5, 2.0), (1.1, 1.05, 1.03)
 STRIDES, PADDINGS, GROUPS, HITS = (8, 4), (0, 8, 16, 32), (0, 1, 2, 3), (-0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 STRIDE, PADDING, LEAST = 4, 32, -0.5
-"""Windows are scored once at this stride and padding; those of all settings are among them."""
+"""Windows are scored once at this stride and padding, which cover the windows of all settings."""
 
 
 def measure_miss_rate(options: bench.Options) -> tuple[str, Any]:
-    """Recall at one and at 0.1 false boxes an image, beside OpenCV.
+    """Measure recall at one and at 0.1 false boxes per image, beside OpenCV.
 
-    OpenCV stands at its defaults and at the best of 2016 settings, chosen for each clip by recall at one false box on
-    some of its own frames (--grid-frames; 0 leaves OpenCV out), with the body's box fitted to that clip.
+    OpenCV runs at its defaults and at the best of 2016 settings. This setting is chosen for each clip by recall at one
+    false box on some of its own frames (--grid-frames; 0 leaves OpenCV out), with the body's box fitted to the clip.
     """
     parameters = load_config(overrides=options.set).people
     rows, found, panels = [], {}, []
@@ -165,13 +165,13 @@ def measure_miss_rate(options: bench.Options) -> tuple[str, Any]:
 
 
 def detect_clip(clip: Clip, parameters: PeopleParameters) -> dict[int, Any]:
-    """The people of every frame, by the onboard engine."""
+    """Return the people of every frame found by the onboard engine."""
     scorer = load_scorer(parameters, "onboard")
     return {number: detect_people([image], scorer, parameters)[0] for number, image in clip.frames.items()}
 
 
 def measure_opencv(clip: Clip, parameters: PeopleParameters, every: int) -> dict[str, Curve]:
-    """OpenCV's curves on all frames: at its defaults and at its best setting."""
+    """Return OpenCV's curves on all frames at its defaults and at its best setting."""
     if not is_opencv(next(iter(clip.frames.values())), OPENCV_DEFAULTS._replace(enlarge=1.5, groups=1)):
         sys.exit(f"{clip.name}: the rectangles are not those of detectMultiScale; nothing of OpenCV was measured")
     side = (1 - parameters.width_share) / 2
@@ -189,14 +189,14 @@ def measure_opencv(clip: Clip, parameters: PeopleParameters, every: int) -> dict
 
 
 def opencv_detector() -> "cv2.HOGDescriptor":
-    """OpenCV's detector with its default classifier."""
+    """Return OpenCV's detector with its default classifier."""
     hog = cv2.HOGDescriptor()
     hog.setSVMDetector(cv2.HOGDescriptor.getDefaultPeopleDetector())
     return hog
 
 
 def all_windows(image: np.ndarray, enlarge: float, scale: float) -> np.ndarray:
-    """(N, 6) scale, width and height of the level, x, y and score of each window that scores -0.5 or more."""
+    """Return (N, 6) scale, level width, level height, x, y and score of each window with a score of at least -0.5."""
     hog, rows, level_scale = opencv_detector(), [], 1.0
     picture = cv2.resize(image, None, fx=enlarge, fy=enlarge) if enlarge != 1 else image
     height, width = picture.shape[:2]
@@ -213,7 +213,7 @@ def all_windows(image: np.ndarray, enlarge: float, scale: float) -> np.ndarray:
 
 
 def rectangles(scored: np.ndarray, size: tuple[int, int], setting: Setting) -> Found:
-    """What detectMultiScale returns, brought back to the size of the picture before it was enlarged."""
+    """Return the result of detectMultiScale in pixels of the picture before its enlargement."""
     level_scale, width, height, x, y, score = scored.T
     stride, padding = setting.stride, setting.padding
     there = (x >= -padding) & (y >= -padding) & (x + 64 <= width + padding) & (y + 128 <= height + padding)
@@ -226,7 +226,7 @@ def rectangles(scored: np.ndarray, size: tuple[int, int], setting: Setting) -> F
 
 
 def is_opencv(image: np.ndarray, setting: Setting) -> bool:
-    """Whether `rectangles` are those of detectMultiScale."""
+    """Return whether `rectangles` gives the same result as detectMultiScale."""
     box, _ = rectangles(all_windows(image, setting.enlarge, setting.scale), image.shape[1::-1], setting)
     enlarge, scale, stride, padding, groups, hit = setting
     picture = cv2.resize(image, None, fx=enlarge, fy=enlarge)
@@ -236,20 +236,20 @@ def is_opencv(image: np.ndarray, setting: Setting) -> bool:
 
 
 def score_windows(clip: Clip, enlarge: float, scale: float) -> dict[int, np.ndarray]:
-    """The windows of every frame."""
+    """Return the scored windows of every frame."""
     with ThreadPoolExecutor(2) as pool:
         each = pool.map(lambda image: all_windows(image, enlarge, scale), clip.frames.values())
         return dict(zip(clip.frames, each, strict=True))
 
 
 def shrink(found: Found, shares: np.ndarray) -> Found:
-    """Bodies in rectangles. shares: (4,) of x, y, width, height in the rectangle's own size."""
+    """Return bodies inside rectangles. shares: (4,) x, y, width, height relative to the rectangle's size."""
     box, score = found
     return np.concatenate([box[:, :2] + box[:, 2:] * shares[:2], box[:, 2:] * shares[2:]], axis=1), score
 
 
 def fit_body(found: dict[int, Found], clip: Clip, shares: np.ndarray) -> np.ndarray:
-    """(4,) the shares that suit a clip's true boxes best: medians over the rectangles that match, in two rounds."""
+    """Fit the shares (4,) to a clip's true boxes: medians over the matching rectangles, in two rounds."""
     for _ in range(2):
         rows = []
         for number, here in found.items():
@@ -261,7 +261,7 @@ def fit_body(found: dict[int, Found], clip: Clip, shares: np.ndarray) -> np.ndar
 
 
 def try_settings(clip: Clip, shares: np.ndarray) -> Iterator[tuple[Setting, Curve]]:
-    """Every setting with its curve, bodies by the shares that fit the clip at that pyramid."""
+    """Yield every setting with its curve. Bodies use the shares that fit the clip at the setting's pyramid."""
     for enlarge, scale in product(ENLARGE, SCALES):
         found = score_windows(clip, enlarge, scale)
         for stride, padding in product(STRIDES, PADDINGS):
@@ -277,10 +277,10 @@ def try_settings(clip: Clip, shares: np.ndarray) -> Iterator[tuple[Setting, Curv
 
 
 def measure_parity(options: bench.Options) -> tuple[str, Any]:
-    """Scores of all windows, and boxes, beside cv2.HOGDescriptor on the same pyramid (scale step 1.05).
+    """Compare scores of all windows, and boxes, with cv2.HOGDescriptor on the same pyramid (scale step 1.05).
 
-    worst difference: of a window's score; signs: windows that score above zero in one only; boxes: OpenCV's; other:
-    boxes that only one has. The padding is a multiple of the common divisor of window and block stride.
+    worst difference: of a window's score. signs: windows with a positive score in one detector only. boxes: OpenCV's.
+    other: boxes of one detector only. The padding is a multiple of the common divisor of window and block stride.
     """
     images, rows = read_frames(options.data, options.most), []
     svm, size = read_classifier("opencv", 3780), images[0].shape[1::-1]
@@ -312,7 +312,7 @@ def measure_parity(options: bench.Options) -> tuple[str, Any]:
 
 
 def opencv_scores(image: np.ndarray, size: tuple[int, int], parameters: PeopleParameters) -> np.ndarray:
-    """The map of one level; NaN where OpenCV has no window."""
+    """Return OpenCV's score map of a level; NaN where OpenCV has no window."""
     level = image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR_EXACT)
     stride, pad = parameters.window_stride_px, parameters.padding_px
     places, scores = map(np.asarray, opencv_detector().detect(level, -1e9, (stride, stride), (pad, pad)))
@@ -330,14 +330,14 @@ MODES = {
     "around what moves": ("everywhere", True),
     "regions, and around what moves": ("regions", True),
 }
-"""people.search, and whether only the surroundings of moving targets are searched."""
+"""`people.search`, and whether the search covers only the surroundings of moving targets."""
 
 
 def measure_regions(options: bench.Options) -> tuple[str, Any]:
-    """Recall, windows and time of the search in regions, beside the search everywhere.
+    """Measure recall, windows and time of the search in regions, beside the search in the whole picture.
 
-    Recall is that of detections with a probability of at least 0.5, in percent of the true boxes; time is the median
-    over frames of a frame's ratio to the whole search, all taken in turn frame by frame.
+    Recall counts detections with a probability of at least 0.5, in percent of the true boxes. Time is the median over
+    frames of the ratio to the whole search. All searches take turns on each frame.
     """
     settings, rows = load_config(overrides=options.set), []
     scorer = load_scorer(settings.people, options.engine)
@@ -374,7 +374,7 @@ def measure_regions(options: bench.Options) -> tuple[str, Any]:
 
 
 def find_movers(video: str, settings: Settings, frames: int) -> DetectionTable:
-    """What `dddas detect` finds in the first frames, as a table."""
+    """Return the detections of `dddas detect` in the first frames, as a table."""
     found = [
         (scene.frame.number, *box)
         for scene in islice(detect_motion(open_source(video), settings, "onboard"), frames)

@@ -1,13 +1,13 @@
-"""Places of people on real data: distances from the ground, people as landmarks; and places by telemetry alone.
+"""Measure places of people: on real data by ranging and by people as landmarks; by telemetry alone in simulation.
 
 python eval/places.py ranging DATA      distances to people against world positions of PETS09-S2L1 and TUD-Stadtmitte
-python eval/places.py landmarks DATA    people of known place as moving landmarks, the others located
-python eval/places.py telemetry         targets located by telemetry alone, simulated; no data needed
+python eval/places.py landmarks DATA    places of people, with other people of known place as moving landmarks
+python eval/places.py telemetry         targets located by telemetry alone, simulated; needs no data
 
 DATA is a folder of MOTChallenge 2015 sequences whose gt.txt has world metres in columns 8 to 10. PETS comes with its
-camera (Tsai); that of TUD is fitted to the true feet and their world positions. The world positions of both were made
-from the lower edges of the true boxes through these cameras: so for true boxes the foot row errs by nothing but the
-camera's model. Detections are those of det/det.txt that overlap a true box.
+camera (Tsai). The camera of TUD is fitted to the true feet and their world positions. Both sets of world positions were
+computed from the lower edges of the true boxes with these cameras, so the foot rows of true boxes only have the error
+of the camera model. Detections are those of det/det.txt that overlap a true box.
 """
 
 import sys
@@ -47,7 +47,7 @@ from torchvision_dddas.types import Camera, Flight, LandmarkObservations, Poses,
 SIZES = {"PETS09-S2L1": (768, 576), "TUD-Stadtmitte": (640, 480)}
 RATE_HZ = {"PETS09-S2L1": 7.0, "TUD-Stadtmitte": 25.0}
 FOOT_SIGMA_PX = {"PETS09-S2L1": 0.4, "TUD-Stadtmitte": 1.5}
-"""Of a true box's foot, along each axis: what the true camera leaves unexplained."""
+"""Standard deviation along each axis of a true box's foot from the true camera's prediction."""
 SURVEYED = {
     "focal_sigma": 0.002,
     "height_sigma_m": 0.03,
@@ -55,12 +55,12 @@ SURVEYED = {
     "heading_sigma_rad": float(np.radians(0.1)),
     "position_sigma_m": 0.05,
 }
-"""How well such cameras are known, one standard deviation."""
+"""Standard deviations of the parameters of such cameras."""
 
 
 @dataclass(frozen=True)
 class People:
-    """Boxes and the truth of the people in them: frame (N,), who (N,), box_px (N, 4), cut (N,), east_north_m (N, 2)."""
+    """Boxes and their people's truth: frame, who (N,), box_px (N, 4), cut (N,), east_north_m (N, 2)."""
 
     frame: np.ndarray
     who: np.ndarray
@@ -70,12 +70,12 @@ class People:
 
     @property
     def foot_px(self) -> np.ndarray:
-        """(N, 2) middle of the lower edges."""
+        """(N, 2) middles of the lower edges."""
         return self.box_px[:, :2] + self.box_px[:, 2:] * (0.5, 1.0) - 0.5
 
 
 def read_sequences(data: Path) -> Iterator[tuple[str, str, People, Camera]]:
-    """Sequence, kind of boxes, people and camera; ends the program with one line where there is none."""
+    """Yield sequence, kind of boxes, people and camera. End the program with one line if there are none."""
     places = [data / name for name in SIZES if (data / name / "gt/gt.txt").is_file()]
     for place in places:
         name, size = place.name, SIZES[place.name]
@@ -93,7 +93,7 @@ def read_sequences(data: Path) -> Iterator[tuple[str, str, People, Camera]]:
 
 
 def match_detections(path: Path, truth: People, size: tuple[int, int], least: float = 0.5) -> People:
-    """A detector's boxes that overlap a true one (IoU at least `least`, one to one), with the truth of that."""
+    """Match a detector's boxes one to one with true boxes (IoU at least `least`). Return them with their truth."""
     table = read_detections(path)
     cut = touches_border(table.box_px, size) if table.cut is None else table.cut
     ours, theirs = [], []
@@ -109,7 +109,7 @@ def match_detections(path: Path, truth: People, size: tuple[int, int], least: fl
 
 
 def tsai_camera(path: Path) -> Camera:
-    """The camera of a Tsai calibration file, in metres. Its distortion is turned into OpenCV's, to the fourth power."""
+    """Read the camera of a Tsai calibration file, in metres. Convert its distortion to OpenCV's up to fourth power."""
     root = ET.parse(path).getroot()
     part = {kind: {k: float(v) for k, v in node.attrib.items()} for kind in ("Geometry", "Intrinsic", "Extrinsic")
             if (node := root.find(kind)) is not None}  # fmt: skip
@@ -139,7 +139,7 @@ def tsai_camera(path: Path) -> Camera:
 
 
 def fit_camera(people: People, size: tuple[int, int]) -> Camera:
-    """The camera with square pixels, its axis through the middle, that puts the feet on their rows and columns."""
+    """Fit a camera to the feet's rows and columns. It has square pixels and its axis through the middle."""
     box, middle = people.box_px, (np.array(size) - 1) / 2
     feet = box[:, :2] + box[:, 2:] * (0.5, 1) - 0.5
     centre = people.east_north_m.mean(axis=0)
@@ -179,13 +179,13 @@ WAYS: dict[str, tuple[GroundParameters, bool]] = {
     "foot row": (GroundParameters(use="feet"), False),
     "both, calibrated": (GroundParameters(), True),
 }
-"""Parameters, and whether the body's height is calibrated."""
+"""Parameters, and whether the body height is calibrated."""
 
 
 def measure_ranging(options: bench.Options) -> tuple[str, Any]:
-    """Errors of distances from the camera's ground point to each person.
+    """Measure errors of distances from the camera's ground point to each person.
 
-    The body's height is calibrated on one half of the frames and used on the other, both ways.
+    The body height is calibrated on one half of the frames and used on the other half, both ways.
     """
     parts, found = [], {}
     for name, kind, people, camera in read_sequences(options.data):
@@ -212,14 +212,14 @@ def measure_ranging(options: bench.Options) -> tuple[str, Any]:
 
 
 def range_all(people: People, camera: Camera, parameters: GroundParameters) -> Sightings:
-    """What ranging says of all people."""
+    """Return the ranges of all people."""
     n = len(people.frame)
     poses = Poses(np.tile(camera.place, (n, 1)), np.full(n, camera.heading_rad), np.full(n, camera.pitch_rad))
     return range_people(people.box_px, people.cut, camera, poses, poses.place, parameters)
 
 
 def fit_height(people: People, camera: Camera, use: np.ndarray) -> float:
-    """The body height with which the median person stands where it should."""
+    """Return the body height at which the median person has the right distance."""
     found = range_all(people, camera, GroundParameters(use="height", body_height_m=1.75))
     far = np.linalg.norm(people.east_north_m - camera.place, axis=1)
     return float(np.nanmedian((1.75 * far / found.distance_m)[use & ~people.cut]))
@@ -233,15 +233,15 @@ MODES = {
     "pose": ("pose", True, 0.0),
     "pose over time": ("pose", True, 20.0),
 }
-"""aerial.mode, whether there is telemetry, and aerial.correlation_s."""
+"""`aerial.mode`, whether there is telemetry, and `aerial.correlation_s`."""
 LANDMARK_SIGMA_M = 0.02
 
 
 def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
-    """Errors of people located by others of known place, who are chosen by chance or stand most nearly on one line.
+    """Measure errors of people located by others of known place. These are chosen at random or nearest to a line.
 
-    The telemetry is that of the true camera with errors drawn once a seed: 1 % in the focal length, 1° of tilt, 5° of
-    heading, 2 % of the height, a GPS of 3.5 m in 95 %. Without telemetry only the focal length is known.
+    The telemetry is that of the true camera with errors drawn once per seed: 1 % in the focal length, 1° of tilt, 5° of
+    heading, 2 % of the height, a GPS with 3.5 m in 95 %. Without telemetry only the focal length is known.
     """
     parts, found = [], {}
     for name, kind, people, camera in read_sequences(options.data):
@@ -274,9 +274,9 @@ def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
 
 
 def choose_landmarks(people: People, n: int, rng: np.random.Generator | None) -> dict[int, np.ndarray]:
-    """Rows of n landmarks for every frame that has more people.
+    """Choose the rows of n landmarks in every frame with more people.
 
-    With rng everyone has a rank, and the first in the picture serve; without, those most nearly on one line.
+    With rng, each person has a random rank, and the first in the picture are chosen. Else those nearest to a line are.
     """
     ids = np.unique(people.who)
     rank = dict(zip(ids, rng.permutation(len(ids)), strict=True)) if rng else {}
@@ -297,7 +297,7 @@ def choose_landmarks(people: People, n: int, rng: np.random.Generator | None) ->
 
 
 def draw_telemetry(camera: Camera, rng: np.random.Generator) -> tuple[Camera, Flight]:
-    """The camera as it is known, its focal length a little wrong, and what its telemetry says."""
+    """Return the known camera, with an error in its focal length, and its telemetry."""
     axes = looking(*(np.array(a) for a in (camera.heading_rad, camera.pitch_rad, camera.roll_rad)))
     axes = turned(rng.normal(0, (TILT_SIGMA, TILT_SIGMA, HEADING_SIGMA))) @ axes
     sigma = (POSITION_SIGMA_M, POSITION_SIGMA_M, ALTITUDE_SIGMA * camera.height_m)
@@ -311,7 +311,7 @@ def locate_others(
     people: People, sigma_px: np.ndarray, chosen: dict[int, np.ndarray], camera: Camera, flight: Flight, mode: str,
     rate_hz: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Errors in metres of all who are no landmarks, NaN where there is no place, and whether ellipses hold them."""
+    """Return errors in metres of people who are not landmarks, NaN without a place, and whether ellipses hold them."""
     method, has_telemetry, correlation_s = MODES[mode]
     settings = with_parameters(Settings(), {"aerial.mode": method, "aerial.correlation_s": correlation_s})
     georeferencer, far, inside = Georeferencer(camera, settings, load_solver("onboard")), [], []
@@ -335,16 +335,16 @@ def locate_others(
 # -- telemetry alone -------------------------------------------------------------------------------------------------
 
 ERRORS = {"consumer drone (default)": None, "rtk": "rtk", "cheap": "cheap"}
-"""Whose errors the telemetry has, and the configuration that says so."""
+"""Kind of the telemetry's errors, and the configuration with these errors."""
 VIEWS_DEG, ALTITUDES_M = (90, 60, 45, 30), (40.0, 120.0)
 TARGETS = 12
-"""Targets of a flight, anywhere in the picture."""
+"""Targets per flight, anywhere in the picture."""
 
 
 def measure_telemetry(options: bench.Options) -> tuple[str, Any]:
-    """Errors of targets located by telemetry alone, whose errors are drawn as the parameters say they are.
+    """Measure errors of targets located by telemetry alone. Its errors are drawn with the parameters' sigmas.
 
-    Each flight has errors of its own, common to its targets; pixels err by 1 px.
+    Each flight has its own errors, which its targets share. Pixels have an error of 1 px.
     """
     rows = []
     for name, config in ERRORS.items():
@@ -368,7 +368,7 @@ def measure_telemetry(options: bench.Options) -> tuple[str, Any]:
 def fly_once(
     rng: np.random.Generator, height_m: float, pitch_rad: float, settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the targets of one picture in metres, NaN where there is no place, and whether ellipses hold them."""
+    """Return errors of the targets of a picture in metres, NaN without a place, and whether ellipses hold them."""
     sigma, count = settings.aerial, TARGETS
     heading = np.array(rng.uniform(0, 2 * np.pi))
     axes = looking(heading, np.array(pitch_rad), np.array(0.0))
@@ -394,7 +394,7 @@ def fly_once(
 
 
 def draw_flight(rng: np.random.Generator, axes: np.ndarray, place: np.ndarray, sigma: AerialParameters) -> Flight:
-    """What the telemetry of a camera says, with the errors that the parameters give it."""
+    """Return the telemetry of a camera, with errors by the parameters."""
     tilt, heading = np.radians((sigma.tilt_sigma_deg, sigma.heading_sigma_deg))
     up = np.hypot(sigma.altitude_sigma * place[2], sigma.altitude_sigma_m)
     shift = rng.normal(0, (sigma.position_sigma_m, sigma.position_sigma_m, up))

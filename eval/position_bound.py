@@ -1,11 +1,11 @@
-"""Errors of targets located from the air beside the Cramér-Rao bound, by altitude, pitch and errors; no data needed.
+"""Measure errors of targets located from the air beside the Cramér-Rao bound, by altitude, pitch and errors.
 
 python eval/position_bound.py
 
-Single simulated pictures (geo_scene.py, seed 0): 1080p, a lens of 70 degrees, 1 px; targets within 25 m of the middle
-of the view, all over the disc. Errors of telemetry and of the landmarks' receivers are a fifth of, as large as, and
-twice those of a consumer drone: 1 % in focal length, 1 degree in tilt, 5 in heading, 2 % in altitude, 3.5 m of GPS in
-95 %. They are stated rightly. The bound holds for estimates without bias, with the priors counted as measurements.
+The study needs no data. It simulates single pictures (geo_scene.py, seed 0): 1080p, a lens of 70 degrees, 1 px, targets
+within 25 m of the middle of the view. Errors of telemetry and receivers are 0.2, 1 and 2 times those of a consumer
+drone: 1 % in focal length, 1 degree in tilt, 5 in heading, 2 % in altitude, 3.5 m of GPS in 95 %. The stated errors are
+right. The bound holds for unbiased estimates and counts the priors as measurements.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ TARGETS = 20
 
 @dataclass(frozen=True)
 class Errors:
-    """Root of the mean square error of the targets and of the bound, m, and the share within 95 % ellipses."""
+    """RMS error of the targets and of the bound, metres, and the share within 95 % ellipses."""
 
     rms_m: float
     bound_m: float
@@ -35,7 +35,7 @@ class Errors:
 
 
 def measure(case: geo_scene.Case, count: int) -> Errors:
-    """Locate the targets of some scenes, each picture by itself."""
+    """Locate the targets of some scenes, each picture separately."""
     plain = geo_error.settings_for("pose")
     stated = {f"aerial.{name}": case.grade * getattr(plain.aerial, name) for name in PARAMETERS}
     settings: Settings = with_parameters(plain, stated)
@@ -51,7 +51,7 @@ def measure(case: geo_scene.Case, count: int) -> Errors:
 
 
 def measure_bounds(options: bench.Options) -> tuple[str, Any]:
-    """A row for each altitude, pitch and grade of errors, by telemetry alone and with landmarks."""
+    """Measure errors for each altitude, pitch and grade of errors, by telemetry alone and with landmarks."""
     rows = []
     for altitude in options.altitudes:
         for pitch in options.pitches:

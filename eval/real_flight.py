@@ -1,16 +1,16 @@
-"""Places by telemetry alone on a real flight over surveyed cones, by what its heights count from.
+"""Measure places by telemetry alone on a real flight over surveyed cones, by the datum of its heights.
 
 python eval/real_flight.py ../shared/data/telemetry/thunderstorm
 
-The README of that folder describes the picks and their traps. The log's heights above the ellipsoid and those of its
-terrain are both 2 x 28 m too high, as after a geoid of the wrong sign. Each pick is located by itself, over ground that
-is level at one height. The shares come with 90 % intervals of a bootstrap by picture.
+The README of that folder describes the picks and their traps. The log's heights above the ellipsoid and its terrain
+heights are both 2 x 28 m too high, as after a geoid of the wrong sign. Each pick is located separately, over level
+ground. Shares have 90 % intervals of a bootstrap by picture.
 
-For `dddas calibrate-flight` pictures are left out in turn: the others tell the errors, by which the pictures left out
-are located by telemetry alone.
+For `dddas calibrate-flight`, pictures are left out in turn. The other pictures give the errors of the log, and the left
+out pictures are located by corrected telemetry alone.
 
-With landmarks each pick is located by the other picks of its picture, the pictures in their order: what earlier
-pictures show of the landmarks' errors counts in later ones. Their true error is about 0.2 m; wrong ones are stated too.
+With landmarks, each pick is located by the other picks of its picture, in the order of the pictures. Estimates of the
+landmarks' errors carry over to later pictures. The true error is about 0.2 m; the study also states wrong errors.
 """
 
 import copy
@@ -39,7 +39,7 @@ from torchvision_dddas.geometry import east_north, geoid_height, ground_with_slo
 from torchvision_dddas.types import Camera, Elevation, Flight, LandmarkObservations, Telemetry, Tracks
 
 DRONE_ABOVE_CONES_M = 54.4
-"""How much higher than above the cones' datum the log has the drone, as the README of the data states it."""
+"""Offset of the drone's logged height from its height above the cones' datum, by the data's README."""
 Pick = Mapping[str, float]
 
 INPUTS = (
@@ -49,7 +49,7 @@ INPUTS = (
     "sea, ellipsoid and terrain",
     "true heights and terrain",
 )
-"""Which heights a user gives. Terrain: above the sea, as the log's own program had it before its geoid."""
+"""Heights that a user gives. Terrain: above the sea, as the log's own program had it before its geoid."""
 STATED: dict[str, dict[str, float]] = {
     "defaults": {},
     "terrain 3 m, datum 3 m": {"aerial.terrain_sigma_m": 3.0, "aerial.datum_sigma_m": 3.0},
@@ -61,11 +61,11 @@ STATED: dict[str, dict[str, float]] = {
         "aerial.terrain_sigma_m": 3.0, "aerial.datum_sigma_m": 3.0,
     },
 }  # fmt: skip
-"""Errors that the user states. The misfits are those in the README of the data: they were found on this very flight."""
+"""Errors that the user states. The misfits are those in the data's README, which were found on the same flight."""
 
 
 def read_picks(folder: Path) -> list[Pick]:
-    """The picks, with the camera's heading: that which the other program's answers in a picture imply."""
+    """Read the picks, with the camera's heading from the other program's answers in a picture."""
     with (folder / "picks.csv").open(encoding="utf-8") as file:
         picks = [{k: float(v) for k, v in row.items() if k != "cone"} for row in csv.DictReader(file)]
     turns: dict[float, list[complex]] = {}
@@ -78,7 +78,7 @@ def read_picks(folder: Path) -> list[Pick]:
 
 
 def locate_pick(pick: Pick, given: str, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
-    """Error east and north in metres, (2,), and its covariance; NaN where there is no place."""
+    """Return the error (2,) east, north in metres, and its covariance; NaN without a place."""
     size = int(pick["width_px"]), int(pick["height_px"])
     centre = (size[0] - 1) / 2, (size[1] - 1) / 2
     camera = Camera("drone", size, (pick["f_x_px"],) * 2, centre, k1=pick["k1"], k2=pick["k2"])
@@ -115,7 +115,7 @@ def locate_pick(pick: Pick, given: str, settings: Settings) -> tuple[np.ndarray,
 
 
 def see_pictures(picks: list[Pick], stated_m: float) -> list[tuple[float, Camera, Flight, LandmarkObservations]]:
-    """Number, camera, log with true heights and picks of each picture, in metres about the first pick."""
+    """Return number, camera, log with true heights and picks of each picture, in metres about the first pick."""
     origin = picks[0]["cone_longitude"], picks[0]["cone_latitude"]
     base_m, seen = np.mean([pick["cone_height_m"] for pick in picks]), []
     for number, picture in enumerate(dict.fromkeys(pick["picture"] for pick in picks)):
@@ -141,7 +141,7 @@ def see_pictures(picks: list[Pick], stated_m: float) -> list[tuple[float, Camera
 
 
 def locate_by_landmarks(picks: list[Pick], stated_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors (N, 2), covariances (N, 2, 2) and pictures (N,) of picks located by the others of their picture."""
+    """Return errors (N, 2), covariances (N, 2, 2), pictures (N,) of picks located by the others of their picture."""
     georeferencer, found = None, []
     for number, (picture, camera, flight, marks) in enumerate(see_pictures(picks, stated_m)):
         georeferencer = georeferencer or Georeferencer(camera, Settings(), load_solver("onboard"))
@@ -156,7 +156,7 @@ def locate_by_landmarks(picks: list[Pick], stated_m: float) -> tuple[np.ndarray,
 
 
 def find_errors(picks: list[Pick]) -> FlightErrors:
-    """What `dddas calibrate-flight` finds by some picks, each picture 60 s after the one before."""
+    """Return the result of `dddas calibrate-flight` for some picks, with 60 s between pictures."""
     looks = [
         Look(number, 60.0 * number, pose_prior(flight, camera, Settings().aerial), marks)
         for number, (_, camera, flight, marks) in enumerate(see_pictures(picks, 0.2), 1)
@@ -165,7 +165,7 @@ def find_errors(picks: list[Pick]) -> FlightErrors:
 
 
 def list_errors(picks: list[Pick]) -> str:
-    """A table of the errors that all pictures show: offsets as truth less log, and sigmas from picture to picture."""
+    """Format the errors over all pictures: offsets (truth minus log), and sigmas from picture to picture."""
     found, rows = find_errors(picks), []
     for k, name in enumerate(OFFSETS[:6]):
         part, scale, unit = PART_OF_OFFSET[k], np.degrees(1) if k < 3 else 1, "°" if k < 3 else "m"
@@ -179,9 +179,9 @@ FOLDS = 5
 
 
 def locate_left_out(picks: list[Pick], in_a_row: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Errors and covariances of picks by telemetry alone, calibrated by the pictures of the other folds.
+    """Return errors and covariances of picks by telemetry alone, calibrated by the pictures of the other folds.
 
-    in_a_row: a fold is a stretch of the flight; else every fifth picture.
+    in_a_row: a fold is a consecutive part of the flight, else every fifth picture.
     """
     names = list(dict.fromkeys(pick["picture"] for pick in picks))
     fold_of = {name: k * FOLDS // len(names) if in_a_row else k % FOLDS for k, name in enumerate(names)}
@@ -198,7 +198,7 @@ def locate_left_out(picks: list[Pick], in_a_row: bool) -> tuple[np.ndarray, np.n
 
 
 def scale_by_others(squares: np.ndarray, pictures: np.ndarray) -> np.ndarray:
-    """(N,) factor of the covariances by which half of the errors in all other pictures lie in their 50 % ellipses."""
+    """Return (N,) factors of the covariances for which 50 % ellipses hold half of the errors in other pictures."""
     return np.array([np.median(squares[pictures != own]) for own in pictures]) / (-2 * np.log(0.5))
 
 
@@ -210,11 +210,11 @@ PARTS = {
     "focal length 1 %": {"aerial.focal_sigma": 0.01},
     "pixel 1 px": {"aerial.target_sigma_px": 1.0},
 }
-"""The errors that the defaults state, each by itself."""
+"""The errors of the defaults, one at a time."""
 
 
 def list_parts(picks: list[Pick]) -> str:
-    """A table of how much of the ellipses comes from which stated error, as the root of the mean variance."""
+    """Format the part of the ellipses that comes from each stated error, as the root of the mean variance."""
     none = {name: 0.0 for values in PARTS.values() for name in values}
     parts = {**PARTS, "all": {name: value for values in PARTS.values() for name, value in values.items()}}
     rows = []
@@ -231,10 +231,10 @@ FLIGHTS = 4000
 
 
 def list_chances(picks: list[Pick]) -> str:
-    """A table of the shares that simulated flights show whose errors are as the defaults state, by how long they last.
+    """Format the coverage of ellipses in simulated flights with the defaults' errors, by the errors' lasting share.
 
-    The picks, poses and ellipses are those of the flight; of each error a share of the variance is drawn once a flight,
-    the rest anew in each picture (seed 0).
+    The picks, poses and ellipses are those of the flight. A share of each error's variance is drawn once per flight,
+    the rest is drawn for each picture (seed 0).
     """
     slopes, picture = [], []
     for number, (_, camera, flight, marks) in enumerate(see_pictures(picks, 0.2)):
@@ -243,7 +243,7 @@ def list_chances(picks: list[Pick]) -> str:
         level = np.eye(7)
         level[:2, :2] = [[-np.cos(heading), np.sin(heading)], [np.sin(heading), np.cos(heading)]]
         by_pose = ground_with_slopes(prior.pose, camera, marks.image_px, marks.up_m)[1]
-        slopes.append(by_pose @ level.T * sigma)  # tilts to the left and ahead, not east and north
+        slopes.append(by_pose @ level.T * sigma)  # tilts to the left and ahead instead of east and north
         picture += [number] * len(marks)
     slope, rng, rows = np.concatenate(slopes), np.random.default_rng(0), []
     inverse = np.linalg.inv(slope @ slope.swapaxes(1, 2))
@@ -263,7 +263,7 @@ def list_chances(picks: list[Pick]) -> str:
 
 
 def list_distributions(picks: list[Pick]) -> str:
-    """A table of how well distributions with the 95 % ellipses of the defaults predict the errors of the flight."""
+    """Format the fit of distributions with the defaults' 95 % ellipses to the errors of the flight."""
     settings = with_parameters(Settings(), {"aerial.point": "centre", "aerial.own_sigma": 0.0})
     off, covariance = (
         np.array(p) for p in zip(*(locate_pick(pick, INPUTS[4], settings) for pick in picks), strict=True)
@@ -284,7 +284,7 @@ def list_distributions(picks: list[Pick]) -> str:
 
 
 def measure_flight(options: bench.Options) -> tuple[str, Any]:
-    """Errors and ellipses by what the heights count from and by the errors that are stated."""
+    """Measure errors and ellipses by the datum of the heights and by the stated errors."""
     picks = read_picks(options.data)
     pictures, rows = np.array([pick["picture"] for pick in picks]), []
     for given in INPUTS:

@@ -1,4 +1,4 @@
-"""Accuracy of detection under harder conditions: jumps of the exposure, and the registration by itself.
+"""Measure detection with jumps of the exposure, and the accuracy of the registration alone.
 
 python eval/robustness.py exposure DATA [--config fast]
 python eval/robustness.py registration DATA
@@ -27,15 +27,15 @@ from torchvision_dddas.types import Frame
 KINDS = ("as it is", "steps", "flashes", "flicker")
 LEVELS = (0.85, 1.0, 1.15)
 JUMPS = {"steps": 0.2, "flashes": 0.2, "flicker": 1.0}
-"""Probability that the gain jumps at a frame."""
+"""Probability of a jump of the gain at a frame."""
 
 
 def measure_exposure(options: bench.Options) -> tuple[str, Any]:
-    """F of clips with masks whose exposure jumps.
+    """Measure F of clips with masks when the exposure jumps.
 
-    As it is; with the gain of about every fifth frame jumping to 1.15, 1 or 0.85 and staying (steps); with single
-    frames lighter or darker (flashes); with a jump between any two frames (flicker). Frames are multiplied, rounded and
-    cut off at 255; the jumps are drawn from a fixed seed.
+    The clips are used unchanged; with a lasting jump of the gain to 1.15, 1 or 0.85 at about every fifth frame (steps);
+    with single lighter or darker frames (flashes); and with a jump at every frame (flicker). Frames are multiplied,
+    rounded and clipped at 255. The jumps are drawn from a fixed seed.
     """
     cv2.setNumThreads(2)
     settings, found = load_config(options.config), {}
@@ -60,7 +60,7 @@ def measure_exposure(options: bench.Options) -> tuple[str, Any]:
 
 
 def draw_gains(frames: int, kind: str, seed: int) -> np.ndarray:
-    """(frames,) the gain of each frame."""
+    """Draw the gain (frames,) of each frame."""
     random = np.random.default_rng(seed)
     gain = np.ones(frames)
     if kind == "as it is":
@@ -75,13 +75,13 @@ def draw_gains(frames: int, kind: str, seed: int) -> np.ndarray:
 
 
 def change_exposure(frames: Sequence[Frame], gain: np.ndarray) -> list[Frame]:
-    """The frames multiplied by their gains."""
+    """Return the frames multiplied by their gains."""
     pairs = zip(frames, gain, strict=True)
     return [replace(f, image=np.clip(np.round(f.image * g), 0, 255).astype(np.uint8)) for f, g in pairs]
 
 
 def score(frames: Sequence[Frame], truth: truths.ClipTruth, settings: Settings) -> tuple[float, int]:
-    """F over the labelled frames, and how many frames were unreliable."""
+    """Return F over the labelled frames, and the number of unreliable frames."""
     pixels, unreliable = Pixels(), 0
     for scene in detect_motion(frames, settings, "onboard"):
         unreliable += not scene.reliable
@@ -91,11 +91,11 @@ def score(frames: Sequence[Frame], truth: truths.ClipTruth, settings: Settings) 
 
 
 def measure_registration(options: bench.Options) -> tuple[str, Any]:
-    """Distance of registrations from a careful one: mean over the picture's corners, px.
+    """Measure the distance of registrations from a careful registration: mean over the picture's corners, px.
 
-    The careful registration follows up to 3000 corners from frame to frame and back through a wide window to a
-    thousandth of a pixel, finds the background by MAGSAC and fits the inliers three times at a shrinking tolerance.
-    Pairs are one and two frames apart; ours two apart are composed of two steps, as the detector composes them.
+    The careful registration tracks up to 3000 corners to the other frame and back in a wide window to 0.001 px. It
+    finds the background by MAGSAC and fits the inliers three times with decreasing tolerance. Pairs are one and two
+    frames apart. Our registrations over two frames are composed of two steps, as in the detector.
     """
     found = {
         clip.name: registration_errors(read_frames(clip / "frames")) for clip in clips_in(options.data, options.only)
@@ -108,7 +108,7 @@ def measure_registration(options: bench.Options) -> tuple[str, Any]:
 def registration_errors(
     frames: list[np.ndarray], configs: tuple[str, ...] = ("fast", "default")
 ) -> dict[str, dict[str, float]]:
-    """{"plain": {"median", "p90", "pairs"}, "fast": ..., "default": ...} over all pairs of a clip."""
+    """Return {"plain": {"median", "p90", "pairs"}, "fast": ..., "default": ...} over all pairs of a clip."""
     greys = [cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in frames]
     apart = [(i, i + gap) for gap in (1, 2) for i in range(len(greys) - gap)]
     tried = {(a, b): register_carefully(greys[a], greys[b]) for a, b in apart}
@@ -127,19 +127,19 @@ def registration_errors(
 
 
 def register_plainly(grey: np.ndarray, later: np.ndarray) -> np.ndarray:
-    """grey_from_later of the plain chain."""
+    """Return grey_from_later of the plain chain."""
     return plain_chain.register(grey, later, plain_chain.keypoints(grey))
 
 
 def register_onboard(frames: list[np.ndarray], config: str) -> list[np.ndarray]:
-    """later_from_earlier of successive frames."""
+    """Return later_from_earlier of successive frames."""
     engine = load_engine("onboard", load_config(None if config == "default" else config))
     views = [engine.prepare(frame) for frame in frames]
     return [engine.register([pair])[0].later_from_earlier for pair in pairwise(views)]
 
 
 def register_carefully(grey: np.ndarray, later: np.ndarray) -> np.ndarray | None:
-    """later_from_grey, or None where fewer than 50 points agree."""
+    """Return later_from_grey, or None if fewer than 50 points agree."""
     start: Any = cv2.goodFeaturesToTrack(grey, 3000, 0.001, 5, blockSize=5)
     if start is None:
         return None
@@ -162,7 +162,7 @@ def register_carefully(grey: np.ndarray, later: np.ndarray) -> np.ndarray | None
 
 
 def corner_distance(a: np.ndarray, b: np.ndarray, width: int, height: int) -> float:
-    """Mean distance of two homographies over the corners of a picture."""
+    """Return the mean distance of two homographies over the corners of a picture, px."""
     corners = np.array([[0, 0], [width - 1, 0], [0, height - 1], [width - 1, height - 1]], float)
     return float(np.linalg.norm(transfer(a, corners) - transfer(b, corners), axis=1).mean())
 

@@ -1,10 +1,10 @@
-"""From which size of people in the picture on the settings for tiny people are better: `python eval/scale.py [DATA]`.
+"""Find the size of people below which the settings for tiny people are better: `python eval/scale.py [DATA]`.
 
-Simulated flights from several heights, with crowds, with single walkers and cars, and with nothing that moves; and
-thermal pictures of DATA (clips with telemetry.csv and truth.json), as they are and reduced, so that people get smaller.
-Heights and thermal clips are left out in turn: the limit for them is the best on all others, a simulated row and a
-thermal row of equal weight. A simulated target is found by a box that shares 0.3 of the smaller of the two and is not
-much larger; a thermal one by a box at an IoU of 0.25.
+The data are simulated flights at several heights, with crowds, with single walkers and cars, and without movers; and
+thermal pictures of DATA (clips with telemetry.csv and truth.json), in full and in reduced size. Heights and thermal
+clips are left out in turn. Their limit is the best on all others, with equal weights of simulated and thermal rows. A
+box finds a simulated target if it shares 0.3 of the smaller of the two and is not much larger, and a thermal target at
+an IoU of 0.25.
 """
 
 from collections.abc import Sequence
@@ -36,20 +36,20 @@ WAYS: dict[str, Case] = {
     "tiny": {"gates.tiny_px": 1000.0},
     "default": {},
 }
-"""The settings of larger people, those of tiny ones without and with tracklets, and what the default takes."""
+"""Settings for larger people, for tiny people without and with tracklets, and of the default."""
 LIMITS_PX = (0.0, 2.0, 3.0, 4.5, 6.0, 7.0, 8.0, 10.0, 12.0, 1000.0)
 VIEWS = tuple(product((30.0, 50.0, 75.0, 100.0, 150.0, 200.0), (90.0, 45.0)))
 """Height in m and pitch in degrees of each flight."""
 SCENES = ("crowds", "singles", "still")
 REDUCED = (1.0, 1.5, 2.0, 3.0)
 RATE_HZ = 7.5
-"""Of the thermal clips, by their clip.json."""
+"""Rate of the thermal clips, by their clip.json."""
 SKIPPED = 3
-"""Frames at the start that are not scored: there a window looks one way only."""
+"""Unscored frames at the start, where windows look in one direction only."""
 
 
 def measure_scale(options: bench.Options) -> tuple[str, Any]:
-    """F1 by the size of people under each way, and the limit chosen with heights and clips left out."""
+    """Measure F1 by the size of people for each way, and choose the limit with heights and clips left out."""
     cases: list[Case] = [
         {"altitude_m": altitude, "pitch_deg": pitch, "seed": seed, "seconds": options.seconds, "scene": scene}
         for (altitude, pitch), scene, seed in product(VIEWS, SCENES, range(options.seeds))
@@ -95,7 +95,7 @@ def _cells(rows: Sequence[tuple[str, str, float, dict[str, list[float]]]]) -> li
 
 
 def _mean(kinds: Sequence[Any], limit_px: float, only: str = "", but: str = "") -> float:
-    """Mean F1 with a limit, each kind of equal weight, of some group of rows or of all but one."""
+    """Return mean F1 with a limit over a group of rows, or all other groups. Kinds have equal weights."""
     means = []
     for rows in kinds:
         values = [
@@ -115,7 +115,7 @@ def _best(kinds: Sequence[Any], left_out: str) -> float:
 
 
 def fly(case: Case) -> Case:
-    """F1 and boxes a frame of each way, and the size of people."""
+    """Return F1 and boxes per frame of each way, and the size of people."""
     cv2.setNumThreads(1)
     source = flight_over(case)
     frames, truths, found = list(source), source.truths(), {}
@@ -130,7 +130,7 @@ def fly(case: Case) -> Case:
 
 
 def flight_over(case: Case) -> SimulatorSource:
-    """Exact instruments above two crowds, above single walkers and cars, or above trees and buildings alone."""
+    """Return a flight with exact instruments over two crowds, over walkers and cars, or over trees and buildings."""
     altitude, pitch, seconds, seed = (case[name] for name in ("altitude_m", "pitch_deg", "seconds", "seed"))
     uav = {"altitude_m": altitude, "pitch_deg": pitch, "speed_m_s": 3.0, "start_m": (-15.0, 0.0)}
     uav |= {"way_m": ((15.0, 0.0),), "place_error95_m": 0.0, "angle_error_deg": 0.0, "heading_error_deg": 0.0}
@@ -160,13 +160,13 @@ def flight_over(case: Case) -> SimulatorSource:
 
 
 def detect(frames: Sequence[Any], settings: Any, rate_hz: float, telemetry: Telemetry) -> list[Scene]:
-    """A scene a frame."""
+    """Return one scene per frame."""
     detector = MotionDetector(settings, backend="onboard", rate_hz=rate_hz, telemetry=telemetry)
     return [scene for frame in frames for scene in detector.update(frame)] + detector.flush()
 
 
 def covered(found: np.ndarray, true: np.ndarray) -> tuple[int, int, int]:
-    """True boxes that a box of their own covers, boxes, and true boxes."""
+    """Return the numbers of true boxes that are covered by a box of their own, of boxes, and of true boxes."""
     common, _ = box_metrics.areas(true[:, None], found[None])
     area, other = true[:, 2:].prod(axis=1), found[:, 2:].prod(axis=1)
     share = common / np.minimum(area[:, None], other)
@@ -183,7 +183,7 @@ def covered(found: np.ndarray, true: np.ndarray) -> tuple[int, int, int]:
 
 
 def look(case: Case) -> Case:
-    """F1 and false boxes a picture of each way, and the size of people."""
+    """Return F1 and false boxes per picture of each way, and the size of people."""
     cv2.setNumThreads(1)
     place, reduced = Path(case["place"]), case["reduced"]
     telemetry = read_telemetry(place / "telemetry.csv")

@@ -1,9 +1,9 @@
-"""Studies on rendered video with known truth; no data needed.
+"""Studies on rendered video with known truth. They need no data.
 
 python eval/simulated.py altitude     errors of crowds from video to metres by altitude, and from the ground
                                       (appendix A, Fig. 7)
-python eval/simulated.py landmarks    four landmarks or six, by the centres of their colours or of motion (Fig. 8, 9)
-python eval/simulated.py loop         what feedback buys: closed loop beside open loops
+python eval/simulated.py landmarks    four or six landmarks, by the centres of their colours or of motion (Fig. 8, 9)
+python eval/simulated.py loop         the benefit of feedback: closed loop beside open loops
 python eval/simulated.py ground       centre and course of crowds by the people seen from the ground (appendix A, III-B)
 python eval/simulated.py whole        whole scenarios in the closed loop
 
@@ -44,17 +44,17 @@ CHAINS: dict[str, tuple[str | None, Case]] = {
     "ours, raw degrees": (None, RAW),
     "source, raw degrees": ("source", RAW),
 }
-"""Configuration and settings: `ours` locates by the camera's pose."""
+"""Configuration and settings. `ours` locates by the camera's pose."""
 SOURCE_M = {50.0: 1.3, 200.0: 3.5}
 """The source's mean errors by altitude, simulated (appendix A, Fig. 7)."""
 
 
 def measure_altitude(options: bench.Options) -> tuple[str, Any]:
-    """Errors of crowds located from rendered video, with exact places of four landmarks and receivers of 3.5 m.
+    """Measure errors of crowds located from rendered video, with four exact landmarks and with receivers of 3.5 m.
 
-    targets: of each located target from the people in its box. crowds: of each crowd from what was located of it.
-    picture: of the picture on the ground where the crowds are, by landmarks and telemetry alone. From the ground: by
-    the people whom the same ground vehicles see when their cameras are turned to the nearest crowd.
+    targets: distance of each located target from the people in its box. crowds: distance of each crowd from its located
+    targets. picture: error of the picture's map to the ground at the crowds, by landmarks and telemetry alone. From the
+    ground: by the people whom the same ground vehicles see with cameras turned to the nearest crowd.
     """
     cases = [
         {"seed": seed, "altitude_m": altitude, "seconds": options.seconds, "size": bench.parse_size(options.size)}
@@ -100,7 +100,7 @@ def measure_altitude(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_altitude(case: Case) -> Case:
-    """One clip, located in all ways."""
+    """Simulate a clip and return its scores by each way of location."""
     cv2.setNumThreads(1)
     width, height = case["size"]
     tables = {"uav": {"altitude_m": case["altitude_m"]}, "camera": {"width_px": width, "height_px": height}}
@@ -117,15 +117,15 @@ def fly_altitude(case: Case) -> Case:
 
 
 def _by_second(of: list[Case], column: int) -> dict[str, Any]:
-    """A line of the mean over seeds, for each second of a clip; of targets (column 1) or of the picture (2)."""
+    """Return a line of the mean over seeds, for each second of a clip; of targets (column 1) or of the picture (2)."""
     columns = list(zip_longest(*(r["seconds"] for r in of), fillvalue=(0, math.nan, math.nan)))
     return {"x": list(range(len(columns))), "y": [Spread(one[column] for one in second).mean for second in columns]}
 
 
 SIX, FOUR = (), (0, 1, 3, 4)
-"""Of six that stand in a ring four are a rectangle."""
+"""Rows of the used landmarks: all six (empty), or four of the ring that form a rectangle."""
 SLOW_S = 15
-"""When the vehicles slow down, in the source (appendix A, section V) and in `team.patrol = gather`."""
+"""Time at which the vehicles slow down, in the source (appendix A, section V) and in `team.patrol = gather`."""
 PARTS = {"fast": slice(0, SLOW_S), "slow": slice(SLOW_S, None)}
 LANDMARK_CHAINS = ("ours", "ours, raw degrees", "source, raw degrees")
 SOURCE_LANDMARKS_M = {4: 2.24, 6: 2.49}
@@ -133,11 +133,11 @@ SOURCE_LANDMARKS_M = {4: 2.24, 6: 2.49}
 
 
 def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
-    """Errors with four landmarks or six, whose image places are the centres of their colours or of what moves there.
+    """Measure errors with four or six landmarks, whose image places are the centres of their colours or of motion.
 
-    Six ground vehicles gather about two crowds, fast until t = 15 s and slow from then on, with exact places unless
-    --gps95 says otherwise. With four, the reports of two are not used. targets, picture: as of `altitude`; means over
-    the seconds, over which the plot shows them.
+    Six ground vehicles gather about two crowds, fast until t = 15 s and slow afterwards, with exact places unless
+    --gps95 is given. With four landmarks, the reports of two vehicles are not used. targets, picture: as in `altitude`,
+    means over the seconds. The plot shows the errors by second.
     """
     cases = [
         {"seed": seed, "altitude_m": options.altitude, "seconds": options.seconds, "gps95_m": options.gps95}
@@ -162,7 +162,7 @@ def measure_landmarks(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_landmarks(case: Case) -> Case:
-    """One clip, located in all ways."""
+    """Simulate a clip and return its scores by each way of location."""
     cv2.setNumThreads(1)
     team = {"ugvs": 6, "patrol": "gather", "ring_m": 18.0}
     scenario = walking(case["seed"], case["seconds"], uav={"altitude_m": case["altitude_m"]}, team=team)
@@ -175,7 +175,7 @@ def fly_landmarks(case: Case) -> Case:
 
 
 def _part(of: list[Case], part: slice, column: int) -> Spread:
-    """The mean over some seconds of each clip; of targets weighted by how many were located."""
+    """Return the mean over some seconds of each clip. Weight the means of targets by the number of located targets."""
     values = []
     for result in of:
         seconds = np.array(result["seconds"], float)[part]
@@ -199,7 +199,7 @@ LOOPS: dict[str, Case] = {
 
 
 class TimedSource:
-    """A source whose own processor time, drawing above all, is known."""
+    """A source that measures its own processor time, mainly for drawing."""
 
     def __init__(self, source: SimulatorSource, every: int) -> None:
         self._source, self._every = source, every
@@ -223,10 +223,10 @@ class TimedSource:
 
 
 def measure_loop(options: bench.Options) -> tuple[str, Any]:
-    """Error of the known place of every crowd at every moment, against processor time a second of clip.
+    """Measure the error of each crowd's known place at each moment, against processor time per second of clip.
 
-    A crowd of which nothing is known costs 10 m. Open loops fly as planned and look at every k-th frame. Time is of one
-    thread, without drawing and judging; "aerial": without people seen from the ground.
+    An unknown crowd counts as 10 m. Open loops fly as planned and process every k-th frame. The time is of one thread,
+    without drawing and scoring. "aerial": without people seen from the ground.
     """
     cases = [
         {"scenario": name, "seed": seed, "seconds": options.seconds, "set": LOOPS[loop]}
@@ -254,13 +254,13 @@ def measure_loop(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_loop(case: Case) -> Case:
-    """One run of a shipped scenario."""
+    """Run a shipped scenario."""
     scene = [f"clip.seconds={case['seconds']}"] if case["seconds"] else []
     return fly(SimulatorSource(load_scenario(case["scenario"], scene, case["seed"]), case["scenario"]), case["set"])
 
 
 def fly(source: SimulatorSource, changed: Case) -> Case:
-    """One run with changed settings; `every` of them: look at every so many frames."""
+    """Run with changed settings. The setting `every` = N processes every N-th frame only."""
     cv2.setNumThreads(1)
     parameters = {name: value for name, value in changed.items() if name != "every"}
     settings = with_parameters(load_config(None, (), base=scenario_settings(source.scenario)), parameters)
@@ -285,9 +285,9 @@ def fly(source: SimulatorSource, changed: Case) -> Case:
 
 
 def measure_whole(options: bench.Options) -> tuple[str, Any]:
-    """Whole scenarios in the closed loop, from video to metres: what `dddas run sim:NAME --seed 11` says at its end.
+    """Measure whole scenarios in the closed loop, from video to metres: the final scores of `dddas run sim:NAME`.
 
-    Nothing was chosen on seed 11.
+    The seed is 11, on which no parameter was chosen.
     """
     cases = [{"scenario": name, "seed": options.seed} for name in options.scenarios]
     scores = bench.run_cases(cases, fly_whole, options.jobs, options.cache)
@@ -301,7 +301,7 @@ def measure_whole(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_whole(case: Case) -> Case:
-    """The score of one run, by name."""
+    """Return the scores of a run, by name."""
     from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
@@ -312,14 +312,14 @@ def fly_whole(case: Case) -> Case:
 # -- crowds by the ground vehicles -----------------------------------------------------------------------------------
 
 FOLLOWS = {"closed loop": True, "the UAV does not follow": False}
-"""Where the UAV flies as planned it loses crowds, and what the ground vehicles see steers them."""
+"""A UAV that flies as planned loses crowds. Then sightings from the ground steer the ground vehicles."""
 
 
 def measure_ground(options: bench.Options) -> tuple[str, Any]:
-    """Errors of crowds.csv: centre and predicted course of a crowd by the people whom ground vehicles see.
+    """Measure errors of crowds.csv: centre and predicted course of a crowd by the people whom ground vehicles see.
 
-    A row of crowds.csv is compared with the true crowd whose centre is nearest. steers: rows of a crowd that the air
-    has lost, by which the vehicles are steered. Appendix A, III-B.
+    A row of crowds.csv is compared with the true crowd with the nearest centre. steers: rows of crowds that the UAV has
+    lost, which steer the ground vehicles. Appendix A, III-B.
     """
     cases = [
         {"scenario": name, "seed": seed, "follow": follow}
@@ -343,7 +343,7 @@ def measure_ground(options: bench.Options) -> tuple[str, Any]:
 
 
 def fly_ground(case: Case) -> list[list[float]]:
-    """Of each row of crowds.csv the errors of centre and course, and whether it steers."""
+    """Return the errors of centre and course of each row of crowds.csv, and whether the row steers vehicles."""
     from torchvision_dddas.lab.evaluation.simulated_run import run_scenario
 
     with tempfile.TemporaryDirectory() as out:
@@ -371,7 +371,7 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def about(options: bench.Options) -> str:
-    """The last line of a text."""
+    """Return the last line of a study's text."""
     length = f"{options.seconds:g} s each" if options.seconds else "each as long as the scenario says"
     return f"{options.seeds} seeds, {length}: mean ± standard error (range over seeds)."
 

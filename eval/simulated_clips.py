@@ -1,4 +1,4 @@
-"""Clips of the simulator for the studies: their scenarios, and crowds located from the air and from the ground."""
+"""Simulated clips for the studies: their scenarios, and crowds located from the air and from the ground."""
 
 import math
 from collections import Counter
@@ -41,10 +41,10 @@ Case = dict[str, Any]
 
 @dataclass(frozen=True)
 class Way:
-    """How a clip is located. config: of detection and location, parameters: set in it.
+    """A way to locate a clip. config: configuration of detection and location. parameters: changes to it.
 
-    gps95_m: error of the landmarks' receivers in 95 %, added to the reports. used: rows of the landmarks whose reports
-    are used; empty: all.
+    gps95_m: 95 % error of the landmarks' receivers, added to the reports. used: rows of the landmarks whose reports are
+    used; empty for all.
     """
 
     gps95_m: float
@@ -56,13 +56,13 @@ class Way:
 def usual(
     source: SimulatorSource, config: str | None = None, parameters: Mapping[str, object] | None = None
 ) -> Settings:
-    """The settings of `dddas run sim: --config CONFIG`, some of them changed."""
+    """Return the settings of `dddas run sim: --config CONFIG` with some changes."""
     settings = fit_settings(load_config(config, (), base=scenario_settings(source.scenario, config)), source)
     return with_parameters(settings, parameters or {})
 
 
 class ClipLocator:
-    """Locates the scenes of a clip, and scores that. Targets are those of single frames, without tracks."""
+    """Locates the scenes of a clip and scores the places. Targets are those of single frames, without tracks."""
 
     def __init__(self, source: SimulatorSource, way: Way) -> None:
         self._source, self._way, self._gps95_m = source, way, way.gps95_m
@@ -72,14 +72,14 @@ class ClipLocator:
         self._watch: LandmarkWatch | None = None
 
     def scorer(self) -> CrowdScorer:
-        """A new one in the truth's metres."""
+        """Return a new scorer in the truth's local metres."""
         return CrowdScorer(self._local)
 
     def locate(self, scene: Scene, scorers: Sequence[CrowdScorer], truth: Truth) -> float:
-        """Locate the targets of the next scene; the truth of its frame has been fed to the scorers.
+        """Locate the targets of the next scene. The scorers already have the truth of its frame.
 
-        Returns the error of the picture on the ground, m: mean over the crowds of the distance between their middle and
-        the place to which its pixel is projected; NaN where that is not known.
+        Return the error of the picture's map to the ground, metres: the mean distance of the crowds' middles from the
+        projections of their pixels, or NaN if unknown.
         """
         site = self._site()
         if self._watch is None:
@@ -117,7 +117,7 @@ class ClipLocator:
         return float(np.linalg.norm(self._local(places) - middle[inside, :2], axis=1).mean())
 
     def _site(self) -> Site:
-        """What was reported until now, in the metres of the first report, with the ground's elevation."""
+        """Return the site by the reports until now, in local metres of the first report, with the elevation."""
         reports, telemetry = self._reports(), self._source.telemetry()
         if self._watch is None:
             site = build_site(reports, telemetry)
@@ -128,7 +128,7 @@ class ClipLocator:
         return replace(site, landmarks=local[0], telemetry=local[1])
 
     def _reports(self) -> Landmarks:
-        """The landmarks' reports with the receivers' errors; without planned waypoints."""
+        """Return the landmarks' reports with the receivers' errors, without planned waypoints."""
         table = self._source.landmarks()
         kept = ~table.planned
         if self._way.used:
@@ -145,7 +145,7 @@ class ClipLocator:
 
 
 def receiver_errors(scenario: Scenario, gps95_m: float, count: int, frames: int) -> np.ndarray:
-    """(F, K, 2) errors in metres in each frame: the same for all ways, except for their size."""
+    """Return errors (F, K, 2) in metres in each frame. Ways differ only in the size of the errors."""
     gps, errors = scenario.gps, []
     receivers = Receivers(
         count, gps95_m, gps.white_share, gps.correlation_s, 0.0, np.random.default_rng([scenario.seed, 77])
@@ -157,9 +157,9 @@ def receiver_errors(scenario: Scenario, gps95_m: float, count: int, frames: int)
 
 
 def locate_clip(scenario: Scenario, ways: Mapping[str, Way]) -> Case:
-    """The scores of each way; ways of one configuration have the same detections.
+    """Return the scores of each way. Ways with the same configuration share their detections.
 
-    seconds: for each second of the clip the number of located targets, their mean error and that of the picture, m.
+    seconds: for each second of the clip, the number of located targets, their mean error and the picture's error, m.
     """
     found: Case = {}
     for config in dict.fromkeys(way.config for way in ways.values()):
@@ -173,7 +173,7 @@ def _locate_clip(scenario: Scenario, config: str | None, ways: Mapping[str, Way]
     scorers, errors = {name: one.scorer() for name, one in locators.items()}, {name: [] for name in locators}
     by_second: dict[str, dict[int, tuple[CrowdScorer, list[float]]]] = {name: {} for name in locators}
     truths, settings, started = {}, usual(source, config), StartedSource(source)
-    if settings.steering.sampling:  # as many frames are left out as the closed loop leaves out before it found anything
+    if settings.steering.sampling:  # skip as many frames as the closed loop does before its first detection
         scale = pixels_per_metre(scenario.uav.altitude_m, source.camera.focal_px[0])
         least = every_least(scale, source.rate_hz, settings.steering)
         source.steer(Command(every=int(np.clip(round(least), 1, settings.steering.maximum_every))))
@@ -203,7 +203,7 @@ def _second(scorer: CrowdScorer, picture_m: list[float]) -> tuple[int, float, fl
 
 
 def _mean(values: list[float]) -> float:
-    """NaN without a finite value."""
+    """Return the mean of the finite values, or NaN without any."""
     known = np.array(values)[np.isfinite(values)]
     return float(known.mean()) if len(known) else math.nan
 
@@ -211,22 +211,22 @@ def _mean(values: list[float]) -> float:
 # -- from the ground -------------------------------------------------------------------------------------------------
 
 LOOK_S = 0.5
-"""Each vehicle takes a picture this often."""
+"""Time between two pictures of a vehicle."""
 BESIDE_M = 3.0
-"""People located further than this outside of every crowd are counted as elsewhere."""
+"""People located further outside of every crowd count as elsewhere."""
 GROUND_WAYS: dict[str, tuple[bool, Case]] = {
     "each vehicle alone, as printed": (False, {"ground.mode": "paper"}),
     "each vehicle alone": (False, {}),
     "all vehicles fused": (True, {}),
 }
-"""Whether the sightings of all vehicles are fused, and the settings."""
+"""Whether sightings of all vehicles are fused, and the settings."""
 
 
 def locate_from_ground(scenario: Scenario) -> Case:
-    """Errors of crowds located by the people that the ground vehicles see, for each way; no picture from the air.
+    """Return errors of crowds located by the people that ground vehicles see, for each way, without aerial pictures.
 
-    Each vehicle's camera is turned to the middle of the nearest crowd; it drives as planned. A crowd's place is the
-    mean of the people located within its radius and BESIDE_M.
+    Each vehicle drives as planned and turns its camera to the middle of the nearest crowd. A crowd's place is the mean
+    of the people located within its radius plus BESIDE_M.
     """
     source, settings = SimulatorSource(scenario), load_config(None, (), base=scenario_settings(scenario))
     detector, local = (
@@ -279,9 +279,9 @@ def locate_from_ground(scenario: Scenario) -> Case:
 
 
 def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str, object]) -> Scenario:
-    """A team about two crowds that walk side by side through its ring, to one side or past one another.
+    """Return a scenario of a team and two crowds that walk side by side or past each other through the team's ring.
 
-    tables: parameters beside the usual ones, by table: `uav={"altitude_m": 200.0}`.
+    tables: further parameters by table, such as `uav={"altitude_m": 200.0}`.
     """
     rng = np.random.default_rng([seed, 5])
     crowds = []
@@ -289,10 +289,10 @@ def walking(seed: int, seconds: float, rate_hz: float = 10.0, **tables: dict[str
     for k, people in enumerate(rng.integers(6, 13, 2).tolist()):
         ahead = np.radians(heading + k * turn + rng.uniform(-10, 10))
         speed = rng.uniform(0.7, 1.4)
-        # They pass one another at some distance: who is who where they meet is another question.
+        # Let crowds pass each other at a distance, because the study does not test identities in mixed crowds.
         aside = (-1 if k == 0 else 1) * rng.uniform(5, 7) * (1 if turn == 0 or k == 0 else -1)
         way = np.array([np.sin(ahead), np.cos(ahead)])
-        # In the middle of the ring halfway through the run.
+        # The crowds reach the middle of the ring halfway through the run.
         start = -way * speed * min(seconds / 2, 12) + aside * way[::-1] * (1, -1)
         crowds.append(
             CrowdPlan(

@@ -1,8 +1,8 @@
-"""Studies on films of the simulator as files, which `dddas run CLIP --telemetry LOG` would read; no data needed.
+"""Studies on the simulator's films as files, in the form that `dddas run CLIP --telemetry LOG` reads. Need no data.
 
-python eval/simulated_films.py identities   identities that five movers get, by pitch and seed
+python eval/simulated_films.py identities   number of identities of five movers, by pitch and seed
 python eval/simulated_films.py boxes        precision and recall of the default in the village and in thermal pictures
-python eval/simulated_films.py write OUT    clips with frames/ and truth.json, such as `eval/tracklets.py learn` reads
+python eval/simulated_films.py write OUT    clips with frames/ and truth.json for `eval/tracklets.py learn`
 
 --cache FILE keeps finished cases.
 """
@@ -31,20 +31,20 @@ from torchvision_dddas.lab.simulation import Scenario, load_scenario, record_sce
 from torchvision_dddas.pipeline import AerialInput, Pipeline, assemble_files
 
 LEAST = 0.25
-"""IoU from which a box is right: people are some 15 px high, and their shadows as large as they."""
+"""Least IoU of a right box. People are about 15 px high, and their shadows are as large as the people."""
 HIDDEN_SHARE = 0.5
-"""A box of less than this share of the target's usual area shows only a part of it, and does not count."""
+"""A box with a smaller share of the target's usual area shows a part of the target and does not count."""
 
 DRY = ["world.shore_m=0", "uav.size_m=0"]
-"""Changes the village: no water, and no shadow of the UAV."""
+"""Overrides for the village without water and without the UAV's shadow."""
 
 Case = dict[str, Any]
 Clip = list[list[Case]]
-"""Of each frame the boxes: box (x, y, width, height), cls, state (moving, still or unsure), id."""
+"""Boxes of each frame: box (x, y, width, height), cls, state (moving, still or unsure), id."""
 
 
 def film(case: Case, folder: Path) -> tuple[Scenario, Clip]:
-    """Film a scenario into a folder; returns it and its truth."""
+    """Film a scenario into a folder. Return the scenario and its truth."""
     changed = [f"uav.{name}={case[name]}" for name in ("pitch_deg", "altitude_m") if case.get(name)]
     scenario = load_scenario(case["scenario"], changed + (DRY if case.get("is_dry") else []), case["seed"])
     record = record_scenario(folder, scenario, ("frames",), case.get("frames"), case["scenario"])
@@ -59,13 +59,13 @@ def film(case: Case, folder: Path) -> tuple[Scenario, Clip]:
         clip[int(frame) - 1].append({"box": box, "cls": kinds[int(number)], "state": state, "id": int(number)})
     pictures = [path.read_bytes() for path in sorted((folder / "frames").iterdir())]
     for k in range(1, len(clip)):
-        if pictures[k] == pictures[k - 1]:  # a copy shows what was there before
+        if pictures[k] == pictures[k - 1]:  # a repeated picture shows the last frame's truth
             clip[k] = clip[k - 1]
     return scenario, clip
 
 
 def run(folder: Path, scenario: Scenario) -> list[Any]:
-    """The tracked frames of a film, as `dddas run` with the log and the default configuration gives them."""
+    """Return the tracked frames of a film by `dddas run` with the log and the default configuration."""
     source = open_source(folder / "frames", rate_hz=scenario.clip.rate_hz)
     log = folder / "telemetry.csv"
     given = AerialInput(None, log, folder / "camera.toml", None, None, None)
@@ -77,7 +77,7 @@ def run(folder: Path, scenario: Scenario) -> list[Any]:
 
 
 def measure_identities(options: bench.Options) -> tuple[str, Any]:
-    """Identities that five movers past a parked car get, filmed from 40 m; IDF1 at an IoU of 0.25."""
+    """Measure the identities of five movers past a parked car, filmed from 40 m, and IDF1 at an IoU of 0.25."""
     cases = _cases("movers", options)
     results = bench.run_cases(cases, count_identities, options.jobs, options.cache)
     rows = []
@@ -90,11 +90,11 @@ def measure_identities(options: bench.Options) -> tuple[str, Any]:
 
 
 def count_identities(case: Case) -> Case:
-    """How many identities a film's tracks have, and IDF1."""
+    """Return the number of identities in a film's tracks, and IDF1."""
     with tempfile.TemporaryDirectory() as out:
         scenario, clip = film(case, Path(out))
         tracked = run(Path(out), scenario)
-    # What moves counts as soon as a pixel shows.
+    # A moving target counts as soon as one pixel is visible.
     truth = [(k, r["id"], r["box"]) for k, boxes in enumerate(clip, 1) for r in boxes if r["state"] != "still"]
     found = [
         (one.number, number, box)
@@ -114,7 +114,7 @@ def _table(rows: list[tuple[int, int, list[float]]]) -> TrackTable:
 
 
 def measure_boxes(options: bench.Options) -> tuple[str, Any]:
-    """Precision and recall of detections at an IoU of 0.25; boxes on what is mostly hidden count neither way."""
+    """Measure precision and recall of detections at an IoU of 0.25. Boxes on mostly hidden targets do not count."""
     village = _cases("village", options)
     cases = [*village, *(case | {"is_dry": True} for case in village), *_cases("thermal", options)[: options.seeds]]
     results = bench.run_cases(cases, count_boxes, options.jobs, options.cache)
@@ -129,7 +129,7 @@ def measure_boxes(options: bench.Options) -> tuple[str, Any]:
 
 
 def count_boxes(case: Case) -> Case:
-    """Precision and recall in a film."""
+    """Return the counts for precision and recall in a film."""
     with tempfile.TemporaryDirectory() as out:
         scenario, clip = film({**case, "pitch_deg": case["pitch_deg"] * (case["scenario"] == "village")}, Path(out))
         tracked = run(Path(out), scenario)

@@ -1,13 +1,13 @@
-"""The source's chain of detection (`--config source`) step by step, on the clips whose name begins with `bms_`.
+"""Measure the source's detection chain (`--config source`) step by step, on clips with names that begin with `bms_`.
 
 python eval/source_search.py search DATA     the constants that the source's text leaves open
 python eval/source_search.py kernels DATA    the six measures by smoothing, erosion, dilation, and by the last two at
                                              once (appendix B, Fig. 8)
 python eval/source_search.py steps DATA      Gmean after each step, at t and at t + Δt, by interval
 
-The mask of reference t is scored against the truth of frame t + Δt, the middle one of the three, where equation 9 draws
-a mover (moved to frame t by the registration), and against the truth of frame t. Pixel counts are pooled over a clip;
-figures are means over the clips.
+The mask of reference t is scored against the truth of frame t + Δt (moved to frame t by the registration), because
+equation 9 draws a mover at its place in the middle of three frames. It is also scored against the truth of frame t.
+Pixel counts are pooled over a clip. Figures are means over the clips.
 """
 
 from collections.abc import Iterator, Sequence
@@ -50,12 +50,12 @@ KERNELS: dict[str, tuple[int, ...]] = {
 INTERVALS = (1, 2, 3, 4)
 Point = tuple[int, ...]
 Scores = dict[tuple[Point, str, str], dict[str, float]]
-"""Measures by point, clip, and frame of the truth: middle or reference."""
+"""Measures by point, clip, and the truth's frame: middle or reference."""
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """A difference of eq. 9, (H, W) uint8, and the truth of a frame, by number, in the frame of its reference."""
+    """A difference of eq. 9, (H, W) uint8, and the truth of frame `number`, mapped to the reference frame."""
 
     difference: np.ndarray
     truth: np.ndarray
@@ -64,11 +64,11 @@ class Labelled:
 
 
 def search(options: bench.Options) -> tuple[str, dict[str, dict[str, float]]]:
-    """The constants that the source's text leaves open, searched on a grid.
+    """Search the constants that the source's text leaves open on a grid.
 
-    The rule of choice: of the points whose mean Gmean at t + Δt is at least .90 the one of the best mean F there; where
-    none is, the best mean Gmean. It was made after an earlier search on the same clips, so figures of clips left out
-    are a little too good. Each clip is also scored with the point that the other clips choose.
+    The rule chooses the point with the best mean F among the points with a mean Gmean at t + Δt of at least .90, or the
+    point with the best mean Gmean. The rule was made after an earlier search on the same clips, so figures of clips
+    left out are slightly too good. Each clip is also scored with the point that the other clips choose.
     """
     cv2.setNumThreads(1)
     base = load_config("source")
@@ -87,18 +87,18 @@ def search(options: bench.Options) -> tuple[str, dict[str, dict[str, float]]]:
 
 
 def parameters_of(point: Point) -> dict[str, float]:
-    """The settings of a point of the grid."""
+    """Return the settings of a point of the grid."""
     return {name: float(v) if name == "difference.threshold" else v for name, v in zip(GRID, point, strict=True)}
 
 
 def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
-    """The differences of a clip that a label stands for, at the reference or in the middle."""
+    """Yield the differences of a clip that have a label at the reference or at the middle frame."""
     engine, interval = load_engine("onboard", settings), settings.interval.frames
     views = [engine.prepare(frame.image) for frame in open_source(place / "frames")]
     steps = [step.later_from_earlier for step in engine.register(list(pairwise(views)))]
 
     def ahead_of(at: int, gap: int) -> np.ndarray:
-        """Map frame `at` to the one `gap` after it: registered directly, or chained where that fails."""
+        """Return the map from frame `at` to the frame `gap` later, by direct registration, or chained if that fails."""
         (step,) = engine.register([(views[at], views[at + gap])])
         return step.later_from_earlier if step.reliable else chain(steps[at : at + gap])
 
@@ -124,7 +124,7 @@ def labelled_frames(place: Path, settings: Settings) -> Iterator[Labelled]:
 
 
 def score(frames: Sequence[Labelled], settings: Settings) -> dict[str, dict[str, float]]:
-    """Measures of a clip by frame of the truth, pixel counts pooled."""
+    """Return the measures of a clip by the truth's frame, with pooled pixel counts."""
     counts = {"reference": Pixels(), "middle": Pixels()}
     difference = settings.difference
     for frame in frames:
@@ -138,12 +138,12 @@ def score(frames: Sequence[Labelled], settings: Settings) -> dict[str, dict[str,
 
 
 def mean(scores: Scores, point: Point, clips: Sequence[str], where: str, measure: str) -> float:
-    """The mean of a measure over clips."""
+    """Return the mean of a measure over some clips."""
     return float(np.mean([scores[point, clip, where][measure] for clip in clips]))
 
 
 def choose(scores: Scores, clips: Sequence[str]) -> Point:
-    """The point that the rule chooses from some clips."""
+    """Return the point that the rule chooses on some clips."""
 
     def value(point: Point) -> tuple[bool, float]:
         gmean = mean(scores, point, clips, "middle", "gmean")
@@ -154,7 +154,7 @@ def choose(scores: Scores, clips: Sequence[str]) -> Point:
 
 
 def report(scores: Scores, clips: Sequence[str]) -> tuple[str, dict[str, dict[str, float]]]:
-    """Tables of the choice, of the best points by Gmean, and of each clip left out; the figures that they show."""
+    """Format tables of the choice, of the best points by Gmean, and of each clip left out. Also return the figures."""
     points = list(dict.fromkeys(point for point, _, _ in scores))
     at_reference = max(points, key=lambda p: mean(scores, p, clips, "reference", "gmean"))
     at_middle = max(points, key=lambda p: mean(scores, p, clips, "middle", "gmean"))
@@ -186,10 +186,10 @@ def report(scores: Scores, clips: Sequence[str]) -> tuple[str, dict[str, dict[st
 
 
 def measure_kernels(options: bench.Options) -> tuple[str, Any]:
-    """The six measures at t + Δt by kernel of smoothing, erosion, dilation, and by the last two at once.
+    """Measure the six measures at t + Δt by kernel of smoothing, erosion, dilation, and by the last two at once.
 
-    A kernel is varied about the constants of `--config source`; 1 is none. The table of both at once has F and Gmean,
-    the result and the plot all six.
+    Each kernel varies about the constants of `--config source`; a kernel of 1 does nothing. The table of the last two
+    shows F and Gmean. The result and the plot have all six measures.
     """
     base, clips = load_config("source"), _read_clips(options.data, load_config("source"))
     rows, figures, panels = [], {}, []
@@ -233,9 +233,9 @@ def measure_kernels(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_steps(options: bench.Options) -> tuple[str, Any]:
-    """What each step of `--config source` does to specificity, recall and Gmean, at t and at t + Δt, by interval.
+    """Measure specificity, recall and Gmean after each step of `--config source`, at t and at t + Δt, by interval.
 
-    Only labelled frames count that can be both.
+    Only labelled frames that can be reference and middle frame count.
     """
     base = load_config("source")
     bare = {"difference.blur_px": 1, "morphology.erode_px": 1, "morphology.dilate_px": 1, "gates.min_area_px": 1}
@@ -267,19 +267,19 @@ def measure_steps(options: bench.Options) -> tuple[str, Any]:
 
 
 def _read_clips(data: Path, settings: Settings) -> dict[str, list[Labelled]]:
-    """The differences of each clip at the settings' interval."""
+    """Read the differences of each clip at the settings' interval."""
     cv2.setNumThreads(1)
     return {place.name: list(labelled_frames(place, settings)) for place in clips_in(data, "bms_")}
 
 
 def _keep_both(frames: list[Labelled]) -> list[Labelled]:
-    """Those whose labels are compared with at the reference and in the middle."""
+    """Keep the frames that are labelled both as reference and as middle frame."""
     at, middle = ({frame.number for frame in frames if frame.where == where} for where in ("reference", "middle"))
     return [frame for frame in frames if frame.number in at & middle]
 
 
 def _score_clips(clips: dict[str, list[Labelled]], settings: Settings) -> dict[str, dict[str, float]]:
-    """Means of the measures over the clips, by frame of the truth."""
+    """Return the means of the measures over the clips, by the truth's frame."""
     found = [score(frames, settings) for frames in clips.values()]
     return {w: {m: float(np.mean([one[w][m] for one in found])) for m in MEASURES} for w in ("middle", "reference")}
 

@@ -1,16 +1,16 @@
-"""Time and memory, always beside a reference in the same turns: ratios are medians over turns, with quartiles.
+"""Measure time and memory beside a reference in the same turns. Ratios are medians over turns, with quartiles.
 
-python eval/speed.py detection [DATA]   a frame by stage and resolution, beside the plain OpenCV chain; onboard, torch
+python eval/speed.py detection [DATA]   time per frame by stage and resolution, beside plain OpenCV; onboard, torch
 python eval/speed.py memory             peak memory of one chain alone, of `dddas detect` and of `dddas people`
 python eval/speed.py people             the person detector beside cv2.HOGDescriptor on the same pyramid
 python eval/speed.py geo                homographies, poses and conversions beside NumPy's and OpenCV's solvers
-python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, a picture
+python eval/speed.py operations         the batched operations beside Kornia's and OpenCV's, per picture
 python eval/speed.py batches            the torch engine with more or fewer pictures in work at once
-python eval/speed.py gpu                frames a second and the operations' forms on an accelerator; see `make gpu`
+python eval/speed.py gpu                frame rate and the operations' forms on an accelerator; see `make gpu`
 python eval/speed.py association SEQ    the source's association of a MOTChallenge sequence, onboard and torch
 
-The processor's time is summed over threads; a ratio of two in one turn suffers least from other programs. Without DATA
-detection is timed on the tests' synthetic scene.
+Processor time is summed over threads. The ratio of two times in the same turn is least sensitive to other programs.
+Without DATA, detection is timed on the tests' synthetic scene.
 """
 
 import subprocess
@@ -36,7 +36,7 @@ from torchvision_dddas.types import Frame, Registration, Tracks, is_sampled
 
 TURN_FRAMES, WARM_UP = 8, 3
 STAGES = ("prepare", "register", "foreground", "targets")
-"""Grey pictures; the camera's motion; difference to mask; mask to targets and all that belongs to no other stage."""
+"""Grey pictures; camera motion; difference to mask; mask to targets with everything outside of other stages."""
 CHAINS = (
     "onboard fast", "onboard half", "onboard default", "torch fast b1", "torch fast b8", "torch default b1",
     "torch default b8",
@@ -48,7 +48,7 @@ CHAINS = (
 
 
 class Stopwatch:
-    """Seconds by clock and processor, summed for each stage."""
+    """Clock and processor seconds, summed for each stage."""
 
     def __init__(self) -> None:
         self.spent: dict[str, np.ndarray] = {}
@@ -66,7 +66,7 @@ class Stopwatch:
 
 
 class TimedEngine:
-    """An engine whose stages are timed."""
+    """An engine that times its stages."""
 
     def __init__(self, engine: Engine, watch: Stopwatch) -> None:
         self._engine, self._watch, self.name = engine, watch, engine.name
@@ -75,15 +75,15 @@ class TimedEngine:
         return getattr(self._engine, name)
 
     def prepare(self, image: np.ndarray) -> View:
-        """As the engine's own, and so the next two."""
+        """Prepare an image with the engine, and time it."""
         return self._timed("prepare", self._engine.prepare, image)
 
     def register(self, pairs: Sequence[tuple[View, View]]) -> list[Registration]:
-        """Camera motion of pairs."""
+        """Register pairs with the engine, and time it."""
         return self._timed("register", self._engine.register, pairs)
 
     def foreground(self, windows: Sequence[Window]) -> list[Foreground]:
-        """What differs in windows."""
+        """Find the foreground of windows with the engine, and time it."""
         return self._timed("foreground", self._engine.foreground, windows)
 
     def _timed(self, stage: str, call: Callable[[Any], Any], argument: Any) -> Any:
@@ -96,7 +96,7 @@ class TimedEngine:
 class Chain:
     """A detection chain on a clip: "plain", or engine, configuration and batch size as in CHAINS.
 
-    stages: of each turn, the seconds of its stages. targets: numbers of targets found.
+    stages: seconds of the stages in each turn. targets: numbers of found targets.
     """
 
     def __init__(self, name: str, frames: Sequence[np.ndarray]) -> None:
@@ -113,7 +113,7 @@ class Chain:
             )
 
     def __call__(self, turn: int) -> None:
-        """Process the frames of a turn."""
+        """Process the frames of a turn and record their times."""
         self._watch.spent = {}
         for i in range(turn * TURN_FRAMES, (turn + 1) * TURN_FRAMES):
             self.process(i)
@@ -131,13 +131,13 @@ class Chain:
 
 
 def available_chains(wanted: Iterable[str]) -> list[str]:
-    """The chains that can run here: torch only where it is installed."""
+    """Return the chains that can run here. Torch chains need torch."""
     has_torch = find_spec("torch") is not None and find_spec("kornia") is not None
     return [name for name in wanted if has_torch or not name.startswith("torch")]
 
 
 def time_chains(clips: Mapping[str, Sequence[np.ndarray]], names: Sequence[str], rounds: int) -> dict[str, Any]:
-    """{clip: {chain: figures}}: all chains on all clips in turns of TURN_FRAMES frames."""
+    """Time all chains on all clips in turns of TURN_FRAMES frames. Return {clip: {chain: figures}}."""
     count = (rounds + WARM_UP) * TURN_FRAMES + 2
     chains = {
         (clip, name): Chain(name, there_and_back(frames, count))
@@ -156,7 +156,7 @@ def time_chains(clips: Mapping[str, Sequence[np.ndarray]], names: Sequence[str],
 
 
 def stage_times(turns: Sequence[Mapping[str, np.ndarray]], whole_s: np.ndarray) -> dict[str, float]:
-    """Median processor milliseconds a frame of each stage; the rest of the whole belongs to the targets."""
+    """Return median processor ms per frame of each stage. The targets' stage includes the rest of the whole."""
     times = {
         stage: np.array([turn.get(stage, np.zeros(2))[1] for turn in turns]) / TURN_FRAMES for stage in STAGES[:-1]
     }
@@ -168,7 +168,7 @@ def stage_times(turns: Sequence[Mapping[str, np.ndarray]], whole_s: np.ndarray) 
 
 
 def measure_detection(options: bench.Options) -> tuple[str, Any]:
-    """Time of a frame by stage at several resolutions, beside the plain chain."""
+    """Measure the time per frame by stage at several resolutions, beside the plain chain."""
     chains, load = available_chains(options.chains), bench.OtherLoad()
     clips: dict[str, Sequence[np.ndarray]] = {}
     sizes = [bench.parse_size(size) for size in options.sizes]
@@ -214,9 +214,9 @@ def _films(data: Path | None, size: Size) -> Iterable[tuple[str, list[np.ndarray
 
 
 def measure_memory(options: bench.Options) -> tuple[str, Any]:
-    """Peak memory of a process that takes one chain through a video; "nothing" reads the video only.
+    """Measure the peak memory of a process that runs a chain on a video. "nothing" only reads the video.
 
-    `dddas detect` and `dddas people` run on videos of two lengths: their memory does not grow.
+    `dddas detect` and `dddas people` run on videos of two lengths, to show whether memory grows with length.
     """
     width, height = bench.parse_size(options.size)
     found = {}
@@ -246,7 +246,7 @@ def measure_memory(options: bench.Options) -> tuple[str, Any]:
 
 
 def run_chain(options: bench.Options) -> tuple[str, Any]:
-    """Take one chain through a video and end (used by `memory`)."""
+    """Run a chain on a video and end (used by `memory`)."""
     frames: list[np.ndarray] = []
     chain = None if options.name == "nothing" else Chain(options.name, frames)
     for frame in open_source(options.data):
@@ -256,15 +256,15 @@ def run_chain(options: bench.Options) -> tuple[str, Any]:
         ready = len(frames) - (3 if options.name == "plain" else 1)
         if ready >= 0:
             chain.process(ready)
-            frames[ready] = frames[ready][:0]  # keeps indices, frees the picture
+            frames[ready] = frames[ready][:0]  # free the picture but keep the indices
     return "", None
 
 
 def measure_people(options: bench.Options) -> tuple[str, Any]:
-    """The person detector beside detectMultiScale with steps of 8 px and 1.05, no padding.
+    """Measure the person detector beside detectMultiScale with steps of 8 px and 1.05, without padding.
 
-    Regions are three of 192×256 px: "regions" scores windows whose body lies inside, "regions, blobs" those for bodies
-    of a third to 1.3 times a blob of 150 px.
+    There are three regions of 192×256 px. "regions" scores windows whose body lies inside. "regions, blobs" scores
+    windows for bodies of 1/3 to 1.3 times a blob of 150 px.
     """
     from torchvision_dddas.people import pyramid
     from torchvision_dddas.people.classifiers import read_classifier
@@ -295,7 +295,7 @@ def measure_people(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_geo(options: bench.Options) -> tuple[str, Any]:
-    """Homographies of landmarks, poses with all checks, and conversions of degrees."""
+    """Measure homographies of landmarks, poses with all checks, and conversions of degrees."""
     from geo_error import georeferencer_inputs, settings_for
     from geo_scene import CAMERA, Case, scenes
 
@@ -335,7 +335,7 @@ def measure_geo(options: bench.Options) -> tuple[str, Any]:
 
 
 def _landmark_sets(n: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places and pixels, (sets, n, 2) each, from 50 m above and a little tilted, with 1 px of noise."""
+    """Return places and pixels, (sets, n, 2) each, seen from 50 m with a small tilt and 1 px of noise."""
     rng = np.random.default_rng(n)
     ground = rng.uniform(-12.5, 12.5, (sets, n, 2))
     flat = ground * (27.4, -27.4) / (1 + ground @ (1e-3, 2e-3))[..., None]
@@ -343,7 +343,7 @@ def _landmark_sets(n: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def measure_operations(options: bench.Options) -> tuple[str, Any]:
-    """`functional` beside Kornia and OpenCV on batches of pictures or of pairs of points; processor time of each."""
+    """Measure processor time of `functional` beside Kornia and OpenCV, on batches of pictures or of point pairs."""
     import torch
     from tensor_operations import operations
 
@@ -379,7 +379,7 @@ def measure_operations(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_batches(options: bench.Options) -> tuple[str, Any]:
-    """The torch engine with more or fewer megabytes of pictures in work at once, batch 8."""
+    """Measure the torch engine with different megabytes of pictures in work at once, batch 8."""
     from torchvision_dddas.detection.torch_engine import TorchEngine
 
     frames, found, text = scene(bench.parse_size(options.size), 24), {}, []
@@ -406,10 +406,10 @@ def measure_gpu(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_association(options: bench.Options) -> tuple[str, Any]:
-    """The source's association of a sequence's true boxes, onboard and torch in turns, in processor time.
+    """Measure the source's association of a sequence's true boxes, onboard and torch in turns, in processor time.
 
-    "association" is everything but reading and registering, "solver" the assignment, the same for both.
-    "dddas track" is the command, started anew, with reading and registering.
+    "association" is everything except reading and registering. "solver" is the assignment, which both share.
+    "dddas track" is a new process of the command, including reading and registering.
     """
     place, interval = options.data, options.interval
     film = film_of(place)
@@ -455,7 +455,7 @@ def measure_association(options: bench.Options) -> tuple[str, Any]:
                     whole, solver = bench.now() - start, watch.spent["solver"]
                     identities[backend] = [each.identity.tolist() for each in tracks]
                     figures = {"association": whole, "of it solver": solver, "features and affinities": whole - solver}
-                    if turn:  # the first warms up
+                    if turn:  # the first turn warms up
                         figures["dddas track"] = run_command(backend)
                         for name, spent in figures.items():
                             parts.setdefault(name, {}).setdefault(backend, []).append(float(spent[1]))
@@ -478,7 +478,7 @@ def measure_association(options: bench.Options) -> tuple[str, Any]:
 
 
 def _beside_first(calls: Mapping[str, Callable[[int], object]], rounds: int, title: str) -> tuple[str, Any]:
-    """Table of calls beside the first of them."""
+    """Time calls beside the first call and format a table."""
     load = bench.OtherLoad()
     spent = bench.time_in_turns(calls, rounds)
     reference = next(iter(spent.values()))

@@ -1,4 +1,4 @@
-"""The batched operations of `functional`, each beside OpenCV's and Kornia's for the same work."""
+"""The batched operations of `functional`, beside OpenCV's and Kornia's operations for the same work."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,9 +26,9 @@ _BOXES, _BOX_PX = 10, (40, 90)
 
 
 def operations(size: Size, batch: int, device: str = "cpu") -> dict[str, dict[str, Call | None]]:
-    """{operation: {"OpenCV", "ours", "Kornia"}}, calls that do the work of a batch; None where Kornia has nothing.
+    """Return {operation: {"OpenCV", "ours", "Kornia": call on a batch}}; None if Kornia lacks the operation.
 
-    device: where torch computes, for ours and for Kornia's. OpenCV computes on the CPU.
+    device: torch device of our and Kornia's calls. OpenCV computes on the CPU.
     """
     made = _of_pictures(size, batch, device) | _of_points(batch, device)
     return {row: dict(zip(("OpenCV", "ours", "Kornia"), calls, strict=True)) for row, calls in made.items()}

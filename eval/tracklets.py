@@ -1,7 +1,7 @@
-"""Learn the weights by which tracklets are judged, and measure them on kinds of clips that were left out.
+"""Learn the weights of tracklet scores, and measure them on data sets that were left out.
 
-The clips of a data set (HIT-UAV, UAV123, UAVDT, DTB70, BMS, DAVIS) are scored with weights that were learned on all
-others. `learn` prints the weights for `detection/tracklet_scores.py`.
+The clips of a data set (HIT-UAV, UAV123, UAVDT, DTB70, BMS, DAVIS) are scored with weights learned on all other data
+sets. `learn` prints the weights for `detection/tracklet_scores.py`.
 """
 
 import json
@@ -41,11 +41,11 @@ KINDS = {
     "hit": "hit", "car14": "uav123", "wakeboard": "uav123", "group": "uav123", "uav123": "uav123", "S0310": "uavdt",
     "Mountain": "dtb70", "bms": "bms", "davis": "davis",
 }  # fmt: skip
-"""The data set of a clip, by a part of its name; all clips of a data set are left out together."""
+"""The data set of a clip, by a part of its name. All clips of a data set are left out together."""
 
 SETTINGS = Settings()
 PARTLY = 0.2
-"""Weight of a candidate about a target that is much larger than it."""
+"""Weight of a candidate on a target that is much larger than the candidate."""
 
 PEOPLE = "people from 60 m"
 
@@ -54,9 +54,9 @@ Weights = tuple[dict[str, float], dict[str, float]]
 
 @dataclass
 class Look:
-    """What the detector had when it judged one look.
+    """Inputs of the detector's decision on a look.
 
-    drawn: of each blob, (N, 4) boxes of its refined outline. small: of small tracks.
+    drawn: (N, 4) boxes of the blobs' refined outlines. small: boxes of small tracks.
     """
 
     candidates: Candidates
@@ -68,10 +68,10 @@ class Look:
 
 @dataclass
 class Film:
-    """A clip at one sampling. looks: by frame. truth: by frame, boxes to be found, or None where it is unlabelled.
+    """A clip at a sampling. looks: by frame. truth: boxes to find by frame, or None for an unlabelled frame.
 
-    unsure: by frame, boxes that count neither way. how: all, one, masks or none, what the labels cover. moves: of one
-    target, the frames in which it moves. plain: by frame, the boxes of the plain chain.
+    unsure: boxes by frame that do not count. how: extent of the labels: all, one, masks or none. moves: frames in which
+    the single target moves. plain: boxes of the plain chain by frame.
     """
 
     name: str
@@ -86,12 +86,12 @@ class Film:
 
     @property
     def kind(self) -> str:
-        """Its data set."""
+        """The data set of the clip."""
         return next((kind for part, kind in KINDS.items() if part in self.name), "other")
 
 
 class _WholeFlow(DenseFlow):
-    """The flow of one whole frame, searched once."""
+    """The flow of a whole frame, computed once."""
 
     flows: list[np.ndarray] | None = None
 
@@ -102,7 +102,7 @@ class _WholeFlow(DenseFlow):
 
 
 class _Recorder(MotionDetector):
-    """The default detector, which keeps what tracklets are judged by and takes all blobs."""
+    """The default detector. It stores the inputs of tracklet scores and accepts all blobs."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -128,7 +128,7 @@ class _Recorder(MotionDetector):
 
 
 def record(case: tuple[Path, int]) -> Film:
-    """Run the detector on every so-manyth picture of a clip."""
+    """Run the detector on every N-th picture of a clip."""
     place, every = case
     cv2.setNumThreads(1)
     pictures = sorted((place / "frames").iterdir())[::every]
@@ -141,7 +141,7 @@ def record(case: tuple[Path, int]) -> Film:
     name = place.name if every == 1 else f"{place.name}@{every}"
     how, truth, unsure, moves = read_truth(place, every, pictures)
     plain = []
-    for i in range(len(images)):  # each frame and its next two; the last two look back
+    for i in range(len(images)):  # each frame and its next two; the last two frames look back
         step = 1 if i + 2 < len(images) else -1
         plain.append(plain_chain.plain_window(images[i], images[i + step], images[i + 2 * step])[1])
     return Film(name, how, len(pictures), detector.looks, repeats, truth, unsure, moves, plain)
@@ -150,7 +150,7 @@ def record(case: tuple[Path, int]) -> Film:
 def read_truth(
     place: Path, every: int, pictures: Sequence[Path]
 ) -> tuple[str, list[np.ndarray | None], list[np.ndarray], list[bool]]:
-    """What `Film` holds of the labels."""
+    """Read the labels into the fields how, truth, unsure and moves of `Film`."""
     count, none = len(pictures), np.zeros((0, 4))
     unsure, moves = [none] * count, [True] * count
     if (place / "truth.json").exists():
@@ -186,7 +186,7 @@ def _boxes_of_mask(mask: np.ndarray) -> np.ndarray:
 
 
 def fit_logistic(x: np.ndarray, y: np.ndarray, weight: np.ndarray, ridge: float = 3e-3) -> np.ndarray:
-    """(F + 1,) weights of the columns of x, (N, F), and a constant: Newton's method on standardized columns."""
+    """Fit weights (F + 1,) of the columns of x (N, F) and a constant by Newton's method on standardized columns."""
     mean, spread = x.mean(axis=0), x.std(axis=0) + 1e-6
     z, weight = np.c_[np.clip((x - mean) / spread, -5, 5), np.ones(len(x))], weight / weight.sum()
     b, penalty = np.zeros(z.shape[1]), ridge * np.eye(z.shape[1])
@@ -199,7 +199,7 @@ def fit_logistic(x: np.ndarray, y: np.ndarray, weight: np.ndarray, ridge: float 
 
 
 def label(film: Film, frame: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) best IoU of the look's candidates with a target, and their weights: 0 where the labels do not say."""
+    """Return the best IoU (N,) of the look's candidates with a target, and weights (N,), 0 for unlabelled ones."""
     box, truth, drawn = film.looks[frame].candidates.box_px, film.truth[frame], film.looks[frame].drawn
     if truth is None or not len(box):
         return np.zeros(len(box)), np.zeros(len(box))
@@ -217,13 +217,13 @@ def label(film: Film, frame: int) -> tuple[np.ndarray, np.ndarray]:
             axis=2
         )
         weight[(best < 0.1) & (inside | (iou(box, unsure) > 0.05)).any(axis=1)] = 0
-    if film.how == "one" or film.kind == "davis":  # others may move too
+    if film.how == "one" or film.kind == "davis":  # other targets may move too
         weight[best < 0.05] *= 0.3
     return best, weight
 
 
 def learn_weights(films: Sequence[Film]) -> Weights:
-    """The weights of both scores; every film counts alike, false candidates twice as much as true ones."""
+    """Learn the weights of both scores. Films have equal weights. False candidates weigh twice as much as true ones."""
 
     def fit(names: Sequence[str], rows: Callable[[Film, int], dict[str, np.ndarray]]) -> dict[str, float]:
         xs, ys, ws = [], [], []
@@ -253,7 +253,7 @@ def learn_weights(films: Sequence[Film]) -> Weights:
 
 
 def seen_by(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[int, Candidates]:
-    """The looks that the tracklets of a frame cross, by offset, 0 their own, scored with some weights."""
+    """Return {offset: candidates} of the looks that a frame's tracklets cross (0 is its own), scored with weights."""
     order = sorted(film.looks)
     at, members = order.index(frame), film.looks[frame].tracklets.members
     near = {offset: film.looks[order[at + offset]] for offset in (0, *members)}
@@ -261,7 +261,7 @@ def seen_by(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[i
 
 
 def describe(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[str, np.ndarray]:
-    """What `describe_tracklets` gives with some weights of looks."""
+    """Return the result of `describe_tracklets` with some weights of looks."""
     seen = seen_by(film, frame, look_weights)
     return describe_tracklets(seen.pop(0), film.looks[frame].tracklets, seen)
 
@@ -270,7 +270,7 @@ def describe(film: Film, frame: int, look_weights: Mapping[str, float]) -> dict[
 
 
 def detect(film: Film, weights: Weights | None, accept: float = 0.0, worth: Worth = BLOB) -> list[np.ndarray]:
-    """The boxes of every frame by the detector's rule; without weights, those of all blobs."""
+    """Return the boxes of every frame by the detector's rule, or of all blobs without weights."""
     found = []
     for frame in range(film.frames):
         source = film.repeats.get(frame, frame)
@@ -293,7 +293,7 @@ def detect(film: Film, weights: Weights | None, accept: float = 0.0, worth: Wort
 
 
 def score(film: Film, found: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Counts of a film, as the scorers of the shared tools: hits, false, missed at IoU .25 and .5, or of one target."""
+    """Return a film's counts as in the shared tools: hits, false, missed at IoU .25 and .5, or of one target."""
     if film.how in ("all", "masks"):
         counts = {f"counts{100 * least:.0f}": np.zeros(3) for least in (0.25, 0.5)}
         for boxes, truth, unsure in zip(found, film.truth, film.unsure, strict=True):
@@ -331,19 +331,19 @@ def score(film: Film, found: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _holds(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(N, M) whether boxes hold points."""
+    """Return (N, M) whether boxes contain points."""
     return ((points[None] >= boxes[:, None, :2]) & (points[None] <= boxes[:, None, :2] + boxes[:, None, 2:])).all(
         axis=2
     )
 
 
 def f1(counts: np.ndarray) -> float:
-    """From hits, false and missed."""
+    """Return F1 from hits, false and missed."""
     return float(2 * counts[0] / max(2 * counts[0] + counts[1] + counts[2], 1e-9))
 
 
 def summarize(films: Sequence[Film], found: Mapping[str, Sequence[np.ndarray]]) -> dict[str, float]:
-    """Figures over all films, each kind by its usual measure."""
+    """Return figures over all films, with the usual measure of each data set."""
     of = {film.name: score(film, found[film.name]) for film in films}
     low = [film for film in films if "hit_60" in film.name and "@" not in film.name]
     pooled = {n: sum((of[film.name][n] for film in low), np.zeros(3)) for n in ("counts25", "counts50")}
@@ -362,7 +362,7 @@ def summarize(films: Sequence[Film], found: Mapping[str, Sequence[np.ndarray]]) 
 
 
 def mean(values: Sequence[Any]) -> float:
-    """The mean; NaN of nothing."""
+    """Return the mean, or NaN without values."""
     return float(np.mean(values)) if values else float("nan")
 
 
@@ -370,7 +370,7 @@ def mean(values: Sequence[Any]) -> float:
 
 
 def load_films(options: bench.Options) -> list[Film]:
-    """Record every clip of the folder, at all samplings; kept in a file if one is named."""
+    """Record every clip of the folder at all samplings, and store the films if a file is given."""
     if options.keep and Path(options.keep).exists():
         films: list[Film] = pickle.loads(Path(options.keep).read_bytes())
     else:
@@ -390,7 +390,7 @@ def load_films(options: bench.Options) -> list[Film]:
 
 
 def learn(options: bench.Options) -> tuple[str, Any]:
-    """Weights learned on all clips, and figures with each kind left out."""
+    """Learn weights on all clips, and measure figures with each data set left out."""
     films = load_films(options)
     left_out = {kind: learn_weights([f for f in films if f.kind != kind]) for kind in sorted({f.kind for f in films})}
     rows: dict[str, dict[str, float]] = {}

@@ -1,4 +1,4 @@
-"""What tuning by gradient is worth, by hard decisions on data that nothing was learned from.
+"""Measure the benefit of tuning by gradient, with hard decisions, on data without learning.
 
 python eval/tuning.py recovery           perturbed parameters of motion, on simulated scenes
 python eval/tuning.py default            the shipped parameters of the difference beside those before they were tuned
@@ -35,7 +35,7 @@ from torchvision_dddas.lab.tuning.tracking import TrackingFamily
 MOTION = ("difference.noise_levels", "difference.gradient_share", "difference.threshold", "difference.peak")
 SIZE, FRAMES, FACTOR, WITHIN = (320, 240), 16, 3.0, 0.9
 BASE = {"gates.min_area_px": 60, "morphology.close_px": 9}
-"""People are some ten pixels tall at this size."""
+"""Settings for people about ten pixels tall, as at this size."""
 BEFORE = {"difference.threshold": 4.0, "difference.gradient_share": 0.15, "refine.spatial_px": 60.0}
 
 
@@ -43,10 +43,10 @@ BEFORE = {"difference.threshold": 4.0, "difference.gradient_share": 0.15, "refin
 
 
 def measure_recovery(options: bench.Options) -> tuple[str, Any]:
-    """Parameters that start off by factors of 1/3 to 3 and learn from the masks of one scene.
+    """Tune parameters that start off by factors of 1/3 to 3, with the masks of one scene.
 
-    F of pixels of the hard pipeline at the shipped, perturbed and tuned parameters, on that scene and on another. A
-    seed has recovered where F on its scene is at least 0.9 of that of the shipped parameters.
+    The figures are F of pixels of the hard pipeline at the shipped, perturbed and tuned parameters, on that scene and
+    on another. A seed has recovered if F on its scene is at least 0.9 of the F of the shipped parameters.
     """
     shipped, rows = with_parameters(load_config(), BASE), []
     for seed in range(options.seeds):
@@ -55,7 +55,7 @@ def measure_recovery(options: bench.Options) -> tuple[str, Any]:
             factors = FACTOR ** np.random.default_rng([seed, 7]).uniform(-1, 1, len(MOTION))
             start = scaled(shipped, dict(zip(MOTION, factors.tolist(), strict=True)))
             tuned = start
-            for after in (False, True):  # first far from what is right, then with the hard steps after the hulls
+            for after in (False, True):  # first roughly, then with the hard steps after the hulls
                 family, plan = MotionFamily(with_later_steps=after), Plan(options.steps, 4, 0.15, seed, most_watched=4)
                 tuned = descend(family, Parameters(tuned, MOTION), family.examples([learned], tuned), plan).settings
             rows.append([measure_f(clip, s) for clip in (learned, other) for s in (shipped, start, tuned)])
@@ -72,9 +72,9 @@ def measure_recovery(options: bench.Options) -> tuple[str, Any]:
 
 
 def measure_default(options: bench.Options) -> tuple[str, Any]:
-    """F of the shipped parameters of the difference beside those before they were tuned on real clips."""
+    """Measure F of the shipped parameters of the difference, beside their values before tuning on real clips."""
     shipped, rows = load_config(), []
-    for seed in range(100, 100 + options.seeds):  # far from the seeds of other studies
+    for seed in range(100, 100 + options.seeds):  # other studies do not use these seeds
         with tempfile.TemporaryDirectory() as place:
             clip = film_clip(Path(place), seed, (640, 480))
             rows.append([measure_f(clip, settings) for settings in (with_parameters(shipped, BEFORE), shipped)])
@@ -85,26 +85,26 @@ def measure_default(options: bench.Options) -> tuple[str, Any]:
 
 
 def film_clip(place: Path, seed: int, size: tuple[int, int]) -> Clip:
-    """A synthetic scene on disk, as a clip of a data set."""
+    """Write a synthetic scene to disk and return it as a clip of a data set."""
     clips.film_into(place / f"scene-{seed}", seed, FRAMES, size)
     (clip,) = read(DatasetSource("folder", place, (f"scene-{seed}",)), place).clips
     return clip
 
 
 def scaled(settings: Settings, factors: Mapping[str, float]) -> Settings:
-    """Parameters multiplied by factors, within their ranges."""
+    """Return settings with some parameters multiplied by factors, within their ranges."""
     values = {name: TUNABLE[name].rounded(value_of(settings, name) * factor) for name, factor in factors.items()}
     return with_parameters(settings, values)
 
 
 def value_of(settings: Settings, name: str) -> float:
-    """The value of a parameter, such as difference.threshold."""
+    """Return the value of a parameter, such as difference.threshold."""
     group, parameter = name.split(".")
     return float(getattr(getattr(settings, group), parameter))
 
 
 def measure_f(clip: Clip, settings: Settings) -> float:
-    """F of pixels of the hard pipeline."""
+    """Return F of pixels of the hard pipeline."""
     total = segmentation.Pixels()
     for scene in detect_motion(open_clip(clip), settings, "onboard"):
         total = add_counts(total, segmentation.count(scene.mask, labels_of(clip.truth, scene.frame.number)))
@@ -130,9 +130,9 @@ TRACKING = tuple(
 
 
 def measure_identities(options: bench.Options) -> tuple[str, Any]:
-    """IDF1 of the tracker on each sequence, with parameters tuned by the likelihood of true links on all others.
+    """Measure IDF1 of the tracker on each sequence, with parameters tuned by the likelihood of links on all others.
 
-    On true boxes without identities, or with --detections on public ones; without pictures.
+    The tracker gets true boxes without identities, or public detections with --detections, and no pictures.
     """
     task: Task = "tracking" if options.detections else "association"
     found = clips.identified_clips(options.data, ("motchallenge", "cvml", "sdd"))

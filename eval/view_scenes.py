@@ -1,7 +1,7 @@
 """Pairs of views with known identities: streets, crowds and real tracks, seen by two cameras that move and turn.
 
-A target is a cuboid on a plane; its box in a picture is that of its corners, cut at the border, with noise. Targets are
-missed for some frames at a time, and each view numbers them by itself, with new numbers after gaps and at random.
+A target is a cuboid on a plane. Its box in a picture encloses its corners, clipped at the border, with noise. Targets
+are missed for some frames at a time. Each view has its own numbers, with new numbers after gaps and at random.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ PIXEL_M, CUT_PX = 0.045, 8
 
 
 class View(NamedTuple):
-    """One picture: true (N,) and own (N,) numbers of the targets, boxes (N, 4), and the picture's map (3, 3)."""
+    """A picture: true numbers (N,) and own numbers (N,) of the targets, boxes (N, 4), the picture's map (3, 3)."""
 
     true: np.ndarray
     own: np.ndarray
@@ -35,7 +35,7 @@ class World(NamedTuple):
 
 
 def street_world(rng: np.random.Generator, frames: int) -> World:
-    """A crossing of two streets of four lanes, with queues of regular spacing, rows of parked cars, and walkers."""
+    """Draw a crossing of two streets with four lanes, regularly spaced queues, rows of parked cars, and walkers."""
     tracks: list[tuple[np.ndarray, np.ndarray, tuple[float, float, float]]] = []
     time = np.arange(frames) / RATE_HZ
     for street in range(2):
@@ -63,7 +63,7 @@ def street_world(rng: np.random.Generator, frames: int) -> World:
 
 
 def crowd_world(rng: np.random.Generator, frames: int) -> World:
-    """Walkers and bikers on a square, some in groups, some standing."""
+    """Draw walkers and bikers on a square, some in groups, some standing."""
     tracks = []
     for _ in range(rng.integers(12, 35)):
         start, angle = rng.uniform(-35, 35, 2), rng.uniform(0, 2 * np.pi)
@@ -77,7 +77,7 @@ def crowd_world(rng: np.random.Generator, frames: int) -> World:
 
 
 def real_world(file: Path, frames: int, first: int) -> World:
-    """Real tracks of the Stanford Drone Dataset, seen from straight above, at every third frame."""
+    """Read real tracks of the Stanford Drone Dataset, seen from straight above, at every third frame."""
     rows = [line.split() for line in file.read_text().splitlines()]
     tracks = []
     for number in sorted({row[0] for row in rows}):
@@ -102,7 +102,7 @@ def _join(tracks: list) -> World:
 
 
 def fly(rng: np.random.Generator, frames: int, height_m: tuple[float, float], heading: float, aim: np.ndarray) -> list:
-    """(3, 3) homographies to the picture from the ground, and (3, 4) cameras, of a flight that drifts and turns."""
+    """Return picture_from_ground (3, 3) and cameras (3, 4) of a flight that drifts and turns."""
     pitch, height = np.radians(rng.uniform(30, 65)), rng.uniform(*height_m)
     drift, spin = rng.normal(0, 0.7, 3) * (1, 1, 0.2), np.radians(rng.normal(0, 1.0))
     focal = SIZE[0] * rng.uniform(0.62, 0.9)
@@ -123,7 +123,7 @@ def fly(rng: np.random.Generator, frames: int, height_m: tuple[float, float], he
 
 
 def film(rng: np.random.Generator, world: World, cameras: list) -> Iterator[View]:
-    """What a tracker gives of the world in each frame of one camera."""
+    """Yield a tracker's view of the world in each frame of a camera."""
     count = world.place.shape[1]
     numbers = rng.permutation(20 * count)[:count].tolist()
     fresh = iter(range(20 * count, 10**9))
@@ -154,7 +154,7 @@ def film(rng: np.random.Generator, world: World, cameras: list) -> Iterator[View
 
 
 def scene(kind: str, seed: int, frames: int = 300) -> tuple[list[View], list[View]]:
-    """A pair of views: kind is street, crowd, or the path of a table of real tracks."""
+    """Return a pair of views. kind: street, crowd, or the path of a table of real tracks."""
     rng = np.random.default_rng([seed, len(kind)])
     heights = (45.0, 110.0) if kind == "street" else (18.0, 50.0)
     if kind == "street":
@@ -173,17 +173,17 @@ def scene(kind: str, seed: int, frames: int = 300) -> tuple[list[View], list[Vie
 
 
 def true_map(a: View, b: View) -> np.ndarray:
-    """(3, 3) homography to the picture of b from that of a, over the ground."""
+    """Return the homography (3, 3) from the picture of a to the picture of b, over the ground."""
     return b.picture_from_ground @ np.linalg.inv(a.picture_from_ground)
 
 
 def feet(box_px: np.ndarray) -> np.ndarray:
-    """(N, 2) middle of the lower edge."""
+    """Return the middles (N, 2) of the lower edges."""
     return box_px[:, :2] + box_px[:, 2:] * (0.5, 1.0) - (0.5, 1.0)
 
 
 def nearest_right(a: View, b: View) -> tuple[int, int]:
-    """Of the targets in both views, how many have as nearest foot point, by the true map, that of their own box."""
+    """Count targets in both views whose nearest foot point by the true map is their own, and all targets in both."""
     there = geometry.transfer(true_map(a, b), feet(a.box_px))
     apart = np.linalg.norm(there[:, None] - feet(b.box_px)[None], axis=-1)
     both = np.isin(a.true, b.true)

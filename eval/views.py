@@ -1,13 +1,13 @@
-"""How well two views share identities, on simulated pairs and on real tracks that are seen by two simulated cameras.
+"""Measure shared identities of two views, on simulated pairs and on real tracks seen by two simulated cameras.
 
 python eval/views.py [SDD_FILE ...]      precision and recall of shared identities, beside two baselines
 
 Pairs are streets with regular queues and parked cars, crowds, and tables of the Stanford Drone Dataset
-(../shared/data/association/SDD-*/annotations.txt). Headings differ by up to 180 degrees, cameras drift and turn. A
-pair of boxes with one identity in a frame counts as found; it is right if both boxes are of one target. A pair of views
-is lost if its recall is below a half. nearest: mutual nearest foot points by the true homography of each frame.
-carried: seeded with the true homography of the first frame, then fitted to the pairs of each frame. --cache FILE
-keeps finished cases. handed over: targets that leave one view while the other sees them, and keep their identity there.
+(../shared/data/association/SDD-*/annotations.txt). Headings differ by up to 180 degrees. Cameras drift and turn. Two
+boxes with the same identity in a frame count as found. They are right if both boxes show the same target. A pair of
+views is lost if its recall is below 0.5. nearest: mutual nearest foot points by the true homography of each frame.
+carried: the homography starts with the truth of the first frame and is fitted to the pairs of each frame. handed over:
+targets that leave a view while the other view sees them, and keep their identity. --cache FILE keeps finished cases.
 """
 
 import time
@@ -29,7 +29,7 @@ Case = dict[str, Any]
 
 
 def measure(options: bench.Options) -> tuple[str, Any]:
-    """Precision and recall of shared identities by kind of scene, pairs of views lost, and frames a second."""
+    """Measure precision and recall of shared identities, lost pairs of views, and frames per second, by scene kind."""
     kinds = ["street", "crowd", *map(str, options.files or [])]
     cases = [
         {"kind": kind, "seed": seed} for kind in kinds for seed in range(options.first, options.first + options.seeds)
@@ -54,7 +54,7 @@ def measure(options: bench.Options) -> tuple[str, Any]:
 
 
 def run_case(case: Case) -> Case:
-    """Of each way: how many pairs of boxes are right, found and true; and the speed of ours."""
+    """Return, for each way, the numbers of right, found and true pairs of boxes; and the speed of our way."""
     a, b = scene(case["kind"], case["seed"])
     start = time.perf_counter()
     shared = share(a, b)
@@ -73,7 +73,7 @@ def run_case(case: Case) -> Case:
 
 
 def share(a: list[View], b: list[View]) -> list[tuple[np.ndarray, ...]]:
-    """Shared identities of each frame of both views."""
+    """Return the shared identities in each frame of both views."""
     tracker, frames = MultiViewTracker(delay_frames=150), []
     for number, views in enumerate(zip(a, b, strict=True), 1):
         frames += tracker.update([Tracks(number, view.own.astype(np.int64), view.box_px) for view in views])
@@ -92,9 +92,9 @@ def _score_pairs(a: View, b: View, pairs: np.ndarray) -> tuple[int, int, int]:
 
 
 def _hand_over(a: list[View], b: list[View], shared: list[tuple[np.ndarray, ...]]) -> tuple[int, int]:
-    """Of the targets that leave one view while the other sees them, how many keep their identity; and how many leave.
+    """Return the number of targets that leave a view while the other sees them and keep their identity, and of all.
 
-    Those count that both views have seen for 3 s before, and that stay away for 3 s.
+    A target counts if both views have seen it for 3 s before, and if it stays away for 3 s.
     """
     kept = left = 0
     named = [

@@ -1,16 +1,16 @@
-"""How right events at zones are, from rendered video with known truth; no data needed.
+"""Measure events at zones, from rendered video with known truth. Needs no data.
 
 python eval/zone_events.py      precision and recall of entering, leaving and crossing, and the error of counts
 
-Each run of a scenario is watched by zones that lie at random on the ways of its crowds and cars: rectangles with sides
-of 6 to 20 m, and lines of 10 to 30 m. A true event is one of a target of which the picture shows 6 px or more then: its
-place has been 0.5 m or more on one side of the border, and is 0.5 m or more on the other side afterwards. What passes
-a border by less is neither missed nor false: places are not known better. A crowd's
-place is the mean of its people's, and does not count while people join it or leave it. A found event is right if a true
-one of the same kind is at the same zone within 3 s; each counts once. In the row of targets apart, true events of
-targets within 3 m of another (which count as one crowd with it) and the found ones that fit these do not count.
-Counts over time are how many targets are inside an area at each look, by the events; their error is the sum of all
-differences by that of the true numbers. --cache FILE keeps finished cases.
+Each run of a scenario has random zones on the ways of its crowds and cars: rectangles with sides of 6 to 20 m, and
+lines of 10 to 30 m. In a true event, a target's place was at least 0.5 m on one side of the border and is at least
+0.5 m on the other side afterwards, and the picture shows at least 6 px of the target. Smaller motion across a border is
+neither missed nor false, because places are not known better. A crowd's place is the mean of its people's places. It
+does not count while people join or leave. A found event is right if a true event of the same kind is at the same zone
+within 3 s. Each event counts once. In the row of targets apart, true events of targets within 3 m of another target
+(which form one crowd with it) and the matching found events do not count. Counts over time are the numbers of targets
+inside an area at each look, by the events. Their error is the sum of all differences divided by the sum of the true
+numbers. --cache FILE keeps finished cases.
 """
 
 from collections import defaultdict
@@ -38,20 +38,20 @@ TRUE, APART = "all, by true places", "all, targets apart"
 KINDS = ("enter", "leave", "cross")
 WITHIN_S, FEWEST_PX, NOISE_M = 3.0, 6, 0.15
 CLEAR_M, JOIN_M = 0.5, 3.0
-"""CLEAR_M: who stands nearer to a border has not passed it. JOIN_M: `crowds.join_m` of simulated teams."""
+"""CLEAR_M: least distance from a border after passing it. JOIN_M: `crowds.join_m` of simulated teams."""
 
 Case = dict[str, Any]
 Ways = dict[int, list[tuple[float, np.ndarray, int, bool]]]
-"""Of each true target while it is in the picture: time, place in metres of the world, number of bodies, and whether all
-others are more than JOIN_M away."""
+"""{target: records while it is in the picture}: time, place in metres of the world, number of bodies, and whether all
+other targets are more than JOIN_M away."""
 Crowds = list[tuple[float, dict[int, int]]]
-"""Times, and the true crowd of each person by number."""
+"""Times, and {person number: true crowd} at each time."""
 
 
 def measure(options: bench.Options) -> tuple[str, Any]:
-    """Precision and recall of events, and the error of counts, by scenario.
+    """Measure precision and recall of events, and the error of counts, by scenario.
 
-    --every: look at every frame, in place of those that the feedback loop chooses.
+    --every: process every frame instead of the frames that the feedback loop chooses.
     """
     cases = [
         {"scenario": name, "seed": seed, "every": options.every}
@@ -83,9 +83,9 @@ def measure(options: bench.Options) -> tuple[str, Any]:
 
 
 def watch(case: Case) -> Case:
-    """`run`: the figures of a run from video. `true`: those of true places, as in `place_truly`.
+    """Return `run`: the figures of a run from video, and `true`: those of true places, as in `place_truly`.
 
-    Of each kind of event how many are right, found and true; of counts how far they are off; errors of times.
+    The figures are the numbers of right, found and true events of each kind, the errors of counts, and errors of times.
     """
     results, ways, origin, _ = fly(case)
     there = place_truly(results, ways, origin, np.random.default_rng(case["seed"]))
@@ -95,7 +95,7 @@ def watch(case: Case) -> Case:
 def place_truly(
     results: list[FrameResult], ways: Ways, origin: tuple[float, float], rng: np.random.Generator
 ) -> list[FrameResult]:
-    """The same looks as if each target were found and kept its identity; places are off by NOISE_M along each axis."""
+    """Return the looks as if every target was found and kept its identity. Places have NOISE_M of noise per axis."""
     placed = []
     for result in results:
         assert result.locations is not None
@@ -114,7 +114,7 @@ def place_truly(
 
 
 def fly(case: Case) -> tuple[list[FrameResult], Ways, tuple[float, float], Crowds]:
-    """A run of a shipped scenario as `dddas run sim:NAME` does it: results without pictures, and the truth."""
+    """Run a shipped scenario as `dddas run sim:NAME` does. Return results without pictures, and the truth."""
     cv2.setNumThreads(1)
     scenario = load_scenario(case["scenario"], (), case["seed"])
     own = scenario_settings(scenario)
@@ -155,7 +155,7 @@ def _add_truth(ways: Ways, truth: Truth) -> None:
 
 
 def score(results: list[FrameResult], ways: Ways, origin: tuple[float, float], seed: int, number: int = 10) -> Case:
-    """The figures of a run with so many random areas, and as many lines."""
+    """Return the figures of a run with `number` random areas and as many lines."""
     rng = np.random.default_rng(seed)
     at = np.array([place for way in ways.values() for _, place, *_ in way])
     shapes: dict[str, np.ndarray] = {}
@@ -218,7 +218,7 @@ def _count_inside(
     shapes: dict[str, np.ndarray],
     areas: Iterable[str],
 ) -> tuple[int, int]:
-    """By how much the targets inside the areas are counted wrong, over all looks, and how many there truly are."""
+    """Return the sum over all looks of the errors of counts inside the areas, and of the true counts."""
     off = count = 0
     for result in results:
         assert result.locations is not None
@@ -233,9 +233,9 @@ def _count_inside(
 
 
 def _true_events(ways: Ways, shape: np.ndarray, is_area: bool) -> tuple[list[tuple[str, str, float, bool, bool]], int]:
-    """Kind, direction, time of the true events at a zone, whether the target was apart, and whether it passed clearly.
+    """Return the true events at a zone: kind, direction, time, whether the target was apart and passed clearly.
 
-    Also how many targets were clearly at the zone.
+    Also return the number of targets that were clearly at the zone.
     """
     edges, events, count = geometry.edges_of([shape], closed=is_area), [], 0
     for way in ways.values():
@@ -245,7 +245,7 @@ def _true_events(ways: Ways, shape: np.ndarray, is_area: bool) -> tuple[list[tup
         own, net, passed, side = [], 0, None, None
         for k, (before, now) in enumerate(pairwise([(way[0][0], places[0], *way[0][2:]), *way])):
             crossed, _ = geometry.crossings(before[1], now[1], edges)
-            if before[2] != now[2] or now[0] - before[0] > 1.0:  # people have joined or left, or it was away
+            if before[2] != now[2] or now[0] - before[0] > 1.0:  # people joined or left, or the target was away
                 net, passed, side = 0, None, None
             elif crossed:
                 net, passed = net + crossed, (now[0], before[3] and now[3])

@@ -1,11 +1,11 @@
-"""Does this board keep up? Latency of the onboard chain, of the graphs, and what memory it takes; no torch needed.
+"""Check whether a board keeps up: latency of the onboard chain and the graphs, and peak memory. Needs no torch.
 
 usage: python export/check_latency.py [CLIP] [--size 640x480] [--config fast] [--rate 25] [--frames 100] [--people]
 
-Run it where the package is installed. CLIP is a video or a folder of pictures; without one the project's
-own scene is rendered at --size. Told are milliseconds a frame, the middle, the 95th and the 99th of a hundred and the
-worst, beside the time that --rate leaves; the time of one set of landmarks through the homography graph; the peak
-memory. Exit code 0 if the 99th of a hundred fits the rate, 1 if not.
+Run it where the package is installed. CLIP is a video or a folder of pictures. Without CLIP, the project's own scene
+is rendered at --size. The script prints milliseconds per frame (median, 95th and 99th percentile, maximum) beside the
+time that --rate leaves, the time of one set of landmarks through the homography graph, and the peak memory.
+The exit code is 0 if the 99th percentile fits the rate, else 1.
 """
 
 import argparse
@@ -32,7 +32,7 @@ WARM_UP = 10
 
 
 def pictures(clip: str | None, size: tuple[int, int], count: int) -> Iterator[np.ndarray]:
-    """Decoded frames, the clip forwards and backwards for as long as it takes."""
+    """Yield `count` decoded frames. The clip is played forwards and backwards until there are enough."""
     if clip is None:
         held = [image for image, _ in film(load_scenario("demo"), 0, 20, size)]
     else:
@@ -42,20 +42,20 @@ def pictures(clip: str | None, size: tuple[int, int], count: int) -> Iterator[np
 
 
 def spent_ms(work: Callable[[], object]) -> float:
-    """Of one call, by the clock: what a pilot waits."""
+    """Return the wall-clock time of a call, milliseconds."""
     start = time.perf_counter()
     work()
     return 1e3 * (time.perf_counter() - start)
 
 
 def told(name: str, ms: list[float]) -> str:
-    """A line."""
+    """Return the line to print about the times of a stage."""
     middle, most, nearly, worst = np.percentile(ms, [50, 95, 99, 100])
     return f"{name:24s} {middle:8.2f} {most:8.2f} {nearly:8.2f} {worst:8.2f}"
 
 
 def homography_ms() -> list[float]:
-    """Six landmarks, over and over."""
+    """Return the times of repeated homographies from six landmarks."""
     solver, weight = load_solver("onboard"), np.ones((1, 6))
     ground = np.array([[[0.0, 0], [10, 0], [10, 8], [0, 9], [4, 5], [7, 3]]])
     image = 40 * ground + [100.0, 50.0]
@@ -63,7 +63,7 @@ def homography_ms() -> list[float]:
 
 
 def people_ms(images: list[np.ndarray]) -> list[float]:
-    """All windows of whole pictures on all levels: the dearest search there is."""
+    """Return the times of the most expensive search: all windows of all levels of whole pictures."""
     from torchvision_dddas.people.classifiers import read_classifier
     from torchvision_dddas.people.pyramid import everywhere
 
@@ -74,7 +74,7 @@ def people_ms(images: list[np.ndarray]) -> list[float]:
 
 
 def checked(options: argparse.Namespace) -> bool:
-    """Measure and print; whether the rate is kept."""
+    """Measure and print. Return whether the chain keeps the rate."""
     width, _, height = options.size.partition("x")
     settings = load_config(options.config, [])
     loop = MotionDetector(settings, backend="onboard", rate_hz=options.rate)

@@ -1,8 +1,8 @@
-"""Make the table of the geoid that the package carries: `python export/geoid_table.py`, after `pip install egm96`.
+"""Make the package's table of the geoid: `python export/geoid_table.py`, after `pip install egm96`.
 
-The undulations are those of EGM96 (NGA, NASA and Ohio State University; public domain), on a grid of 5 minutes as the
-package egm96 0.3.0 (MIT) carries them. Every 2 degrees one of them is kept, in decimetres. The script prints the error
-of the bilinear interpolation against the whole grid, weighted by area.
+The undulations are those of EGM96 (NGA, NASA and Ohio State University; public domain), on a grid of 5 minutes, from
+the package egm96 0.3.0 (MIT). The table keeps one undulation every 2 degrees, in decimetres. The script prints the
+error of the bilinear interpolation against the whole grid, weighted by area.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ STEP_DEG = 2
 def main() -> None:
     longitude, latitude = np.meshgrid(np.arange(-180, 180, STEP_DEG), np.arange(-90, 91, STEP_DEG))
     decimetres = np.round(10 * np.asarray(undulation(latitude, longitude))).astype(np.int16)
-    # Differences between neighbours are small numbers, which take a quarter less space.
+    # Store differences between neighbours. They are small numbers and take a quarter less space.
     np.savez_compressed(Path(geoid.TABLE), east_steps=np.diff(decimetres, axis=1, prepend=0))
     geoid.load_table.cache_clear()
     longitude, latitude = np.meshgrid(np.arange(-180, 180, 0.25), np.arange(-89.875, 90, 0.25))

@@ -1,19 +1,19 @@
-"""Train a linear SVM for people on your own pictures: the file that `--set people.classifier=FILE` takes.
+"""Train a linear SVM for people on your own pictures, and write the file for `--set people.classifier=FILE`.
 
 usage: python export/train_people.py POSITIVES NEGATIVES --out FILE.npz [--set people.window_width_px=32 ...]
 
-POSITIVES: a folder of crops, one person each, centred, with the margin around the body that windows shall have; of
-crops with more around them, `--crop 64x128` takes that much in the middle. NEGATIVES: a folder of pictures of anything
-else. It needs the extras `torch` and `train`. What it does:
+POSITIVES: a folder of crops. Each crop shows one centred person with the margin that windows have. `--crop 64x128` cuts
+the middle out of larger crops. NEGATIVES: a folder of pictures without people. The script needs the extras `torch` and
+`train`. Its steps:
 
-1. descriptors of the positives and their mirror images, and of random windows of the negatives, on every level;
-2. C by cross-validation (average precision), where --c does not give it;
-3. rounds of hard negatives: the windows of the negatives that the last classifier takes for people join them;
-4. accuracy, and windows missed against false ones, on a share of both folders that took no part in 1 to 3.
+1. Compute descriptors of the positives and their mirror images, and of random windows of the negatives on all levels.
+2. Choose C by cross-validation (average precision), unless --c gives it.
+3. Mine hard negatives in rounds: add the windows of the negatives that the last classifier takes for people.
+4. Measure accuracy, and missed windows against false windows, on a share of both folders that steps 1 to 3 leave out.
 
-The descriptor is that of the people settings, which the file tells of; use it with the same ones. Where the body lies
-in the window (people.height_share and its like) is that of your crops, and the score at which people are likely
-(people.probability_even) that of your data. The same pictures, settings and --seed give the same file.
+The descriptor follows the people settings, which the file records. Use the file with the same settings. Set
+people.height_share and the other shares of the body in the window from your crops, and people.probability_even from
+your data. The same pictures, settings and --seed give the same file.
 """
 
 import argparse
@@ -43,7 +43,7 @@ from torchvision_dddas.types import LinearSvm, Part
 
 CHOICES = (0.003, 0.01, 0.03, 0.1, 0.3)
 BATCH = 256
-# Mining and measuring go through the pyramid in steps of at least this: windows of closer levels are much the same.
+# Least step of the pyramid in mining and measuring, because windows of closer levels are similar.
 STEP = 1.2
 FALSE_PER_WINDOW = (1e-3, 1e-4, 1e-5)
 MOST_WINDOWS = 100_000  # 1.5 GB of descriptors
@@ -51,10 +51,10 @@ MOST_WINDOWS = 100_000  # 1.5 GB of descriptors
 
 @dataclass(frozen=True)
 class Plan:
-    """How to train. negatives: random windows at first. rounds, hard: of mining, and windows a picture in each.
+    """Training options. negatives: random windows at the start. rounds: rounds of mining. hard: windows per picture.
 
-    c: of the SVM, or None to choose it. margin: windows of the negatives above this score are hard ones. held_out:
-    share of either folder that is only measured on.
+    c: C of the SVM, or None to choose it. margin: negative windows above this score are hard. held_out: share of each
+    folder that is used for measuring only.
     """
 
     negatives: int = 3000
@@ -67,14 +67,14 @@ class Plan:
 
 
 class Trained(NamedTuple):
-    """A classifier, and what was found on the way, to print."""
+    """A classifier, and lines about the training to print."""
 
     svm: LinearSvm
     lines: list[str]
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Train and write. Exit code 2, with one line, for bad input."""
+    """Train and write. Return 2, with one line, for bad input."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("positives", type=Path)
     parser.add_argument("negatives", type=Path)
@@ -94,7 +94,7 @@ def main(words: Sequence[str] | None = None) -> int:
         plan = Plan(options.windows, options.rounds, c=options.c, held_out=options.held_out, seed=options.seed)
         check(plan)
         check_out(options.out, (options.positives, options.negatives))
-        _sklearn("svm")  # better missed before the work than after it
+        _sklearn("svm")  # fail early if scikit-learn is missing
         people = crops(options.positives, parameters, size_of(options.crop) if options.crop else None)
         rest = pictures(options.negatives, parameters)
         trained = train(people, rest, parameters, plan, options.quiet)
@@ -113,7 +113,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def check(plan: Plan) -> None:
-    """Raises InputError where a number makes no sense."""
+    """Raise InputError for a number outside its range."""
     for name, value, fine, wanted in (
         ("--windows", plan.negatives, 1 <= plan.negatives <= MOST_WINDOWS, f"1 to {MOST_WINDOWS}"),
         ("--seed", plan.seed, 0 <= plan.seed < 2**32, "0 or more, below 2 to the 32nd"),
@@ -126,7 +126,7 @@ def check(plan: Plan) -> None:
 
 
 def check_out(path: Path, folders: Sequence[Path]) -> None:
-    """Raises InputError where the file cannot be written or would lie among the pictures: before hours of work."""
+    """Raise InputError early if the file cannot be written or would lie among the pictures."""
     refuse_folder(path)
     place = Path(os.path.realpath(path)).parent
     if among := [folder for folder in folders if place.is_relative_to(os.path.realpath(folder))]:
@@ -142,7 +142,7 @@ def check_out(path: Path, folders: Sequence[Path]) -> None:
 
 
 def files(folder: Path) -> list[Path]:
-    """The images of a folder and of those in it, by name. Raises InputError if there are none."""
+    """Return the images of a folder and its subfolders, sorted by name. Raises InputError if there are none."""
     if not folder.is_dir():
         raise InputError(f"{folder} is no folder; wanted one that holds images")
     found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
@@ -152,7 +152,7 @@ def files(folder: Path) -> list[Path]:
 
 
 def picture(path: Path) -> np.ndarray:
-    """uint8 (H, W, 3) BGR. Raises InputError where it cannot be decoded."""
+    """Read a picture, uint8 (H, W, 3) BGR. Raises InputError if it cannot be decoded."""
     image = cv2.imread(utf8_name(path), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"{path} cannot be decoded; repair it or leave it out")
@@ -160,7 +160,7 @@ def picture(path: Path) -> np.ndarray:
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """(width, height) of `64x128`."""
+    """Parse a size such as `64x128` to (width, height)."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise InputError(f"--crop is '{text}'; wanted width x height in pixels, such as 64x128")
@@ -168,15 +168,15 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 def crops(folder: Path, parameters: PeopleParameters, crop: tuple[int, int] | None = None) -> np.ndarray:
-    """(N, h + 2, w + 2, 3) uint8: the windows of a folder's crops with their neighbours, resized as a scan would.
+    """Return (N, h + 2, w + 2, 3) uint8 windows of a folder's crops with a border of one pixel, resized as in a scan.
 
-    Raises InputError: a crop of less than half the window's size, which would be a blur, or smaller than `crop`.
+    Raises InputError for a crop smaller than `crop` or than half the window, which would be blurred.
     """
     return np.stack([window(picture(path), path, parameters, crop) for path in files(folder)])
 
 
 def window(image: np.ndarray, path: Path, parameters: PeopleParameters, crop: tuple[int, int] | None) -> np.ndarray:
-    """The middle of a picture as a window with one pixel around it."""
+    """Return the middle of a picture as a window with a border of one pixel."""
     size, wanted = image.shape[1::-1], (parameters.window_width_px, parameters.window_height_px)
     crop = crop or size
     if crop[0] > size[0] or crop[1] > size[1]:
@@ -193,12 +193,12 @@ def window(image: np.ndarray, path: Path, parameters: PeopleParameters, crop: tu
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """A level of the pyramid, as the recognizer makes it."""
+    """Return a level of the pyramid as in the recognizer."""
     return image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 def bordered(level: np.ndarray, place: Part) -> np.ndarray:
-    """A window of a level with one pixel around it; the level is reflected (101) beyond its edge."""
+    """Return a window of a level with a border of one pixel. The level is reflected (101) beyond its edge."""
     rows, columns = (
         np.arange(begin - 1, begin + length + 1) for begin, length in ((place.y, place.height), (place.x, place.width))
     )
@@ -212,7 +212,7 @@ def _reflected(index: np.ndarray, length: int) -> np.ndarray:
 
 
 def pictures(folder: Path, parameters: PeopleParameters) -> list[np.ndarray]:
-    """The pictures of a folder that hold a window. Raises InputError if none does."""
+    """Return the pictures of a folder that are as large as a window. Raises InputError if there are none."""
     every = [picture(path) for path in files(folder)]
     held = [
         image
@@ -232,7 +232,7 @@ def pictures(folder: Path, parameters: PeopleParameters) -> list[np.ndarray]:
 
 
 def descriptors(windows: np.ndarray, parameters: PeopleParameters) -> np.ndarray:
-    """(N, F) float32 in OpenCV's order, of (N, h + 2, w + 2, 3) windows with one pixel around them."""
+    """Return descriptors (N, F) float32, in OpenCV's order, of windows (N, h + 2, w + 2, 3) with a border of 1 px."""
     layout = descriptor(parameters)
     (across, down), cells = layout.blocks, layout.cells
     found = [np.zeros((0, layout.features), np.float32)]
@@ -248,7 +248,7 @@ def descriptors(windows: np.ndarray, parameters: PeopleParameters) -> np.ndarray
 def random_windows(
     images: Sequence[np.ndarray], parameters: PeopleParameters, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """(count, h + 2, w + 2, 3) windows of any picture, level and place; coarse levels as often as fine ones."""
+    """Return windows (count, h + 2, w + 2, 3) of random pictures, levels and places. All levels are equally likely."""
     found = []
     for index in np.sort(rng.integers(0, len(images), count)):
         image = images[index]
@@ -265,7 +265,7 @@ def _somewhere(image: np.ndarray, parameters: PeopleParameters, rng: np.random.G
 
 
 def cut(image: np.ndarray, places: Sequence[Part]) -> list[np.ndarray]:
-    """Windows of a picture with one pixel around them."""
+    """Return windows of a picture with a border of one pixel."""
     kept: dict[tuple[int, int], np.ndarray] = {}
     for place in places:
         if place.level not in kept:
@@ -276,7 +276,7 @@ def cut(image: np.ndarray, places: Sequence[Part]) -> list[np.ndarray]:
 def scored(
     images: Sequence[np.ndarray], recognizer: TorchScorer, parameters: PeopleParameters
 ) -> Iterator[tuple[list[Part], list[np.ndarray]]]:
-    """The parts and score maps of each picture, on levels STEP apart."""
+    """Yield the parts and score maps of each picture, on levels STEP apart."""
     parameters = parameters.model_copy(update={"scale_step": max(parameters.scale_step, STEP)})
     for image in images:
         parts = everywhere(image.shape[1::-1], parameters)
@@ -286,7 +286,7 @@ def scored(
 def hardest(
     parts: Sequence[Part], maps: Sequence[np.ndarray], parameters: PeopleParameters, above: float, count: int
 ) -> list[Part]:
-    """The windows that score highest, and above a number, best first."""
+    """Return up to `count` windows with the highest scores above a limit, best first."""
     places = [np.argwhere(scores > above) for scores in maps]
     values = np.concatenate([scores[scores > above] for scores in maps])
     of = np.repeat(np.arange(len(maps)), [len(place) for place in places])
@@ -306,9 +306,9 @@ def hardest(
 def train(
     people: np.ndarray, rest: Sequence[np.ndarray], parameters: PeopleParameters, plan: Plan, quiet: bool = False
 ) -> Trained:
-    """A classifier of windows (as of `crops`) against all windows of pictures.
+    """Train a classifier of people (windows as from `crops`) against all windows of other pictures.
 
-    Raises InputError where there is too little of either, or scikit-learn is missing.
+    Raises InputError if there are too few windows or pictures, or if scikit-learn is missing.
     """
     rng = np.random.default_rng(plan.seed)
     people, tested = split(people, plan.held_out, rng, "positives")
@@ -333,7 +333,7 @@ def train(
 
 
 def split(items: np.ndarray, share: float, rng: np.random.Generator, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Items to learn from, and those to measure on. Raises InputError where too few remain."""
+    """Split items into a part for training and a part for measuring. Raises InputError if too few remain."""
     order = rng.permutation(len(items))
     aside = round(share * len(items))
     if len(items) - aside < (2 if name == "positives" else 1):
@@ -342,14 +342,14 @@ def split(items: np.ndarray, share: float, rng: np.random.Generator, name: str) 
 
 
 def mirrored(windows: np.ndarray) -> np.ndarray:
-    """The windows, and after them their mirror images."""
+    """Return the windows, followed by their mirror images."""
     return np.concatenate([windows, windows[:, :, ::-1]])
 
 
 def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[str]) -> float:
-    """C by cross-validation in which a person and its mirror image stay together; the smallest that is as good.
+    """Choose C by cross-validation: the smallest of equally good values. A person and its mirror image share a fold.
 
-    Raises InputError where there are too few to part.
+    Raises InputError if there are too few people for the folds.
     """
     model_selection, metrics = _sklearn("model_selection"), _sklearn("metrics")
     x = np.concatenate([positive, negative])
@@ -358,7 +358,7 @@ def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[st
     groups = np.concatenate([np.tile(np.arange(half), 2), half + np.arange(len(negative))])
     folds = min(4, half)
     every = model_selection.GroupKFold(folds, shuffle=True, random_state=seed).split(x, y, groups)
-    # Of few pictures a fold may hold people alone, or none.
+    # With few pictures, a fold may hold only people or no people.
     parts = [one for one in every if all(len(np.unique(y[rows])) == 2 for rows in one)]
     if not parts:
         raise InputError(f"{half} people and {len(negative)} windows are too few to choose C by; give more, or --c")
@@ -376,7 +376,7 @@ def choose(positive: np.ndarray, negative: np.ndarray, seed: int, lines: list[st
 
 
 def fit(positive: np.ndarray, negative: np.ndarray, c: float, seed: int) -> LinearSvm:
-    """A linear SVM with the hinge loss squared, both classes of equal weight in sum."""
+    """Fit a linear SVM with squared hinge loss. Both classes have the same total weight."""
     svm = _sklearn("svm")
     model = svm.LinearSVC(C=c, class_weight="balanced", dual=True, random_state=seed, max_iter=20_000)
     x = np.concatenate([positive, negative])
@@ -387,7 +387,7 @@ def fit(positive: np.ndarray, negative: np.ndarray, c: float, seed: int) -> Line
 def mine(
     images: Sequence[np.ndarray], parameters: PeopleParameters, svm: LinearSvm, plan: Plan, name: str, quiet: bool
 ) -> np.ndarray:
-    """(N, F) descriptors of the windows that a classifier wrongly takes for people, on every level."""
+    """Return (N, F) descriptors of the windows that a classifier wrongly takes for people, on every level."""
     recognizer = TorchScorer(parameters, svm)
     found = [np.zeros((0, svm.weights.size), np.float32)]
     with progress(name, len(images), quiet) as tick:
@@ -400,7 +400,7 @@ def mine(
 
 
 def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], parameters: PeopleParameters) -> list[str]:
-    """Lines on pictures that took no part in the training."""
+    """Return lines about the accuracy on pictures that the training left out."""
     if not len(people) or not len(rest):
         return ["nothing was held out, so nothing was measured"]
     score = descriptors(people, parameters) @ svm.weights + svm.bias
@@ -423,13 +423,13 @@ def measured(svm: LinearSvm, people: np.ndarray, rest: Sequence[np.ndarray], par
 
 
 def write(path: Path, svm: LinearSvm, parameters: PeopleParameters) -> None:
-    """As .npz with the layout, else as text that tells it in its comments. Raises InputError if the disk refuses."""
+    """Write .npz with the layout, or text with the layout in comments. Raises InputError if writing fails."""
     import io
 
     layout = parameters.descriptor
     held = io.BytesIO()
     if path.suffix.lower() == ".npz":
-        # The format keeps no names of its own in `layout`, so arrays of the same name do.
+        # The format has no record for `layout`, so store each value as an array of its name.
         arrays: dict[str, Any] = {name: np.asarray(value) for name, value in layout.items()}
         np.savez(held, weights=svm.weights, bias=np.float32(svm.bias), **arrays)
     else:
@@ -444,7 +444,7 @@ def write(path: Path, svm: LinearSvm, parameters: PeopleParameters) -> None:
 
 
 def _sklearn(name: str) -> Any:
-    """A module of scikit-learn. Raises InputError where it is not installed."""
+    """Return a module of scikit-learn. Raises InputError if it is not installed."""
     import importlib
 
     try:
