@@ -130,7 +130,7 @@ CASES = [
     ("colours view.png --out view.toml", "is a file that this run writes"),
     ("colours text.png", "text.png is not a whole picture"),
     ("colours nothing.png", "cannot be read"),
-    ("colours grey.png", "has no colours"),
+    ("colours grey.png", "is not a colour picture"),
     ("simulate nowhere", "no scenario is named 'nowhere'; choose from border100, border200"),
     ("simulate joining --set uav.altitud_m=3", "unknown parameter 'uav.altitud_m'; did you mean uav.altitude_m"),
     ("simulate joining --set team.ugvs=3", "scenario joining: team.ugvs must be 4 or more in a clip located by"),

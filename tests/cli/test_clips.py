@@ -283,7 +283,7 @@ MOVING = "frame,target,x_px,y_px,width_px,height_px,score,kind\n"
 MOVING += "".join(f"{n},1,{4 + n},10,8,24,0.41,moving\n" for n in range(1, 6))
 NOTED = {
     "moving targets": (MOVING, "note: all rows are moving targets of dddas detect", 0.41),
-    "SVM margins": (walker(range(1, 6)).replace("0.95", "43.332"), "scores from 43.332 to 43.332 are no prob", 43.332),
+    "SVM margins": (walker(range(1, 6)).replace("0.95", "43.332"), "scores from 43.332 to 43.332 are not prob", 43.332),
     "unlikely rows": (
         walker(range(1, 6)) + walker(range(1, 6), x=40).replace("0.95", "0.05"),
         "10 detections, 1 identities, 5 detections without one",

@@ -48,7 +48,7 @@ def locate(dddas, file, out):
 
 def test_tracks_become_positions_with_covariances(locate, out, tmp_path):
     said = locate(tracks(camera()))
-    left = "no pitch_deg: level is assumed; no heading_deg: north is assumed; no place: 0, 0 is assumed"
+    left = "no pitch_deg: a level camera is assumed; no heading_deg: north is assumed; no place: 0, 0 is assumed"
     assert said.splitlines() == [
         "3 frames, 6 sightings (6 by height and feet, 0 by height, 0 by feet alone), 6 positions",
         f"note: {tmp_path / 'c0.toml'} has {left}",

@@ -38,8 +38,8 @@ def test_the_least_that_a_camera_needs(write):
     assert math.isnan(camera.height_m) and camera.heading_rad == camera.pitch_rad == camera.k1 == 0
     assert read_camera_keys(write("width_px = 640")) == {"width_px": 640}
     assert describe_missing(write("width_px = 640")).endswith(
-        " has no height_m: distances by the foot row are unknown; no pitch_deg: level is assumed; no heading_deg: "
-        "north is assumed; no place: 0, 0 is assumed"
+        " has no height_m: distances from the foot row are unknown; no pitch_deg: a level camera is assumed; "
+        "no heading_deg: north is assumed; no place: 0, 0 is assumed"
     )
 
 
@@ -84,7 +84,7 @@ def test_every_key_reaches_the_camera(write):
         ("width_px = 640\nheight_px = 480", "has no focal length (focal_px). `dddas calibrate` finds it"),
         (LEAST + "hfov_deg = 60", "both focal_px and hfov_deg; give one"),
         ("focal_px = 1000", "lacks width_px, height_px"),
-        (LEAST + "focal = 3", "has the key focal, which no camera has; did you mean focal_px"),
+        (LEAST + "focal = 3", "has the unknown key focal; did you mean focal_px"),
         (LEAST + "height_m = -1", "height_m is -1; wanted a number from 0.01 to 1000"),
         (LEAST + 'pitch_deg = "down"', "pitch_deg is 'down'; wanted a number from -89 to 89"),
         (LEAST + "heading_deg = true", "heading_deg is True; wanted a number"),
@@ -151,7 +151,7 @@ def test_measurements_are_known_by_their_columns(write):
         (read_poses, "frame,east_m\n1,2\n", "wanted east_m and north_m together"),
         (read_poses, "frame,east_m,north_m,longitude_deg,latitude_deg\n1,2,3,4,5\n", "in degrees or in metres"),
         (read_poses, "frame,heading_deg\n", "a header but no rows"),
-        (read_poses, "frame,heading_deg\n1,2\n1,3\n", "line 3: frame goes from 1 to 1; wanted each after"),
+        (read_poses, "frame,heading_deg\n1,2\n1,3\n", "line 3: frame goes from 1 to 1; wanted rising values"),
         (read_poses, "frame,heading_deg\n1,north\n", "line 2: heading_deg is 'north'; wanted a number from -360"),
         (read_poses, "frame,pitch_deg\n1\n", "line 2: pitch_deg is missing: the line ends before it"),
         (read_poses, "frame,heading_deg,heading_deg\n1,2,3\n", "heading_deg is named twice"),

@@ -124,7 +124,7 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
     few = np.arange(1, 31)
     assert boxes(few, few, 0.5).extent == (27, 27)
     assert boxes(few[1:], few[1:], 0.5).extent is boxes(few, few, 0.4).extent is None
-    # Where scores are no probabilities, every row counts.
+    # Where scores are not probabilities, every row counts.
     assert boxes(few, few, -0.4).extent == boxes(few, few, 0.4, own=True).extent == (27, 27)
 
 
@@ -149,7 +149,7 @@ def test_the_extent_comes_from_thirty_likely_boxes_without_three_stray_ones():
         ("frame,x,y\n1,2,3", "lacks x_px, y_px, width_px, height_px; its columns are frame, x, y"),
         ("hello world", "its columns are hello world"),
         (f"{NAMED}\n1,2,3,4", "line 2: 4 columns; the first line names 5"),
-        (f"{NAMED},cut\n1,0,0,5,5,maybe\n", "line 2: cut is 'maybe'; wanted 1 where"),
+        (f"{NAMED},cut\n1,0,0,5,5,maybe\n", "line 2: cut is 'maybe'; wanted 1 if the border"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_file_and_line(refused, text, words):
@@ -283,7 +283,7 @@ def test_labels_of_a_folder_in_pixels_are_centre_and_size_or_refused(tmp_path):
     assert "centre and size in pixels" in " ".join(table.notes)
     for k in range(8):
         (tmp_path / f"img_{k:03d}.txt").write_text(f"2 {60 + 9 * k} {70 + 5 * k} {80 + 9 * k} {90 + 5 * k} 0.9\n")
-    with pytest.raises(InputError, match="corners; pass --box-format xyxy if so"):
+    with pytest.raises(InputError, match="corners; pass --box-format xyxy if they are"):
         read_detections(tmp_path, order=None, size=SHAPE)
     table = read_detections(tmp_path, order="xyxy", size=SHAPE)
     np.testing.assert_allclose(table.box_px[0], [60, 70, 20, 20])
@@ -365,7 +365,7 @@ OWN = replace(rows_on([1, 2, 3], score=0.5), own=True)
         (rows_on([1, 2, 3, 4, 5, 6, 6]), 5, None, ["4 of 7 rows lie on frames that --interval 5 leaves out"]),
         (rows_on([1, 6, 21]), 1, None, ["--interval 5 if"]),
         (rows_on([1, 6]), 1, None, []),  # two frames do not show an interval
-        (rows_on([1, 2, 3], score=43.3), 1, None, ["from 43.3 to 43.3 are no probabilities"]),
+        (rows_on([1, 2, 3], score=43.3), 1, None, ["from 43.3 to 43.3 are not probabilities"]),
         (OWN, 1, None, ["all rows are moving targets of dddas detect: every row counts as certain"]),
         (rows_on([]), 1, clip(5), ["detections det.txt holds no rows"]),
         *(
@@ -383,7 +383,7 @@ def test_what_is_left_out_or_read_in_an_unexpected_way_is_noted(table, interval,
 def test_a_table_of_another_clip_or_interval_is_refused():
     with pytest.raises(InputError, match=r"det\.txt, line 3: .* frame 9 but walk\.mp4 ends after frame 5 \(2 of 4"):
         check_table(rows_on([1, 5, 6, 9]), 1, clip(5))
-    with pytest.raises(InputError, match=r"no row on frames 1, 6, 11, .* --interval 5 .* first is on frame 5"):
+    with pytest.raises(InputError, match=r"no row on frames 1, 6, 11, .* --interval 5 .* first row is on frame 5"):
         check_table(rows_on([5, 10, 15]), 5)
 
 

@@ -118,8 +118,8 @@ def test_positions_are_sorted_by_frame_and_what_is_not_there_is_unknown(table):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (LOCATED + "\n2,1,0,0,1,0,1,1\n1,1,0,0,-1,0,1,1\n", "line 3: -1, 0, 1 are no variances"),
-        (LOCATED + "\n1,1,0,0,1,5,1,1\n", "line 2: 1, 5, 1 are no variances"),
+        (LOCATED + "\n2,1,0,0,1,0,1,1\n1,1,0,0,-1,0,1,1\n", "line 3: -1, 0, 1 are not the variances"),
+        (LOCATED + "\n1,1,0,0,1,5,1,1\n", "line 2: 1, 5, 1 are not the variances"),
         (PLACES + "\n1,1,0,0,10,95\n", "line 2: latitude_deg is '95'; wanted a number from -90 to 90"),
         (PLACES + "\n2,1,0,0,10,50\n1,1,0,0,,\n", "line 3: no longitude_deg or latitude_deg, which other rows"),
     ],

@@ -33,7 +33,7 @@ def test_polygons_lines_and_their_properties_are_read(file):
     assert [[len(ring) for ring in area.rings] for area in (one, other)] == [[4], [3]], "areas of a zone may overlap"
     assert (one.name, other.name) == ("field #2", "field #3") and (line.name, line.is_line) == ("line 4", True)
     np.testing.assert_allclose(line.rings[0], RING[:3])
-    assert len(notes) == 3 and "field is there more than once" in notes[0] and "1 of its features" in notes[2]
+    assert len(notes) == 3 and "field occurs more than once" in notes[0] and "are left out: 1" in notes[2]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_kml_of_a_map_program_keeps_its_own_data_and_a_point_beside_an_area_is
     point = "<Point><coordinates>1,2</coordinates></Point>"
     text = f"<kml><Placemark>{data}<MultiGeometry><Polygon>{outline}</Polygon>{point}</MultiGeometry></Placemark></kml>"
     (zone,), notes = read_zones(file("zones.kml", text))
-    assert zone.dwell_s == 30 and "neither polygon nor line: 1 of its features" in notes[0]
+    assert zone.dwell_s == 30 and "neither polygon nor line are left out: 1" in notes[0]
 
 
 def test_a_unit_beside_the_features_is_that_of_the_coordinates(file):

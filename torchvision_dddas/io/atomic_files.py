@@ -23,11 +23,11 @@ with suppress(ImportError):  # without system locks, nothing is refused and no f
     import fcntl
 
 LOCK = ".dddas.lock"
-"""The file in a folder that its run has locked."""
+"""The name of the lock file that a run keeps in its folder."""
 
 _PART = re.compile(r"\.(.+)\.[0-9a-f]{16}\.part(\.\w+)?")
 _PATTERN = ".*.part*"
-# Folders in a run's folder that it writes into.
+# The folders inside a run's folder that the run writes into.
 _INNER = ("", "masks", "frames", "ground/*", "truth", "truth/masks")
 
 
@@ -50,7 +50,7 @@ class Part(Protocol[_Taken]):
 
 
 class PartFile:
-    """A file being written. path: its hidden name, random and unique to this process, with the final file's suffix.
+    """A file that is being written. path: its hidden name, unique to this process, with the final file's suffix.
 
     Raise OSError if it cannot be created.
     """
@@ -68,7 +68,7 @@ class PartFile:
             os.close(self._file)
 
     def write(self, content: bytes) -> None:
-        """Add bytes. Raise OSError."""
+        """Add bytes. Raise OSError if the disk refuses."""
         rest = memoryview(content)
         with self.naming():
             while rest:
@@ -80,7 +80,7 @@ class PartFile:
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Set this file's name in an OSError of the block that names no file."""
+        """Add this file's name to an OSError of the block, if the error has no file name."""
         try:
             yield
         except OSError as error:
@@ -88,7 +88,7 @@ class PartFile:
             raise
 
     def keep(self) -> None:
-        """Move the file to its place. Raise OSError."""
+        """Move the file to its place. Raise OSError if this fails."""
         self.path.replace(self.place)
         self._close()
 
@@ -104,7 +104,7 @@ class PartFile:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step. Raise OSError, and then leave neither a new file nor a temporary file."""
+    """Write a file in one step. Raise OSError if the disk refuses; then no new or temporary file remains."""
     part = PartFile(path)
     try:
         part.write(content)
@@ -124,7 +124,7 @@ def save_file(path: Path, content: bytes) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file if it exists and can be removed. Used while another error is being reported to the user."""
+    """Remove a file if it exists and can be removed. Callers use this while they report another error to the user."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
@@ -175,7 +175,7 @@ class ClaimedFolder:
                 raise InputError(
                     f"another run is writing into {self.folder}: wait for its end, or choose another folder with --out"
                 )
-            if has_lock is None or _is_at(file, path):  # otherwise the previous run removed the file meanwhile
+            if has_lock is None or _is_at(file, path):  # otherwise the previous run has removed this file
                 return file
             os.close(file)
 
@@ -201,7 +201,7 @@ class ClaimedFolder:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[ClaimedFolder]:
-    """Claim a folder for the block, and remove it afterwards if it is empty. Raise InputError."""
+    """Claim a folder for the block, and remove it afterwards if it is empty. Raise InputError as ClaimedFolder does."""
     claim = ClaimedFolder(folder)
     try:
         yield claim
@@ -229,9 +229,9 @@ def _is_at(file: int, path: Path) -> bool:
 
 
 def utf8_name(path: str | Path) -> str:
-    """Return a name for FFmpeg, which takes `word:` at the beginning for a protocol and needs UTF-8.
+    """Return a name that FFmpeg can open: UTF-8, without `word:` at the beginning, which FFmpeg reads as a protocol.
 
-    Other names may crash FFmpeg; for such a file the name is that of a link, which lasts as long as the process.
+    Other encodings may crash FFmpeg. For such a name, return a link to the file, which exists until the process ends.
     Raise InputError if the link cannot be made.
     """
     name = os.path.abspath(path) if ":" in str(path) else str(path)  # noqa: PTH100 (a link is not followed)
@@ -245,7 +245,7 @@ def utf8_name(path: str | Path) -> str:
             return _link(folder + b"/" + file)
         return f"{_link(folder)}/{file.decode()}"
     except (OSError, UnicodeEncodeError) as error:
-        raise InputError(f"{name} cannot be opened under that name ({error}); give it a plain one") from None
+        raise InputError(f"{name} cannot be opened under that name ({error}); give it a plain name") from None
 
 
 def _is_utf8(name: bytes) -> bool:
@@ -258,7 +258,7 @@ def _is_utf8(name: bytes) -> bool:
 
 @cache
 def _link(target: bytes) -> str:
-    """Return a plain name with the same suffix that links to a file or folder."""
+    """Return the path of a link to a file or folder. The path is ASCII and keeps the suffix."""
     ending = re.sub(r"[^\w.]", "", Path(os.fsdecode(target)).suffix, flags=re.ASCII)
     link = Path(_links().name) / f"{secrets.token_hex(8)}{ending}"
     link.symlink_to(os.fsdecode(target))
@@ -298,7 +298,7 @@ def refuse_folder(path: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> InputError:
-    """Return the InputError for a failed write of a file."""
+    """Return the InputError for a file that could not be written."""
     part = _PART.fullmatch(path.name)
     place = path if part is None else path.with_name(f"{part[1]}{part[2] or ''}")
     return InputError(

@@ -36,12 +36,12 @@ LIMITS: dict[str, tuple[float, float]] = {
 focal_v_px: focal length along the columns, if pixels are not square. centre_px: u, v of the optical axis. pitch_deg:
 positive down. roll_deg: clockwise. takeoff_above_sea_m: height of the take-off point of an aerial vehicle.
 elevation_m: height above the sea of the ground below a ground camera. k1, k2, k3: radial distortion, p1, p2: tangential
-distortion, as in OpenCV. The sigmas are standard deviations, of the focal length as a share. Defaults: 1 %, 0.05 m,
-0.5°, 2° (a compass) and 1.43 m (a GPS of 3.5 m in 95 %); for aerial cameras those of the group `aerial`.
+distortion, as in OpenCV. The sigmas are standard deviations; focal_sigma is a share of the focal length. Their defaults
+are 1 %, 0.05 m, 0.5°, 2° (a compass) and 1.43 m (a GPS). Aerial cameras have the defaults of the group `aerial`.
 """
 
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
-"""The keys of the distortion, in OpenCV's order."""
+"""The keys of the lens distortion, in OpenCV's order."""
 
 KEYS = (*LIMITS, "centre_px", "name")
 _SIZE = ("width_px", "height_px")
@@ -55,17 +55,17 @@ _FIELDS = (
 def read_camera_keys(
     path: str | Path, is_aerial: bool = False, content: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Read and check the keys of a camera's file, which may be incomplete. is_aerial: it may look straight down.
+    """Read and check the keys of a camera's file. Keys may be missing. is_aerial: the camera may look straight down.
 
-    content: the keys, if they are a table in another file; path then only names that file in messages.
-    Raise InputError with the file and the key: unreadable, not TOML, an unknown key, a value out of range.
+    content: the keys, if they are a table in another file; path is then used only in messages.
+    Raise InputError with the file and the key if the file is unreadable or not TOML, or a key or value is not allowed.
     """
     content = read_toml(path, "camera") if content is None else content
     for key in content:
         if key not in KEYS:
             near = get_close_matches(key, KEYS, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(KEYS)}"
-            raise InputError(f"camera {path} has the key {key}, which no camera has; {hint}")
+            hint = f"did you mean {near[0]}?" if near else f"the keys are {', '.join(KEYS)}"
+            raise InputError(f"camera {path} has the unknown key {key}; {hint}")
     limits = LIMITS | {"pitch_deg": (-90, 90)} if is_aerial else LIMITS
     for key, (low, high) in limits.items():
         value = content.get(key, low)
@@ -89,8 +89,8 @@ def describe_missing(camera: str | Path, poses: PoseTable | None = None, content
     """Return which keys a camera's file and its poses lack, and what is assumed instead; "" if nothing is missing."""
     given = {*read_camera_keys(camera, content=content), *(poses.values if poses is not None else ())}
     assumed = {
-        "no height_m: distances by the foot row are unknown": {"height_m"},
-        "no pitch_deg: level is assumed": {"pitch_deg"},
+        "no height_m: distances from the foot row are unknown": {"height_m"},
+        "no pitch_deg: a level camera is assumed": {"pitch_deg"},
         "no heading_deg: north is assumed": {"heading_deg"},
         "no place: 0, 0 is assumed": {"east_m", "longitude_deg"},
     }
@@ -109,7 +109,7 @@ def read_aerial_camera(path: str | Path, size_px: tuple[int, int] | None) -> Cam
 def read_camera(path: str | Path, *, content: dict[str, Any] | None = None) -> Camera:
     r"""Read a camera. content: as in `read_camera_keys`.
 
-    Raise InputError with the file and the key: unreadable, unknown, missing, out of range.
+    Raise InputError with the file and the key if the file is unreadable, or a key is unknown, missing or out of range.
 
     >>> lines = ["focal_px = 500", "width_px = 640", "height_px = 480", "height_m = 1.2", "east_m = 0", "north_m = 0"]
     >>> written = pathlib.Path("camera.toml").write_text("\n".join([*lines, "heading_deg = 90", "pitch_deg = 0"]))
@@ -180,10 +180,10 @@ POSES = Schema("poses", *(Column(name, "g", *LIMITS.get(name, (-1e12, 1e12))) fo
 
 
 def read_poses(path: str | Path) -> PoseTable:
-    r"""Read the poses of a camera: `frame` or `time_s`, and any other column of POSES; further ones are ignored.
+    r"""Read the poses of a camera from `frame` or `time_s` and the other columns of POSES. Ignore further columns.
 
-    Raise InputError with file and line: as read_table, no such column, half a place, no rows, a frame or time that
-    does not come after the one before.
+    Raise InputError with file and line as read_table does, and if no column of POSES, half a place or no row is given,
+    or if frames or times do not rise.
 
     >>> written = pathlib.Path("poses.csv").write_text("frame,heading_deg\n1,0\n2,5\n")
     >>> td.read_poses("poses.csv").values["heading_deg"]
@@ -207,7 +207,7 @@ def read_poses(path: str | Path) -> PoseTable:
     at = table[clock]
     if (is_back := np.diff(at) <= 0).any():
         row = int(is_back.argmax()) + 1
-        raise table.error(f"{clock} goes from {at[row - 1]:g} to {at[row]:g}; wanted each after the one before", row)
+        raise table.error(f"{clock} goes from {at[row - 1]:g} to {at[row]:g}; wanted rising values", row)
     return PoseTable(str(path), at, clock == "time_s", {name: table[name] for name in wanted})
 
 

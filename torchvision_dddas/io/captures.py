@@ -1,4 +1,4 @@
-"""Open videos, streams and cameras: through PyAV if it is installed; otherwise, and for cameras, through OpenCV."""
+"""Open videos and streams with PyAV if it is installed. Open cameras, and videos without PyAV, with OpenCV."""
 
 import os
 import time
@@ -19,17 +19,17 @@ from torchvision_dddas.io.atomic_files import utf8_name
 from torchvision_dddas.io.images import quiet_opencv
 from torchvision_dddas.memory import VIDEO, check_memory
 
-# FFmpeg renders any text file as an old terminal would. Such input is refused.
+# FFmpeg draws any text file as an old terminal would. Such input is refused.
 _TEXT_AS_VIDEO = {"ansi", "xbin", "bin ", "bintext"}
 # A stream is the cover of a file if it is marked as an attached picture, a thumbnail or a still image, or if it holds a
 # single picture in one of the codecs of pictures.
 _COVER_MARKS, _COVER_CODECS = 1024 | 2048 | 1048576, {"mjpeg", "png", "bmp", "webp", "gif", "tiff"}
-# FFmpeg's options for streams, `name;value|name;value`, from the variable that OpenCV reads, with OpenCV's default.
+# The variable with FFmpeg's options for streams, `name;value|name;value`, and its default. Both are as in OpenCV.
 _OPTIONS, _DEFAULT_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp"
 
 # Number of pictures after which a stream without key frames has replaced damaged content.
 _HEALED = 250
-# Number of pictures from whose time stamps a rate is measured, and the smallest sufficient number.
+# Number of pictures whose time stamps give a rate, and the smallest sufficient number of steps between time stamps.
 _MEASURED, _LEAST_MEASURED = 64, 8
 
 
@@ -47,7 +47,7 @@ def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | N
     """Open a file, a camera by its index, or a stream by its address.
 
     limits_s: timeouts for opening a stream and for reading from it. Without PyAV an address is refused, because OpenCV
-    (4.14) silently resizes pictures of another size to the size of the first one (OpenCV issue 27116).
+    (4.14) silently resizes pictures of another size to the size of the first picture (OpenCV issue 27116).
     Raise InputError if the target cannot be opened or is not a video.
     """
     if isinstance(target, str):
@@ -60,11 +60,11 @@ def open_capture(target: str | int, name: str, limits_s: tuple[float, float] | N
 
 
 def open_by_opencv(target: str | int, name: str) -> cv2.VideoCapture:
-    """Open a camera's index, or a file without PyAV, as open_capture does."""
+    """Open a camera by its index, or a file without PyAV. Arguments and errors are those of `open_capture`."""
     with quiet_opencv():
         if isinstance(target, int):
             capture = cv2.VideoCapture(target)  # a camera needs the system's own driver
-        else:  # back ends other than FFmpeg take a numbered image or a text file for a video
+        else:  # back ends other than FFmpeg would accept a numbered image or a text file as a video
             capture = cv2.VideoCapture(utf8_name(target), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(_refusal(target, name))
@@ -87,11 +87,11 @@ def is_cut_to_8_bits(capture: Capture) -> bool:
 
 
 class AvCapture:
-    """A file or stream through PyAV; arguments and errors as in `open_capture`. Pixels equal those of OpenCV.
+    """A file or stream, read by PyAV. Arguments and errors: as in `open_capture`. Pixels equal those of OpenCV.
 
     Pictures keep the size in which they were sent. If there are several video streams, the first that is not a cover is
-    read. concealed: whether the last grabbed picture has errors that the decoder concealed, or damaged data.
-    damaged: whether the picture may depend on such a picture: until the next key frame, or for _HEALED pictures.
+    read. concealed: whether the last grabbed picture has errors that the decoder concealed, or damaged data. damaged:
+    whether the picture may depend on a concealed picture: until the next key frame, or for _HEALED pictures.
     stored: number of pictures in the data read so far, whether or not they can be decoded.
     Raise ImportError if PyAV is not installed.
     """
@@ -112,7 +112,7 @@ class AvCapture:
         films = [video for video in videos if not _is_cover(video)] or videos
         if not films or films[0].codec_context.name in _TEXT_AS_VIDEO:
             self._container.close()
-            raise InputError(f"{name} is {'a text file, not' if films else 'no'} video")
+            raise InputError(f"{name} is {'a text file, ' if films else ''}not a video")
         _check_size(target, name, films[0].width, films[0].height)
         self._video, self._reformatter = films[0], cast(Any, VideoReformatter())
         self._tick_s = float(self._video.time_base or 0)
@@ -122,7 +122,7 @@ class AvCapture:
             self._video.thread_type, self._video.codec_context.thread_count = "FRAME", cv2.getNumberOfCPUs()
         elif self._video.codec_context.name == "h264":
             self._video.codec_context.thread_count = 1
-        # Until a larger block has been freed, glibc maps each picture's memory anew, which takes 2 ms at 1080p.
+        # Allocate and free a large block once. Without it, glibc maps new memory for each picture: 2 ms at 1080p.
         np.empty(min(4 * self._video.width * self._video.height, 2**25), np.uint8)
         form = self._video.format if limits_s is None else None
         self._is_deep = form is not None and form.name.startswith("gray") and form.bits_per_pixel > 8
@@ -151,7 +151,7 @@ class AvCapture:
                 self._spoiled.add(packet.pts)
             try:
                 self._waiting = packet.decode()
-            except self._failures:  # a damaged packet: a file loses one picture, a stream continues
+            except self._failures:  # after a damaged packet, a file lacks one picture and a stream continues
                 self._since = 0
                 if self._limit_s == float("inf"):
                     return False
@@ -182,11 +182,11 @@ class AvCapture:
         return False, None
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        """Read the next picture, as OpenCV's `read` does: whether there is one, and the picture."""
+        """Return whether there is a next picture, and the picture, as OpenCV's `read` does."""
         return self.retrieve() if self.grab() else (False, None)
 
     def get(self, propId: int, /) -> float:
-        """Return, as OpenCV does, the last time stamp (NaN: none), the announced rate, or the frame count."""
+        """Return, as OpenCV does, the announced rate, the frame count, or the last time stamp, ms (NaN if missing)."""
         video, frame = self._video, self._frame
         rate_hz = float(video.guessed_rate or video.average_rate or 0)
         if propId == cv2.CAP_PROP_FPS:
@@ -197,10 +197,10 @@ class AvCapture:
         return float("nan") if stamp is None else 1000 * self._tick_s * stamp
 
     def sample(self, count: int) -> list[np.ndarray]:
-        """Return up to `count` - 1 pictures spread over the rest of a file, which can then not be read in order."""
+        """Return up to `count` - 1 pictures spread over a file. Afterwards the file cannot be read in order."""
         found = []
         for share in np.linspace(0, 1, count)[1:].tolist():
-            with suppress(*self._failures):  # seek to the key frame before
+            with suppress(*self._failures):  # seek goes to the last key frame before the place
                 self._container.seek(int(share * (self._container.duration or 0)))
             self._packets, self._waiting = self._container.demux(self._video), []
             decoded, image = self.read()
@@ -208,19 +208,19 @@ class AvCapture:
         return found
 
     def stamps_s(self, most: int | None = None) -> list[float]:
-        """Return stored time stamps of at most `most` next pictures, NaN for none, without decoding them."""
+        """Return the time stamps of up to `most` next pictures, s, NaN if missing. Do not decode the pictures."""
         packets, stamps = islice(self._packets, most), list[int | None]()
         with suppress(*self._failures):
             stamps.extend(packet.dts if packet.pts is None else packet.pts for packet in packets if packet.size)
         return [float("nan") if stamp is None else self._tick_s * stamp for stamp in stamps]
 
     def measure_hz(self) -> float | None:
-        """Measure the usual rate of the next pictures from time stamps, None if unknown. Pictures are not decoded."""
+        """Return the usual rate of the next pictures by their time stamps, None if unknown. Do not decode pictures."""
         stamps_s = np.array(self.stamps_s(_MEASURED))
         steps_s = np.diff(np.unique(stamps_s[np.isfinite(stamps_s)]))
         if len(steps_s) < _LEAST_MEASURED:
             return None
-        usual_s = np.median(steps_s)  # the mean of those near it, because stamps may be rounded to milliseconds
+        usual_s = np.median(steps_s)  # average the steps near it: stamps may be rounded to milliseconds
         step_s = float(steps_s[abs(steps_s - usual_s) <= 0.25 * usual_s].mean())
         return 1 / step_s if 0.001 <= step_s <= 100 else None
 
@@ -241,14 +241,14 @@ def announced_hz(capture: Capture) -> float | None:
 
 
 def _check_size(target: str | int, name: str, width: int, height: int) -> None:
-    is_file = isinstance(target, str) and not is_live(target) and Path(target).is_file()  # not frame%d.png
+    is_file = isinstance(target, str) and not is_live(target) and Path(target).is_file()  # unlike frame%d.png
     size = Path(str(target)).stat().st_size if is_file else None
     check_memory(VIDEO * width * height, f"{name} has frames of {width}x{height} pixels", size)
 
 
 def _is_cover(video: Any) -> bool:
     marks = getattr(video, "disposition", 0)
-    is_marked = int(getattr(marks, "value", marks)) & _COVER_MARKS  # a flag before PyAV 16, then a number
+    is_marked = int(getattr(marks, "value", marks)) & _COVER_MARKS  # PyAV 16 replaced the flag by a number
     return bool(is_marked) or (video.codec_context.name in _COVER_CODECS and video.frames <= 1)
 
 

@@ -1,4 +1,4 @@
-"""The colours of landmarks in TOML files.
+"""Read and write the colours of landmarks as TOML.
 
 Ranges of hue (0 to 180), saturation and value (0 to 255):
 
@@ -22,10 +22,10 @@ HIGHEST = (180, 255, 255)
 
 
 def read_colours(path: str | Path) -> Colours:
-    r"""Read the ranges, in the file's order.
+    r"""Read the ranges of colours, in the file's order.
 
-    Raise InputError with the file and the name: unreadable, not TOML, no colours, low or high missing or not three
-    whole numbers in range, lowest saturation or value above the highest, two ranges that overlap.
+    Raise InputError with the file and the name if the file is unreadable, not TOML or empty, if low or high is not
+    three whole numbers in range, if a lowest saturation or value is above the highest, or if two ranges overlap.
 
     >>> written = pathlib.Path("colours.toml").write_text("[red]\nlow = [170, 80, 80]\nhigh = [10, 255, 255]\n")
     >>> td.read_colours("colours.toml").names

@@ -1,4 +1,4 @@
-"""Columns as Parquet and GeoPackage: places are points that maps show (GeoParquet 1.1, GeoPackage 1.3)."""
+"""Write columns as Parquet or GeoPackage, with places as points for maps (GeoParquet 1.1, GeoPackage 1.3)."""
 
 import json
 import sqlite3
@@ -13,7 +13,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.atomic_files import save_file
 
 PLACE = ("longitude_deg", "latitude_deg")
-"""The columns of which points are made."""
+"""The columns that become points."""
 
 _WGS84 = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
@@ -36,9 +36,9 @@ Columns = Mapping[str, Sequence[Any] | np.ndarray]
 
 
 def write_columns(columns: Columns, path: Path) -> None:
-    """Write a .parquet or .gpkg. Rows with the columns PLACE become points of WGS84.
+    """Write columns to a .parquet or .gpkg file. The columns PLACE become points in WGS84.
 
-    Raises InputError without pyarrow, for a GeoPackage without places, and where the disk refuses.
+    Raise InputError if pyarrow is missing for Parquet, if a GeoPackage has no places, or if the disk refuses.
     """
     values = {name: [_known(value) for value in np.asarray(column).tolist()] for name, column in columns.items()}
     places = np.array([values[name] for name in PLACE], float).T if set(PLACE) <= values.keys() else None
@@ -59,7 +59,7 @@ def _bounds(places: np.ndarray) -> list[float]:
 
 
 def _parquet(values: dict[str, list[Any]], places: np.ndarray | None, path: Path) -> bytes:
-    """Source: geoparquet.org, version 1.1.0; no `crs` is WGS84 with the longitude first."""
+    """Return a GeoParquet file. A missing `crs` means WGS84, longitude first. Source: geoparquet.org, version 1.1.0."""
     pyarrow, parquet = _import_parquet(path)
     table = pyarrow.table(values)
     if places is not None:
@@ -84,9 +84,9 @@ def _import_parquet(path: Path) -> tuple[Any, Any]:
 
 
 def _geopackage(values: dict[str, list[Any]], places: np.ndarray | None, path: Path) -> bytes:
-    """Source: OGC 12-128r18."""
+    """Return a GeoPackage file. Source: OGC 12-128r18."""
     if places is None:
-        raise InputError(f"{path} holds places: wanted columns {' and '.join(PLACE)}, got {', '.join(values)}")
+        raise InputError(f"{path} needs places: wanted the columns {' and '.join(PLACE)}, got {', '.join(values)}")
     values = {name: column for name, column in values.items() if name != "fid"}
     points = [None if (point := _wkb(p)) is None else struct.pack("<2sBBi", b"GP", 0, 1, 4326) + point for p in places]
     kinds = {int: "INTEGER", bool: "BOOLEAN", float: "REAL", str: "TEXT"}
@@ -119,7 +119,7 @@ def _geopackage(values: dict[str, list[Any]], places: np.ndarray | None, path: P
 
 
 def read_columns(path: Path, name: str) -> dict[str, list[Any]]:
-    """The columns of a .parquet without geometry. name: for messages. Raises InputError where it is unreadable."""
+    """Return the columns of a .parquet file, without geometry. name: for messages. Raise InputError if unreadable."""
     pyarrow, parquet = _import_parquet(path)
     try:
         values: dict[str, list[Any]] = parquet.read_table(path).to_pydict()

@@ -1,4 +1,4 @@
-"""Detections from a table: MOTChallenge text, a CSV with named columns, YOLO's labels, or a foreign format."""
+"""Read detections from MOTChallenge text, a CSV with named columns, YOLO's labels, or the format of another program."""
 
 import os
 import re
@@ -28,22 +28,22 @@ from torchvision_dddas.io.tables import (
 from torchvision_dddas.types import DetectionTable, Source, are_corners, is_sampled, share_orders
 
 MOT_NAMES = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score")
-"""The columns of MOTChallenge text, which has no first line that names them."""
+"""The columns of MOTChallenge text, which does not name its columns."""
 
 FEET = ("feet_u_px", "feet_v_px")
-"""Columns of the point between the feet, from the first pixel's centre."""
+"""Columns of the point between the feet, in pixels from the centre of the first pixel."""
 
 CLASS = ("class", "class_name", "label")
-"""Names that the column of classes may have; the first that is there counts."""
+"""Possible names of the column of classes. If a table has several, the first in this order is read."""
 
 ORDERS = {
     "yolo": ("x_center y_center width height", "xcenter ycenter width height", "cx cy w h", "xc yc w h"),
     "xyxy": ("x1 y1 x2 y2", "xmin ymin xmax ymax", "x_min y_min x_max y_max", "left top right bottom"),
     "xywh": ("x y w h", "x y width height", "left top w h", "left top width height"),
 }
-"""Orders of a box's four columns, with names that other programs give them; yolo: the centre, and the size.
+"""Orders of the four columns of a box, and the names that other programs give the columns. yolo: centre and size.
 
-Capitals and what _BEFORE matches before a name do not count.
+Names are compared without capitals and without the prefixes of _BEFORE.
 """
 
 _BEFORE = re.compile(r"(bbox|bb|box)_")
@@ -55,25 +55,25 @@ _OWN_NAMES = {
 }
 
 _MANY, _FILLS = 20, 50
-"""So many boxes in [0, 100] that go beyond the second in both directions are percent of a larger picture."""
+"""If at least _MANY boxes lie in [0, 100], and reach beyond _FILLS in x and in y, they are percent of a picture."""
 
 FEW_SHARE = 0.01
-"""Where fewer of the scores lie outside [0, 1], they are mistakes among probabilities and not another scale."""
+"""Scores outside [0, 1] are mistakes if their share is smaller than this. Otherwise the scores have another scale."""
 
 _FILLED = 10
-"""A table has no more than this many times the cells that its lines have."""
+"""Short lines are filled up with empty cells, to at most this many times the number of given cells."""
 
 REQUIRED = ("frame", "x_px", "y_px", "width_px", "height_px")
 
 SCHEMA = Schema(
     "detections",
     replace(FRAME, low=0, wanted=f"a whole number from 1 to {LAST_FRAME}, or from 0 throughout"),
-    *(replace(column, low=-FARTHEST) for column in BOX),  # in any order
+    *(replace(column, low=-FARTHEST) for column in BOX),  # numbers of any order
     Column("score", ".6g", may_be_empty=True),
     Column("identity"),
     Column("class_id", "d", -1, 2**53, is_whole=True, may_be_empty=True),
     Column("kind"),
-    Column("cut", "d", 0, 1, is_whole=True, may_be_empty=True, wanted="1 where the border cuts it, else 0"),
+    Column("cut", "d", 0, 1, is_whole=True, may_be_empty=True, wanted="1 if the border cuts the target, else 0"),
     *(Column(name, ".2f", -FARTHEST, FARTHEST, may_be_empty=True, wanted="pixels") for name in FEET),
     *map(Column, CLASS),
 )
@@ -82,18 +82,18 @@ SCHEMA = Schema(
 def read_detections(
     path: str | Path, *, order: str | None = None, size: tuple[float, float] | None = None, pictures: Sequence[str] = ()
 ) -> DetectionTable:
-    r"""Read `frame,id,x,y,w,h[,score[,...]]`, by commas or blanks; or a CSV whose first line names REQUIRED columns.
+    r"""Read a table, `frame,id,x,y,w,h[,score[,...]]` with commas or blanks, or a CSV that names the REQUIRED columns.
 
-    Or a folder of YOLO's labels, `class cx cy w h [score]`, a file a picture; classes.txt may name the classes. Or
-    COCO, CVAT, VisDrone and the others of `foreign_boxes`, or Parquet.
-    pictures: their names without endings, in order; else the number at the end of a file's name is its frame. order: of
-    a box's columns, one of ORDERS; None: as names and numbers tell. size: (width, height) of the pictures; boxes within
-    [0, 1] are shares of it. Frames may count from 0.
-    An identity that is no whole number from 1 is none. The columns `score`, `identity`, `cut`, FEET, CLASS, `class_id`
-    may be there; any other and all that follows the score are ignored. Rows may come in any order.
-    A table without rows is valid: `dddas detect` writes one for a clip in which nothing moves.
-    Raises InputError with file and line: unreadable, too few columns, a column named twice, not a finite number, out of
-    range, a few scores outside [0, 1] (see FEW_SHARE), shares where the size is not known, boxes of unknown order.
+    The path may also be a Parquet file, a file of `foreign_boxes` (COCO, CVAT, VisDrone and others), or a folder of
+    YOLO's labels: a file `class cx cy w h [score]` for each picture, and optional class names in classes.txt.
+    pictures: their names without endings, in order; by default, a number at the end of a file's name is the frame.
+    order: order of a box's columns, one of ORDERS; None: the names and numbers decide. size: (width, height) of the
+    pictures; boxes within [0, 1] are shares of it. Frames may count from 0, and rows may come in any order.
+    An identity counts as missing unless it is a whole number from 1. The columns `score`, `identity`, `cut`, FEET,
+    CLASS and `class_id` are optional. Other columns, and unnamed columns after the score, are ignored.
+    A table without rows is valid: `dddas detect` writes such a table for a clip without motion. Raise InputError with
+    file and line for an unreadable file, too few columns, a column named twice, a value that is no number or out of
+    range, a few scores outside [0, 1] (see FEW_SHARE), shares of an unknown size, or boxes of unknown order.
 
     >>> written = pathlib.Path("boxes.txt").write_text("1,-1,40,60,20,20,0.9,-1,-1,-1\n")
     >>> td.read_detections("boxes.txt").at(1).xyxy
@@ -136,7 +136,7 @@ def read_detections(
         score = score / 100
         notes.append("scores are numbers up to 100: they were read as percent")
     is_outside = (score < 0) | (score > 1)
-    # One score of 1.3 among thousands of probabilities must not make all of these certain.
+    # One score of 1.3 among thousands of probabilities must not make all rows count as certain.
     if 0 < is_outside.sum() < FEW_SHARE * len(score):
         table.refuse(
             is_outside,
@@ -178,7 +178,7 @@ def read_detections(
 
 
 def _rename(text: CsvText) -> tuple[list[str], str | None]:
-    """The header with our names for the columns of other programs, and the order of a box that these names tell."""
+    """Return the header with this package's names of columns, and the order of ORDERS that the names show, or None."""
     header, bare = list(text.header), [_BEFORE.sub("", name.lower()) for name in text.header]
     order = "xywh" if set(REQUIRED) <= set(header) else None
     for kind, names in ORDERS.items():
@@ -186,7 +186,7 @@ def _rename(text: CsvText) -> tuple[list[str], str | None]:
             if order is None and set(known) <= set(bare):
                 own, order = dict(zip(known, REQUIRED[1:], strict=True)), kind
                 header = [own.get(short, name) for short, name in zip(bare, header, strict=True)]
-    if {"class", "name"} <= set(header) and "class_id" not in header:  # of YOLOv5: the number, and its name
+    if {"class", "name"} <= set(header) and "class_id" not in header:  # YOLOv5: the number, and its name
         at = header.index("class")
         if all(row[at].isdigit() for row in text.rows if len(row) > at):
             header = [{"class": "class_id", "name": "class"}.get(name, name) for name in header]
@@ -196,7 +196,7 @@ def _rename(text: CsvText) -> tuple[list[str], str | None]:
 def _in_pixels(
     table: CsvTable, order: str | None, size: tuple[float, float] | None, is_folder: bool, path: str | Path
 ) -> tuple[np.ndarray, str, list[str]]:
-    """Boxes (N, 4) as x, y, width, height in pixels, the order of the columns, and notes. Raises InputError."""
+    """Return boxes (N, 4) as x, y, width, height in pixels, the order of the columns, and notes. Raise InputError."""
     box, notes, whole = table.stack(*REQUIRED[1:]), list[str](), 1
     shares, first, last = share_orders(box), box[:, :2], box[:, 2:]
     if not shares and len(percent := share_orders(box / 100)) and size is not None and min(size) > 200:
@@ -214,18 +214,18 @@ def _in_pixels(
     if order is None and is_folder:
         found = "yolo"
         if (found not in shares) if shares else is_corners:
-            raise InputError(f"labels {path}: by their numbers the boxes are corners; pass --box-format xyxy if so")
+            raise InputError(f"labels {path}: the numbers look like corners; pass --box-format xyxy if they are")
         if not shares:
-            notes.append("the labels are no shares: they were read as centre and size in pixels")
+            notes.append("the labels are not shares: they were read as centre and size in pixels")
     elif order is None and shares:
         found = "xyxy" if "xyxy" in shares and is_corners else shares[0]
         if len(shares) > 1 and not is_corners:
             raise InputError(
-                f"detections {path}: boxes in {limits} may be {' or '.join(shares)}; pass --box-format to say which"
+                f"detections {path}: boxes in {limits} may be {' or '.join(shares)}; pass --box-format to choose"
             )
     elif order is None and is_corners:
         found = "xyxy"
-        notes.append("by their numbers the boxes are corners, and were read as xyxy; --box-format says it otherwise")
+        notes.append("the boxes look like corners: they were read as xyxy; --box-format sets another order")
     if shares and size is not None:
         box = box * np.array([*size, *size]) / whole
         kind = "shares" if whole == 1 else "percent"
@@ -237,7 +237,7 @@ def _in_pixels(
 
 
 def _check_columns(identity: np.ndarray, box_px: np.ndarray, path: str | Path) -> None:
-    """Raises InputError for text without names whose columns are others than frame,id,x,y,w,h."""
+    """Raise InputError if text without names of columns has other columns than frame,id,x,y,w,h."""
     is_small = ((box_px > 0) & (box_px < 1)).all(axis=0) & (len(box_px) >= np.array([5, 5, 1, 1]))
     if 2 * (identity[np.isfinite(identity)] % 1 > 0).sum() > len(identity) or (is_small & (len(box_px) > 0)).any():
         what = ["x", "y", "width", "height"][int(is_small.argmax())] if is_small.any() else ""
@@ -248,7 +248,7 @@ def _check_columns(identity: np.ndarray, box_px: np.ndarray, path: str | Path) -
 
 
 def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
-    """The cells of a folder of YOLO's labels, as those of a table. Raises InputError with file and line."""
+    """Return the labels of a YOLO folder as the cells of a table without names. Raise InputError with file and line."""
     files = sorted((f for f in folder.glob("*.txt") if f.stem != "classes"), key=lambda file: natural_order(file.name))
     ends = [re.search(r"[0-9]{1,9}$", file.stem) for file in files]
     first = min((int(end[0]) for end in ends if end), default=1)
@@ -257,7 +257,7 @@ def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
     for file, end in zip(files, ends, strict=True):
         number = places.get(file.stem) if places else int(end[0]) + (first == 0) if end else None
         if number is None:
-            raise InputError(f"{file} belongs to no picture: wanted the name of one, or a name that ends in its number")
+            raise InputError(f"{file} belongs to no picture: wanted a picture's name, or a name that ends in a number")
         for line, row in enumerate(read_csv(file, "labels", has_header=False).rows, 1):
             cells = row if len(row) > 1 else row[0].split()
             if not 5 <= len(cells) <= 7:
@@ -270,7 +270,7 @@ def _read_labels(folder: Path, pictures: Sequence[str]) -> tuple[CsvText, bool]:
 
 
 def _class_names(folder: Path) -> dict[int, str]:
-    """The names of classes by number, of a file classes.txt in a folder of labels or above it, a line each."""
+    """Return the names of classes by number, from the lines of classes.txt in a folder of labels or above it."""
     for file in (folder / "classes.txt", folder.parent / "classes.txt"):
         if file.is_file():
             return dict(enumerate(file.read_text("utf-8", "replace").splitlines()))
@@ -280,30 +280,30 @@ def _class_names(folder: Path) -> dict[int, str]:
 def read_for_clip(
     path: Path, order: str | None, source: Source | None, size: tuple[float | None, float | None] = (None, None)
 ) -> DetectionTable:
-    """`read_detections` for a clip, whose size counts before the one that is given. Raises InputError as it does."""
+    """Read detections for a clip, whose size replaces the given size. Raise InputError as `read_detections` does."""
     size = size if source is None else source.size
     known = (size[0], size[1]) if size[0] and size[1] else None
     return read_detections(path, order=order, size=known, pictures=[file.stem for file in getattr(source, "files", ())])
 
 
 def read_header(path: str | Path) -> list[str]:
-    """The column names of a table, MOT_NAMES where its first line holds numbers, none where it is empty."""
+    """Return the column names of a table: MOT_NAMES if its first line holds numbers, [] if the table is empty."""
     text, is_named = _read_cells(path)
     return text.header if text.rows or is_named else []
 
 
 def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """The column names and cells of a table that its reader found valid, sorted by frame as readers sort it.
+    """Return the column names and cells of a valid table, sorted by frame as its reader sorts it.
 
-    without: columns to leave out. Raises InputError where it cannot be read, or where a few lines have many times the
-    columns of the others, which would all be filled up.
+    without: columns to leave out. Raise InputError if the table cannot be read, or if a few lines have so many columns
+    that filling up the other lines would exceed _FILLED.
     """
     (header, lines, rows), _ = _read_cells(path)
     counts = [len(row) for row in rows]
     if len(header) * len(rows) > _FILLED * sum(counts):
         line = lines[counts.index(max(counts))]
         raise InputError(
-            f"{path}, line {line}: {max(counts)} columns, over {_FILLED} times those of most; wanted as many in each"
+            f"{path}, line {line}: {max(counts)} columns, over {_FILLED} times as many as usual; wanted the same number"
         )
     frame = header.index("frame")
     kept = [place for place, name in enumerate(header) if name not in without]
@@ -312,9 +312,9 @@ def read_rows(path: str | Path, without: Sequence[str] = ()) -> tuple[list[str],
 
 
 def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
-    """The cells of a table, and whether its first line names the columns; else they get the names of MOTChallenge."""
+    """Return the cells of a table, and whether its first line names the columns. Unnamed columns get MOT_NAMES."""
     _, line, rows = read_csv(path, what, has_header=False)
-    # The first name may be empty: so a table with an index begins.
+    # The first name of a table with an index is empty.
     first, *_ = [*" ".join(rows[0]).split(), ""] if rows else [""]
     if first[:1].isalpha() and first.lower() not in ("nan", "inf", "infinity"):
         low = [name.lower() if name.lower() in SCHEMA.names or name.lower() in _OWN_NAMES else name for name in rows[0]]
@@ -327,13 +327,13 @@ def _read_cells(path: str | Path, what: str = "") -> tuple[CsvText, bool]:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Whether a table fits its clip and the detection interval.
+# Check that a table fits its clip and the detection interval.
 
 
 def check_table(table: DetectionTable, interval: int, source: Source | None = None) -> list[str]:
-    """Notes on rows that are left out or read in an unexpected way, each a sentence without a full stop.
+    """Return notes on rows that are left out or read in an unexpected way. A note is a sentence without a full stop.
 
-    Raises InputError as check_within_clip does, and where no row lies on a sampled frame.
+    Raise InputError as check_within_clip does, and if no row lies on a sampled frame.
     """
     name = f"detections {table.path}"
     if len(table) == 0:
@@ -345,8 +345,8 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
     if left_out == len(table):
         sampled = ", ".join(str(1 + k * interval) for k in range(3))
         raise InputError(
-            f"{name} has no row on frames {sampled}, ..., which --interval {interval} samples; its first is on frame "
-            f"{table.first}: number the frames so that one of them is 1, or take --interval 1"
+            f"{name} has no row on frames {sampled}, ..., which --interval {interval} samples; its first row is on "
+            f"frame {table.first}: number the frames so that one of them is 1, or take --interval 1"
         )
     frames = np.unique(table.frame)
     step = int(np.gcd.reduce(frames - 1)) if len(frames) > 2 else 1  # two frames do not show an interval
@@ -362,7 +362,7 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
     elif not table.probable:
         low, high = table.score.min(), table.score.max()
         notes.append(
-            f"scores from {low:g} to {high:g} are no probabilities: every row counts as certain (divide percent by 100)"
+            f"scores from {low:g} to {high:g} are not probabilities: all rows count as certain (divide percent by 100)"
         )
     if source is not None:
         low, high = table.box_px[:, :2], table.box_px[:, :2] + table.box_px[:, 2:]
@@ -372,7 +372,7 @@ def check_table(table: DetectionTable, interval: int, source: Source | None = No
 
 
 def check_within_clip(table: DetectionTable, source: Source) -> None:
-    """Raises InputError for a table that goes on after the end of a clip whose length is known."""
+    """Raise InputError if a table continues after the end of a clip of known length."""
     if source.exact and source.count is not None and table.last > source.count:
         is_beyond = table.frame > source.count
         raise InputError(

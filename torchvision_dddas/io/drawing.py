@@ -1,4 +1,4 @@
-"""Pictures of results for programs: what overlays of runs show of targets, drawn on one frame."""
+"""Draw results on one frame, as the overlays of runs show them."""
 
 import math
 from collections.abc import Iterable
@@ -19,16 +19,16 @@ from torchvision_dddas.io.overlay import (
 from torchvision_dddas.types import Detections, Frame, FrameResult, Scene, TrackedFrame, Tracks, as_picture
 
 Tracked = FrameResult | TrackedFrame | Tracks
-"""Results of one frame with identities."""
+"""The results of one frame, with identities."""
 
 
 def draw(frame: Frame | np.ndarray, result: Tracked | Scene | Detections | Iterable[Tracked]) -> np.ndarray:
-    """A copy of a frame, (H, W, 3) uint8 BGR, with the boxes of a result, their identities, classes and speeds.
+    """Return a copy of a frame, (H, W, 3) uint8 BGR, with the boxes, identities, classes and speeds of a result.
 
-    result: of `Pipeline`, `Tracker` or a detector; or the tracks of the last frames, oldest first. Then the last ones
-    are drawn, and the others make the trails and speeds. Speeds are in m/s where targets are located, else in pixels
-    per frame. The camera's motion is taken out of both in results of `Pipeline`; `Tracks` do not know that motion.
-    Raises InputError for what is no picture or no such result.
+    result: a result of `Pipeline`, `Tracker` or a detector, or the tracks of the last frames, oldest first. The last
+    tracks are drawn; earlier tracks give trails and speeds. Speeds are in m/s for located targets, else in pixels
+    per frame. Trails and speeds exclude the camera's motion for results of `Pipeline`; `Tracks` do not contain it.
+    Raise InputError if frame is not a picture, or for a result of another type.
 
     >>> frame = td.Frame(1, 0.0, np.zeros((48, 64, 3), np.uint8))
     >>> tracks = td.Tracks(1, np.array([7]), np.array([[10.0, 20, 20, 9]]), np.ones(1), np.zeros(1, int))
@@ -64,7 +64,7 @@ def _tracked_of(result: object) -> TrackedFrame:
 
 
 def _words(result: object, tracks: Tracks, trails: Trails) -> dict[int, str]:
-    """The class and the speed of each identity, and what other platforms say of it."""
+    """Return a text for each identity: its class, its speed, and the reports of other platforms."""
     identities = tracks.identity.tolist()
     speeds = {identity: _speed_text(trails.speed(identity), "px") for identity in identities}
     others: dict[int, str] = {}

@@ -1,4 +1,4 @@
-"""Georeferenced rasters of the ground on grids of local metres: heights, and photos taken from straight above."""
+"""Read georeferenced rasters of the ground on grids of local metres: heights, and photos from straight above."""
 
 import math
 import warnings
@@ -30,13 +30,13 @@ Degrees = tuple[float, float] | None
 """Longitude and latitude of the origin of local metres; None if local metres are the raster's own coordinates."""
 
 _ALONE = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO", "GDAL_CACHEMAX": 64}
-"""GDAL settings that open no file beside the raster, because such files may name others, also on the network.
+"""GDAL settings that open only the raster itself, because a file beside it may name others, also on the network.
 
 GDAL's block cache gets 64 MB; by default it takes 5 % of the machine's memory.
 """
 
 Grid = tuple[np.ndarray, np.ndarray, float]
-"""Values (R, C) or (B, R, C), rows to the north, NaN without data; place of the first value; metres a cell."""
+"""Values (R, C) or (B, R, C), with rows to the north and NaN for no data; place of the first value; metres a cell."""
 
 
 def read_elevation(path: str | Path, places: np.ndarray, origin_deg: Degrees, *, margin_m: float = 500.0) -> Elevation:
@@ -97,9 +97,9 @@ def read_geoid(path: str | Path, lonlat_deg: tuple[float, float]) -> float:
 
 
 def read_ortho(path: str | Path, places: np.ndarray, origin_deg: Degrees, *, margin_m: float = 100.0) -> Ortho:
-    """Read a photo around places (N, 2), with one grey or three colour bands; otherwise as read_elevation.
+    """Read a photo, with one grey band or three colour bands, around places (N, 2). Errors: as in `read_elevation`.
 
-    Pixels without data are white.
+    origin_deg, margin_m: as in `read_elevation`. Pixels without data are white.
 
     >>> import rasterio
     >>> form = {"driver": "GTiff", "width": 40, "height": 40, "count": 3, "crs": "EPSG:4326"}
@@ -133,7 +133,7 @@ def _known_places(places: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[Any]:
-    """Open a GeoTIFF, without any other file that it names: its place and its CRS must be in the file itself.
+    """Open a GeoTIFF, but no other file that it names. The place and the CRS must be in the GeoTIFF itself.
 
     Raise InputError if rasterio is missing, the file is not a GeoTIFF, or its CRS does not fit.
     """
@@ -155,7 +155,7 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
                 raster = rasterio.open(Path(path), driver="GTiff")
         with rasterio.Env(**_ALONE), raster:
             if raster.tags(ns="OVERVIEWS"):
-                raise InputError(f"{what} {path} keeps its overviews in another file; give one that does not")
+                raise InputError(f"{what} {path} keeps its overviews in another file; give a single GeoTIFF")
             t = raster.transform
             if raster.crs is None and t.is_identity:
                 raise InputError(f"{what} {path} does not say where it lies; give a georeferenced GeoTIFF")
@@ -175,10 +175,10 @@ def _open_raster(path: str | Path, what: str, origin_deg: Degrees) -> Iterator[A
 
 
 def _check_blocks(raster: Any, name: str) -> None:
-    """Raise InputError if a strip or tile of a raster, which is read as a whole, needs too much memory."""
+    """Raise InputError if a strip or tile of a raster needs too much memory. It can only be read as a whole."""
     import rasterio
 
-    copies = raster.count if raster.count == 1 else 2 * raster.count  # as stored, and by bands
+    copies = raster.count if raster.count == 1 else 2 * raster.count  # as stored, and sorted by band
     levels = [{}, *({"overview_level": level} for level in range(len(raster.overviews(1))))]
     for level in levels:
         with rasterio.open(raster.name, driver="GTiff", **level) as opened:
@@ -197,7 +197,7 @@ def _resample(
     most_cells: int,
     within: tuple[float, float] = (-math.inf, math.inf),
 ) -> Grid:
-    """Resample bands of a raster around places (N, 2) in local metres; average a finer one to most_cells a side.
+    """Resample bands of a raster around places (N, 2), m. Average a finer raster to at most most_cells a side.
 
     within: values outside this range are holes that the raster does not declare.
     """

@@ -1,4 +1,4 @@
-"""Boxes as other programs and data sets write them: COCO, CVAT, UA-DETRAC, BDD100K, VisDrone, VIRAT, and masks."""
+"""Read boxes of other programs and data sets: COCO, CVAT, UA-DETRAC, BDD100K, VisDrone, VIRAT, and masks."""
 
 import json
 import os
@@ -18,30 +18,30 @@ VISDRONE = (
     *("pedestrian", "people", "bicycle", "car", "van"),
     *("truck", "tricycle", "awning-tricycle", "bus", "motor"),
 )
-"""The categories of VisDrone, from 1. 0 is an unlabelled region, 11 another object."""
+"""The categories of VisDrone, numbered from 1. Category 0 is an unlabelled region, 11 another object."""
 VIRAT = ("person", "car", "vehicle", "object", "bike")
-"""The types of VIRAT's objects, from 1. 0 is unknown."""
+"""The types of VIRAT's objects, numbered from 1. Type 0 is unknown."""
 
 COLUMNS = ("frame", "identity", "x_px", "y_px", "width_px", "height_px", "score", "class_id", "class")
-"""The columns of a box here; None is unknown."""
+"""The columns of a Row. An unknown value is None."""
 
 Row = tuple[Any, ...]
 
 
 class BoxText(CsvText):
-    """The cells of boxes that no table held; `line` has the place of each box in its file."""
+    """The cells of boxes from a file that is not a table. `line` is the number of each box in its file."""
 
     @property
     def unit(self) -> str:
-        """What messages call a row."""
+        """The word for a row in messages."""
         return "box"
 
 
 def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, list[str]] | None:
-    """The cells of COLUMNS that a file has, frames from 1, and notes. None for what is no JSON, XML or folder of masks.
+    """Return the cells and notes of a JSON, an XML or a folder of masks; None for other paths. Frames count from 1.
 
-    pictures: the names of the clip's pictures without endings, in order; else numbers in names are frames.
-    Raises InputError with the file and the box.
+    Cells are those of the known COLUMNS. pictures: the names of the clip's pictures without endings, in order; by
+    default, the numbers in file names are frames. Raise InputError with the file and the number of the box.
     """
     if os.path.isdir(path):  # noqa: PTH112 (pathlib raises for a name that no file can have)
         files = sorted(path.glob("*.png"), key=lambda file: natural_order(file.name))
@@ -59,7 +59,7 @@ def read_foreign(path: Path, pictures: Sequence[str] = ()) -> tuple[CsvText, lis
 
 
 def name_columns(path: Path, text: CsvText) -> tuple[CsvText, list[str]] | None:
-    """Text without names of columns as VisDrone and VIRAT write it, with names; None for any other text."""
+    """Return text of VisDrone or VIRAT with the names of its columns, and notes; None for any other text."""
     try:
         if path.name.endswith("viratdata.objects.txt"):
             rows = [_virat_row(*map(int, row)) for row in text.rows]
@@ -90,7 +90,7 @@ def _virat_row(identity: int, _duration: int, frame: int, x: int, y: int, w: int
 
 
 def _cells(path: Path, rows: Iterable[Row]) -> tuple[CsvText, list[str]]:
-    """The rows as text without columns that are unknown throughout. Raises InputError with the box that is wrong."""
+    """Return the rows as text, without columns that are always unknown. Raise InputError with the number of the box."""
     found: list[Row] = []
     try:
         for row in rows:
@@ -111,12 +111,12 @@ def _cells(path: Path, rows: Iterable[Row]) -> tuple[CsvText, list[str]]:
 
 
 def _number_identities(given: list[Any]) -> tuple[list[int | None], list[str]]:
-    """Whole numbers from 1: as they are given, or one more where they begin with 0, or by their order. -1 is none."""
-    given = [None if identity == -1 else identity for identity in given]
+    """Return identities as whole numbers from 1, and notes. Numbers from 0 grow by 1; words are numbered in order."""
+    given = [None if identity == -1 else identity for identity in given]  # -1 means no identity
     known = [str(identity) for identity in given if identity is not None]
     if all(re.fullmatch("[0-9]{1,15}", identity) for identity in known):
         first = int("0" in {identity.lstrip("0") or "0" for identity in known})
-        notes = ["identities count from 0: 0 is 1 here, 1 is 2, and so on"] * first
+        notes = ["identities count from 0: one is added to each of them"] * first
         return [None if identity is None else int(identity) + first for identity in given], notes
     numbers = {name: number for number, name in enumerate(dict.fromkeys(known), 1)}
     notes = ["identities are words: they are numbered in their order"]
@@ -124,7 +124,7 @@ def _number_identities(given: list[Any]) -> tuple[list[int | None], list[str]]:
 
 
 def frames_of(names: Sequence[str], pictures: Sequence[str]) -> list[int]:
-    """The frame, from 1, of each picture: its place among the clip's, else the number in its name, else its order."""
+    """Return the frame, from 1, of each picture: its place in the clip, else the number in its name, else its order."""
     stems = [Path(name).stem for name in names]
     places = {name: number for number, name in enumerate(pictures, 1)}
     if places and set(stems) <= set(places):
@@ -146,13 +146,13 @@ def _read_json(content: bytes, pictures: Sequence[str]) -> Iterator[Row]:
 
 
 def _read_coco(data: dict[str, Any], pictures: Sequence[str]) -> Iterator[Row]:
-    """COCO's detections (a list), or annotations with `track_id` or `instance_id` where they have identities.
+    """Read COCO's detections (a list), or annotations. `track_id` or `instance_id` is the identity, if given.
 
     Source: cocodataset.org, data format and results format; TAO and CocoVID for tracks.
     """
     images = data.get("images", [])
     if len({image.get("video_id") for image in images}) > 1:
-        raise ValueError("the images are of several videos; wanted one file for each")
+        raise ValueError("the images are of several videos; wanted one file for each video")
     if images and all("frame_id" in image for image in images):
         first = min(image["frame_id"] for image in images)
         numbers = [image["frame_id"] + (first == 0) for image in images]
@@ -165,7 +165,7 @@ def _read_coco(data: dict[str, Any], pictures: Sequence[str]) -> Iterator[Row]:
             continue
         number, kind = box["image_id"], box.get("category_id")
         if images and number not in frames:
-            raise ValueError(f"image_id {number} is none of the {len(images)} images")
+            raise ValueError(f"image_id {number} is not among the {len(images)} images")
         if len(box["bbox"]) != 4:
             raise ValueError(f"bbox has {len(box['bbox'])} numbers; wanted x, y, width, height")
         held = box.get("attributes") or {}
@@ -174,10 +174,10 @@ def _read_coco(data: dict[str, Any], pictures: Sequence[str]) -> Iterator[Row]:
 
 
 def _read_bdd(frames: list[dict[str, Any]]) -> Iterator[Row]:
-    """BDD100K's tracks in Scalabel's format, whose right and lower edges lie on the last pixel."""
+    """Read BDD100K's tracks in Scalabel's format. The right and lower edges lie on the last pixel."""
     numbers = [frame.get("frameIndex", place) for place, frame in enumerate(frames)]
     if len({frame.get("videoName") for frame in frames}) > 1:
-        raise ValueError("the frames are of several videos; wanted one file for each")
+        raise ValueError("the frames are of several videos; wanted one file for each video")
     for number, frame in zip(numbers, frames, strict=True):
         for target in frame.get("labels") or ():
             if (box := target.get("box2d")) is not None:
@@ -189,12 +189,12 @@ def _read_bdd(frames: list[dict[str, Any]]) -> Iterator[Row]:
 def _read_xml(content: bytes, pictures: Sequence[str]) -> Iterator[Row]:
     root = ElementTree.fromstring(content)
     if root.tag not in ("sequence", "annotations"):
-        raise ValueError(f"<{root.tag}> is no XML of boxes; wanted <annotations> of CVAT or <sequence> of UA-DETRAC")
+        raise ValueError(f"the XML begins with <{root.tag}>; wanted <annotations> of CVAT or <sequence> of UA-DETRAC")
     yield from _read_detrac(root) if root.tag == "sequence" else _read_cvat(root, pictures)
 
 
 def _read_cvat(root: ElementTree.Element, pictures: Sequence[str]) -> Iterator[Row]:
-    """CVAT for video 1.1, frames from 0; and CVAT for images, which has no identities.
+    """Read CVAT for video 1.1, whose frames count from 0, or CVAT for images, which has no identities.
 
     Source: docs.cvat.ai, XML annotation format.
     """
@@ -215,7 +215,7 @@ def _read_cvat(root: ElementTree.Element, pictures: Sequence[str]) -> Iterator[R
 
 
 def _read_detrac(root: ElementTree.Element) -> Iterator[Row]:
-    """UA-DETRAC: <frame num="1"><target_list><target id="1"><box left top width height/><attribute vehicle_type/>."""
+    """Read UA-DETRAC: <frame num><target_list><target id><box left top width height/><attribute vehicle_type/>."""
     for frame in root.iter("frame"):
         for target in frame.iter("target"):
             box, kind = target.find("box"), target.find("attribute")
@@ -227,8 +227,8 @@ def _read_detrac(root: ElementTree.Element) -> Iterator[Row]:
 
 
 def _read_masks(files: Sequence[Path], pictures: Sequence[str]) -> Iterator[Row]:
-    """The extent of each value of a mask."""
-    from scipy import ndimage  # it would slow down the start of a run
+    """Yield the extent of the pixels of each value of a mask as a box. The value 0 is background."""
+    from scipy import ndimage  # imported here, because it would slow down the start of every run
 
     for frame, file in zip(frames_of([file.name for file in files], pictures), files, strict=True):
         mask = read_mask(file)
@@ -242,7 +242,7 @@ def _read_masks(files: Sequence[Path], pictures: Sequence[str]) -> Iterator[Row]
 
 
 def _palette(png: bytes) -> dict[int, int]:
-    """The place in the palette of each colour as `read_mask` has it; empty for a PNG without a palette."""
+    """Return the palette index of each colour, numbered as in `read_mask`; empty for a PNG without a palette."""
     at = png.find(b"PLTE")
     if png[25:26] != b"\x03" or at < 0:
         return {}

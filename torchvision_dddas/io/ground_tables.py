@@ -1,4 +1,4 @@
-"""CSV tables of places on the ground: reports of landmarks, which are vehicles of known place, and located targets.
+"""Read CSV tables of places on the ground: landmarks, which are vehicles of known place, and located targets.
 
 frame,landmark,longitude_deg,latitude_deg       # or time_s; or east_m,north_m; optional u_px,v_px, sigma_m, planned
 1,rover,-110.95000,32.23000
@@ -52,8 +52,8 @@ def read_landmarks(path: str | Path, *, rate_hz: float | None = None, clock_offs
     Rows may come in any order; further columns are ignored. An empty place is a dropout, and empty u_px and v_px mean
     not seen; `nan` counts as empty. Times become frames, 1 + (time_s + clock_offset_s) rate_hz, rounded if the row has
     pixels; a table by frames ignores rate and offset.
-    Raise InputError with file and line: as read_table, times without a rate, longitude and latitude swapped, degrees
-    and metres mixed, half a place, a landmark twice in a frame, places further apart than FARTHEST_M.
+    Raise InputError with file and line as read_table does, and for times without a rate, swapped degrees, degrees
+    beside metres, half a place, a landmark twice in a frame, or places further apart than FARTHEST_M.
 
     >>> written = pathlib.Path("marks.csv").write_text("frame,landmark,east_m,north_m\n1,a,3.0,4.0\n1,b,7.0,4.0\n")
     >>> td.read_landmarks("marks.csv").names
@@ -122,7 +122,7 @@ def _check_degrees(table: CsvTable) -> None:
 
 
 def _places(table: CsvTable) -> tuple[np.ndarray, bool]:
-    """Return the (N, 2) places, and whether they are longitudes and latitudes."""
+    """Return the places (N, 2), and whether they are longitudes and latitudes."""
     degrees, metres = (_pair(table, kind) for kind in PLACES)
     in_degrees, in_metres = np.isfinite(degrees[:, 0]), np.isfinite(metres[:, 0])
     table.refuse(
@@ -151,7 +151,7 @@ def _check_once_a_frame(found: Landmarks) -> None:
     keys = np.stack([found.frame, found.landmark, found.planned])[:, order]
     is_same = (keys[:, 1:] == keys[:, :-1]).all(axis=0)
     if is_same.any():
-        # Report the first duplicate of the file, for any order of frames.
+        # Report the first duplicate in the file, whatever the order of the frames is.
         k = int(np.where(is_same, found.line[order][1:], np.iinfo(np.int64).max).argmin())
         row, again = order[k : k + 2]
         raise InputError(
@@ -167,7 +167,7 @@ def _check_far(found: Landmarks) -> None:
     start = found.place[is_known][0]
     from_start = found.place - start
     if found.geographic:
-        from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # both sides of 180 degrees are near each other
+        from_start[:, 0] = (from_start[:, 0] + 180) % 360 - 180  # places on both sides of 180 degrees are neighbours
     middle = start + np.median(from_start[is_known], axis=0)
     away = great_circle_m(found.place, middle) if found.geographic else np.linalg.norm(found.place - middle, axis=1)
     k = int(np.where(is_known, away, 0.0).argmax())
@@ -181,7 +181,7 @@ def _check_far(found: Landmarks) -> None:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# Positions of targets, as `dddas locate` writes them.
+# Tables of the positions of targets. `dddas locate` writes them.
 
 SCORE = Column("score", ".6g", -FARTHEST, FARTHEST, may_be_empty=True)
 POSITIONS = Schema("positions", FRAME, TARGET, *EAST_NORTH, *COVARIANCE, *DEGREES, SCORE)
@@ -192,8 +192,8 @@ def read_positions(path: str | Path) -> Positions:
     r"""Read POSITION_COLUMNS, and the covariance, longitude_deg, latitude_deg and score if given.
 
     Rows may come in any order. An empty cell of a covariance or score is unknown. A table without rows is valid.
-    Raise InputError with file and line: as read_table, impossible variances, a longitude and latitude in only some
-    rows.
+    Raise InputError with file and line as read_table does, and for impossible variances, or if only some rows have
+    longitude and latitude.
 
     >>> written = pathlib.Path("places.csv").write_text("frame,target,east_m,north_m\n1,7,3.0,4.0\n")
     >>> td.read_positions("places.csv").east_north_m
@@ -202,12 +202,12 @@ def read_positions(path: str | Path) -> Positions:
     table = read_table(path, POSITIONS, POSITION_COLUMNS)
     check_crowding(table["frame"], f"positions {path}", "places")
     east, both, north = (table[column.name] for column in COVARIANCE)
-    # Comparisons with unknown variances pass; a correlation slightly above 1 allows for rounding.
+    # Unknown variances (NaN) pass these comparisons. Rounding may give a correlation slightly above 1.
     is_wrong = (east < 0) | (north < 0) | (both**2 > east * north * 1.01 + 1e-8)
     if is_wrong.any():
         row = int(is_wrong.argmax())
         raise table.error(
-            f"{east[row]:g}, {both[row]:g}, {north[row]:g} are no variances of one place; wanted var_east_m2 and "
+            f"{east[row]:g}, {both[row]:g}, {north[row]:g} are not the variances of a place; wanted var_east_m2 and "
             "var_north_m2 of 0 or more, and cov_east_north_m2 squared below their product",
             row,
         )

@@ -42,13 +42,13 @@ def read_image(file: Path, cost: int = PICTURE, size: int | None = None) -> np.n
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """The labels of a mask file, (H, W) int32: a value or colour a target. Raises InputError if it is no picture."""
+    """Return the labels of a mask file, (H, W) int32, from its values or colours. Raise InputError if unreadable."""
     try:
         image = decode_image(path.read_bytes(), cv2.IMREAD_UNCHANGED, path, MASK)
     except OSError:
         image = None
     if image is None:
-        raise InputError(f"{path} is no picture that can be read")
+        raise InputError(f"{path} cannot be read as a picture")
     if image.ndim == 2:
         return image.astype(np.int32)
     blue, green, red = (image[..., k].astype(np.int32) for k in range(3))
@@ -61,7 +61,7 @@ def read_colour_image(file: Path) -> np.ndarray:
     if image is None:
         raise InputError(f"{file} is not a whole picture; give a PNG, JPEG or TIFF")
     if image.dtype != np.uint8 or image.ndim != 3:
-        raise InputError(f"{file} has no colours of 8 bits; give a colour picture, as the camera delivers it")
+        raise InputError(f"{file} is not a colour picture of 8 bits; give a colour picture, as the camera delivers it")
     return np.ascontiguousarray(image[:, :, :3])
 
 
@@ -80,7 +80,7 @@ def read_ignored(file: Path, size: tuple[int, int]) -> np.ndarray:
         got, wanted = (f"{width}x{height}" for width, height in (shown.shape[::-1], size))
         raise InputError(f"{file} has {got} pixels and the frames {wanted}; give a mask of the frames' size")
     if shown.all():
-        raise InputError(f"{file} has no black pixel, so nothing of the frames is left; black is what is searched")
+        raise InputError(f"{file} has no black pixel, so all pixels are ignored; make the pixels to search black")
     return np.where(shown, 255, 0).astype(np.uint8)
 
 
@@ -89,8 +89,8 @@ def decode_image(
 ) -> np.ndarray | None:
     """Decode the bytes of a picture file, (H, W) or (H, W, C); None if it is incomplete. flags: cv2.IMREAD_...
 
-    name: of the file, for messages. cost, input_size: cost and size of `read_image`. A picture without a size in its
-    header is not decoded. Raise InputError, before decoding, if the picture has more pixels than the input may have.
+    name: the file's name, for messages. cost, input_size: cost and size of `read_image`. A picture without a size in
+    its header is not decoded. Raise InputError, before decoding, if the picture is too large for the size of the input.
     """
     size = size_in_header(data)
     if size is None or not _is_whole(data):
@@ -105,7 +105,7 @@ def decode_image(
 
 
 def size_in_header(data: bytes) -> tuple[int, int] | None:
-    """Return (width, height), px, from the header of a picture file, before any rotation; None if it gives none."""
+    """Return (width, height), px, from the header of a picture file, before any rotation; None if missing."""
     try:
         return next((find(data) for magic, find in _SIZES if data.startswith(magic)), None)
     except (struct.error, IndexError):  # too short
@@ -113,7 +113,7 @@ def size_in_header(data: bytes) -> tuple[int, int] | None:
 
 
 def _at(form: str, place: int) -> Callable[[bytes], tuple[int, int]]:
-    """Return a reader of a size that is stored at a fixed place. form: its format for `struct`."""
+    """Return a function that reads a size at a fixed place. form: the format of the size for `struct`."""
     return lambda data: struct.unpack_from(form, data, place)
 
 
@@ -168,7 +168,7 @@ def _size_in_jpeg(data: bytes) -> tuple[int, int] | None:
     place = 2
     while (place := data.find(b"\xff", place)) >= 0:
         marker = data[place + 1]
-        if marker in (0x00, 0xFF):  # a stray byte, a fill byte
+        if marker in (0x00, 0xFF):  # a stray byte or a fill byte
             place += 1
         elif 0xC0 <= marker < 0xD0 and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame; the others are tables
             height, width = struct.unpack_from(">HH", data, place + 5)
@@ -214,7 +214,7 @@ def _is_whole(data: bytes) -> bool:
 
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
-    """Suppress OpenCV's own messages: the user gets one line from this package instead."""
+    """Suppress OpenCV's own messages. The user gets one line from this package instead."""
     level = OPENCV_LOGGING.getLogLevel()
     OPENCV_LOGGING.setLogLevel(0)
     try:
@@ -230,7 +230,7 @@ def natural_order(name: str) -> list[str | int]:
 
 
 def images_of_folder(folder: Path) -> list[Path]:
-    """Return the folder's images in natural order. Raise InputError without any, with a guess at the intended input."""
+    """Return the folder's images in natural order. If there are none, raise InputError with a guess at the input."""
     try:
         entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     except OSError as error:
@@ -267,7 +267,7 @@ _FREQUENT = 2e-4
 # Values this many core widths away from all others are bars, padding or the sun, and not part of the scene. For a
 # single constant value, such as that of bars, half the width suffices.
 _APART, _APART_CONSTANT = 4.0, 0.5
-# Largest number of levels for one step of the values: more would only show the noise.
+# Largest number of levels for one step of the values. More levels would only show noise.
 _MOST_GAIN = 4
 _SENSOR_BITS = (8, 10, 12, 14, 16)
 
@@ -313,7 +313,7 @@ class Levels:
             self.black = min(max(moved, 0.0), self._most)
         black = round(self.black)
         gain = 255 / self.width
-        levels = cv2.addWeighted(image, gain, image, 0.0, -black * gain, dtype=cv2.CV_8U)  # in one pass, cut at 0
+        levels = cv2.addWeighted(image, gain, image, 0.0, -black * gain, dtype=cv2.CV_8U)  # one pass, clipped to 0
         return levels, low < black or high > math.ceil(self.white)
 
     def _fit(self, samples: Sequence[np.ndarray]) -> None:
@@ -364,7 +364,7 @@ def _find_shares(image: np.ndarray) -> np.ndarray:
 
 
 class Masks(Part[Scene]):
-    """Write masks/000001.png and so on, each as a whole. 8 bits, or 16 for frames with over 255 targets."""
+    """Write masks/000001.png and so on, each whole or not at all. Masks with values over 255 have 16 bits, others 8."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / "masks"

@@ -30,13 +30,13 @@ def _heeded() -> list[int]:
 
 
 def ignore_signals() -> None:
-    """Ignore signals from now on. Used at the end of the process, when Python would let them kill it."""
+    """Ignore signals from now on. Callers use this at the end of the process, when a signal would kill it."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal requests the end of the run. number: of the signal. Its notes say what is kept; without any, nothing."""
+    """Raised when a signal requests the end of the run. number: the signal's number. Notes name any kept outputs."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -73,7 +73,7 @@ class StopSignals:
         notice: Callable[[int, FrameType | None], object] = lambda number, frame: None,
         together_s: float = TOGETHER_S,
     ) -> None:
-        """ask: called in another thread at the first signal. notice: called in the main thread at each, when possible.
+        """ask: called in another thread at the first signal. notice: called in the main thread at each signal.
 
         at_once: called with the exit code at a further signal later than together_s.
         """
@@ -118,7 +118,7 @@ class StopSignals:
 
 
 Rescue = Callable[[], bool]
-"""Makes the outputs of an open run whole, from another thread. Returns whether there are any."""
+"""A function that makes the outputs of an open run whole, from another thread. It returns whether there are outputs."""
 
 _rescues: list[Rescue] = []
 # Signals that the main thread has received; it acts on them when allowed. An Event would take a lock, and a handler
@@ -137,7 +137,7 @@ def rescued_by(rescue: Rescue) -> Iterator[None]:
 
 
 def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
-    """Return signals that raise Stopped in the main thread, once.
+    """Return StopSignals that raise Stopped once, in the main thread.
 
     If that thread is stuck in a library, another thread makes open outputs whole and then calls `end` with the signal
     and whether anything was kept; `end` ends the process.
@@ -150,7 +150,7 @@ def raising_signals(end: Callable[[int, bool], object]) -> StopSignals:
         signals.noticed = signals.noticed or number
         if taken.acquire(blocking=False):
             raise Stopped(number)
-        if is_rescued.is_set():  # this thread was stuck, and the other one is about to end the process
+        if is_rescued.is_set():  # this thread was stuck, and the other thread is about to end the process
             time.sleep(_DEAF_S)
 
     def ask(number: int) -> None:
@@ -187,6 +187,6 @@ def uninterrupted() -> Iterator[None]:
     if not held:
         return
     if callable(handler := before[held[0]]):
-        handler(held[0], None)  # a new signal would count as the user's second one
+        handler(held[0], None)  # a new signal would count as the user's second signal
     else:
         signal.raise_signal(held[0])

@@ -12,7 +12,7 @@ from torchvision_dddas.errors import InputError
 from torchvision_dddas.io.sources import frame_times
 from torchvision_dddas.types import COLUMNS_OF_TELEMETRY, Frame, Problem, Source, Telemetry, is_sampled
 
-# A clip that begins within this time of the end of the one before is continuous with it: log clocks are inaccurate.
+# A clip that begins within this time of the previous clip's end continues that clip: log clocks are inaccurate.
 _SEAM_S = 2.0
 
 
@@ -23,7 +23,7 @@ class JoinedSource:
     """
 
     def __init__(self, parts: Sequence[Source], logs: Sequence[Path] = ()) -> None:
-        """logs: one for all clips, or one for each. Raise InputError for clips of different sizes or rates."""
+        """logs: one log for all clips, or one for each. Raise InputError for clips of different sizes or rates."""
         self._parts, self._logs, first = parts, logs, parts[0]
         if len(logs) not in (0, 1, len(parts)):
             raise InputError(
@@ -84,7 +84,7 @@ class JoinedSource:
 
 
 def _joined(logs: Sequence[Telemetry], starts_s: np.ndarray) -> Telemetry:
-    """Join logs, each cut to its clip. Values are unknown in a pause between two clips."""
+    """Join logs. Cut each log to its clip. Values are unknown in a pause between two clips."""
     if len({log.geographic for log in logs}) > 1:
         raise InputError("some logs have longitudes and latitudes, others local metres; give all in one kind")
     pieces = list[dict[str, Any]]()
@@ -93,7 +93,7 @@ def _joined(logs: Sequence[Telemetry], starts_s: np.ndarray) -> Telemetry:
         rows = (time_s < until_s) & ((time_s >= starts_s[k]) | (k == 0))
         piece = {"time_s": time_s[rows], **{name: getattr(log, name)[rows] for name in COLUMNS_OF_TELEMETRY}}
         ends_s = [*(pieces[-1]["time_s"][-1:] if pieces else ()), *piece["time_s"][:1]]
-        if np.ptp(ends_s) > _SEAM_S:  # the last sample holds for a while, as at the end of a log
+        if np.ptp(ends_s) > _SEAM_S:  # keep the last sample for a while, as at the end of a log
             held = {name: column[-1:] for name, column in pieces[-1].items()}
             unknown = {name: np.full_like(column, np.nan) for name, column in held.items()}
             pieces.append(held | {"time_s": held["time_s"] + _SEAM_S / 2})

@@ -1,4 +1,4 @@
-"""Live streams, picture by picture. The camera or the sender may stop sending at any time."""
+"""Read live streams picture by picture. The camera or the sender may stop sending at any time."""
 
 from typing import Protocol
 
@@ -36,7 +36,7 @@ def open_stream(target: str | int, name: str, limits_s: tuple[float, float]) -> 
 
 
 class OpenedStream:
-    """A Stream that reads from a capture."""
+    """A LiveStream that reads from a capture."""
 
     def __init__(self, capture: Capture) -> None:
         self._capture, self.rate_hz = capture, announced_hz(capture)
@@ -74,4 +74,4 @@ def first_picture(stream: LiveStream, name: str) -> np.ndarray:
             raise InputError(f"no picture comes from {name}; is it sending, in a codec that FFmpeg knows?")
         if (image := stream.retrieve()) is not None:
             return image
-    raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection too poor")
+    raise InputError(f"no picture of {name} can be decoded; its codec is unknown, or the connection is too poor")

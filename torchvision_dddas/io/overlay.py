@@ -1,4 +1,4 @@
-"""What overlays show: targets with tint and heading, tracks with trails, people, landmarks and orders."""
+"""Draw overlays: targets with tint and heading, tracks with trails, people, landmarks and orders."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -33,16 +33,16 @@ AREA: Colour = (220, 120, 190)
 LANDMARK: dict[str, Colour] = {"used": (90, 230, 90), "reassigned": (60, 220, 255), "excluded": WARNING}
 """The colour of a landmark by its state in the fix."""
 LETTERS = {"human": "H", "not_human": "N"}
-"""What ground vehicles say of a target, in one letter."""
+"""The letter for each kind of target that ground vehicles report."""
 LIKELY = 0.5
-"""The least probability of a person that is drawn as one."""
-_GOLDEN_DEG = 137.508  # neighbours in number are far apart in hue, for any count of them
+"""People with a lower probability are drawn as unlikely."""
+_GOLDEN_DEG = 137.508  # consecutive identities get very different hues
 TRAIL_LENGTH = 12
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def identity_colour(identity: int) -> Colour:
-    """The colour of an identity, the same in every frame and on maps."""
+    """Return the colour of an identity. It is the same in every frame and on maps."""
     hue = identity * _GOLDEN_DEG % 360 / 2
     value = 255 - 55 * (identity // 5 % 2)
     (blue, green, red), *_ = cv2.cvtColor(np.array([[[hue, 200, value]]], np.uint8), cv2.COLOR_HSV2BGR)[0].tolist()
@@ -50,17 +50,17 @@ def identity_colour(identity: int) -> Colour:
 
 
 def colour_picture(image: np.ndarray) -> np.ndarray:
-    """A copy of a grey or colour image, (H, W, 3) uint8 BGR, to draw on."""
+    """Return a copy of a grey or colour image to draw on, (H, W, 3) uint8 BGR."""
     return cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
 
 
 def line_width(picture: np.ndarray) -> int:
-    """The width of drawn lines in pixels, for a picture of this height."""
+    """Return the width of drawn lines in pixels, which depends on the picture's height."""
     return max(1, round(picture.shape[0] / 480))
 
 
 def drawable(points: np.ndarray) -> np.ndarray:
-    """Whole pixels that OpenCV can draw; places far outside are moved nearer."""
+    """Return whole pixels that OpenCV can draw. Places far outside the picture are moved nearer."""
     return np.clip(np.nan_to_num(points), -30_000, 30_000).round().astype(np.int32)
 
 
@@ -71,7 +71,7 @@ def rectangle(picture: np.ndarray, box: np.ndarray, colour: Colour, thick: int) 
 
 
 def label(picture: np.ndarray, box: np.ndarray, text: str, colour: Colour) -> None:
-    """Write a text on a patch of a colour, above the box where there is room."""
+    """Write a text on a coloured patch, above the box if there is room."""
     scale, thick = max(picture.shape[0] / 1200, 0.35), line_width(picture)
     (width, height), _ = cv2.getTextSize(text, _FONT, scale, thick)
     x, y = drawable(box[:2]).tolist()
@@ -100,7 +100,7 @@ def _arrow(picture: np.ndarray, start: np.ndarray, tip: np.ndarray, colour: Colo
 
 
 def draw_scene(scene: Scene) -> np.ndarray:
-    """The frame with its targets, (H, W, 3) uint8 BGR; the caption says when not to trust it."""
+    """Return the frame with its targets, (H, W, 3) uint8 BGR. The caption warns of an unreliable registration."""
     picture = colour_picture(scene.frame.image)
     foreground = scene.mask > 0
     if foreground.any():
@@ -127,9 +127,9 @@ def draw_detections(picture: np.ndarray, found: Detections) -> None:
 
 
 def draw_people(found: PeopleFrame) -> np.ndarray:
-    """The frame with its people, (H, W, 3) uint8 BGR.
+    """Return the frame with its people, (H, W, 3) uint8 BGR.
 
-    A person whom the border cuts has another colour and a `?`. People below LIKELY have thin grey boxes underneath.
+    People cut by the border have another colour and a `?`. People below LIKELY have thin grey boxes under the others.
     """
     picture, people = colour_picture(found.frame.image), found.people
     thick = line_width(picture)
@@ -145,7 +145,7 @@ def draw_people(found: PeopleFrame) -> np.ndarray:
         cv2.circle(picture, feet, radius, colours[i] if sure else UNLIKELY, -1, cv2.LINE_AA)
         if sure:
             cv2.circle(picture, feet, radius, (0, 0, 0), 1, cv2.LINE_AA)
-    for i in likely:  # above all boxes
+    for i in likely:  # draw labels over all boxes
         label(picture, people.box_px[i], f"{people.score[i]:.2f}{'?' if people.cut[i] else ''}", colours[i])
     searched = "everywhere" if found.regions_px is None else f"in {found.share:.0%} of the windows"
     unlikely = f" + {len(people) - len(likely)} unlikely" if len(likely) < len(people) else ""
@@ -157,7 +157,7 @@ def draw_people(found: PeopleFrame) -> np.ndarray:
 class Trails:
     """The last places of every identity, moved along with the camera's motion. Frames are added in order.
 
-    length: places kept per identity. memory_frames: an identity unseen for so long is forgotten.
+    length: places kept per identity. memory_frames: an identity that is unseen for more frames is removed.
     places: identity -> frame number, u_px, v_px of each place.
     """
 
@@ -166,7 +166,7 @@ class Trails:
         self.places: dict[int, list[tuple[int, float, float]]] = {}
 
     def add(self, tracked: TrackedFrame) -> None:
-        """Carry all places to this frame, and add the centres of its boxes."""
+        """Move all places into this frame by the camera's motion, and add the centres of its boxes."""
         if tracked.now_from_before is not None and self.places:
             points = np.array([place[1:] for trail in self.places.values() for place in trail], float)
             moved = iter(cv2.perspectiveTransform(points[None], tracked.now_from_before)[0].tolist())
@@ -181,7 +181,7 @@ class Trails:
             del self.places[identity]
 
     def speed(self, identity: int) -> float:
-        """Pixels a frame over the ground since the place before; NaN for an identity with one place."""
+        """Return the speed over the ground since the previous place, pixels a frame; NaN without a previous place."""
         trail = self.places[identity]
         if len(trail) < 2:
             return math.nan
@@ -190,15 +190,15 @@ class Trails:
 
 
 class RunPictures:
-    """Draws frames of a run with tracks, landmarks, what ground vehicles say, and what they were asked to do.
+    """Draw frames of a run with tracks, landmarks, reports of ground vehicles, and orders to vehicles.
 
-    Frames are shown in order; each is drawn once however many callers want it, and not at all if none does.
+    Frames are shown in order. A frame is drawn only if a caller asks for it, and once for all callers.
     """
 
     def __init__(self, size: tuple[int, int], names: Sequence[str] = (), zones: Sequence[Zone] = ()) -> None:
-        """size: (width, height) of the pictures, for frames that could not be read. names: of the landmarks.
+        """size: (width, height) of the pictures, for frames that could not be read. names: the landmarks' names.
 
-        zones: those in pixels are drawn.
+        zones: zones in pixels are drawn, and others are ignored.
         """
         self._size, self._names = size, tuple(names)
         self._zones = [zone for zone in zones if zone.unit == "px"]
@@ -207,13 +207,13 @@ class RunPictures:
         self._picture: np.ndarray | None = None
 
     def show(self, result: FrameResult) -> None:
-        """Go on to the next frame, if it is not the same."""
+        """Add a frame to the trails, unless it is the frame that was shown last."""
         if result is not self._shown:
             self._trails.add(result.tracked)
             self._shown, self._picture = result, None
 
     def __call__(self, result: FrameResult) -> np.ndarray:
-        """The picture of a frame, (H, W, 3) uint8 BGR; black where it could not be read.
+        """Return the picture of a frame, (H, W, 3) uint8 BGR; black if the frame could not be read.
 
         The caller must not draw on it.
         """
@@ -276,7 +276,7 @@ class RunPictures:
 
 
 def draw_tracks(picture: np.ndarray, tracked: TrackedFrame, trails: Trails, words: Mapping[int, str]) -> None:
-    """Draw trails, boxes and identities, and after an identity its words."""
+    """Draw trails, boxes and identities. words: identity -> text behind its number."""
     thick, tracks = line_width(picture), tracked.tracks
     for row in tracked.untracked:
         rectangle(picture, tracked.detections.box_px[row], UNTRACKED, 1)
@@ -289,7 +289,7 @@ def draw_tracks(picture: np.ndarray, tracked: TrackedFrame, trails: Trails, word
 
 
 def target_words(result: FrameResult) -> dict[int, str]:
-    """What ground vehicles say of targets, in one letter, and the fused number of those that several platforms see."""
+    """Return a text for each target: the letter of its kind, and the fused number if several platforms see it."""
     located, confirmed, fused = result.locations, result.confirmed, result.fused
     words: dict[int, str] = {}
     if confirmed is not None and located is not None:
@@ -303,7 +303,7 @@ def target_words(result: FrameResult) -> dict[int, str]:
 
 
 def _summarize_location(located: AerialLocations) -> tuple[str, Colour]:
-    """By what the frame was located and how well."""
+    """Return a text on the method and the precision of the frame's location, and the colour of the text."""
     fix = located.fix
     if not fix.by:
         return f"not located: {fix.cause}", WARNING
@@ -327,13 +327,13 @@ def _summarize_command(command: Command) -> str:
 
 
 ToMetres = Callable[[np.ndarray], np.ndarray]
-"""(2,) local metres of a place in a command."""
+"""A function that returns the local metres (2,) of a place in a command."""
 
 
 def command_metres(result: FrameResult) -> ToMetres | None:
-    """A function from the places of a frame's commands to local metres; None where the frame does not tell enough.
+    """Return a function from the places of a frame's commands to local metres; None if the scale is unknown.
 
-    Commands are in degrees where landmarks have degrees, else in local metres. The scale follows from the landmarks.
+    Commands are in degrees if landmarks have degrees, else in local metres. The scale follows from the landmarks.
     """
     located, degrees = result.locations, result.mark_lonlat_deg
     if located is None:
@@ -342,7 +342,7 @@ def command_metres(result: FrameResult) -> ToMetres | None:
         return lambda place: np.asarray(place, float)
     metres = located.marks.east_north_m
     both = np.isfinite(degrees).all(axis=1) & np.isfinite(metres).all(axis=1)
-    # Less than some metres apart, rounding would dominate the scale.
+    # If landmarks are less than a metre apart, rounding would dominate the scale.
     if both.sum() < 2 or (np.ptp(metres[both], axis=0) < 1.0).any():
         return None
     middle_deg, middle_m = degrees[both].mean(axis=0), metres[both].mean(axis=0)
@@ -350,18 +350,18 @@ def command_metres(result: FrameResult) -> ToMetres | None:
 
     def to_metres(place: np.ndarray) -> np.ndarray:
         place = np.asarray(place, float)
-        # A place that is no such longitude and latitude is in local metres already.
+        # A place more than a degree from the landmarks is already in local metres.
         return place if np.abs(place - middle_deg).max() > 1.0 else middle_m + (place - middle_deg) * scale
 
     return to_metres
 
 
 def _pixels_per_metre(located: AerialLocations) -> np.ndarray | None:
-    """(2, 2) pixels to the right and down of a metre to the east and north about the landmarks; None where unknown."""
+    """Return (2, 2) pixels right and down per metre east and north, near the landmarks; None if unknown."""
     marks = located.marks
     both = np.isfinite(marks.image_px).all(axis=1) & np.isfinite(marks.east_north_m).all(axis=1)
     place, pixel = marks.east_north_m[both], marks.image_px[both]
     apart = place - place.mean(axis=0) if len(place) >= 3 else np.zeros((2, 2))
-    if np.linalg.svd(apart, compute_uv=False)[-1] < 1.0:  # fewer than three, or all but on one line
+    if np.linalg.svd(apart, compute_uv=False)[-1] < 1.0:  # fewer than three places, or nearly on one line
         return None
     return np.asarray(np.linalg.lstsq(apart, pixel - pixel.mean(axis=0), rcond=None)[0].T)

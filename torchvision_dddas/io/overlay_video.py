@@ -1,4 +1,4 @@
-"""overlay.mp4 and overlay.png: pictures of a run, encoded in a thread beside the work that makes them."""
+"""Write overlay.mp4 and overlay.png, the pictures of a run. The video is encoded in a separate thread."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,12 +17,12 @@ Item = TypeVar("Item")
 
 
 class OverlayVideo(Generic[Item]):
-    """overlay.mp4: H.264, which browsers play, where PyAV is installed (extra `video`); else OpenCV's mp4v."""
+    """Write overlay.mp4 as H.264, which browsers play, if PyAV is installed (extra `video`), else as OpenCV's mp4v."""
 
     def __init__(
         self, folder: Path, rate_hz: float, draw: Callable[[Item], np.ndarray], name: str = "overlay.mp4"
     ) -> None:
-        """draw: returns a new picture of an item, (H, W, 3) uint8 BGR."""
+        """draw: a function that returns a new picture of an item, (H, W, 3) uint8 BGR."""
         self._path = folder / name
         self._part: PartFile | None = None
         self._rate = Fraction(min(max(rate_hz, 1.0), 240.0)).limit_denominator(1001)
@@ -30,7 +30,7 @@ class OverlayVideo(Generic[Item]):
         self._draw = draw
 
     def write(self, item: Item) -> None:
-        """Draw a frame and add it. Raises OSError if the disk refuses."""
+        """Draw a frame and add it. Raise OSError if the disk refuses."""
         picture = self._draw(item)
         height, width = picture.shape[:2]
         # Colour is stored for blocks of 2×2 pixels: repeat the last row and column of odd sizes.
@@ -42,18 +42,18 @@ class OverlayVideo(Generic[Item]):
         self._writer.write(picture)
 
     def close(self, complete: bool) -> None:
-        """Finish the video and put it in its place; a run without frames has none."""
+        """Finish the video and move it to its place. A run without frames has no video."""
         if self._writer is None or self._part is None:
             return
         writer, self._writer = self._writer, None
         writer.close()
-        # OpenCV's writer stays silent on a full disk: only a video that can be opened again is whole.
+        # OpenCV's writer does not report a full disk, so check that the video can be opened again.
         if not cv2.VideoCapture(utf8_name(self._part.path)).isOpened():
             raise OSError(f"{self._path.name} could not be finished")
         self._part.keep()
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove the unfinished video."""
         if self._writer is not None:
             with suppress(Exception):  # a full disk refuses the last frames again; an encoder may raise anything
                 self._writer.close()
@@ -63,30 +63,30 @@ class OverlayVideo(Generic[Item]):
 
 
 class OverlayPicture(Part[Item]):
-    """overlay.png: the picture of the last item."""
+    """Write overlay.png, the picture of the last item."""
 
     def __init__(self, folder: Path, draw: Callable[[Item], np.ndarray]) -> None:
         self._path, self._draw = folder / "overlay.png", draw
         self._content = b""
 
     def write(self, item: Item) -> None:
-        """Draw it."""
+        """Draw the item."""
         self._content = cv2.imencode(".png", self._draw(item))[1].tobytes()
 
     def close(self, complete: bool) -> None:
-        """Write it, if there is one. Raises OSError if the disk refuses."""
+        """Write the picture, if there is one. Raise OSError if the disk refuses."""
         if self._content:
             write_whole(self._path, self._content)
 
 
 class ThreadedWriter:
-    """Encodes pictures in a thread: on two cores the slower of the two sets the pace.
+    """Encode pictures in a thread, so that encoding and other work use two cores.
 
-    A picture must not be changed after it was given. An error of the work is raised by the next call.
+    A picture must not be changed after it was given. The next call raises an error of the thread.
     """
 
     def __init__(self, waiting: int = 2) -> None:
-        """waiting: pictures held at most; `write` waits for room."""
+        """waiting: largest number of pictures in the queue. `write` waits if the queue is full."""
         self._queue: Queue[np.ndarray | None] = Queue(waiting)
         self._error: Exception | None = None
         self._thread = Thread(target=self._work, daemon=True)
@@ -100,12 +100,12 @@ class ThreadedWriter:
         """Finish the file."""
 
     def write(self, picture: np.ndarray) -> None:
-        """Hand over a picture."""
+        """Add a picture to the queue."""
         self._raise()
         self._queue.put(picture)
 
     def close(self) -> None:
-        """Finish the file when all pictures are in it."""
+        """Wait until all pictures are encoded, and finish the file."""
         self._queue.put(None)
         self._thread.join()
         self.finish()
@@ -125,7 +125,7 @@ class ThreadedWriter:
 
 
 def _open_writer(path: Path, rate: Fraction, size: tuple[int, int]) -> ThreadedWriter:
-    """A writer of H.264 if PyAV is there, else of mp4v. size: (width, height). Raises OSError if it cannot begin."""
+    """Return a writer of H.264 if PyAV is installed, else of mp4v. size: (width, height). Raise OSError on failure."""
     try:
         return _H264(path, rate, size)
     except ImportError:
@@ -141,9 +141,9 @@ class _H264(ThreadedWriter):
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
-        self._stream.codec_context.thread_count = 2  # memory that does not depend on the machine's cores
-        # No look-ahead: it would hold tens of frames in memory. The preset: 3.1 ms of processor time a frame at 768x576
-        # instead of `veryfast`'s 7.5, for a file 1.5 times the size.
+        self._stream.codec_context.thread_count = 2  # so memory does not depend on the number of cores
+        # Look-ahead would hold tens of frames in memory. The preset takes 3.1 ms of processor time a frame at 768x576,
+        # and `veryfast` takes 7.5 ms. With this preset, the file is 1.5 times as large.
         self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "22"}
         super().__init__()
 

@@ -4,9 +4,9 @@ clip = "ugv1.mp4"          # or detections = "people.csv", boxes of an earlier r
 camera = "camera.toml"     # or a table [camera] with the keys of such a file
 poses = "poses.csv"        # by frame or time_s of this clip; omit it for a camera that stands still
 starts_s = 2.5             # when the clip begins, in seconds of the main clip; or starts_utc, a date and time
-rate_hz = 10               # of a folder of pictures or a table; a video has its own
+rate_hz = 10               # of a folder of pictures or a table; a video has its own rate
 
-A further UAV has telemetry and landmarks instead of poses, and may have colours, dem and set, as in `dddas run`.
+A further UAV has telemetry or landmarks instead of poses, and may have colours, dem and set, as in `dddas run`.
 """
 
 import math
@@ -33,20 +33,20 @@ KEYS: dict[str, tuple[type, ...]] = {
     "rate_hz": (float, int),
     "interval": (int,),
 }
-"""Keys and their types. name: of the platform, by default the file's name. interval: people are detected in every n-th
+"""Keys and their types. name: the platform's name, by default the file's. interval: people are detected in every n-th
 frame of the clip. Relative paths start at the file's own folder.
 """
 BESIDE = ("telemetry", "landmarks", "camera", "colours", "dem")
 AERIAL_KEYS = {key: kinds for key, kinds in KEYS.items() if key != "poses"} | dict.fromkeys(BESIDE, (str,))
 AERIAL_KEYS["set"] = (list,)
-"""Keys of a further UAV. BESIDE are files, each as the option of `dddas run`; set is a list of texts as for --set."""
+"""Keys of a further UAV. Keys of BESIDE name files, like options of `dddas run`. `set` is a list of --set values."""
 _KINDS = {str: "a text in quotes", dict: "a table", float: "a number", int: "a whole number"}
 _KINDS |= {datetime: "a date and time", list: "a list"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Platform:
-    """A platform as its file describes it. clip: the input to open, or "" with detections. files: all files it names.
+    """The content of a platform's file. clip: the input to open, or "" with detections. files: all files it names.
 
     starts_s: NaN if starts_utc_s, seconds since 1970, is given instead. beside, overrides: for a further UAV, the given
     files of BESIDE, and its parameter changes.
@@ -79,7 +79,7 @@ class PlatformFile(Platform):
 
 
 def read_platform(path: str | Path) -> PlatformFile:
-    """Read a platform's file. Raise InputError with the file: unreadable; keys unknown, missing or of a wrong type."""
+    """Read a platform's file. Raise InputError if it is unreadable, or a key is unknown, missing or of a wrong type."""
     path = Path(path)
     content = _read_keys(path, KEYS)
     if "camera" not in content:
@@ -88,7 +88,7 @@ def read_platform(path: str | Path) -> PlatformFile:
         if other in content and "detections" in content:
             raise InputError(f"platform {path} has {other} and detections; give one of them")
     if not {"clip", "detections"} & content.keys():
-        raise InputError(f"platform {path} lacks clip, its pictures, or detections, the boxes of its people")
+        raise InputError(f"platform {path} lacks clip (its pictures) or detections (the boxes of its people)")
     if "detections" in content and "rate_hz" not in content:
         raise InputError(f"platform {path} has detections by frame; give rate_hz too, the frames per second")
     files = {key: path.parent / content[key] for key in ("camera", "poses") if isinstance(content.get(key), str)}
@@ -105,11 +105,11 @@ def read_platform(path: str | Path) -> PlatformFile:
 
 
 def read_aerial_platform(path: str | Path) -> Platform:
-    """Read the file of a further UAV. Raise InputError as `read_platform`, and if nothing can locate the UAV."""
+    """Read the file of a further UAV. Raise InputError as `read_platform` does, and if nothing can locate the UAV."""
     path = Path(path)
     content = _read_keys(path, AERIAL_KEYS)
     if "clip" not in content:
-        raise InputError(f"platform {path} lacks clip, its pictures")
+        raise InputError(f"platform {path} lacks clip (its pictures)")
     if not {"telemetry", "landmarks"} & content.keys():
         raise InputError(
             f"platform {path} lacks telemetry or landmarks, which are needed to locate targets; without them, "
@@ -125,9 +125,9 @@ def _read_keys(path: Path, keys: dict[str, tuple[type, ...]]) -> dict[str, Any]:
     for key, value in content.items():
         if key not in keys:
             near = get_close_matches(key, keys, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(keys)}"
+            hint = f"did you mean {near[0]}?" if near else f"the keys are {', '.join(keys)}"
             if key in KEYS | AERIAL_KEYS:
-                hint = "is the file one for --aerial?" if keys is KEYS else "is the file one for --ground?"
+                hint = "is this a file for --aerial?" if keys is KEYS else "is this a file for --ground?"
             raise InputError(f"platform {path} has the unknown key {key}; {hint}")
         if not isinstance(value, keys[key]) or isinstance(value, bool):
             raise InputError(f"platform {path}: {key} is {str(value)[:40]!r}; wanted {_KINDS[keys[key][0]]}")
@@ -139,7 +139,7 @@ def _read_keys(path: Path, keys: dict[str, tuple[type, ...]]) -> dict[str, Any]:
 
 
 def _common(path: Path, content: dict[str, Any], files: list[Path]) -> dict[str, Any]:
-    """Return the fields that every platform has. files: further files that it names."""
+    """Return the fields that every platform has. files: further files that the platform names."""
     rate_hz, interval, starts_s = content.get("rate_hz"), content.get("interval", 1), content.get("starts_s", 0.0)
     if not (interval >= 1 and (rate_hz is None or 0 < rate_hz <= 1000) and abs(starts_s) < 1e9):
         raise InputError(f"platform {path}: interval must be 1 or more, rate_hz 0 to 1000, starts_s in seconds")

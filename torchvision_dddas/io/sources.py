@@ -45,7 +45,7 @@ def open_source(
     rate_hz: frames a second; None: the video's own rate, or 10 for images.
     full_scale: the value of 16-bit pictures that becomes white (255), or the values that become black and white. None:
     `images.Levels` takes them from the clip; the source's `levels` holds them.
-    single: accept a file that is one image as a clip of one frame. By default it is refused, as nothing can move in it.
+    single: accept one image as a clip of one frame. By default it is refused, because nothing can move in it.
     Raise InputError with one line if the clip cannot be read.
     """
     text = str(spec)
@@ -63,7 +63,7 @@ def open_source(
         path.stat()
     except FileNotFoundError:
         pass
-    except (OSError, ValueError) as error:  # a long name, a forbidden folder, a name with a NUL
+    except (OSError, ValueError) as error:  # such as a long name, a forbidden folder, a name with a NUL
         raise InputError(f"{text[:200]} cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
         return VideoSource(text, text, rate_hz, scale)
@@ -87,7 +87,7 @@ _LASTING = 10
 
 
 class _Clip(ABC):
-    """The common part of recordings.
+    """The common base of recordings.
 
     tolerant: leave out frames of another size or depth, and adopt a size that persists. If it is not set, such a frame
     raises InputError.
@@ -119,7 +119,7 @@ class _Clip(ABC):
         self.problems.append(Problem(number, what))
 
     def _fits(self, image: np.ndarray, number: int, this: str, first: str) -> bool:
-        """Return whether a picture has the clip's size. this, first: names of it and of the first, for messages."""
+        """Return whether a picture has the clip's size. this, first: names of this picture and of the first."""
         (width, height), size = self.size, (image.shape[1], image.shape[0])
         self._odd = 0 if size == self.size else self._odd + 1
         if self.tolerant and self._odd >= _LASTING:
@@ -216,7 +216,7 @@ class ImageSource(_Clip):
 
 # These containers store their number of frames; for others it is estimated from the duration, often off by one.
 _EXACT_COUNT = {".mp4", ".m4v", ".mov", ".avi"}
-# Consecutive reads that may fail before the clip counts as ended, however many frames it announced.
+# Number of consecutive failed reads after which a clip has ended, however many frames it announced.
 _MOST_LOST, _MOST_LOST_LIVE = 1000, 10
 STALL_S = 30.0
 """An address that sends nothing for this time counts as lost."""
@@ -246,8 +246,8 @@ class _Stamps:
     def add(self, stamp_s: float, lost: int, damaged: bool) -> int:
         """Number the next frame. Return how many frames are missing before it, or -1 if it came out of order.
 
-        stamp_s: time stamp; NaN if it has none, which counts as one step after the frame before. lost: failed reads
-        before it. damaged: whether its data are damaged.
+        stamp_s: time stamp; NaN (none) counts as one step after the previous frame. lost: failed reads before the
+        frame. damaged: whether its data are damaged.
         """
         self._damaged |= damaged or lost > 0
         # For a varying rate use the shortest step, so that the next stamp is not passed.
@@ -284,7 +284,7 @@ class _Stamps:
             return ""
         return (
             f"the frame rate varies: pictures are {usual} ms apart, but {odd} times {steps[0]} to {steps[-1]} ms; all "
-            "times are the file's"
+            "times are from the file"
         )
 
 
@@ -294,7 +294,7 @@ class VideoSource(_Clip):
     A file's rotation is applied, so size is that of the upright picture. rate_hz: the file's own, unless the caller
     gives one. Frames that cannot be decoded leave a gap in the numbers. Times come from the file, or from the clock
     for a live stream.
-    Raise InputError: cannot be opened, not a video, first frame cannot be decoded, size changes.
+    Raise InputError if it cannot be opened, is not a video, has no first frame to decode, or changes its size.
     """
 
     def __init__(self, target: str | int, name: str, rate_hz: float | None = None, scale: Scale = None) -> None:
@@ -424,7 +424,7 @@ def _span(first: int, last: int) -> str:
 
 
 def frame_times(source: Source) -> dict[int, float]:
-    """Return the time of each frame of a video file, s, from its stored data; empty if they do not give it."""
+    """Return the time of each frame of a video file, s, from its stored data; empty if unknown."""
     if not isinstance(source, VideoSource) or source._live:
         return {}
     capture, stamps, times_s = source._open(), _Stamps(source._own_hz, source._given_hz), dict[int, float]()
@@ -441,7 +441,7 @@ def frame_times(source: Source) -> dict[int, float]:
 
 
 def names_file(spec: str) -> bool:
-    """Return whether a file has this name, although it begins like `camera:` or `sim:`."""
+    """Return whether this name is that of a file, even if it begins with `camera:` or `sim:`."""
     try:
         return Path(spec).exists()
     except (OSError, ValueError):
@@ -449,7 +449,7 @@ def names_file(spec: str) -> bool:
 
 
 def stream_target(spec: str) -> str | int | None:
-    """Return the target to open for `camera:0` or an address; None for anything else. Raise InputError."""
+    """Return the target to open for `camera:0` or an address, else None. Raise InputError for a wrong camera index."""
     if spec.startswith("camera:") and not names_file(spec):
         index = spec.removeprefix("camera:")
         if not index.isdecimal() or len(index) > 4:

@@ -1,4 +1,4 @@
-"""Text tables, CSV and MOTChallenge. A schema defines the columns once, for the reader and for the writer."""
+"""Read and write CSV and MOTChallenge text. A schema defines the columns once, for the reader and for the writer."""
 
 import codecs
 import csv
@@ -29,7 +29,7 @@ FARTHEST = 1e9
 
 
 MOST_BOXES = 1000
-"""Largest number of boxes in a frame: tracking and scoring compare each with each of the next frame or of the truth.
+"""Most boxes in a frame. Tracking and scoring compare each box with all boxes of another frame or the truth.
 
 A frame of 1000 boxes takes 0.6 GB and 1 s to score.
 """
@@ -39,7 +39,7 @@ A frame of 1000 boxes takes 0.6 GB and 1 s to score.
 class Column:
     """A column of a table.
 
-    name: with its unit, as `x_px`. format: of its numbers, as for `format(value, ".2f")`; "" for text.
+    name: the name with the unit, as `x_px`. format: as for `format(value, ".2f")`; "" for text.
     low, high: the range that a reader accepts, ends included. is_whole: whether numbers must be whole.
     may_be_empty: whether a reader accepts empty cells, which become NaN. wanted: the range in words, for messages.
     """
@@ -194,7 +194,7 @@ class CsvText(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """What messages call a row."""
+        """The word for a row in messages."""
         return "line"
 
 
@@ -290,12 +290,12 @@ def _find_format(head: str) -> tuple[str, str | None]:
     pointed = [cell for cell in cells if "." in cell and _POINTED.fullmatch(cell)]
     points = sum("." in cell for cell in numbers if "," not in cell)
     is_thousands = all(map(_THOUSANDS.fullmatch, commas))
-    # If commas are certainly decimal, points may all separate thousands.
+    # Points can separate thousands only if commas are certainly decimal.
     if not is_thousands and pointed and points <= len(pointed) <= len(commas):
         return separator, ".,"
     if 10 * points > len(commas):
         return separator, "" if commas and is_thousands else None
-    # If every comma may separate thousands, only a semicolon decides: it is used because commas are decimal.
+    # If all commas may separate thousands, the separator decides: semicolons are used where commas are decimal.
     return separator, "." if separator == ";" or not is_thousands else None
 
 
@@ -350,8 +350,8 @@ def read_table(
 
     required: names that the table must have. is_ragged: whether lines may have more or fewer cells than the first, as
     long as the schema's columns are present. text: the file's cells, if already read.
-    Raise InputError with file and line: unreadable, a column missing or named twice, too many or too few cells, not a
-    number, out of range.
+    Raise InputError with file and line for an unreadable file, a column that is missing or named twice, too many or
+    too few cells, or a cell that is not a number or out of range.
     """
     text = text or read_csv(path, schema.what)
     header, _, rows = text
@@ -402,7 +402,7 @@ def parse_numbers(cells: Sequence[str]) -> np.ndarray:
 
 
 def check_crowding(frame: np.ndarray, name: str, rows: str = "boxes") -> None:
-    """Raise InputError if one of the frames (N,) has more than MOST_BOXES rows. name: of the table."""
+    """Raise InputError if one of the frames (N,) has more than MOST_BOXES rows. name: the table's name."""
     numbers, counts = np.unique(frame, return_counts=True)
     if len(counts) and counts.max() > MOST_BOXES:
         crowded = numbers[counts.argmax()]
@@ -413,7 +413,7 @@ def check_crowding(frame: np.ndarray, name: str, rows: str = "boxes") -> None:
 
 def _parse_number(cell: str) -> float:
     try:
-        value = math.inf if "_" in cell else float(cell)  # 1_0 is a number to Python alone
+        value = math.inf if "_" in cell else float(cell)  # only Python reads 1_0 as a number
     except ValueError:
         return math.inf
     return math.inf if math.isnan(value) else value

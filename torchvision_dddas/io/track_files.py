@@ -1,4 +1,4 @@
-"""Tracks, detections and positions as files that other programs read."""
+"""Write tracks, detections and positions as files that other programs read."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -30,12 +30,12 @@ from torchvision_dddas.io.tables import (
 from torchvision_dddas.types import AerialLocations, DetectionTable, FrameResult, Positions, Scene, TrackedFrame, Tracks
 
 _CSV = Schema("tracks", FRAME, IDENTITY, *BOX, PRECISE_SCORE, Column("class"), Column("class_id", ".0f"))
-_MOST_VALUES = 65535  # of a mask of 16 bits
+_MOST_VALUES = 65535  # the largest value of a 16-bit mask
 
 Item = FrameResult | TrackedFrame | Tracks | Scene | AerialLocations
 """The results of one frame that can be written."""
 Size = tuple[int, int] | None
-"""Width and height of the pictures; None where unknown."""
+"""Width and height of the pictures; None if unknown."""
 
 
 def write_tracks(
@@ -49,10 +49,10 @@ def write_tracks(
     """Write the boxes or places of a clip in one of FORMATS. Return notes on what the format cannot hold.
 
     tracks: a table, or the results of frames in order, as `Pipeline`, `Tracker` and `read_detections` give them.
-    to: the format; None: the ending of the path says it. size: (width, height) of the pictures, which yolo and davis
-    need. pictures: their file names, in order. Places go to Parquet and GeoPackage; `Pipeline` has them as
-    `result.locations`.
-    Raises InputError: nothing to write, an unknown format, a size or places that are missing, a disk that refuses.
+    to: the format; None: the ending of the path decides. size: (width, height) of the pictures, which yolo and davis
+    need. pictures: their file names, in order. Only Parquet and GeoPackage hold places, such as `result.locations` of
+    `Pipeline`.
+    Raise InputError for nothing to write, an unknown format, a missing size or place, or if the disk refuses.
 
     >>> tracks = td.Tracks(1, np.array([7]), np.array([[10.0, 20, 20, 9]]), np.ones(1), np.zeros(1, int))
     >>> notes = td.write_tracks([tracks], "tracks.json", size=(64, 48))
@@ -80,7 +80,7 @@ def write_tracks(
         notes.append(f"{(~has['identities']).sum()} boxes without identity are left out")
         table = table[has["identities"]]
     if to in ("coco", "yolo", "cvat") and (table.label == "").any():
-        notes.append(f"{(table.label == '').sum()} boxes without a class have the class target")
+        notes.append(f"{(table.label == '').sum()} boxes without a class get the class target")
     try:
         notes += write(table, path, size, pictures)
     except OSError as error:
@@ -91,7 +91,7 @@ def write_tracks(
 def convert_positions(table: Path, path: Path, to: str | None = None) -> int:
     """Write all columns of a table of positions as Parquet or GeoPackage, and return the number of its rows.
 
-    Raises InputError as `read_positions` and `write_tracks`.
+    Raise InputError as `read_positions` and `write_tracks` do.
     """
     count, ending = len(places := read_positions(table)), path.suffix.lower()
     if count == 0 or ending not in (".parquet", ".gpkg") or to not in (None, ending[1:]):
@@ -103,7 +103,7 @@ def convert_positions(table: Path, path: Path, to: str | None = None) -> int:
 
 
 def _typed(cells: list[str]) -> Sequence[Any] | np.ndarray:
-    """Cells as whole numbers, numbers or words."""
+    """Return the cells as whole numbers, numbers or words."""
     values = parse_numbers(cells)
     if np.isinf(values).any():
         return cells
@@ -111,7 +111,7 @@ def _typed(cells: list[str]) -> Sequence[Any] | np.ndarray:
 
 
 def _table_of(tracks: DetectionTable | Tracks | Positions | Iterable[Item]) -> Tracks | Positions:
-    """All rows in one table. Raises InputError for what has none."""
+    """Return all rows in one table. Raise InputError if there are no results, or both boxes and places."""
     if isinstance(tracks, Positions):
         return tracks
     if isinstance(tracks, DetectionTable):
@@ -168,16 +168,16 @@ def _write_mot(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> l
 
 
 def _write_visdrone(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    """The last columns are the category, and truncation and occlusion, -1 for unknown."""
+    """Write VisDrone text. The last columns are the category, and truncation and occlusion as unknown (-1)."""
     numbers = {name: number for number, name in enumerate(VISDRONE, 1)}
     others = sorted({name or "unknown" for name in table.label.tolist() if name not in numbers})
     category = np.array([numbers.get(name, len(VISDRONE) + 1) for name in table.label])
     save_file(path, MOT_TRACKS.format_rows({**_mot_rows(table), "x": category}).encode())
-    return [f"VisDrone has no class {', '.join(others)}: it is 11, others"] if others else []
+    return [f"VisDrone has no class {', '.join(others)}: written as 11, others"] if others else []
 
 
 def _numbered_classes(table: Tracks, first: int) -> tuple[dict[int, str], np.ndarray]:
-    """The name of each class, and (N,) the number of each row: those of the table where all rows have one."""
+    """Return the name of each class, and the class of each row, (N,). Keep the table's numbers if all rows have one."""
     pairs = {*zip(table.class_id.tolist(), table.label.tolist(), strict=True)}
     names = {number: name or str(number) for number, name in sorted(pairs)}
     if min(names, default=-1) >= 0 and len(names) == len(pairs):
@@ -187,7 +187,7 @@ def _numbered_classes(table: Tracks, first: int) -> tuple[dict[int, str], np.nda
 
 
 def _write_coco(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    """Annotations with scores, which are COCO's results too, and with track_id where there are identities."""
+    """Write annotations with scores, which are also COCO results. Boxes with an identity have a track_id."""
     kinds, number = _numbered_classes(table, 1)
     shape = {} if size is None else {"width": size[0], "height": size[1]}
     boxes = []
@@ -210,7 +210,7 @@ def _picture(frame: int, names: Sequence[str]) -> str:
 
 
 def _write_yolo(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    """Centres and sizes as shares of the picture, at whose border boxes end; scores where there are any."""
+    """Write centres and sizes as shares of the picture. Cut boxes at the border. Write scores unless all are 1."""
     assert size is not None
     low, high = np.clip(table.box_px[:, :2], 0, size), np.clip(table.box_px[:, :2] + table.box_px[:, 2:], 0, size)
     kinds, number = _numbered_classes(table, 0)
@@ -229,7 +229,7 @@ def _write_yolo(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
 
 
 def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    """CVAT for video 1.1. A box with outside="1" ends each stretch of a track; CVAT would go on with the last one."""
+    """Write CVAT for video 1.1. A box with outside="1" ends each part of a track; else CVAT repeats the last box."""
     frames = np.unique(table.frame)
     step, last = int(np.diff(frames).min(initial=1 << 30)), max(int(frames.max(initial=0)), len(names))
     labels = sorted({name or "target" for name in table.label.tolist()})
@@ -260,7 +260,7 @@ def _write_cvat(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> 
 
 
 def _write_davis(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
-    """masks/000001.png and so on, whose values are identities."""
+    """Write masks/000001.png and so on. The values of the masks are identities."""
     assert size is not None
     if (most := int(table.identity.max())) > _MOST_VALUES:
         raise InputError(f"identity {most} is above {_MOST_VALUES}, the largest value of a mask")
@@ -274,7 +274,7 @@ def _write_davis(table: Tracks, path: Path, size: Size, names: Sequence[str]) ->
             left, top, right, bottom = edges[row]
             mask[top:bottom, left:right] = table.identity[row]
         masks.add(frame, mask)
-    return ["the masks are filled boxes, because tracks have no outlines; of boxes that overlap the last is on top"]
+    return ["the masks are filled boxes, because tracks have no outlines; where boxes overlap, the last is on top"]
 
 
 def _write_columns(table: Tracks, path: Path, size: Size, names: Sequence[str]) -> list[str]:
@@ -296,7 +296,7 @@ FORMATS: dict[str, tuple[Callable[[Tracks, Path, Size, Sequence[str]], list[str]
     "parquet": (_write_columns, _ALL),
     "gpkg": (_write_columns, _ALL),
 }
-"""The functions that write each format, and what it holds; identities come first where it holds tracks alone."""
+"""The writer of each format, and what the format can hold. If `identities` is first, the format holds only tracks."""
 
 _ENDINGS = {"": "yolo", ".csv": "csv", ".txt": "mot", ".json": "coco", ".xml": "cvat"} | {
     f".{name}": name for name in ("parquet", "gpkg")

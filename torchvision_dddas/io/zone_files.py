@@ -28,7 +28,7 @@ _KINDS = {"Polygon": 1, "MultiPolygon": 2, "LineString": 0, "MultiLineString": 1
 def read_zones(path: str | Path) -> tuple[list[Zone], list[str]]:
     """Return the zones of a file, and notes on what was left out.
 
-    Raise InputError: unreadable, neither GeoJSON nor KML, no polygon or line, and as `make_zone`.
+    Raise InputError as `make_zone` does, and for an unreadable file, another format, or a file without polygon or line.
     """
     try:
         content = Path(path).read_bytes()
@@ -57,7 +57,7 @@ def read_zones(path: str | Path) -> tuple[list[Zone], list[str]]:
         used = {zone.name for zone in zones}
         if name in used:
             other_name = next(f"{name} #{k}" for k in range(2, MOST_ZONES + 3) if f"{name} #{k}" not in used)
-            notes.append(f"zones {path}: {name} is there more than once, or has several areas; one is {other_name}")
+            notes.append(f"zones {path}: {name} occurs more than once or has several areas; one is named {other_name}")
             name = other_name
         try:
             zones.append(make_zone(name, lines, is_line, unit, 10.0 if dwell_s is None else dwell_s))
@@ -66,7 +66,7 @@ def read_zones(path: str | Path) -> tuple[list[Zone], list[str]]:
     if not zones or len(zones) > MOST_ZONES:
         raise InputError(f"zones {path} has {len(zones) or 'no'} polygons and lines; wanted 1 to {MOST_ZONES}")
     if other:
-        notes.append(f"zones {path}: left out, neither polygon nor line: {other} of its features")
+        notes.append(f"zones {path}: features that are neither polygon nor line are left out: {other}")
     return zones, notes
 
 
@@ -95,8 +95,8 @@ def make_zone(name: str, lines: Any, is_line: bool, unit: str = "deg", dwell_s: 
         and (far := next((p for ring in rings for p in ring if (abs(p) > (180, 90)).any()), None)) is not None
     ):
         raise InputError(
-            f"{name} has a place at {far[0]:g}, {far[1]:g}; wanted longitude, latitude in degrees. Other coordinates "
-            'are named by a member "unit" of the GeoJSON, "px" or "m"'
+            f"{name} has a place at {far[0]:g}, {far[1]:g}; wanted longitude, latitude in degrees. For other "
+            'coordinates, set the member "unit" of the GeoJSON to "px" or "m"'
         )
     if not is_line and any(map(crosses_itself, rings)):
         raise InputError(f"{name} crosses itself, so its inside is undefined; draw its outline without crossings")
@@ -106,7 +106,7 @@ def make_zone(name: str, lines: Any, is_line: bool, unit: str = "deg", dwell_s: 
 
 
 def zone_rings(zone: Zone, origin_deg: tuple[float, float] | None) -> list[np.ndarray]:
-    """Return the rings in local metres, or as u and -v, so that left and right are those of the viewer."""
+    """Return the rings in local metres. Pixels become u and -v, so that left and right are those of the viewer."""
     if zone.unit == "px":
         return [ring * (1, -1) for ring in zone.rings]
     return [east_north(r, origin_deg) if zone.unit == "deg" and origin_deg else r for r in zone.rings]
@@ -141,7 +141,7 @@ def _list(value: Any) -> list[Any]:
 
 
 def _placemarks(root: ElementTree.Element) -> Iterator[Found]:
-    """Yield the geometries of a KML; the lines of a placemark belong together."""
+    """Yield the geometries of a KML. All lines of a placemark form one geometry."""
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
     for mark in root.iter("Placemark"):
