@@ -106,11 +106,15 @@ LOGS = [
     ),
     *(("a.csv", f"latitude [deg],longitude,time (ms),{n}\n1,2,0,\n1,2,1000,\n1,2,2000,\n", 3, "") for n in NAMES),
     # More digits than a float holds, and than Python makes a number of.
-    *(("a.csv", timed(clock, n), 0, "is no time; wanted a date with a time") for clock in CLOCKS for n in (400, 5000)),
+    *(
+        ("a.csv", timed(clock, n), 0, "is not a time; wanted a date with a time")
+        for clock in CLOCKS
+        for n in (400, 5000)
+    ),
     ("a.csv", "height,seconds" + ",a" * 150_000 + "\n" + "".join(f"1,{k}\n" for k in range(150_000)), 150_000, ""),
     ("a.ts", programme_tables, 0, "carries no KLV metadata; its streams are of the types 0x1b"),
-    *(("a.tlog", partial(mavlink, *given), 4, "are no MAVLink messages") for given in ((b"\xfe", 12), (b"\xfd", 12))),
-    ("a.tlog", partial(mavlink, b"\xfe\x81", 2), 4, "are no MAVLink messages"),
+    *(("a.tlog", partial(mavlink, *given), 4, "are not MAVLink messages") for given in ((b"\xfe", 12), (b"\xfd", 12))),
+    ("a.tlog", partial(mavlink, b"\xfe\x81", 2), 4, "are not MAVLink messages"),
     *(("a.ulg", partial(px4, rubbish), 40, "the log is damaged") for rubbish in (b"\xff", b"a.", b"0")),
 ]
 
@@ -192,7 +196,7 @@ def test_the_boxes_of_many_frames_are_found_by_frame(tmp_path):
 def test_lines_are_not_all_filled_up_to_the_longest(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("1,1,1,1,1,1\n" * 2000 + "1,1,1,1,1,1" + ",1" * 40_000 + "\n")
-    with pytest.raises(InputError, match=r"line 2001: 40006 columns, over 10 times those of most"):
+    with pytest.raises(InputError, match=r"line 2001: 40006 columns, over 10 times as many as usual"):
         detection_tables.read_rows(path)
     path.write_text("1,1,1,1,1,1\n1,1,1,1,1,1,0.5,-1,-1,-1\n")
     header, rows = detection_tables.read_rows(path)

@@ -57,7 +57,7 @@ def test_a_picture_of_rtk_tells_the_error_of_its_place(photo):
 def test_a_large_error_of_a_place_counts_and_a_value_that_is_none_is_unknown(photo, said, sigma_m):
     flown = read_telemetry(photo(xmp=XMP.format(f'drone-dji:RtkStdLon="{said}" drone-dji:RtkStdLat="{said}"'), gps=GPS))
     assert flown.position_sigma_m[0] == pytest.approx(sigma_m, nan_ok=True)
-    assert ("aerial.position_sigma_m counts there" in "".join(flown.notes)) == (said == "0")
+    assert ("aerial.position_sigma_m is used there" in "".join(flown.notes)) == (said == "0")
 
 
 def test_the_calibrated_focal_length_counts_first_and_a_cut_picture_is_named(photo):

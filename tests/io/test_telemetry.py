@@ -33,10 +33,10 @@ def known_at(flown, time_s):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", ["looks like no log", "names none of time_s, altitude_m", "a CSV needs time_s and altitude_m"]),
+        ("", ["is not a log", "names none of time_s, altitude_m", "A CSV needs time_s and altitude_m"]),
         (
             "# Surveillance, from the air\n",
-            ["looks like no log", "a CSV, DJI .SRT,", "altitude_m, or a place"],
+            ["is not a log", "a CSV, DJI .SRT,", "altitude_m, or a place"],
         ),
         ("altitude_m,speed_m_s\n5,1\n", ["lacks time_s;", "its columns are altitude_m, speed_m_s"]),
         ("time_s,speed_m_s\n0,1\n", ["lacks altitude_m", "its columns are time_s, speed_m_s"]),
@@ -54,7 +54,7 @@ def known_at(flown, time_s):
         ("time_s,altitude_m,hfov_deg\n0,20,180\n", ["line 2", "hfov_deg is '180'", "0.05 to 179"]),
         ("time_s,altitude_m,pitch_deg\n0,20,195\n", ["line 2", "pitch_deg is '195'", "-100 to 100"]),
         ("frame,latitude,longitude,rel_alt\n1,48.1,11.5,50\n", ["has frames", "give its clip"]),
-        ("date,latitude,longitude\nsoon,48.1,11.5\n", ["line 2: 'soon' is no time"]),
+        ("date,latitude,longitude\nsoon,48.1,11.5\n", ["line 2: 'soon' is not a time"]),
     ],
 )
 def test_a_mistake_gets_one_line_with_file_and_place(refused, text, words):
@@ -104,7 +104,7 @@ def test_a_speed_left_out_is_that_of_the_places(fly):
         "time_s,altitude_m,east_m,north_m\n" + rows(60, lambda i: f"{i / 10},50,{0.3 * i + 1000:.2f},{-0.4 * i:.2f}")
     )
     np.testing.assert_allclose(flown.speed_m_s, 5, rtol=1e-3)
-    assert any("speed is that of the places" in note for note in flown.notes)
+    assert any("speed is computed from the places" in note for note in flown.notes)
     over_date_line = rows(60, lambda i: f"{i / 10},50,{179.9999 + i * 1e-5 - 360 * (i > 10):.7f},0.5")
     np.testing.assert_allclose(fly(PLACED + over_date_line).speed_m_s, 1e-4 * 111_320, rtol=2e-3)
     too_short = fly(PLACED + rows(4, lambda i: f"{i / 30:.3f},50,11.500000,48.100000"))

@@ -81,7 +81,7 @@ def test_of_two_receivers_the_one_with_a_fix_is_used(fly, dead):
         flown = fly(content, name)
         assert flown.place[0] == pytest.approx([PLACE[0], PLACE[1] - 0.01 * (dead == 1)], abs=2e-7)
         assert flown.above_sea_m[0] == 584 and flown.speed_m_s[0] == 5.5
-        assert any(f"GPS device {1 - dead} is taken, with 11 fixes" in note for note in flown.notes)
+        assert any(f"GPS device {1 - dead} is used, with 11 fixes" in note for note in flown.notes)
 
 
 def test_receivers_of_older_logs_have_messages_of_their_own(fly):
@@ -95,7 +95,7 @@ def test_receivers_of_older_logs_have_messages_of_their_own(fly):
     for name, content in forms(BEFORE_4_1, rows):
         flown = fly(content, name)
         np.testing.assert_allclose(flown.place, [PLACE] * 5, atol=1e-7)
-        assert any("GPS2 device 0 is taken" in note for note in flown.notes)
+        assert any("GPS2 device 0 is used" in note for note in flown.notes)
 
 
 def test_a_log_of_2014_counts_milliseconds_and_has_one_leap_second_less(fly):
@@ -128,7 +128,7 @@ def test_without_an_estimate_the_barometer_tells_the_height(fly):
     assert flown.altitude_m.tolist() == [12.5] * 11
 
 
-@pytest.mark.parametrize(("gimbals", "taken"), [(1, None), (2, "device 0 is taken, left out are device 1")])
+@pytest.mark.parametrize(("gimbals", "taken"), [(1, None), (2, "device 0 is used; left out: device 1")])
 def test_one_gimbal_is_used(fly, gimbals, taken):
     flown = fly(dataflash(KINDS, messages(mounts=gimbals, names=("POS", "ATT", "MNT"))), "a.bin")
     assert math.degrees(flown.at(1.0).pitch_rad) == pytest.approx(30)

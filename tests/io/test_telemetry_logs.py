@@ -113,14 +113,14 @@ def test_of_two_vehicles_the_one_that_reports_most_is_taken_and_the_other_named(
     other = tlog([(t + 9, name, part) for t, name, part in eastward(5)], system=7)
     flown = fly(tlog(eastward(20)) + other, "flight.tlog")
     assert np.nanmax(flown.altitude_m) == 69
-    assert any("system 1 is taken, left out are 7" in note for note in flown.notes)
+    assert any("system 1 is used; left out: 7" in note for note in flown.notes)
 
 
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (lambda c: c[:-20], "cut off"),
-        (lambda c: c[:500] + bytes(range(99)) + c[500:], "no MAVLink messages"),
+        (lambda c: c[:500] + bytes(range(99)) + c[500:], "not MAVLink messages"),
         (lambda c: c[:30] + bytes([c[30] ^ 0x40]) + c[31:], "1 of 40 messages are damaged"),  # in the first position
     ],
 )
@@ -175,7 +175,7 @@ def together(*parts: bytes) -> bytes:
 def test_another_sender_is_never_the_vehicle_though_it_reports_more_often(fly, system, component, said, left_out):
     flown = fly(together(tlog(eastward()), tlog(said, system, component=component)), "flight.tlog")
     assert flown.place[:, 1].tolist() == [-35.0] * len(flown) and np.nanmax(flown.altitude_m) == 69
-    assert any(f"system 1 is taken, left out are {left_out}" in note for note in flown.notes)
+    assert any(f"system 1 is used; left out: {left_out}" in note for note in flown.notes)
 
 
 def test_a_vehicle_without_a_fix_has_no_place_though_a_station_has_one(fly):
@@ -200,19 +200,19 @@ def turns(pitch_up: float, count: int = 20, boot_ms: int = 5000, **more) -> list
         (
             [tlog(turns(-30), component=154), tlog(turns(-80), component=171)],
             30,
-            "component 154 is taken, left out are component 171",
+            "component 154 is used; left out: component 171",
         ),
         (
             [tlog(turns(-30, gimbal_device_id=1)), tlog(turns(-80, gimbal_device_id=2))],
             30,
-            "left out are component 1 device 2",
+            "left out: component 1 device 2",
         ),
         (
             [tlog(turns(-30, q=[0, 0, 0, 0]), component=154), tlog(turns(-80), component=171)],
             80,
-            "component 171 is taken",
+            "component 171 is used",
         ),
-        ([tlog(turns(-30, 3), component=154), tlog(turns(-80), component=171)], 80, "component 171 is taken"),
+        ([tlog(turns(-30, 3), component=154), tlog(turns(-80), component=171)], 80, "component 171 is used"),
         ([tlog(turns(-30), system=9, component=154)], 30, None),
         # The clock of a gimbal began at another time.
         ([tlog(turns(-30, boot_ms=9_000_000), component=154)], 30, None),
@@ -223,7 +223,7 @@ def test_one_gimbal_is_used_and_named(fly, gimbals, pitch, words):
     assert camera_deg(flown.at(1.0))[:2] == pytest.approx([140, pitch], abs=1e-4)
     assert words is None or any("several gimbals report" in note and words in note for note in flown.notes)
     is_other = any(
-        "the gimbal is component 154 of system 9, another than the vehicle's" in note for note in flown.notes
+        "the gimbal is component 154 of system 9, which is not the vehicle's" in note for note in flown.notes
     )
     assert is_other == (words is None and b"\x09\x9a" in gimbals[0])
     assert not any("drift" in note for note in flown.notes)
@@ -295,7 +295,7 @@ def test_of_two_receivers_the_one_with_a_fix_is_used(fly, fused):
     flown = fly(tlog(said), "flight.tlog")
     np.testing.assert_allclose(flown.place, [[11.5, 48.1]] * 10)
     assert flown.above_ellipsoid_m[5] == 607 and flown.above_sea_m[5] == (150 if fused else 560)
-    note = "GPS2_RAW component 1 is taken, with 10 fixes, left out are GPS_RAW_INT component 1 (0)"
+    note = "GPS2_RAW component 1 is used, with 10 fixes; left out: GPS_RAW_INT component 1 (0)"
     assert any(note in one for one in flown.notes)
 
 
@@ -436,7 +436,7 @@ def test_of_px4s_receivers_the_one_with_fixes_is_used(fly, topics, taken):
     np.testing.assert_allclose(flown.place[:20], [[8.5, 47.4]] * 20)
     values = flown.above_sea_m[3], flown.above_ellipsoid_m[3], flown.speed_m_s[3], flown.start_utc_s
     assert values == pytest.approx((488, 535, 5.5, UTC_US / 1e6))
-    assert taken is None or any(f"several receivers report: {taken} is taken" in note for note in flown.notes)
+    assert taken is None or any(f"several receivers report: {taken} is used" in note for note in flown.notes)
 
 
 def test_a_px4_log_whose_receivers_have_no_fix_says_so(fly, refused):

@@ -194,11 +194,15 @@ def test_the_angles_of_camera_and_aircraft_are_told_apart_in_any_order(read, gro
         (["x1.79"], 21.89, None),
         (["2X"], 19.64, None),
         (["140000"], 2.83, "counted in 1/10000: 140000 is 14"),
-        (["1500"], 25.99, "counted in 1/1000: 1500 is 1.5; the log does not say the scale, in 1/100 it were 15"),
-        (["2.00", "2.00"], 19.64, "the zoom is 2 throughout, which a focal length in the camera's file must hold"),
+        (
+            ["1500"],
+            25.99,
+            "counted in 1/1000: 1500 is 1.5; the log does not give the scale: in 1/100 it would be 15",
+        ),
+        (["2.00", "2.00"], 19.64, "the zoom is 2 throughout; a focal length in the camera's file must include it"),
         (["15"], 2.64, "the zoom is 15 throughout"),
         (["10000", "120000"], 3.31, "counted in 1/10000"),
-        (["0"], 38.19, "a zoom of 0 cannot be"),
+        (["0"], 38.19, "a zoom of 0 is impossible"),
     ],
 )
 def test_a_zoom_may_be_in_any_scale(read, zooms, degrees, note):

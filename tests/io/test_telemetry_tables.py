@@ -274,13 +274,13 @@ def test_a_line_of_units_below_the_names_counts(fly):
 def test_names_that_come_again_are_no_rows_and_other_rows_without_a_time_are_noted(fly):
     flown = fly(table(PLACE, "{i},48.1,11.5,50") + table(PLACE, "{i}0,48.1,11.5,50") + "the end\n")
     assert flown.time_s.tolist() == [0, 1, 2, 3, 10, 20, 30]
-    assert [note for note in flown.notes if "line 11: 'the end' is no time; 1 rows" in note]
+    assert [note for note in flown.notes if "line 11: 'the end' is not a time; 1 rows" in note]
 
 
 def test_a_number_that_no_clock_counts_to_is_no_time(fly):
     flown = fly("time_s,lat,lon,x\n-1e308,48.1,11.5,\n" + table("0,48.1,11.5,", "{i},48.1,11.5,"))
     assert flown.time_s.tolist() == [0, 1, 2, 3]
-    assert [note for note in flown.notes if "line 2: '-1e308' is no time; 1 rows" in note]
+    assert [note for note in flown.notes if "line 2: '-1e308' is not a time; 1 rows" in note]
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -413,8 +413,8 @@ def test_times_that_may_have_two_units_are_refused(refused):
     ("cells", "words"),
     [
         (["05/08/2022 12:00:00", "05/08/2022 12:00:01"], "whether day or month comes first"),
-        (["1970-01-01T00:00:00Z", "1970-01-01T00:00:01Z"], "a clock of the year 1970, which cannot be"),
-        (["2022-08-26 12:00:00", "2022-08-26 12:00:01"], "aerial.time_zone tells it"),
+        (["1970-01-01T00:00:00Z", "1970-01-01T00:00:01Z"], "shows the impossible year 1970"),
+        (["2022-08-26 12:00:00", "2022-08-26 12:00:01"], "set aerial.time_zone"),
     ],
 )
 def test_a_clock_that_is_not_sure_is_none_and_a_note_says_why(fly, cells, words):
@@ -558,7 +558,7 @@ def test_times_that_begin_again_elsewhere_go_on_and_the_flights_are_split(fly):
         ("relative altitude,altitude agl,altitude", "50,40,550", {"altitude": 50, "sea": 550}, "altitude agl"),
         ("altitude agl,height", "40,50", {"altitude": 40, "zero": "ground"}, "columns that are not used: height"),
         ("ellipsoidal height", "120", {"ellipsoid": 120, "sea": None, "altitude": None}, "count from the ellipsoid"),
-        ("hae,undulation", "120,47", {"ellipsoid": 120, "sea": 73}, "less the log's own height of the geoid"),
+        ("hae,undulation", "120,47", {"ellipsoid": 120, "sea": 73}, "minus the log's own height of the geoid"),
         ("altitude (m AMSL)", "550", {"sea": 550, "altitude": None}, "no altitude above ground"),
         ("GPS altitude (WGS84) [m]", "588", {"ellipsoid": 588, "sea": None}, "count from the ellipsoid"),
         ("Ellipsoidal altitude", "588", {"ellipsoid": 588, "sea": None}, "count from the ellipsoid"),
@@ -591,13 +591,13 @@ def test_four_heights_are_told_apart_and_what_is_assumed_is_noted(fly, names, ce
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("gimbal_pitch", "-120", "pitch_deg is 120, which cannot be"),
-        ("gimbal_yaw(rad)", "1e308", "heading_deg is inf, which cannot be"),
-        ("hfov", "180", "hfov_deg is 180, which cannot be"),
-        ("hfov", "0", "hfov_deg is 0, which cannot be"),
-        ("speed", "900", "speed_m_s is 900, which cannot be"),
-        ("relative_height", "50000", "above_takeoff_m is 50000, which cannot be"),
-        ("speed", "fast", "speed is 'fast', which is no number; 1 left out"),
+        ("gimbal_pitch", "-120", "pitch_deg is 120, which is impossible"),
+        ("gimbal_yaw(rad)", "1e308", "heading_deg is inf, which is impossible"),
+        ("hfov", "180", "hfov_deg is 180, which is impossible"),
+        ("hfov", "0", "hfov_deg is 0, which is impossible"),
+        ("speed", "900", "speed_m_s is 900, which is impossible"),
+        ("relative_height", "50000", "above_takeoff_m is 50000, which is impossible"),
+        ("speed", "fast", "speed is 'fast', which is not a number; 1 left out"),
     ],
 )
 def test_impossible_values_are_left_out_and_noted(fly, name, value, words):
@@ -641,7 +641,7 @@ def test_only_a_table_all_of_whose_columns_are_own_ones_is_an_own_table(fly):
     check(fly(own), altitude=50, zero="ground", pitch=60)
     other = fly(own.replace("pitch_deg", "pitch_deg,battery").replace(",60\n", ",60,7\n"))
     check(other, altitude=None, sea=50, pitch=None)
-    assert [note for note in other.notes if "no own table has the columns battery: read as another" in note]
+    assert [note for note in other.notes if "own tables have no columns battery: read as another" in note]
     assert [note for note in other.notes if "columns that are not used: pitch_deg" in note]
 
 
@@ -673,7 +673,7 @@ def test_thousands_with_points_quoted_decimal_commas_and_blanks_between_cells_ar
         ("time_s,battery\n0,5\n1,5\n", "nothing in it (table of another program) holds a place"),
         ("battery,voltage\n0,5\n1,5\n", "names none of time_s, altitude_m"),
         ("time_s,lat,lon\n", "has a header but no rows"),
-        ("time_s,lat,lon\nx,1,2\ny,1,2\n", "line 2: 'x' is no time"),
+        ("time_s,lat,lon\nx,1,2\ny,1,2\n", "line 2: 'x' is not a time"),
     ],
 )
 def test_a_table_of_no_use_is_refused_for_the_reason_that_is_true(refused, text, words):

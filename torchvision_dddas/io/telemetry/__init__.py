@@ -1,7 +1,7 @@
 """Read the reports of a vehicle, from any recorder, as one record.
 
 Supported: own tables, DJI's subtitles, logs of MAVLink, PX4 and ArduPilot, MISB ST 0601 inside MPEG-TS, NMEA 0183, and
-the metadata of still pictures. The content of the file determines its kind, then its name.
+the metadata of still pictures. The content of a file, and then its name, determine its kind.
 """
 
 import codecs
@@ -36,8 +36,8 @@ def read_telemetry(
     r"""Read the reports of a vehicle. clock_offset_s: added to its times so that they count from the first frame.
 
     path: a file, or a folder of still pictures. clip: the video that the log belongs to. rate_hz: its frames a second.
-    Tables with frame numbers but no times, and folders of pictures, need one of the two. time_zone: zone of dates
-    without one, a name of the IANA data base or hours from UTC; "" leaves their clock unknown. order: "lat-lon" or
+    Tables with frame numbers but no times, and folders of pictures, need clip or rate_hz. time_zone: the zone of dates
+    without a zone, a name of the IANA data base or hours from UTC; "" leaves their clock unknown. order: "lat-lon" or
     "lon-lat" for two coordinates in one field; by default the numbers or the dialect decide.
     Raise InputError in one line if the file cannot be read or has no usable data. The readable part of a damaged file
     is returned, and its notes say what is missing.
@@ -67,7 +67,7 @@ def read_telemetry(
     if head.startswith(KEY):
         return read_misb(path, None, clock_offset_s)
     text = _text(beginning)
-    # A file damaged at its beginning still has its name. A letter in a text may equal the sync byte of packets.
+    # If the beginning is damaged, the name decides. A letter in a text may equal the sync byte of packets.
     if (layout := (spacing(head) if text is None else None) or _STREAMS.get(suffix)) is not None:
         return read_misb(path, layout, clock_offset_s)
     if KEY in beginning or suffix == ".klv":
@@ -86,7 +86,7 @@ def read_telemetry(
     if suffix == ".csv" or (text is not None and re.search(r"[,;\t|]|^\W{0,9}\w{0,20}time\w{0,20} ", text)):
         return read_telemetry_table(path, clock_offset_s, clip, zone, order, rate_hz)
     if suffix == ".ulg":
-        raise InputError(f"telemetry {path} does not begin like a PX4 log: it is another file, or damaged there")
+        raise InputError(f"telemetry {path} does not begin like a PX4 log: it is another file, or it is damaged")
     if b"ftyp" in head[:12]:
         hint = "give the .SRT beside it, or extract its subtitles: ffmpeg -i VIDEO -map 0:s:0 OUT.srt"
         raise InputError(f"telemetry {path} is a video; {hint}")

@@ -12,7 +12,7 @@ from torchvision_dddas.types import Float
 def axes(
     heading_rad: Float[np.ndarray, "N"], pitch_rad: Float[np.ndarray, "N"], roll_rad: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Return the axes as columns."""
+    """Return the axes of turned bodies, as columns."""
     cos_h, sin_h = np.cos(heading_rad), np.sin(heading_rad)
     cos_p, sin_p = np.cos(pitch_rad), np.sin(pitch_rad)
     cos_r, sin_r = np.cos(roll_rad)[..., None], np.sin(roll_rad)[..., None]
@@ -24,7 +24,7 @@ def axes(
 
 
 def angles(turned: Float[np.ndarray, "N 3 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return heading, pitch and roll. Straight down, the heading is that of the picture's upper edge, and roll is 0."""
+    """Return heading, pitch and roll. Looking straight down, the heading is that of the upper edge, and roll is 0."""
     forward, right, down = np.moveaxis(turned, -1, 0)
     steep = np.hypot(forward[..., 0], forward[..., 1]) < 1e-6
     upwards = -np.sign(forward[..., 2])
@@ -35,7 +35,7 @@ def angles(turned: Float[np.ndarray, "N 3 3"]) -> tuple[np.ndarray, np.ndarray, 
 
 
 def axes_of_quaternion(wxyz: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """Return the axes of a body from its attitude, a quaternion to north, east, down; NaN if it is not a unit one."""
+    """Return the axes of a body from a quaternion to north, east, down; NaN if the quaternion's length is not 1."""
     length = np.linalg.norm(wxyz, axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         w, x, y, z = np.moveaxis(wxyz / np.where(np.abs(length - 1) < 0.1, length, np.nan), -1, 0)

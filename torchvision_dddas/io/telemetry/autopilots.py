@@ -1,4 +1,4 @@
-"""Reports of autopilots: the messages and fields that are read, and the choice of receiver and gimbal."""
+"""Make a record from the messages of an autopilot. Choose the fields to read, the receiver and the gimbal."""
 
 import math
 import re
@@ -11,17 +11,17 @@ from torchvision_dddas.io.telemetry.record import Log, build_record, is_clock
 from torchvision_dddas.types import Telemetry
 
 Topic = dict[str, np.ndarray]
-"""Field -> (N,) values of the messages of one kind and sender; time_s, and their places in the file as `where`."""
+"""Field -> (N,) values of one kind of message from one sender. Extra fields: time_s, and `where` in the file."""
 Topics = dict[str, dict[str, Topic]]
-"""Topics by message, and then by what tells the senders of this message apart."""
+"""Name of a message -> label of a sender -> topic."""
 
 _E7, _DEGREES = "longitude_deg=lon/1e7 latitude_deg=lat/1e7 ", "longitude_deg=lon/1 latitude_deg=lat/1 "
 _ARDUPILOT = "longitude_deg=Lng/1 latitude_deg=Lat/1 above_sea_m=Alt/1 altitude_m=RelHomeAlt/1 altitude_m=RelAlt/1"
 _RECEIVER = f"{_E7} above_sea_m=alt/1e3 above_ellipsoid_m=alt_ellipsoid/1e3 speed_m_s=vel/1e2 speed_m_s=vel_m_s/1"
-_ACCURACY = "accuracy_m=eph/1"  # of PX4's receivers; those of its estimates take slow errors for noise
+_ACCURACY = "accuracy_m=eph/1"  # of PX4's receivers; PX4's estimates treat slow errors as noise
 _SINCE_PX4_1_14 = "above_sea_m=altitude_msl_m/1 above_ellipsoid_m=altitude_ellipsoid_m/1 speed_m_s=vel_m_s/1"
-# By message: each quantity, its field, and how many units of the field make one. The best messages come first: the
-# autopilots' estimates, then receivers, of which the one with most fixes counts, then others with a height or speed.
+# Message -> quantity=field/N for each quantity, where N units of the field are 1 unit of the quantity. The best come
+# first: estimates of the autopilot, receivers (the receiver with most fixes is used), others with a height or speed.
 _PLACES: tuple[dict[str, str], ...] = (
     {
         "GLOBAL_POSITION_INT": f"{_E7} above_sea_m=alt/1e3 altitude_m=relative_alt/1e3 speed_m_s=speed/1e2",
@@ -45,7 +45,7 @@ _HEADINGS = (
     *(("ATTITUDE", "yaw", 1.0), ("vehicle_attitude", "q", 1.0), ("ATT", "Yaw", _DEGREES_A_RADIAN)),
     ("GLOBAL_POSITION_INT", "hdg", 100 * _DEGREES_A_RADIAN),
 )
-# The attitude of a gimbal: its heading against north and against the nose, its pitch upwards and its roll against the
+# The attitude of a gimbal: the fields of heading from north, heading from the nose, pitch (up) and roll from the
 # horizon, and their units per radian; or a quaternion and the flags of MAVLink's gimbal protocol, version 2.
 _GIMBALS: dict[str, tuple[tuple[str, ...], float]] = {
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (("q", "flags"), 1.0),
@@ -57,10 +57,10 @@ _GIMBALS: dict[str, tuple[tuple[str, ...], float]] = {
 }
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _PLACE, _RECEIVERS = ("longitude_deg", "latitude_deg"), 1
-# The fix that a quantity needs, else one in three dimensions. A place beyond these is damage.
+# The fix that a quantity needs; other quantities need a three-dimensional fix (3). Larger degrees are damage.
 _LEAST_FIX = {"altitude_m": 0, "speed_m_s": 2, "accuracy_m": 2, "longitude_deg": 2, "latitude_deg": 2}
 _MOST = {"longitude_deg": 180, "latitude_deg": 90}
-# What stands for an unknown value, and the fields by which one sender tells several devices apart.
+# The values that mean unknown, and the fields that number the devices of one sender.
 _UNKNOWN = {"vel": 65535, "hdg": 65535, "alt_ellipsoid": 0, "altitude_ellipsoid_m": 0, "h_acc": 0}
 _DEVICES, _MOST_DEVICES = ("gimbal_device_id", "camera_device_id", "I"), 16
 NAMES = {*_PLACES[0], *_PLACES[1], *_PLACES[2], *_GIMBALS, *(name for name, *_ in _HEADINGS), "CAMERA_FOV_STATUS"}
@@ -68,7 +68,7 @@ NAMES = {*_PLACES[0], *_PLACES[1], *_PLACES[2], *_GIMBALS, *(name for name, *_ i
 
 
 def build_flight(log: Log, topics: Topics, clock_offset_s: float, clock_s: float) -> Telemetry:
-    """The record of the topics of one vehicle. clock_s: seconds since 1970 at their time 0, or NaN."""
+    """Return the record of one vehicle. clock_s: seconds since 1970 at time 0 of the topics, or NaN."""
     _add_places(log, topics)
     vehicle = _vehicle(topics)
     _add(log, vehicle, {"vehicle_heading_rad": vehicle["yaw"]})
@@ -87,7 +87,7 @@ def build_flight(log: Log, topics: Topics, clock_offset_s: float, clock_s: float
 
 
 def add_topic(topics: Topics, name: str, sender: str, topic: Topic) -> None:
-    """Add the messages of a sender, apart for each device of which it tells."""
+    """Add the messages of a sender, with a separate topic for each device of the sender."""
     device = next((topic[field] for field in _DEVICES if field in topic), None)
     for one in np.zeros(1) if device is None else np.unique(device)[:_MOST_DEVICES]:
         label = f"{sender} device {one:g}".strip() if one or not sender else sender
@@ -96,13 +96,13 @@ def add_topic(topics: Topics, name: str, sender: str, topic: Topic) -> None:
 
 
 def column(topic: Topic, name: str, default: float = np.nan) -> np.ndarray:
-    """A field as floats; the default where the log lacks it, and NaN where it says that the value is unknown."""
+    """Return a field as floats. A missing field has the default; values that mean unknown are NaN."""
     values = topic[name].astype(float) if name in topic else np.full(len(topic["time_s"]), default)
     return np.where(values == _UNKNOWN.get(name), np.nan, values) if name in _UNKNOWN else values
 
 
 def start_clock(messages: Iterable[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Seconds since 1970 at time 0, by messages that tell both; NaN without any. Clocks that can be right go first."""
+    """Return the seconds since 1970 at time 0, NaN if unknown. messages: (utc_s, time_s). Prefer possible dates."""
     utc_s, time_s = np.concatenate([np.zeros((2, 0)), *map(np.stack, messages)], axis=1)
     usable = is_clock(utc_s)
     usable = usable if usable.any() else utc_s > 0
@@ -114,7 +114,7 @@ def _add(log: Log, topic: Topic, values: dict[str, np.ndarray], known: bool = Fa
 
 
 def _vehicle(topics: Topics) -> Topic:
-    """Times and headings, as `yaw`, of the vehicle's nose; empty if none is known."""
+    """Return the times and the headings (`yaw`) of the vehicle's nose; empty if no heading is known."""
     for name, field, per_radian in _HEADINGS:
         for topic in topics.get(name, {}).values():
             yaw = _angles_of(topic)[0] if field == "q" else column(topic, field) / per_radian
@@ -124,26 +124,26 @@ def _vehicle(topics: Topics) -> Topic:
 
 
 def _angles_of(topic: Topic) -> tuple[np.ndarray, ...]:
-    """Heading, pitch and roll of a quaternion."""
+    """Return the heading, pitch and roll of a topic with a quaternion."""
     parts = topic["q"] if "q" in topic else np.stack([column(topic, f"q[{i}]") for i in range(4)], axis=1)
     return angles(axes_of_quaternion(parts))
 
 
 def _attitude(log: Log, gimbal: Topic, fields: tuple[str, ...], per_radian: float) -> tuple[np.ndarray, ...]:
-    """Heading, pitch downwards, roll, and whether the heading is against north; else it is against the nose."""
+    """Return heading, pitch (down), roll, and whether the heading is from north; otherwise it is from the nose."""
     if fields[0] == "q":
         flags = column(gimbal, fields[1], 0).astype(int)
         is_locked = (flags & _YAW_LOCK > 0) & (flags & _YAW_IN_VEHICLE == 0)
         return *_angles_of(gimbal), (flags & _YAW_IN_EARTH > 0) | is_locked
     if not fields[0]:
-        log.note("the mount's pitch and roll are taken against the horizon, its yaw against the vehicle")
+        log.note("the mount's pitch and roll are read as angles from the horizon, its yaw from the vehicle's nose")
     north, nose, pitch, roll = (column(gimbal, field) / per_radian for field in fields)
     is_absolute = np.isfinite(north) & (north != 0)
     return np.where(is_absolute, north, nose), -pitch, roll, is_absolute
 
 
 def _add_places(log: Log, topics: Topics) -> None:
-    """Add the place of the best topic that has any, and each other quantity from the best topic that knows it."""
+    """Add the place of the best topic with places, and each other quantity from the best topic that contains it."""
     sources: list[tuple[int, int, str, Topic, dict[str, np.ndarray]]] = []
     for rank, group in enumerate(_PLACES):
         for name, fields in group.items():
@@ -158,13 +158,13 @@ def _add_places(log: Log, topics: Topics) -> None:
         if not fixes:
             log.note("nothing in the log has a fix: its places are unknown")
         elif rank == _RECEIVERS and others:
-            log.note(f"several receivers report: {name} is taken, with {fixes} fixes, left out are {others}")
+            log.note(f"several receivers report: {name} is used, with {fixes} fixes; left out: {others}")
     for *_, topic, values in sources:
         _add(log, topic, {key: one for key, one in values.items() if key not in log.samples and np.isfinite(one).any()})
 
 
 def _values(topic: Topic, fields: str) -> dict[str, np.ndarray]:
-    """The quantities of a topic. Without a fix the place is 0, 0, which the record counts, and the rest is unknown."""
+    """Return the quantities of a topic. Without a fix, the place is 0, 0 and other quantities are NaN."""
     fix = column(topic, "fix_type" if "fix_type" in topic else "Status", 3)
     fix = np.where(column(topic, "lat_lon_valid", 1) > 0, fix, 0)
     values: dict[str, np.ndarray] = {}
@@ -177,12 +177,12 @@ def _values(topic: Topic, fields: str) -> dict[str, np.ndarray]:
 
 
 def _pick(log: Log, what: str, values: Mapping[str, np.ndarray]) -> str | None:
-    """Return the first sender whose values are not much more often unknown than another's, and note the others."""
+    """Return the first sender with over half as many known values as the best sender, and note the others."""
     known = {sender: count for sender, one in values.items() if (count := np.isfinite(one).sum())}
     chosen = next((sender for sender, count in known.items() if count > max(known.values()) / 2), None)
     others = [sender for sender in values if sender != chosen]
     if chosen is not None and " of system " in chosen:
-        log.note(f"the {what} is {chosen}, another than the vehicle's")
+        log.note(f"the {what} is {chosen}, which is not the vehicle's")
     if chosen is not None and others:
-        log.note(f"several {what}s report: {chosen} is taken, left out are {', '.join(others[:9])}")
+        log.note(f"several {what}s report: {chosen} is used; left out: {', '.join(others[:9])}")
     return chosen

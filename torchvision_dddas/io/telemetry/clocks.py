@@ -1,4 +1,4 @@
-"""Times in flight logs: dates in any order, 12- and 24-hour clocks, durations, seconds since a start or since 1970."""
+"""Read times of flight logs: dates in any order, 12- and 24-hour clocks, durations, seconds since a start or 1970."""
 
 import math
 import re
@@ -16,7 +16,7 @@ from torchvision_dddas.io.tables import parse_numbers
 from torchvision_dddas.io.telemetry.fields import POSSIBLE, UNITS, Known
 from torchvision_dddas.io.telemetry.record import SPLIT_S, Log, is_clock
 
-UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; aerial.time_zone tells it"
+UNKNOWN_ZONE = "the dates are in an unknown time zone, so the clock is not known; set aerial.time_zone"
 """The note on a log whose dates have no zone."""
 
 _DAY_S = 86_400.0
@@ -33,7 +33,7 @@ _SPAN_UNITS = UNITS["time"] | {"m": 60.0, "'": 60.0, "d": 86_400.0, "day": 86_40
 # Hours from UTC of unambiguous zone names; CST, IST and BST are ambiguous.
 _NAMED = "PST-8 PDT-7 MST-7 MDT-6 EST-5 EDT-4 Z+0 UTC+0 GMT+0 CET+1 CEST+2 EET+2 EEST+3 MSK+3 JST+9 KST+9 AEST+10"
 _ZONES = {re.sub(r"[-+].*", "", zone): int(re.sub(r"[A-Z]", "", zone)) for zone in _NAMED.split()}
-# Dates in other forms: that of EXIF, without separators, and with the name of the month.
+# Other forms of dates: as in EXIF, without separators, or with the name of the month.
 _MONTHS = ["jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec"]
 _MONTH = rf"({'|'.join(_MONTHS)})[a-z]{{0,6}}\.?"
 _ODD_DATE = re.compile(
@@ -60,9 +60,9 @@ _MORE, _TICK_S = 0.1, 0.1
 
 
 def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], bool, str]:
-    """Find the first date with a time in each text: seconds since 1970, and whether it has a zone; else UTC is assumed.
+    """Return the first date with a time in each text: seconds since 1970, and whether its zone is given (else UTC).
 
-    None for a text without a date. Also return whether the order of day and month is known, and the assumption about
+    A text without a date gives None. Also return whether the order of day and month is known, and the assumption about
     years. Fractions have the form `.123`, `,123`, or milli- and microseconds, `,774,808`. In dates with dots, the day
     comes before the month.
     """
@@ -82,7 +82,7 @@ def parse_dates(texts: Sequence[str]) -> tuple[list[tuple[float, bool] | None], 
 
 
 def _usual_date(found: re.Match[str]) -> str:
-    """Return a date of another form as 2022-08-26 18:12:57; the text behind it stays."""
+    """Return a match of `_ODD_DATE` in the form 2022-08-26 18:12:57."""
     part = found.groups(default="")
     forms = ([part[k] for k in places] for places in ((0, 1, 2), (3, 4, 5), (12, 11, 10), (16, 13, 14)))
     year, month, day = next(filter(all, forms))
@@ -92,7 +92,7 @@ def _usual_date(found: re.Match[str]) -> str:
 
 
 def _zone_s(zone: str) -> float | None:
-    """Return the seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for other names and without a name."""
+    """Return the seconds from UTC of `+02:00`, `UTC+2` or `CEST`; None for an unknown or empty name."""
     if found := re.fullmatch(r"(?:Z|UTC|GMT)?([+-])([01]?\d)(?::?([0-5]\d))?", zone):
         return float(f"{found[1]}{int(found[2]) * 3600 + int(found[3] or 0) * 60}")
     return 3600.0 * _ZONES[zone] if zone in _ZONES else None
@@ -120,7 +120,7 @@ def _clock_s(hour: str, minute: str, second: str, fraction: str, micro: str, hal
 
 
 def parse_time_zone(text: str) -> tzinfo | None:
-    """Return the zone for a name, Europe/Berlin, or hours from UTC, +02:00; None for "". Raise InputError otherwise."""
+    """Return the zone of a name, Europe/Berlin, or hours from UTC, +02:00; None for "". Raise InputError for others."""
     text = text.strip()
     if not text:
         return None
@@ -136,7 +136,7 @@ def parse_time_zone(text: str) -> tzinfo | None:
 
 
 def to_utc(local_s: float, zone: tzinfo) -> float:
-    """Return the seconds since 1970 of a date in a time zone that `parse_date` read as UTC."""
+    """Return the seconds since 1970 of a date in a time zone. local_s: the seconds of the same date in UTC."""
     moment = datetime.fromtimestamp(local_s, UTC).replace(tzinfo=zone)
     return local_s - (moment.utcoffset() or timedelta()).total_seconds()
 
@@ -149,7 +149,7 @@ class TimeColumn(NamedTuple):
     """A column of times. values: (N,), NaN if missing. scale: factor to seconds, NaN if unknown.
 
     kind: "number" or "span"; "date" for times since 1970, "day" without a time, "clock" without a day. is_utc: whether
-    it is in UTC. is_sure: whether the order of day and month, or the unit, is known. remark: the assumption made.
+    times are in UTC. is_sure: whether the order of day and month, or the unit, is known. remark: the assumption made.
     """
 
     title: str
@@ -208,7 +208,7 @@ def _span_s(text: str) -> float:
 def _spelled(cells: Sequence[str], is_utc: bool) -> list[str] | None:
     """Add separators to dates and times that are written as one number, 20220826181257 or 181257.5.
 
-    Return None for other numbers: if a part is too large, or if the rows would be too far apart.
+    Return None for other numbers: a part is too large, or the rows would be too far apart.
     """
     some = [cell for cell in cells if cell]
     if all(found is not None and len(found[0]) == len(cell) for cell in some for found in [_ODD_DATE.match(cell)]):
@@ -227,7 +227,7 @@ def _spelled(cells: Sequence[str], is_utc: bool) -> list[str] | None:
 
 
 def _day_order(dates: Iterable[str]) -> tuple[bool, bool]:
-    """Return whether the day comes first in dates that end with the year, and whether that is certain."""
+    """Return whether the day comes first in dates that end with the year, and whether the order is certain."""
     parts = [part for date in dates if len((part := re.split(r"[./-]", date))[0]) != 4 and "." not in date]
     first, second = ({int(part[place]) for part in parts} for place in (0, 1))
     if max([*first, *second], default=0) > 12:
@@ -242,7 +242,7 @@ def settle_times(
     """Return seconds since the first time, (N,), NaN if missing; that time since 1970; and the columns used.
 
     Seconds come from the finest times that do not run back, the clock from dates. step_m: distance of the vehicle
-    between rows. is_far: (N,) whether it jumps before the row, as between flights. zone: of dates without one. Raise
+    between rows. is_far: (N,) whether it jumps before the row, as between flights. zone: for dates without one. Raise
     InputError if the unit of all times is unknown.
     """
     day = next((one for one in columns if one.kind == "day"), None)
@@ -310,7 +310,7 @@ def sort_flights(log: Log, time_s: np.ndarray) -> None:
 def _continued(
     splits: dict[str, list[float]], one: TimeColumn, dated: TimeColumn | None, is_far: np.ndarray
 ) -> TimeColumn:
-    """Continue a column of times that restarts with another flight: by the dates, or else one second later.
+    """Continue a column of times that restarts with another flight: by the dates, or one second later without dates.
 
     is_far: (N,) whether the vehicle jumps before the row. Without dates and a jump, the times are unchanged.
     splits: title -> times that separate flights; extended here.
@@ -336,11 +336,11 @@ def _spread(log: Log, title: str, time_s: np.ndarray) -> np.ndarray:
     if is_coarse and more >= _MORE * len(ticks) and (count > 1).sum() > 1 and (np.diff(time_s[known]) >= 0).all():
         usual = float(np.median(count))
         place = np.arange(len(known)) - np.repeat(first, count)
-        place[: count[0]] += max(0, round(usual) - int(count[0]))  # the log begins within a tick
+        place[: count[0]] += max(0, round(usual) - int(count[0]))  # the log begins within a step
         log.note(f"'{title}' steps by {step_s:g} s with {usual:g} rows in each step: they are spread evenly over it")
         time_s[known] += (place - place[0]) * step_s / np.repeat(np.maximum(count, usual), count)
     elif 50 * more > len(known):
-        log.note(f"of the rows with the same '{title}' only the last counts")
+        log.note(f"only the last of the rows with the same '{title}' counts")
     return time_s
 
 
@@ -349,7 +349,7 @@ def _trust(clock: TimeColumn) -> tuple[bool, bool]:
 
 
 def _rank(one: TimeColumn) -> tuple[bool, int]:
-    """Return a sorting key: complete columns of times that do not run back first, then those with most values."""
+    """Return a sorting key. Complete columns whose times do not run back come first, then columns with most values."""
     known = one.values[np.isfinite(one.values)]
     back = int((known < np.maximum.accumulate(known) - 1.0).sum()) if len(known) else 0
     is_open = one.kind == "number" and not one.is_sure
@@ -359,7 +359,7 @@ def _rank(one: TimeColumn) -> tuple[bool, int]:
 def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
     """Convert a column to seconds. span_s: span of the dates in the same rows, 0 without dates."""
     known = one.values[np.isfinite(one.values)]
-    if one.kind == "clock":  # time goes on over midnight
+    if one.kind == "clock":  # a step back is midnight
         return one._replace(values=one.values + _DAY_S * np.cumsum(np.diff(one.values, prepend=math.nan) < -_DAY_S / 2))
     if one.kind != "number" or not len(known):
         return one
@@ -390,7 +390,7 @@ def _in_seconds(one: TimeColumn, step_m: float, span_s: float) -> TimeColumn:
 
 
 def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | None) -> float:
-    """Seconds since 1970 at time 0, NaN with a note if it is not known."""
+    """Return the seconds since 1970 at time 0; NaN with a note if they are unknown."""
     known = np.flatnonzero(np.isfinite(clock.values + time_s))
     apart = (clock.values - time_s)[known]
     # A flight begins where the dates jump and stay away.
@@ -399,30 +399,30 @@ def _start_s(log: Log, clock: TimeColumn, time_s: np.ndarray, zone: tzinfo | Non
     begins = np.flatnonzero(jumps_s > max(DATE_JUMP_S, 10 * float(np.median(jumps_s))))
     log.splits += [float(time_s[known[row]]) + SPLIT_S for row in begins]
     apart = apart[: [*begins, len(apart)][0] + 1]
-    is_whole = bool((clock.values[np.isfinite(clock.values)] % 1 == 0).all())  # rounded down
+    is_whole = bool((clock.values[np.isfinite(clock.values)] % 1 == 0).all())  # whole seconds are rounded down
     start_s = float(apart[:100].max() if is_whole else np.median(apart[:100]))
     drift_s = float(apart[-1]) - start_s
     if abs(drift_s) > 2.0 + 0.02 * float(time_s[known[len(apart) - 1]]):
-        log.note(f"the dates of '{clock.title}' and the seconds of the log part by {drift_s:+.1f} s until its end")
+        log.note(f"the dates of '{clock.title}' and the seconds of the log differ by {drift_s:+.1f} s at its end")
     return clock_at_start(log, start_s, clock.is_utc, clock.is_sure, zone, f"'{clock.title}'", clock.remark)
 
 
 def clock_at_start(
     log: Log, start_s: float, is_utc: bool, is_sure: bool, zone: tzinfo | None, what: str, remark: str
 ) -> float:
-    """Seconds since 1970 at time 0, NaN with a note if the dates do not tell it. start_s: what they say, as UTC."""
+    """Return the seconds since 1970 at time 0, or NaN with a note. start_s: the date at time 0, read as UTC."""
     if remark:
         log.note(remark)
     if math.isnan(start_s):
         return math.nan
     if not _SINCE_1970[0] < start_s < _SINCE_1970[1]:
-        log.note(f"{what} is a clock of the year {1970 + start_s / 31_556_952:.0f}, which cannot be: not used")
+        log.note(f"{what} shows the impossible year {1970 + start_s / 31_556_952:.0f}: it is not used")
         return math.nan
     if is_sure and (is_utc or zone is not None):
         return start_s if is_utc or zone is None else to_utc(start_s, zone)
     if is_sure:
         log.start_local_s = start_s
-    # Another zone is at most half a day away, and another order of day and month eleven months.
+    # Another zone changes the time by at most half a day, another order of day and month by eleven months.
     log.latest_utc_s = start_s + (_DAY_S / 2 if is_sure else 340 * _DAY_S)
     unsure = f"{what} does not show whether day or month comes first, so the clock is not known"
     log.note(UNKNOWN_ZONE if is_sure else unsure)

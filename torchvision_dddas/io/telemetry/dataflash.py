@@ -1,4 +1,4 @@
-"""ArduPilot's DataFlash logs, binary and as text: the log itself describes the columns of its messages."""
+"""Read ArduPilot's DataFlash logs, binary or as text. The log itself describes the columns of its messages."""
 
 import re
 import struct
@@ -12,11 +12,11 @@ from torchvision_dddas.io.telemetry.record import Log
 from torchvision_dddas.types import Telemetry
 
 MAGIC = b"\xa3\x95\x80\x80"
-"""The first bytes of a binary log: the message that describes descriptions."""
+"""The first bytes of a binary log: the beginning of a message that describes messages."""
 IN_TEXT = re.compile(r"^FMT, ?\d+, ?\d+, ?\w+, ?\w+", re.MULTILINE)
 """A description in a text log."""
 _HEAD, _FMT = MAGIC[:2], MAGIC[2]
-# Format letters with another name in NumPy, and the number of units of a letter in one.
+# NumPy's type for each format letter, and the divisors of letters for scaled integers.
 _TYPES = {"M": "b", "g": "e", "c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "n": "S4", "N": "S16"}
 _TYPES |= dict.fromkeys("aZ", "S64") | {letter: letter for letter in "bBhHiIfdqQ"}
 _PER_UNIT = dict.fromkeys("cCeE", 1e2) | {"L": 1e7}
@@ -26,9 +26,9 @@ _WEEK_S, _GPS_EPOCH_S, _LEAP_WEEKS = 604_800, 315_964_800, (1512, 1695, 1851, 19
 
 @np.errstate(invalid="ignore", over="ignore")  # a damaged log may hold any bits
 def read_dataflash(path: Path, text: str | None, clock_offset_s: float) -> Telemetry:
-    """Read positions, heights and attitudes of an ArduPilot log; times count from the first. text: of a text log.
+    """Read positions, heights and attitudes of an ArduPilot log; times count from the first. text: None if binary.
 
-    Raise InputError if it has none.
+    Raise InputError if the log has none of them.
     """
     log = Log(path, "ArduPilot DataFlash log", "byte" if text is None else "line", bridge_s=1.0)
     topics: Topics = {}
@@ -82,7 +82,7 @@ def _binary(log: Log, content: bytes) -> Iterator[tuple[str, Topic]]:
 
 
 def _written(log: Log, text: str) -> Iterator[tuple[str, Topic]]:
-    """Yield the messages to read of a text log, by name. Its numbers are in the units of their columns."""
+    """Yield the messages to read of a text log, by name. The numbers are in the units of their columns."""
     columns: dict[str, tuple[str, ...]] = {}
     rows: dict[tuple[str, tuple[str, ...]], list[list[float]]] = {}  # by name and columns, which damage may change
     bad: list[int] = []

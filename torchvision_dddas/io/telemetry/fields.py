@@ -1,4 +1,4 @@
-"""What programs call a quantity, its units, its possible values and what it counts from; and what each program means.
+"""The names of quantities in logs, their units, possible values and zero points, and their meanings in each program.
 
 The readers of tables and of subtitles know no other names. docs/telemetry.md shows both tables; a test compares them.
 """
@@ -13,10 +13,10 @@ import numpy as np
 
 
 class Field(NamedTuple):
-    """A quantity. kind: which of UNITS it has. low, high: possible values, angles in degrees.
+    """A quantity. kind: its key in UNITS. low, high: possible values, angles in degrees. zero: the zero point.
 
-    zero: what it counts from. names: without capitals, blanks, dashes and underscores, the best first. A vehicle's name
-    before them is left out; `gb`, `camera` and the like are `gimbal`.
+    names: in lower case without blanks, dashes and underscores, the best first. A prefix for the vehicle is ignored,
+    and prefixes such as `gb` and `camera` count as `gimbal`.
     """
 
     quantity: str
@@ -90,16 +90,16 @@ _SCALES: dict[str, dict[float, str]] = {
              3600: "hr hrs hour hours h", math.nan: "utc gmt local epoch"},
 }  # fmt: skip
 UNITS = {kind: {w: scale for scale, words in scales.items() for w in words.split()} for kind, scales in _SCALES.items()}
-"""Of each kind of field: unit -> factor to the record's unit, NaN where only the values tell it."""
+"""For each kind of field: unit -> factor to the record's unit, NaN if only the values show the factor."""
 _ANY_UNIT = {unit for units in UNITS.values() for unit in units}
 
 
 class Dialect(NamedTuple):
-    """A program. order: of the two numbers of a place.
+    """A program and its names. order: the order of the two numbers of a place.
 
-    marks: names that its tables have, alternatives with | between them, `osd.` for any name that begins so; of
-    subtitles an expression that their beginning has, in lower case. means: name=quantity,unit for names that are
-    ambiguous elsewhere, nothing after = for those not to be read.
+    marks: for tables, the names by which the program is recognized; | separates alternatives, and `osd.` is a prefix.
+    For subtitles, a regular expression that matches their lower-case beginning. means: name=quantity,unit for names
+    that are ambiguous elsewhere. Names with nothing after = are ignored.
     """
 
     program: str
@@ -147,7 +147,7 @@ SUBTITLES = (
 )  # fmt: skip
 
 _BY_QUANTITY = {field.quantity: field for field in (*FIELDS, Field("", "text", *_ANY, "", ""))}
-# What a name means: quantity, unit, rank. A column may have the name of its unit, `seconds`.
+# Name -> quantity, unit, rank. A column may have the name of its unit, `seconds`.
 _MEANT = {unit: ("time", unit, 0) for unit, scale in UNITS["time"].items() if not scale >= 60}
 _MEANT |= {name: (field.quantity, "", rank) for field in FIELDS for rank, name in enumerate(field.names.split(), 1)}
 POSSIBLE = {
@@ -157,9 +157,9 @@ POSSIBLE = {
 } | {"altitude_m": _HEIGHT[1:]}
 """Lowest and highest possible value of each quantity, in the record's units."""
 HEIGHTS = ("above_takeoff_m", "above_ground_m", "bare_height_m", "bare_altitude_m", "geoid_m")
-"""What the record's altitude_m and above_sea_m are made of."""
+"""The heights from which the record's altitude_m and above_sea_m are made."""
 
-# What a height counts from, in any order with the words for a height and those that say nothing: `GPS altitude (AMSL)`.
+# Words for the zero point of a height. Names also have words for a height and fillers, in any order: `GPS height AMSL`.
 ZEROS = {
     "above_takeoff_m": "relativetohome relativetotakeoff relative rel abovetakeoffpoint abovetakeoff overtakeoff "
     "fromtakeoff abovehomepoint abovehome fromhome abovelaunch abovestart ato",
@@ -175,7 +175,7 @@ _ALONE |= {"aboveellipsoid", "ellipsoidal", "abovegeoid"}
 _FILL = "gps|gnss|rtk|drone|uav|aircraft|vehicle|point"
 _IN_HEIGHT = re.compile(rf"({'|'.join(_ZERO_OF)})|(altitude|alt|height|elevation|elev|ele|hgt|h)|{_FILL}")
 _NOTHING = re.compile(f"(?:{_FILL})*")
-# The first bracket is looked for alone: an expression for all of it would try each one in a name full of them.
+# Search for the first bracket only: an expression for the whole name would try each bracket of a name with many.
 _OPENING = re.compile(r"[(\[](?!\d{1,2}[)\]])| / (?=\S+$)")
 _BLANKS, _WORDS = re.compile(r"[\s_-]|:[cd]$"), re.compile(r"[^\s,;()\[\]]+")
 _VEHICLE = re.compile(
@@ -196,9 +196,9 @@ _HALF_WIDTH_MM, _NUMBER = 18.0, re.compile(r"[-+]?\d{1,12}(?:\.\d{1,12})?")
 
 
 class Known(NamedTuple):
-    """What a name means. scale: to the record's unit and sign, NaN if only the values tell it.
+    """The meaning of a name. scale: factor to the record's unit and sign, NaN if only the values show it.
 
-    rank: 0 is the best name, one that means so in this dialect alone the last. is_utc: whether it is a clock in UTC.
+    rank: 0 for the best name, _LAST for a meaning in one dialect only. is_utc: whether it is a clock in UTC.
     """
 
     field: Field
@@ -207,14 +207,14 @@ class Known(NamedTuple):
     is_utc: bool = False
 
     def in_unit(self, unit: str) -> "Known | None":
-        """The same in a unit; None if the field has no such unit."""
+        """Return the same meaning in a unit; None if the field has no such unit."""
         scale = UNITS.get(self.field.kind, {}).get(unit)
-        sign = -1 if self.field.quantity == "pitch_rad" else 1  # the record's pitch is counted down
+        sign = -1 if self.field.quantity == "pitch_rad" else 1  # the record's pitch is positive down
         return None if scale is None else self._replace(scale=sign * scale, is_utc=unit in ("utc", "gmt"))
 
 
 class Names:
-    """What names mean in a log that shows some dialects, of which the first counts. program: the first, or ""."""
+    """The meanings of names in a log. dialects: the first takes precedence; program is its program, or ""."""
 
     def __init__(self, dialects: Sequence[Dialect] = ()) -> None:
         self.program = dialects[0].program if dialects else ""
@@ -227,7 +227,7 @@ class Names:
         self._known: dict[str, Known | None] = {}
 
     def find(self, title: str) -> Known | None:
-        """What a name means, with its unit: `OSD.height [ft]`, `Speed (mph)`, `gb_yaw`, `alt_m`; None if unknown."""
+        """Return the meaning of a name with its unit: `OSD.height [ft]`, `Speed (mph)`, `gb_yaw`; None if unknown."""
         try:
             return self._known[title]
         except KeyError:
@@ -239,15 +239,15 @@ class Names:
         for key in dict.fromkeys((name + rest, name)):  # "altitude (m AMSL)" is known as altitudeamsl
             if (known := self._named(key)) is not None:
                 with_unit = next((found for word in words if (found := known.in_unit(word))), None)
-                # A unit that is not known may be any. The letter h means the height only with a unit.
+                # Reject a quantity with an unknown unit. The letter h means the height only with a unit.
                 if key == name and known.field.kind == "length" and not _NOTHING.fullmatch(rest):
-                    continue  # the column does not say from where this height is measured
+                    continue  # the column does not name the zero point of this height
                 if with_unit or (key != "h" and (not words or key != name or known.field.kind not in UNITS)):
                     return with_unit or known
         return None
 
     def _named(self, key: str) -> Known | None:
-        """The meaning of a name as it is, without its prefix, with that of a camera, and with a unit at its end."""
+        """Return the meaning of a name, None if unknown. It may have the prefix of a vehicle or camera, and a unit."""
         bare = key[vehicle.end() :] if (vehicle := _VEHICLE.match(key)) else key
         forms = [key, key.replace(".", ""), bare, bare.replace(".", "")]
         forms += ["gimbal" + form[camera.end() :] for form in (key, bare) if (camera := _CAMERA.match(form))]
@@ -268,7 +268,7 @@ class Names:
 
 @lru_cache(maxsize=10_000)
 def _height(name: str) -> str | None:
-    """The height that words of `ZEROS` and those for a height make; None for other names and for two zero points."""
+    """Return the height that a name means by its words for a height and a zero point; None if the name is unclear."""
     place, zeros, count = 0, set[str](), 0
     while place < len(name) and (found := _IN_HEIGHT.match(name, place)) is not None:
         zeros |= {_ZERO_OF[found[1]]} if found[1] else set()
@@ -282,38 +282,38 @@ def _plain(name: str) -> str:
 
 
 def _parted(title: str) -> tuple[str, list[str]]:
-    """The plain name of a column, and the words in the brackets behind it."""
+    """Return the plain name of a column, and the words in the brackets behind it."""
     opening = _OPENING.search(title)
     end = opening.start() if opening is not None else len(title)
     return _plain(title[:end]), _WORDS.findall(title[opening.end() :].lower()) if opening else []
 
 
 def names_of_table(header: Sequence[str]) -> Names:
-    """What the columns of a table mean, by the programs that write such columns."""
+    """Return the meanings of a table's columns, according to the programs that write such columns."""
     keys = {_parted(title)[0] for title in header}
     keys |= {key.partition(".")[0] + "." for key in keys if "." in key}
     return Names([one for one in TABLES if any(keys.issuperset(marks.split()) for marks in one.marks.split("|"))])
 
 
 def names_of_subtitles(text: str) -> Names:
-    """What the keys of subtitles mean."""
+    """Return the meanings of the keys of subtitles."""
     head = text[:_HEAD].lower()
     return Names([one for one in SUBTITLES if re.search(one.marks, head)])
 
 
 def looks_alike(title: str) -> bool:
-    """Whether the words of a name are those of a place, a height, an attitude, a time or a zoom."""
+    """Return whether the words of a name suggest a place, a height, an attitude, a time or a zoom."""
     return any(_ALIKE.fullmatch(word.lower()) for word in _PARTS.findall(title)) and not _UNLIKE.search(title)
 
 
 _PART = r"(\d{1,3}(?:[.,]\d{1,12})?)"
 ANGLE = rf"([NSEW-])? ?{_PART} ?(?:[°d:]|deg)? ?(?:{_PART} ?['′m:]? ?)?(?:{_PART} ?(?:[\"″s]|'')? ?)?([NSEW])?"
-"""Degrees with a side, minutes and seconds: five groups."""
+"""The pattern of degrees, minutes and seconds, with a letter before or behind them. It has five groups."""
 _ANGLE = re.compile(ANGLE, re.IGNORECASE)
 
 
 def parse_angle(text: str) -> tuple[float, str]:
-    """Degrees of `48.1371 N`, `48°08'13.6"N` or `48,1371`, and the side that it names; NaN for anything else."""
+    """Return the degrees of `48.1371 N`, `48°08'13.6"N` or `48,1371`, and the side if given; NaN for other text."""
     if (found := _ANGLE.fullmatch(text.strip())) is None:
         return math.nan, ""
     degrees, minutes, seconds = (float((part or "0").replace(",", ".")) for part in found.groups()[1:4])
@@ -322,31 +322,31 @@ def parse_angle(text: str) -> tuple[float, str]:
 
 
 def field_of_view(focal: Sequence[str], f_number: Sequence[str], zoom: Sequence[str]) -> tuple[np.ndarray, list[str]]:
-    """Widths of the field of view, rad, (N,), NaN where unknown; and notes. Each argument: (N,) as the log writes it.
+    """Return the widths of the field of view, rad, (N,), NaN if unknown, and notes. Arguments: (N,) texts of the log.
 
-    The focal length is that of a picture with a longer side of 36 mm. Some write it and the aperture times ten and a
-    hundred: 240 beside 280 is 24 mm at f/2.8. The zoom may be 1.79, or a whole number of hundredths to ten thousandths.
+    The focal length is for a picture with a longer side of 36 mm. Some logs have ten times the focal length and 100
+    times the aperture: 240 and 280 mean 24 mm at f/2.8. The zoom is 1.79, or counts hundredths to ten-thousandths.
     """
     texts = (focal, f_number, [text.strip("xX× ") for text in zoom])
     mm, aperture, times = (np.array([float(t) if _NUMBER.fullmatch(t) else np.nan for t in text]) for text in texts)
     is_tenths = np.array(["." not in text for text in focal]) & (mm >= 100) & ~(aperture < 100)
-    notes = ["the field of view is that of a focal length as for a picture with a longer side of 36 mm"]
+    notes = ["the field of view follows from a focal length for a picture with a longer side of 36 mm"]
     if (times >= 100).any():
         first = times[times >= 100][0]
         # The smallest zoom of a log is one or more.
         lowest = times[times >= 100].min()
         scale = next(scale for scale in (10_000, 1000, 100) if scale <= lowest)
         times = np.where(times >= 100, times / scale, times)
-        or_more = f"; the log does not say the scale, in 1/{scale // 10} it were {first / scale * 10:g}"
+        or_more = f"; the log does not give the scale: in 1/{scale // 10} it would be {first / scale * 10:g}"
         notes.append(
             f"the zoom is counted in 1/{scale}: {first:g} is {first / scale:g}{or_more * int(scale != lowest)}"
         )
     known = np.unique(times[np.isfinite(times)])
     if len(known) == 1 and known[0] > 1:
-        notes.append(f"the zoom is {known[0]:g} throughout, which a focal length in the camera's file must hold")
+        notes.append(f"the zoom is {known[0]:g} throughout; a focal length in the camera's file must include it")
     is_wrong = (times < POSSIBLE["zoom"][0]) | (times > POSSIBLE["zoom"][1])
     if is_wrong.any():
-        notes.append(f"a zoom of {times[is_wrong][0]:g} cannot be; {is_wrong.sum()} left out")
+        notes.append(f"a zoom of {times[is_wrong][0]:g} is impossible; {is_wrong.sum()} left out")
     mm = np.where(is_tenths, mm / 10, mm) * np.where(np.isnan(times) | is_wrong, 1.0, times)
     low, high = POSSIBLE["focal_mm"]
     hfov = 2 * np.arctan(_HALF_WIDTH_MM / np.where((mm >= low) & (mm <= high), mm, np.nan))

@@ -1,4 +1,4 @@
-"""MAVLink telemetry logs: messages, each behind the time at which a ground station received it."""
+"""Read MAVLink telemetry logs. Each message follows the time at which a ground station received it."""
 
 import binascii
 import math
@@ -16,7 +16,7 @@ from torchvision_dddas.io.telemetry.record import Log, is_clock
 from torchvision_dddas.types import Telemetry
 
 _V1, _V2 = 0xFE, 0xFD
-_MAGIC = re.compile(bytes([0x5B, _V1, _V2, 0x5D]))  # either of them
+_MAGIC = re.compile(bytes([0x5B, _V1, _V2, 0x5D]))  # either byte
 _SIGNED = 0x01
 _MIRROR = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _V2_MIRRORED, _SIGNED_MIRRORED = _MIRROR[_V2], _MIRROR[_SIGNED]
@@ -24,24 +24,24 @@ _LATEST_US = 7_258_118_400_000_000  # the year 2200; a computer without a clock 
 _PLACES = ("GLOBAL_POSITION_INT", "GPS_RAW_INT", "GPS2_RAW")
 _OF_PARTS = ("GIMBAL_DEVICE_ATTITUDE_STATUS", "MOUNT_ORIENTATION", "MOUNT_STATUS", "CAMERA_FOV_STATUS")
 _HEARTBEAT, _SYSTEM_TIME = 0, 2
-_ENOUGH = 5  # of these two messages that tell something, of a sender
+_ENOUGH = 5  # useful messages of either kind that are read from a sender
 # Kinds of senders in heartbeats (MAV_TYPE): ground stations and antenna trackers; and parts of a vehicle.
 _STATIONS, _PARTS = {5, 6}, {18, 26, 27, *range(30, 35), *range(36, 43), 44, 48}
-# Without a heartbeat the numbers tell: stations have a higher system or this component, autopilots are component 1.
+# Senders without a heartbeat: stations have a higher system number or this component, autopilots are component 1.
 _LAST_VEHICLE, _STATION_COMPONENT, _AUTOPILOT = 250, 190, 1
 # Clocks further apart than this differ by more than the delay of messages.
 _APART_S = 60.0
 
 Sender = tuple[int, int]
-"""System and component."""
+"""The numbers of the system and the component."""
 Row = tuple[float, Any, int]
-"""The time of reception, the message and its first byte."""
+"""The time of reception, the message, and the place of its first byte."""
 
 
 def read_tlog(path: Path, clock_offset_s: float) -> Telemetry:
-    """Positions and attitudes of one vehicle, never of a ground station; times since the first one.
+    """Read positions and attitudes of one vehicle, never of a ground station. Times count from the first sample.
 
-    Raises InputError if no vehicle reports any.
+    Raise InputError if no vehicle reports any.
     """
     log = Log(path, "MAVLink log", "byte", bridge_s=2.0)
     topics, clock_s = _mavlink_topics(log)
@@ -51,7 +51,7 @@ def read_tlog(path: Path, clock_offset_s: float) -> Telemetry:
 
 
 def _mavlink_topics(log: Log) -> tuple[Topics, float]:
-    """The messages of one vehicle by name and sender, at the times of `_sending_times`, and the clock at time 0."""
+    """Return the messages of one vehicle by name and sender, with their times of sending, and the clock at time 0."""
     try:
         from pymavlink.dialects.v20 import all as dialect
     except ImportError:
@@ -114,9 +114,9 @@ def _mavlink_topics(log: Log) -> tuple[Topics, float]:
 
 
 def _choose_vehicle(log: Log, rows: Mapping[Sender, list[Row]], kinds: Mapping[Sender, int]) -> tuple[Sender, set[int]]:
-    """The vehicle with the most places, rather an autopilot than a part; no ground station, else InputError is raised.
+    """Return the vehicle with the most places, and the systems to leave out. Prefer autopilots to parts of vehicles.
 
-    kinds: of the senders, MAV_TYPE in their heartbeats. Also returns the systems that are left out.
+    kinds: the senders' MAV_TYPE in their heartbeats. Raise InputError if all senders are ground stations.
     """
     stations = {system for (system, _), kind in kinds.items() if kind in _STATIONS}
     places = Counter(
@@ -140,30 +140,30 @@ def _choose_vehicle(log: Log, rows: Mapping[Sender, list[Row]], kinds: Mapping[S
         sorted(rows), key=lambda s: (trust(s) // 3, min(trust(s), places[s], 1), trust(s), talks[s], places[s])
     )
     if not trust(chosen):
-        raise log.refuse("only ground stations speak in it; give the log that holds the vehicle's messages")
+        raise log.refuse("it has only messages of ground stations; give the log that holds the vehicle's messages")
     others = [s for s in sorted(places) if s != chosen]
     names = [f"{system}" if system != chosen[0] else f"its component {component}" for system, component in others]
     names = [name + " (ground station)" * (not trust(s)) for name, s in zip(names, others, strict=True)]
     if others:
-        log.note(f"several vehicles report: system {chosen[0]} is taken, left out are {', '.join(names[:9])}")
+        log.note(f"several vehicles report: system {chosen[0]} is used; left out: {', '.join(names[:9])}")
     return chosen, {s[0] for s in rows if places[s] or not trust(s)} - {chosen[0]}
 
 
 def _clock(log: Log, topics: Topics, is_timed: bool) -> float:
-    """What makes seconds since 1970 of the station's times: 0, or what the vehicle's SYSTEM_TIME says."""
+    """Return the seconds since 1970 at the station's time 0: 0, or the value by the vehicle's SYSTEM_TIME."""
     told = [(topic["time_unix_usec"] / 1e6, topic["time_s"]) for topic in topics.get("SYSTEM_TIME", {}).values()]
     behind_s = start_clock(told)
     if not told or not is_clock(behind_s + told[0][1][0]) or (is_timed and abs(behind_s) < _APART_S):
-        return 0.0  # if the station's clock cannot be right either, the record says so
-    log.note(f"the station's clock is {behind_s:.0f} s behind the vehicle's SYSTEM_TIME, which is taken")
+        return 0.0  # if the station's clock is impossible, too, `build_record` notes it
+    log.note(f"the station's clock is {behind_s:.0f} s behind the vehicle's SYSTEM_TIME, which is used")
     return behind_s
 
 
 def _sending_times(log: Log, part: list[Row], is_timed: bool) -> np.ndarray:
-    """When a sender sent each message, by its own clock. is_timed: whether the station has a clock.
+    """Return when a sender sent each message, by its own clock. is_timed: whether the station has a clock.
 
-    Messages arrive in bursts, a second late or more; at 20 m/s that is 20 m. The smallest delay counts as zero. A
-    message without a time has that of the one before. If the clocks drift apart, the times of reception are kept.
+    Messages arrive in bursts, a second late or more: an error of 20 m at 20 m/s. The smallest delay counts as zero. A
+    message without a time has the previous time. If the clocks drift apart, the times of reception are kept.
     """
     came = np.array([came_s for came_s, *_ in part])
     came[is_timed & ~is_clock(came)] = np.nan  # before the station's clock was set, or damaged
@@ -177,14 +177,14 @@ def _sending_times(log: Log, part: list[Row], is_timed: bool) -> np.ndarray:
             log.jitter_s = math.inf  # messages are sorted by time
             latest = np.maximum.accumulate(np.where(is_known, np.arange(len(sent)), np.argmax(is_known)))
             return sent[latest] + np.percentile(apart[alike], 1)
-        log.note("the vehicle's clock and the station's drift apart: times are those of reception")
+        log.note("the vehicle's clock and the station's drift apart: the times of reception are used")
     if np.isnan(came).any():
-        log.note(f"{np.isnan(came).sum()} messages came at times that cannot be and are left out")
+        log.note(f"{np.isnan(came).sum()} messages came at impossible times and are left out")
     return came
 
 
 def looks_like_tlog(head: bytes) -> bool:
-    """Whether eight bytes of time are followed by a message, and that by the next one."""
+    """Return whether a message follows eight bytes of time, and another message follows the first."""
     for place in range(min(len(head), 1024)):
         end = _end(head, place)
         if end is not None and int.from_bytes(head[place : place + 8], "big") < _LATEST_US:
@@ -193,7 +193,7 @@ def looks_like_tlog(head: bytes) -> bool:
 
 
 def _frames(log: Log, content: bytes, extras: Mapping[int, bytes]) -> Iterator[tuple[int, int, int]]:
-    """Start (of its time), end and number of each message; other bytes are skipped. extras: see `_is_whole`."""
+    """Yield the start (of its time), end and number of each message; skip other bytes. extras: see `_is_whole`."""
     place, lost, lost_first = 0, 0, 0
     mirrored = content.translate(_MIRROR)
     while place + 16 <= len(content):
@@ -215,11 +215,11 @@ def _frames(log: Log, content: bytes, extras: Mapping[int, bytes]) -> Iterator[t
     if place < len(content):
         log.note(f"byte {place}: the file ends within a message; it was cut off")
     if lost:
-        log.note(f"byte {lost_first}: {lost} bytes are no MAVLink messages and left out")
+        log.note(f"byte {lost_first}: {lost} bytes are not MAVLink messages and are left out")
 
 
 def _end(content: bytes, place: int) -> int | None:
-    """End of the message that begins here, or None."""
+    """Return the end of the message whose time begins at place, or None."""
     if place + 12 > len(content):
         return None
     if content[place + 8] == _V1:
@@ -230,10 +230,10 @@ def _end(content: bytes, place: int) -> int | None:
 
 
 def _is_whole(mirrored: bytes, begin: int, end: int, extra: bytes) -> bool:
-    """Whether the checksum of a message is right, CRC-16/MCRF4XX.
+    """Return whether the checksum of a message is right, CRC-16/MCRF4XX.
 
-    mirrored: the log with the bits of each byte in reverse, to which the checksum of `binascii` is the same, and fast:
-    every byte may look like the beginning of a message. extra: what its kind adds to the checksum, in reverse as well.
+    mirrored: the log with the bits of each byte reversed. On these bytes, `binascii` gives the same checksum quickly,
+    which matters because any byte may look like the start of a message. extra: the reversed byte that the kind adds.
     """
     if mirrored[begin] == _V2_MIRRORED and mirrored[begin + 2] & _SIGNED_MIRRORED:
         end -= 13

@@ -1,4 +1,4 @@
-"""MISB ST 0601 metadata beside a video in an MPEG transport stream, or alone, as telemetry."""
+"""Read MISB ST 0601 metadata as telemetry, beside a video in an MPEG transport stream or alone."""
 
 import binascii
 import bisect
@@ -19,15 +19,15 @@ from torchvision_dddas.types import Telemetry
 KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
 """The universal key of the UAS datalink local set."""
 
-# No set of any version is longer; a damaged length would swallow the sets behind it.
+# No set of any version is longer. A damaged length would include the sets behind it.
 _LONGEST = 1 << 16
 _CHECKSUM, _STAMP = 1, 2
-# No standard has more than some hundred tags. Each byte of an endless one would copy the number so far.
+# No standard has more than a few hundred tags. An endless tag number would take time quadratic in its length.
 _LARGEST_TAG = 1 << 21
 
 
 class LocalSet(NamedTuple):
-    """A packet. place: its first byte. tags: bytes by tag. whole: its checksum is right."""
+    """A packet. place: position of its first byte. tags: tag -> bytes. whole: whether its checksum is right."""
 
     place: int
     tags: dict[int, bytes]
@@ -35,7 +35,7 @@ class LocalSet(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the last video."""
+    """The payload of a metadata packet. time_s: since the first picture, or NaN. seen_s: time of the picture before."""
 
     time_s: float
     seen_s: float
@@ -45,8 +45,8 @@ class Piece(NamedTuple):
 def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float) -> Telemetry:
     """Read MISB ST 0601 metadata. layout: the transport stream's `spacing`; None for bare local sets.
 
-    Times are the stream's, since its first picture; without them the sets' own stamps, the first of which is aligned
-    with the last picture before it. Raises InputError without intact metadata.
+    Times are those of the stream, since its first picture. If they are missing, times are the sets' own stamps, with
+    the first stamp at the last picture before it. Raise InputError if no metadata is intact.
     """
     log = Log(path, "MISB ST 0601 metadata", "byte", bridge_s=1.0, height_zero="ground")
     content = path.read_bytes()
@@ -56,16 +56,16 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
     found = list(local_sets(stream))
     whole = [one for one in found if one.whole]
     if not found:
-        raise log.refuse("its metadata has no MISB ST 0601 packet, nothing begins with the key of one")
+        raise log.refuse("its metadata has no MISB ST 0601 packet: the key of such packets is missing")
     if 2 * len(whole) < len(found):
         whole = _summed_otherwise(log, stream) or whole
     if not whole:
         why = "they are cut off, or their checksums are wrong in different ways"
         raise log.refuse(f"none of {len(found)} MISB ST 0601 packets is whole: {why}")
     if found[0].place and layout is None:
-        log.note(f"{found[0].place} bytes before the first key are no part of a packet and left out")
+        log.note(f"{found[0].place} bytes before the first key are not part of a packet and are left out")
     if len(whole) < len(found):
-        log.note(f"{len(found) - len(whole)} of {len(found)} packets are damaged or cut off and left out")
+        log.note(f"{len(found) - len(whole)} of {len(found)} packets are damaged or cut off, and are left out")
     times, start_utc_s = _times(log, whole, [pieces[bisect.bisect_right(starts, one.place) - 1] for one in whole])
     timed = np.isfinite(times)
     places = np.array([one.place for one in whole])
@@ -76,14 +76,14 @@ def read_misb(path: Path, layout: tuple[int, int] | None, clock_offset_s: float)
 
 
 def _times(log: Log, whole: list[LocalSet], pieces: list[Piece]) -> tuple[np.ndarray, float]:
-    """Seconds since the first picture, and the clock at it. pieces: where each set is from."""
+    """Return the seconds since the first picture, and the clock at it. pieces: the source of each set."""
     stream_s = np.array([piece.time_s for piece in pieces])
     stamps = np.array([stamp_s(one.tags.get(_STAMP)) for one in whole])
     clocked = np.isfinite(stamps)
     middle = float(np.median(stamps[clocked])) if clocked.any() else math.nan
     for unit, scale in (("milliseconds", 1e3), ("seconds", 1e6), ("nanoseconds", 1e-3)):
         if not is_clock(middle) and is_clock(middle * scale):
-            log.note(f"the stamps of the packets count {unit}, not microseconds as the standard has it")
+            log.note(f"the stamps of the packets count {unit}, not microseconds as in the standard")
             stamps, middle = stamps * scale, middle * scale
     if np.isfinite(stream_s).mean() > 0.5:
         apart = (stamps - stream_s)[clocked & np.isfinite(stream_s)]
@@ -93,7 +93,7 @@ def _times(log: Log, whole: list[LocalSet], pieces: list[Piece]) -> tuple[np.nda
     first = int(np.argmax(clocked))
     start = float(stamps[first]) - pieces[first].seen_s
     if pieces[first].seen_s:
-        log.note("the stream has no times for its metadata: the first is aligned with the picture before it")
+        log.note("the stream has no times for its metadata: the first packet gets the time of the picture before it")
     return stamps - start, start
 
 
@@ -109,13 +109,13 @@ def _quantities(log: Log, whole: list[LocalSet]) -> dict[str, np.ndarray]:
     ellipsoid = first_known(np.array([imap(one.tags.get(104), -900, 40000) for one in whole]), column(75, -900, 19000))
     above_middle = first_known(above_sea - ground, ellipsoid - column(78, -900, 19000))
     if not np.isfinite(above_ground).any() and np.isfinite(above_middle).any():
-        log.note("the altitude above ground is that above the ground in the picture's middle")
+        log.note("the altitude above ground counts from the ground in the picture's middle")
     vehicle_heading = np.radians(column(5, 0, 360))
     vehicle_pitch = np.radians(first_known(column(90, -90, 90, True), column(6, -20, 20, True)))
     vehicle_roll = np.radians(first_known(column(91, -90, 90, True), column(7, -50, 50, True)))
     sensor_heading, sensor_pitch = np.radians(column(18, 0, 360)), np.radians(column(19, -180, 180, True))
     sensor_roll = np.radians(first_known(column(20, 0, 360), 0.0))
-    vehicle = axes(vehicle_heading, -vehicle_pitch, vehicle_roll)  # the standard counts pitch up
+    vehicle = axes(vehicle_heading, -vehicle_pitch, vehicle_roll)  # the standard's pitch is positive up
     heading, pitch, roll = angles(vehicle @ axes(sensor_heading, -sensor_pitch, sensor_roll))
     return {
         "longitude_deg": column(14, -180, 180, True),
@@ -144,7 +144,7 @@ def local_sets(content: bytes) -> Iterator[LocalSet]:
         following = place + len(KEY)
         tags = None
         size, begin = _length(content, following)
-        # The checksum first, which takes the same time for a set of any length: sets may lie in each other.
+        # Check the sum first. It takes the same time for a set of any length, and sets may lie in each other.
         if size <= _LONGEST and begin + size <= len(content) and sums.are_right(place, begin + size):
             following = begin + size
             tags = _tags(content[begin:following])
@@ -155,13 +155,13 @@ def local_sets(content: bytes) -> Iterator[LocalSet]:
 
 
 def _summed_otherwise(log: Log, content: bytes) -> list[LocalSet]:
-    """The packets of an encoder that sums other bytes, or none; empty if the checksums are wrong in different ways.
+    """Return the packets of an encoder with another checksum or none; [] if checksums are wrong in different ways.
 
-    A sum of other bytes, from another start or in another order, differs from the given one by the same number in each
-    packet.
+    An encoder may sum other bytes, in another order, or from another start. Under the right rule, the given checksum
+    differs from the sum by the same number in each packet.
     """
     keys = [found.start() for found in re.finditer(re.escape(KEY), content)]
-    framed: list[tuple[int, int, LocalSet]] = []  # begin of the value, end
+    framed: list[tuple[int, int, LocalSet]] = []  # begin and end of the value
     for place, following in pairwise([*keys, len(content)]):
         size, begin = _length(content, place + len(KEY))
         if begin + size <= following and (tags := _tags(content[begin : begin + size])):
@@ -187,12 +187,12 @@ def _summed_otherwise(log: Log, content: bytes) -> list[LocalSet]:
             if is_sure and is_usual.sum() > max(alike.sum(), len(given) / 2):
                 alike = is_usual
     if alike.any():
-        log.note("the checksums are wrong in the same way throughout: an encoder sums other bytes; packets are read")
+        log.note("the checksums are all wrong in the same way: the encoder sums other bytes. The packets are read")
     return [framed[i][2] for i in np.flatnonzero(alike)]
 
 
 def _length(content: bytes, place: int) -> tuple[int, int]:
-    """A length in BER, short or long, and where its value begins; a length without end where it is cut off."""
+    """Return a length in BER, short or long, and where the value begins; a huge length if it is cut off."""
     first = content[place] if place < len(content) else 0xFF
     if first < 0x80:
         return first, place + 1
@@ -203,7 +203,7 @@ def _length(content: bytes, place: int) -> tuple[int, int]:
 
 
 class _Sums:
-    """Running sums of the bytes at even and at odd places, modulo 2^16. They give the checksum of any part at once."""
+    """Running sums of the bytes at even and at odd places, modulo 2^16. They quickly give the checksum of any part."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
@@ -215,12 +215,12 @@ class _Sums:
             self._running.append(np.append(np.uint16(0), np.cumsum(mine, dtype=np.uint16)))
 
     def by_turns(self, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The sums of the first, third, ... bytes of some parts, and of the second, fourth, ... ones."""
+        """Return the sums of the first, third, ... bytes of some parts, and of the second, fourth, ... bytes."""
         even, odd = (one[end].astype(int) - one[begin] for one in self._running)
         return np.where(begin % 2, odd, even), np.where(begin % 2, even, odd)
 
     def are_right(self, begin: int, end: int) -> bool:
-        """Whether the two bytes before the end are the sum of all before them: the first, third, ... count 256 fold."""
+        """Return whether the last two bytes are the sum of the others, with the first, third, ... bytes times 256."""
         high, low = (int(one[end - 2]) - int(one[begin]) for one in self._running[:: -1 if begin % 2 else 1])
         return ((high << 8) + low) & 0xFFFF == int.from_bytes(self._content[end - 2 : end], "big")
 
@@ -230,7 +230,7 @@ def _tags(content: bytes) -> dict[int, bytes] | None:
     place = 0
     while place < len(content):
         tag = 0
-        while place < len(content):  # a tag in BER-OID: seven bits a byte, the last one's highest bit is 0
+        while place < len(content):  # BER-OID has seven bits a byte; the highest bit of the last byte is 0
             byte = content[place]
             place += 1
             tag = tag << 7 | byte & 0x7F
@@ -247,7 +247,7 @@ def _tags(content: bytes) -> dict[int, bytes] | None:
 
 
 def mapped(value: bytes | None, low: float, high: float, signed: bool = False) -> float:
-    """An integer spread over a range; a signed one's lowest value means out of range. NaN where there is none."""
+    """Map an integer to a range. Return NaN for a missing value and for the lowest signed value (out of range)."""
     if not value or len(value) > 8:
         return math.nan
     number, most = int.from_bytes(value, "big", signed=signed), 2 ** (8 * len(value) - signed) - 1
@@ -257,11 +257,11 @@ def mapped(value: bytes | None, low: float, high: float, signed: bool = False) -
 
 
 def imap(value: bytes | None, low: float, high: float) -> float:
-    """A number as MISB ST 1201 (IMAPB) spreads it; NaN for its special values and where there is none."""
+    """Map an integer to a number by MISB ST 1201 (IMAPB). Return NaN for special and missing values."""
     if not value or len(value) > 8:
         return math.nan
     number, bits = int.from_bytes(value, "big"), 8 * len(value) - 1
-    if number > 1 << bits:  # the highest bit alone is the upper end; with others it means infinity and the like
+    if number > 1 << bits:  # the highest bit alone is the upper end; with other bits it marks special values
         return math.nan
     scale = 2.0 ** (bits - math.ceil(math.log2(high - low)))
     offset = scale * low - math.floor(scale * low) if low < 0 < high else 0.0
@@ -269,7 +269,7 @@ def imap(value: bytes | None, low: float, high: float) -> float:
 
 
 def stamp_s(value: bytes | None) -> float:
-    """Seconds since 1970 of a precision time stamp; NaN where there is none."""
+    """Return the seconds since 1970 of a precision time stamp; NaN if it is missing."""
     return struct.unpack(">Q", value)[0] / 1e6 if value is not None and len(value) == 8 else math.nan
 
 
@@ -278,7 +278,7 @@ def stamp_s(value: bytes | None) -> float:
 
 _SYNC = b"G"
 _PACKET = 188
-# Packets alone, with a time code of 4 bytes before each (.m2ts), or with check bytes behind.
+# Packets alone, with a time code of 4 bytes before each (.m2ts), or with check bytes behind each.
 _SPACINGS = ((188, 0), (192, 4), (204, 0))
 _VIDEO_TYPES = {0x01, 0x02, 0x10, 0x1B, 0x24, 0x33}
 _METADATA_IN_PES, _PRIVATE = 0x15, 0x06
@@ -287,7 +287,7 @@ _HZ = 90_000
 
 
 def spacing(head: bytes) -> tuple[int, int] | None:
-    """Packet spacing and offset of the first sync byte, bytes; None if it is no transport stream."""
+    """Return the packet spacing and the offset of the first sync byte, in bytes; None if not a transport stream."""
     for size, before in _SPACINGS:
         # A recording may begin within a packet.
         for first in range(before, min(before + size, len(head))):
@@ -298,11 +298,11 @@ def spacing(head: bytes) -> tuple[int, int] | None:
 
 
 def _read_stream(log: Log, content: bytes, size: int, first: int) -> list[Piece]:
-    """Every metadata packet of the first programme that has any. Raises InputError if there is none."""
+    """Return every metadata packet of the first programme that has any. Raise InputError if there is none."""
     programmes: set[int] = set()
     streams: list[tuple[int, int, bytes]] = []
     video = metadata = None
-    packets: list[tuple[int | None, int, bytearray]] = []  # time stamp, the video's last one, payload
+    packets: list[tuple[int | None, int, bytearray]] = []  # time stamp, the video's last time stamp, payload
     last_video, earliest = 0, None
     for pid, starts, payload in _packets(log, content, size, first):
         if pid == 0 and starts and not programmes:
@@ -336,12 +336,12 @@ def _read_stream(log: Log, content: bytes, size: int, first: int) -> list[Piece]
 
 
 def _near(stamp: int, other: int) -> int:
-    """A 33-bit time stamp, unwrapped to be near another."""
+    """Return a 33-bit time stamp, unwrapped to be near another time stamp."""
     return other + (stamp - other + _WRAP // 2) % _WRAP - _WRAP // 2
 
 
 def _packets(log: Log, content: bytes, size: int, first: int) -> Iterator[tuple[int, bool, bytes]]:
-    """Stream number, whether a unit starts, and payload of each unscrambled packet; damage is noted at the end."""
+    """Yield stream number, whether a unit starts, and payload of each unscrambled packet; note damage at the end."""
     place = first
     damaged: list[int] = []
     while place + _PACKET <= len(content):
@@ -370,7 +370,7 @@ def _packets(log: Log, content: bytes, size: int, first: int) -> Iterator[tuple[
 
 
 def _programmes(payload: bytes) -> set[int]:
-    """Stream numbers of the programme tables."""
+    """Return the stream numbers of the programme tables."""
     table = payload[1 + payload[0] :] if payload else b""
     length = ((table[1] & 0x0F) << 8 | table[2]) if len(table) > 8 else 0
     entries = table[8 : min(3 + length - 4, len(table))]
@@ -379,7 +379,7 @@ def _programmes(payload: bytes) -> set[int]:
 
 
 def _streams(payload: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Type, number and description of a programme's streams."""
+    """Yield the type, number and description of a programme's streams."""
     table = payload[1 + payload[0] :] if payload else b""
     if len(table) < 12 or table[0] != 0x02:
         return
@@ -393,7 +393,7 @@ def _streams(payload: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _stamp(payload: bytes) -> int | None:
-    """The presentation time of a PES packet, 33 bits at 90 kHz."""
+    """Return the presentation time of a PES packet, 33 bits at 90 kHz; None if it is missing."""
     if payload[:3] != b"\0\0\1" or len(payload) < 14 or not payload[7] & 0x80:
         return None
     a, b, c, d, e = payload[9:14]

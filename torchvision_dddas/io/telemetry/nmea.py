@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences of a receiver as telemetry, alone on their lines or wrapped in other text."""
+"""Read NMEA 0183 sentences of a receiver as telemetry, alone on their lines or within other text."""
 
 import functools
 import math
@@ -15,9 +15,9 @@ from torchvision_dddas.types import Telemetry
 
 _KNOT = 1852 / 3600
 _DAY_S = 86_400.0
-_APART_M = 30.0  # no receiver moves so far within a time
+_APART_M = 30.0  # places further apart at the same time are of two receivers
 # The numbers of the fields in each kind of sentence. A place takes four fields: latitude, N or S, longitude, E or W.
-# A status is empty, 0, V or only N where nothing is known. A sentence that ends before the field `least` is too short.
+# With a status of 0, V or only N, the values are unknown. A sentence that ends before the field `least` is too short.
 _FIELDS: dict[str, dict[str, int]] = {
     "GGA": {"time": 1, "place": 2, "status": 6, "above_sea": 9, "separation": 11, "least": 9},
     "GNS": {"time": 1, "place": 2, "status": 6, "above_sea": 9, "separation": 10, "least": 9},
@@ -29,19 +29,19 @@ _FIELDS: dict[str, dict[str, int]] = {
     "ZDA": {"time": 1, "date": 2, "least": 4},  # its date takes three fields: day, month, year
 }
 SENTENCE = re.compile(rf"(?<![A-Za-z])\$?([A-Z]{{2}}(?:{'|'.join(_FIELDS)}),[^$*\r\n\"'<>\\]*)(\*[0-9A-Fa-f]{{0,2}})?")
-"""A sentence of these kinds in any text: all that its checksum covers, and the checksum with its star."""
+"""A sentence of these kinds in any text: the part that its checksum covers, and the checksum with its star."""
 
 
 def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
-    """Read the sentences of `_FIELDS`. Times count from the first sentence that has one.
+    """Read the sentences of `_FIELDS`. Times count from the first sentence with a time.
 
-    Heights are above the sea, and above the ellipsoid if the sentence has the geoid's. No sentence has a height above
-    ground. Raises InputError if no whole sentence gives a place or a heading together with a time.
+    Heights are above the sea, and also above the ellipsoid if the sentence has the geoid's height. No sentence has a
+    height above ground. Raise InputError if no whole sentence gives a place or a heading together with a time.
     """
     log = Log(path, "NMEA 0183", bridge_s=1.0)
     first_s = last_s = math.nan  # times of day of the first and the latest sentence
     days = 0
-    clocks: list[float] = []  # the clock at the first sentence, as each date tells it
+    clocks: list[float] = []  # the clock at the first sentence, by each date
     faults: list[tuple[int, str]] = []
     seen, elsewhere = (math.nan, (math.nan, math.nan)), list[int]()  # time and place of the latest sentence
     separations: set[float] = set()
@@ -53,7 +53,7 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
             continue
         now_s, date_s, separation = (values.pop(name) for name in ("time", "date", "separation"))
         if math.isfinite(now_s):
-            days += now_s < last_s - _DAY_S / 2  # time goes on over midnight
+            days += now_s < last_s - _DAY_S / 2  # a step back is midnight
             first_s, last_s = now_s if math.isnan(first_s) else first_s, now_s
             clocks += [date_s + first_s - days * _DAY_S] if math.isfinite(date_s) else []
         if math.isfinite(first_s):
@@ -75,20 +75,20 @@ def read_nmea(path: Path, text: str, clock_offset_s: float) -> Telemetry:
         raise log.refuse(f"no NMEA sentence gives a place or a heading together with a time{found}{hint}")
     if elsewhere:
         what = f"line {elsewhere[0]}: the log has two receivers over {_APART_M:g} m from each other"
-        log.note(f"{what}: of each time the first counts, {len(elsewhere)} sentences are left out")
+        log.note(f"{what}: the first place of each time counts, and {len(elsewhere)} sentences are left out")
     if {apart for apart in separations if math.isfinite(apart)} == {0.0}:
         log.note("the receiver gives the geoid as 0 throughout: its heights above the sea may be above the ellipsoid")
     return build_record(log, clock_offset_s, next((s for s in clocks if is_clock(s)), [*clocks, math.nan][0]))
 
 
 def _whole_sentences(log: Log, text: str, faults: list[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    """Yield line and body of each sentence to trust, and append line and fault of each other one to `faults`."""
+    """Yield the line and body of each trusted sentence. Append the line and fault of other sentences to `faults`."""
     found = [
         (number, body, checksum, functools.reduce(operator.xor, body.encode()))
         for number, line in enumerate(text.splitlines(), 1)
         for body, checksum in SENTENCE.findall(line)
     ]
-    # Some programs get every checksum wrong in the same way: by one difference, or by one number that stands for it.
+    # Some programs get every checksum wrong in the same way: by a constant difference, or with a constant checksum.
     sums = [(int(checksum[1:], 16), right) for _, _, checksum, right in found if len(checksum) == 3]
     (apart, alike), (given, same) = (
         max(Counter(values).items(), key=lambda item: item[1], default=(0, 0))
@@ -118,14 +118,14 @@ def _whole_sentences(log: Log, text: str, faults: list[tuple[int, str]]) -> Iter
 
 
 def _values(cells: list[str]) -> dict[str, float]:
-    """The quantities of a sentence, and its `time` of day, `date` and `separation` of the geoid; NaN where unknown.
+    """Return a sentence's quantities, `time` of day, `date` and `separation` of the geoid; NaN if unknown.
 
-    Raises IndexError if the sentence is too short, and KeyError or ValueError if a field is garbled.
+    Raise IndexError if the sentence is too short, and KeyError or ValueError if a field is garbled.
     """
     fields = _FIELDS[cells[0][2:]]
     if len(cells) <= fields["least"]:
         raise IndexError
-    cells += [""] * 12  # a field that the kind or the sentence lacks, at -1 or behind the end, is empty
+    cells += [""] * 12  # a missing field, at -1 or behind the end, is empty
     knots, km_h, heading, height, separation = (
         float(text) if (text := cells[fields.get(name, -1)]) else math.nan
         for name in ("knots", "km_h", "heading", "above_sea", "separation")
@@ -150,7 +150,7 @@ def _values(cells: list[str]) -> dict[str, float]:
 
 
 def _degrees(text: str, letter: str) -> float:
-    """Degrees of 4807.038, degrees and minutes, and of the letter N, S, E or W; NaN without a place."""
+    """Return the degrees of 4807.038 (48 degrees, 7.038 minutes) with N, S, E or W; NaN without a place."""
     if not text or not letter:
         return math.nan
     whole, minutes = divmod(float(text), 100)
@@ -161,7 +161,7 @@ def _degrees(text: str, letter: str) -> float:
 
 
 def _midnight_s(day: str, month: str, year: str) -> float:
-    """Seconds from 1970 to a date, of which RMC has all in the first text: 230394; NaN if it is none."""
+    """Return the seconds from 1970 to a date; NaN if invalid. RMC has the whole date in the first text: 230394."""
     if len(day) == 6:
         day, month, year = day[:2], day[2:4], f"{'19' if day[4] >= '8' else '20'}{day[4:]}"
     return midnight_s(year, month, day)

@@ -1,4 +1,4 @@
-"""The camera's place, heights, angles and field of view, by the EXIF of still pictures and the XMP of drones.
+"""Read the camera's place, heights, angles and field of view from EXIF in still pictures and XMP of drones.
 
 Pillow reads the files. In XMP the angles are those of the gimbal, from true north and negative below the horizon.
 """
@@ -17,7 +17,7 @@ from torchvision_dddas.io.telemetry.record import Log, build_record
 from torchvision_dddas.types import Telemetry
 
 MAGIC = (b"\xff\xd8\xff", b"II*\0", b"MM\0*")
-"""How JPEG and TIFF (DNG, too) begin."""
+"""The first bytes of JPEG and TIFF. DNG is TIFF, too."""
 
 _XMP = re.compile(r"\b[\w-]+:(\w+)\s*(?:=\s*(?:\"([^\"]*)\"|'([^']*)')|>([^<]{1,60})<)")
 _EXIF, _GPS = 0x8769, 0x8825
@@ -28,9 +28,9 @@ _ANGLES = {
     "vehicle_heading_rad": ("FlightYawDegree",),
 }
 _PLACES = {"latitude_deg": ("GpsLatitude",), "longitude_deg": ("GpsLongitude", "GpsLongtitude")}
-_CUT = 0.02  # a picture whose sides differ in ratio by more from those it was taken with has been cut
-_RTK_FIX = 16  # DJI's RtkFlag from which a place is one of RTK
-_ON_ITS_SIDE = (5, 6, 7, 8)  # EXIF orientations
+_CUT = 0.02  # if the aspect ratio has changed by a larger share, the picture was cut
+_RTK_FIX = 16  # the smallest RtkFlag of DJI for a place from RTK
+_ON_ITS_SIDE = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 
 Values = dict[str, float]
 
@@ -38,15 +38,15 @@ Values = dict[str, float]
 def read_photos(
     path: Path, clock_offset_s: float, clip: Path | None, rate_hz: float | None, zone: tzinfo | None
 ) -> Telemetry:
-    """The record of a picture, or of the pictures of a folder, each the frame that it is in a clip of the folder.
+    """Return the record of a picture or of a folder's pictures. Picture n has the time of frame n of their clip.
 
-    Raises InputError where Pillow is missing, the only picture cannot be read, and where none says anything.
+    Raise InputError if Pillow is missing, if the only picture cannot be read, or if no picture has usable values.
     """
     try:
         from PIL import Image
     except ImportError:
         raise InputError(f"pictures such as {path} need Pillow: pip install 'torchvision-dddas[photos]'") from None
-    files = images_of_folder(path) if path.is_dir() else [path]  # the same files as the frames of such a clip
+    files = images_of_folder(path) if path.is_dir() else [path]  # the frames of a clip of the folder
     if len(files) > 1 and rate_hz is None:
         if clip is None:
             raise InputError(f"telemetry {path} is a folder of pictures; give its clip, or --rate, for the times")
@@ -61,7 +61,7 @@ def read_photos(
             says = f"{file.name} cannot be read as a picture: {error}"
             if len(files) == 1:
                 raise log.refuse(" ".join(says.split())) from None
-            log.note(f"{says}; nothing is known of it")
+            log.note(f"{says}; its values are unknown")
             values, utc_s = {}, math.nan
         time_s = (number - 1) / (rate_hz or 1.0)
         log.moments.append((time_s, 0.0, number))
@@ -72,7 +72,7 @@ def read_photos(
 
 
 def _values(log: Log, picture: Any, name: str, zone: tzinfo | None) -> tuple[Values, float]:
-    """The quantities of one picture, named as in `Log`, and its time in s since 1970, NaN if its zone is unknown."""
+    """Return the quantities of a picture, named as in `Log`, and its time, s since 1970, NaN if the zone is unknown."""
     exif = picture.getexif()
     taken, gps = exif.get_ifd(_EXIF), exif.get_ifd(_GPS)
     xmp = picture.info.get("xmp", b"")
@@ -97,12 +97,12 @@ def _values(log: Log, picture: Any, name: str, zone: tzinfo | None) -> tuple[Val
         if gps.get(16) == "T":
             values["heading_rad"] = math.radians(float(gps[17]))
         else:
-            log.note(f"{name} tells its direction from magnetic north, or does not say which: it is not used")
+            log.note(f"{name} gives its direction from magnetic north or an unknown north: it is not used")
     values["hfov_rad"] = _field_of_view(log, picture.size, said, taken, name)
     if exif.get(0x0112, 1) in _ON_ITS_SIDE and not log.is_nominal:
         values["hfov_rad"] = 2 * math.atan(math.tan(values["hfov_rad"] / 2) * picture.size[1] / picture.size[0])
     if exif.get(0x0112, 1) != 1:
-        log.note(f"{name} is stored turned (EXIF orientation {exif[0x0112]}): pixels are those of the picture as shown")
+        log.note(f"{name} is stored turned (EXIF orientation {exif[0x0112]}): pixels refer to the upright picture")
     return {key: value for key, value in values.items() if not math.isnan(value)}, _utc_s(exif, taken, zone)
 
 
@@ -116,7 +116,7 @@ def _number(said: dict[str, str], *names: str) -> float:
 
 
 def _gps_place(gps: dict[int, Any]) -> Values:
-    """Latitude and longitude by EXIF's degrees, minutes and seconds; empty without them."""
+    """Return latitude and longitude from EXIF's degrees, minutes and seconds; {} if they are missing."""
     try:
         latitude, longitude = (
             (-1 if str(gps[key - 1])[:1].upper() in "SW" else 1) * sum(float(v) / 60**k for k, v in enumerate(gps[key]))
@@ -128,10 +128,10 @@ def _gps_place(gps: dict[int, Any]) -> Values:
 
 
 def _field_of_view(log: Log, size: tuple[int, int], said: dict[str, str], taken: dict[int, Any], name: str) -> float:
-    """Horizontal, rad, by the calibrated focal length, else by that "as for 35 mm"; NaN where the picture is cut.
+    """Return the horizontal field of view, rad, by the calibrated or the 35 mm focal length; NaN for a cut picture.
 
-    Focal lengths as for 35 mm compare diagonals (CIPA DCG-001). A picture wider than 3:2 is cut at top and bottom from
-    one that is not: there the width of the film counts.
+    A focal length for 35 mm film refers to the diagonal (CIPA DCG-001). A picture wider than 3:2 is cut at top and
+    bottom, so its focal length refers to the width of the film.
     """
     width, height = size
     focal_px = _number(said, "CalibratedFocalLength")
@@ -140,7 +140,7 @@ def _field_of_view(log: Log, size: tuple[int, int], said: dict[str, str], taken:
         if abs(width / height * middle[1] / middle[0] - 1) > _CUT:
             log.note(
                 f"{name} of {width}x{height} px is cut from a picture of about {2 * middle[0]:.0f}x{2 * middle[1]:.0f} "
-                "px: its field of view is unknown; give the camera's file for what is left"
+                "px: its field of view is unknown; give a camera's file for the cut picture"
             )
             return math.nan
         return 2 * math.atan(middle[0] / focal_px)
@@ -156,7 +156,7 @@ def _field_of_view(log: Log, size: tuple[int, int], said: dict[str, str], taken:
 
 
 def _utc_s(exif: Any, taken: dict[int, Any], zone: tzinfo | None) -> float:
-    """When the picture was taken, in seconds since 1970, if the file or the user tells the zone."""
+    """Return when the picture was taken, seconds since 1970; NaN if neither the file nor the user gives the zone."""
     try:
         local = datetime.strptime(str(taken.get(0x9003) or exif.get(0x0132)).strip("\0 "), "%Y:%m:%d %H:%M:%S")
     except ValueError:

@@ -1,4 +1,4 @@
-"""PX4's ULog: topics with their own time stamps."""
+"""Read PX4's ULog files, whose topics have their own time stamps."""
 
 import contextlib
 import io
@@ -17,9 +17,9 @@ PX4_RADIUS_M = 6_371_000.0  # of the Earth in PX4's MapProjection (CONSTANTS_RAD
 MAGIC = b"ULog\x01\x12\x35"
 
 
-@np.errstate(invalid="ignore")  # where a log is damaged a number may be any bits
+@np.errstate(invalid="ignore")  # a damaged log may hold any bits
 def read_ulog(path: Path, clock_offset_s: float) -> Telemetry:
-    """Positions, heights and attitudes of a PX4 log; times since the first. Raises InputError if it has none."""
+    """Read positions, heights and attitudes of a PX4 log; times count from the first. Raise InputError without data."""
     log = Log(path, "PX4 log", "sample", bridge_s=1.0)
     topics = _px4_topics(log)
     for local in topics.get("vehicle_local_position", {}).values():
@@ -34,11 +34,11 @@ _HEADER = re.compile(rb"(?:[^\0][\0-\x27]|\0[\1-\x27])[ABCDFILMOPQRS]", re.DOTAL
 
 
 class _Onwards(io.BytesIO):
-    """The bytes of a log, of which those between damage and the next beginning of a message are left out.
+    """The bytes of a log, without the bytes from damage to the next beginning of a message.
 
-    pyulog 1.3 seeks back from a damaged message to the byte behind its first, which takes seconds a megabyte; and at
-    the end of the file by its announced length, though it read less, which would loop forever.
-    is_cut: whether the message read last ends behind the file.
+    pyulog 1.3 seeks back from a damaged message to its second byte, which takes seconds a megabyte. At the end of the
+    file, it seeks back by the announced length although it read less, and would loop forever.
+    is_cut: whether the last message that was read ends behind the end of the file.
     """
 
     def __init__(self, content: bytes) -> None:
@@ -56,7 +56,7 @@ class _Onwards(io.BytesIO):
         if whence != io.SEEK_CUR or offset >= 0:
             return super().seek(offset, whence)
         place = self.tell() + offset + self._short
-        if offset == -2 - self._asked:  # behind the first byte of a message, the last that was read
+        if offset == -2 - self._asked:  # pyulog seeks to the second byte of the last message
             following = _HEADER.search(self._content, place)
             place = len(self._content) if following is None else following.start()
         return super().seek(place)
@@ -71,18 +71,18 @@ def _px4_topics(log: Log) -> Topics:
         ) from None
     content = _Onwards(log.path.read_bytes())
     try:
-        # It prints what it finds damaged.
+        # pyulog prints a message for each damaged part.
         with contextlib.redirect_stdout(io.StringIO()):
             read = ULog(content, [*NAMES, "home_position"])
     except Exception as error:
         raise log.refuse(f"the PX4 log is damaged from its beginning and cannot be read ({error})") from None
     if read.file_corruption:
-        log.note("the log is damaged: what could not be read is left out")
+        log.note("the log is damaged: unreadable parts are left out")
     elif content.is_cut:
         log.note(f"byte {log.path.stat().st_size}: the file ends within a message; it was cut off")
     if read.dropouts:
         lost_s = sum(part.duration for part in read.dropouts) / 1000
-        log.note(f"the logger fell behind {len(read.dropouts)} times and lost {lost_s:.3g} s in all")
+        log.note(f"the logger dropped messages {len(read.dropouts)} times, for {lost_s:.3g} s in all")
     topics: Topics = {}
     for topic in sorted(read.data_list, key=lambda topic: topic.multi_id):
         stamps = topic.data.get("timestamp", ())
@@ -97,9 +97,9 @@ def _px4_topics(log: Log) -> Topics:
 def px4_lonlat(
     east_m: np.ndarray, north_m: np.ndarray, longitude0_deg: np.ndarray, latitude0_deg: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Longitudes and latitudes of PX4's local positions, which are azimuthal equidistant about an origin on its sphere.
+    """Return longitudes and latitudes of PX4's local positions, azimuthal equidistant about an origin on PX4's sphere.
 
-    The inverse of what PX4's MapProjection does to the global position.
+    This is the inverse of PX4's MapProjection.
     """
     latitude0, distance = np.radians(latitude0_deg), np.hypot(east_m, north_m) / PX4_RADIUS_M
     over = 1 / PX4_RADIUS_M * np.sinc(distance / np.pi)  # sin(distance) / distance, 1 at the origin
@@ -111,9 +111,9 @@ def px4_lonlat(
 
 
 def _place_local(log: Log, local: Topic, homes: Mapping[str, Topic]) -> None:
-    """Give a local position the fields of a global one about its origin, of the altitude and of the speed.
+    """Add the fields of a global position, altitude, height and speed to a local position.
 
-    The height is above the take-off, or above the ground if a range finder measures it throughout.
+    The height is above the take-off point, or above the ground if a range finder measures it throughout.
     """
     latitude0 = column(local, "ref_lat")
     if np.nanmax(np.abs(latitude0), initial=0) > 0:
@@ -131,7 +131,7 @@ def _place_local(log: Log, local: Topic, homes: Mapping[str, Topic]) -> None:
     if (is_ranged := column(local, "dist_bottom_valid", 0) > 0).mean() > 0.95:
         height = np.where(is_ranged, column(local, "dist_bottom"), np.nan)
         log.height_zero = "ground"
-        log.note("the altitude above ground is that of the range finder")
+        log.note("the altitude above ground comes from the range finder")
     local["height"] = height
     speed = np.hypot(column(local, "vx"), column(local, "vy"))
     local["speed"] = np.where(column(local, "v_xy_valid", 1) > 0, speed, np.nan)

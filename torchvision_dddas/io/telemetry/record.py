@@ -22,9 +22,9 @@ KINDS = (
 OWN = "table"
 """The kind of this package's own tables, which may lack a place."""
 
-# Older logs and logs from the future are rejected. A GPS receiver after a week rollover is 1024 weeks early.
+# Clocks before this date and in the future are rejected. A GPS receiver after a week rollover is 1024 weeks early.
 _FIRST_CLOCK_S, _DAY_S = 1_230_768_000.0, 86_400.0  # 2009-01-01
-# A barometer's zero drifts by metres in a flight; an altitude below this has another zero than the ground.
+# A barometer's zero drifts by metres in a flight. An altitude below this does not count from the ground.
 _DEEP_M = -5.0
 # Samples this close have the same time: a split between them would coincide with one of them.
 _SAME_S = 1e-6
@@ -36,12 +36,12 @@ _ALIKE_M = 0.5
 _GAP_SHARE, _GAP_S = 10.0, 5.0
 # A log that has only these quantities is refused.
 _NOT_ALONE = {"speed_m_s", "hfov_rad", "vehicle_heading_rad", "position_sigma_m"}
-# Angles that turn all the way round, and the lower end of their range.
+# Angles with a full circle of values, and the lower end of their range.
 _TURNING = {"heading_rad": 0.0, "roll_rad": -np.pi, "vehicle_heading_rad": 0.0}
 _FULL = {"longitude_deg": 360.0} | dict.fromkeys(_TURNING, 2 * np.pi)
 # Half the time span over which a line is fitted to the places: smallest and largest value.
 _LEAST_S, _MOST_S = 1.0, 10.0
-# Places are rounded: the span is so long that a step of the last digit changes the speed by at most this.
+# Places are rounded. The span is long enough that a step of the last digit changes the speed by at most this.
 _STEP_M_S = 0.5
 # A receiver's places drift by this even if more digits are written.
 _WANDER_M = 0.1
@@ -49,7 +49,7 @@ _WANDER_M = 0.1
 
 @dataclass
 class Log:
-    """The samples of a log. path: of the file. kind: in words, for messages. where: unit of places in the file.
+    """The samples of a log. path: its file. kind: its kind, for messages. where: the unit of places in the file.
 
     bridge_s: longest pause of a quantity that is interpolated; 0 if a missing value means unknown.
     jitter_s: how far time may run back; a larger step is another recording, or damage. is_nominal: as in Telemetry.
@@ -92,9 +92,9 @@ class Log:
             self.notes.append(text)
 
     def latitude_first(self, pairs: np.ndarray, told: str, asked: str, what: str) -> bool:
-        """Return whether the latitude is the first of two coordinates, (N, 2). told, asked: by dialect and by user.
+        """Return whether the latitude is the first of two coordinates, (N, 2). Raise InputError if unknown.
 
-        what: the field that holds them, in words. Raise InputError if the order is unknown.
+        told, asked: the order according to the dialect and to the user. what: the field that holds them, in words.
         """
         is_beyond = (np.abs(pairs) > 90).any(axis=0)
         if asked == "auto" and is_beyond[0] != is_beyond[1]:
@@ -138,7 +138,7 @@ def build_record(
     if (accuracy := samples.pop("accuracy_m", None)) is not None:
         samples["position_sigma_m"] = accuracy * [1, math.sqrt(0.5), 1]
         middle_m = np.nanmedian(samples["position_sigma_m"][:, 1])
-        log.note(f"the log states the error of its places: a sigma of {middle_m:.2g} m east and north, the median")
+        log.note(f"the log states the error of its places: the median sigma is {middle_m:.2g} m, east and north")
     _split_flights(log, samples)
     if not set(samples) - _NOT_ALONE:
         raise log.refuse(f"nothing in it ({log.kind}) holds a place, an altitude or the attitude of a camera")
@@ -157,7 +157,7 @@ def build_record(
     if "speed_m_s" not in columns and np.isfinite(place).all(axis=1).sum() > 2:
         columns["speed_m_s"], span_s = _speed_from_places(times, place, geographic, log.splits)
         if np.isfinite(columns["speed_m_s"]).any():
-            log.note(f"the speed is that of the places, smoothed over {span_s:.1f} s")
+            log.note(f"the speed is computed from the places over {span_s:.1f} s")
     clock_s = start_utc_s + start
     if np.isfinite(clock_s) and not is_clock(clock_s):
         date = np.datetime64(int(np.clip(clock_s, -1e11, 1e11)), "s")
@@ -180,7 +180,7 @@ def build_record(
 
 
 def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
-    """Return the times, with one more within each gap, where values are unknown."""
+    """Return the times. Add one time within each gap, at which values are unknown."""
     if len(times) < 6:
         return times
     steps = np.diff(times)
@@ -188,8 +188,8 @@ def _with_gaps(log: Log, times: np.ndarray) -> np.ndarray:
     gaps = np.flatnonzero(steps > most)
     if len(gaps):
         log.note(
-            f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s without samples, the first after "
-            f"{times[gaps[0]]:.1f} s for {steps[gaps[0]]:.1f} s: nothing is known within"
+            f"{len(gaps)} gap{'s' * (len(gaps) > 1)} of more than {most:.1f} s without samples: values are unknown "
+            f"there. The first begins at {times[gaps[0]]:.1f} s and lasts {steps[gaps[0]]:.1f} s"
         )
     return np.sort(np.concatenate([times, (times[gaps] + times[gaps + 1]) / 2]))
 
@@ -224,7 +224,7 @@ def _column(times: np.ndarray, rows: np.ndarray, bridge_s: float, full: float | 
 
 
 def _sort(log: Log, rows: np.ndarray) -> np.ndarray:
-    """Sort by time, keep the last of samples at the same time, and leave out single damaged times."""
+    """Sort by time. Keep the last of several samples at the same time, and leave out single damaged times."""
     rows = rows[np.isfinite(rows[:, 0])]
     rows = rows[~_stray(rows[:, 0], log.jitter_s)]
     is_back = np.diff(rows[:, 0]) < -log.jitter_s
@@ -260,8 +260,8 @@ def _drop_impossible(log: Log, samples: dict[str, np.ndarray]) -> None:
             _, value, where = rows[wrong.argmax()]
             value = math.degrees(value) if name.endswith("_rad") else value
             title = name.replace("_rad", "_deg")
-            instead = ", aerial.position_sigma_m counts there" if name == "accuracy_m" else ""
-            what = f"{title} is {value:g}, which cannot be; {wrong.sum()} left out{instead}"
+            instead = ", aerial.position_sigma_m is used there" if name == "accuracy_m" else ""
+            what = f"{title} is {value:g}, which is impossible; {wrong.sum()} left out{instead}"
             log.note(f"{log.where} {where:.0f}: {what}")
             rows[wrong, 1] = np.nan
 
@@ -280,7 +280,7 @@ def _check_globe(log: Log, samples: dict[str, np.ndarray]) -> None:
         nowhere = (longitude[:, 1] == 0) & (latitude[:, 1] == 0)
         longitude[nowhere, 1] = latitude[nowhere, 1] = np.nan
         if nowhere.any():
-            log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: no fix; unknown there")
+            log.note(f"{nowhere.sum()} of {len(nowhere)} places are 0, 0: they have no fix and are unknown")
 
 
 def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
@@ -298,13 +298,13 @@ def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
     if ellipsoid is not None and geoid is not None and "above_sea_m" not in samples:
         up_m = np.interp(ellipsoid[:, 0], geoid[:, 0], geoid[:, 1])
         samples["above_sea_m"] = np.column_stack([ellipsoid[:, 0], ellipsoid[:, 1] - up_m, ellipsoid[:, 2]])
-        log.note("the heights above the sea are those above the ellipsoid less the log's own height of the geoid")
+        log.note("heights above the sea are heights above the ellipsoid minus the log's own height of the geoid")
     if bare is None or "above_sea_m" in samples:
         return
     if lower is None:
         log.height_zero = "unknown"
         log.note(
-            f"{unsaid.format('altitude', 'sea')}; if from the take-off, takeoff_above_sea_m = 0 in the camera's file"
+            f"{unsaid.format('altitude', 'sea')}; for take-off heights set takeoff_above_sea_m = 0 in the camera's file"
         )
     else:
         apart_m = np.abs(np.interp(bare[:, 0], lower[:, 0], lower[:, 1]) - bare[:, 1])
@@ -315,7 +315,7 @@ def _settle_heights(log: Log, samples: dict[str, np.ndarray]) -> None:
 
 
 def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
-    """Split the log where its place jumps: nothing is known between flights; one or two stray places are dropped."""
+    """Split the log at jumps of its place: values between flights are unknown. Drop one or two stray places."""
     for pair, scale in ((("longitude_deg", "latitude_deg"), DEGREE_M), (("east_m", "north_m"), 1.0)):
         east, north = (samples.get(name, np.zeros((0, 3))) for name in pair)
         known = np.flatnonzero(np.isfinite(east[:, 1] + north[:, 1])) if len(east) == len(north) else np.zeros(0, int)
@@ -332,7 +332,7 @@ def _split_flights(log: Log, samples: dict[str, np.ndarray]) -> None:
     if log.splits:
         times_s = ", ".join(f"{time_s:.1f}" for time_s in sorted(set(log.splits))[:5])
         log.note(
-            f"the date or the place jumps after {times_s} s: these are several flights, with nothing known between"
+            f"the date or the place jumps after {times_s} s: these are several flights, and nothing is known between"
         )
         gaps = np.column_stack([log.splits, np.full((len(log.splits), 2), np.nan)])
         for name, rows in samples.items():
@@ -347,7 +347,7 @@ def _note_altitude(log: Log, samples: dict[str, np.ndarray]) -> None:
     if "altitude_m" not in samples:
         log.note("the log holds no altitude above ground")
         if "above_ellipsoid_m" in samples and "above_sea_m" not in samples:
-            log.note("its heights count from the ellipsoid: alone they give no height above ground")
+            log.note("its heights count from the ellipsoid and do not give a height above ground")
         return
     deep = samples["altitude_m"][:, 1] < _DEEP_M
     if deep.any():
@@ -368,8 +368,8 @@ def _note_silence(log: Log, samples: dict[str, np.ndarray]) -> None:
         if len(gaps):
             longest = gaps[np.argmax(steps[gaps])]
             log.note(
-                f"the place is unknown for a while {len(gaps)} time{'s' * (len(gaps) > 1)}, the longest for "
-                f"{steps[longest]:.1f} s after {known[longest]:.1f} s"
+                f"the place is unknown in {len(gaps)} pause{'s' * (len(gaps) > 1)}; the longest begins at "
+                f"{known[longest]:.1f} s and lasts {steps[longest]:.1f} s"
             )
 
 

@@ -1,4 +1,4 @@
-"""Telemetry from CSV: own tables, `time_s,altitude_m,...`, and those of other programs, known by their column names."""
+"""Read telemetry from CSV: own tables, `time_s,altitude_m,...`, and tables of other programs, by their column names."""
 
 import math
 import re
@@ -27,7 +27,7 @@ from torchvision_dddas.types import Telemetry
 
 _PLACE = PLACES[0]
 _KNOWN = {field.quantity: Known(field, math.pi / 180 if field.kind == "angle" else 1.0) for field in FIELDS}
-# Columns of own tables; their pitch is counted down.
+# Columns of own tables; their pitch is positive down.
 _OWN = {"altitude_m": "above_ground_m", "heading_deg": "heading_rad", "pitch_deg": "pitch_rad", "roll_deg": "roll_rad"}
 _OWN |= {"hfov_deg": "hfov_rad", "vehicle_heading_deg": "vehicle_heading_rad"}
 _OWN |= {name: name for name in ("speed_m_s", *_PLACE, *PLACES[1], "above_sea_m", "above_takeoff_m")}
@@ -36,17 +36,17 @@ SCHEMA = Schema(
     "telemetry",
     Column("time_s", "g", -1e10, 1e10, wanted="seconds since the clip's first frame"),
     *(
-        # Whether longitude and latitude are swapped is told later.
+        # A later check reports swapped longitudes and latitudes.
         Column(name, "g", *((-math.inf, math.inf) if name in _PLACE else field[2:4]), may_be_empty=True)
         for name, field in ((name, _KNOWN[quantity].field) for name, quantity in _OWN.items())
     ),
 )
-# Where one of these is known, the other is not read.
+# A quantity is not read if a better one of these is known.
 _BETTER = {"above_ground_m": {"above_takeoff_m"}, "bare_height_m": {"above_takeoff_m", "above_ground_m"}}
 _BETTER |= {"bare_altitude_m": {"above_sea_m"}, "geoid_m": {"above_sea_m"}}
-# The names stand in one of so many rows and cells; before them are lines about the flight.
+# The names of columns are searched for in this many rows and cells: lines about the flight may come before them.
 _PREAMBLE, _CELLS = 60, 1000
-# So many columns of a quantity are tried for one that is not empty, read for times, and named in a note.
+# Largest numbers of columns that are tried for one quantity, read as times, and listed in a note.
 _TRIED, _CLOCKS, _LISTED = 4, 8, 12
 _UNKNOWN = {"nan", "na", "n/a", "null", "none", "no data", "inf", "-inf", "-", "--", "---"}
 _ON = {"1", "1.0", "true", "yes", "y", "rec", "on", "video", "recording", "started"}
@@ -61,9 +61,9 @@ def read_telemetry_table(
     order: str = "auto",
     rate_hz: float | None = None,
 ) -> Telemetry:
-    """Read an own table, whose columns are all in SCHEMA, or that of another program; arguments as `read_telemetry`.
+    """Read an own table, whose columns are all in SCHEMA, or a table of another program, as `read_telemetry` does.
 
-    Raises InputError as that does; and of an own table as read_table, half a place, a time before the one above it.
+    Raise InputError as `read_telemetry`, and for an own table as `read_table`, for half a place, and for falling times.
     """
     _, lines, rows = read_csv(path, "telemetry", has_header=False)
     names = Names()
@@ -71,10 +71,10 @@ def read_telemetry_table(
     place = next((place for place, count in enumerate(known) if count > 1), 0)
     header = [_bare(title) for title in rows[place]] if rows else []
     text = CsvText(header, lines[place + 1 :], rows[place + 1 :])
-    if rows and rows[place] in text.rows:  # the names may come again
+    if rows and rows[place] in text.rows:  # the line of names may be repeated
         kept = [k for k, row in enumerate(text.rows) if row != rows[place]]
         text = CsvText(header, [text.line[k] for k in kept], [text.rows[k] for k in kept])
-    # A comma at the end of the lines, or the numbers of the rows that pandas writes.
+    # Ignore an empty name, as after a comma at the end of the line, and the row numbers of pandas.
     if {name for name in header if name not in ("", "Unnamed: 0")} <= set(SCHEMA.names):
         return _read_own(path, text, clock_offset_s)
     return _Table(path, text).read(clock_offset_s, clip, zone, order, rate_hz)
@@ -86,8 +86,8 @@ def _bare(title: str) -> str:
 
 def _no_log(path: Path) -> InputError:
     return InputError(
-        f"telemetry {path} looks like no log: its first line names none of {', '.join(SCHEMA.names)}; wanted {KINDS}, "
-        "of which a CSV needs time_s and altitude_m, or a place"
+        f"telemetry {path} is not a log: its first line names none of {', '.join(SCHEMA.names)}; wanted {KINDS}. A CSV "
+        "needs time_s and altitude_m, or a place"
     )
 
 
@@ -96,8 +96,8 @@ def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
         raise _no_log(path)
     pairs = [pair for pair in PLACES if set(pair) & set(text.header)]
     if len(pairs) > 1:
-        raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind, leave the other out")
-    # The camera's file may say the height.
+        raise InputError(f"telemetry {path} has places in degrees and in metres; wanted one kind: leave the other out")
+    # The camera's file may give the height of the take-off point.
     has_height = any(name.startswith("above_") for name in text.header)
     wanted = pairs[0] if pairs else () if has_height else ("altitude_m",)
     table = read_table(path, SCHEMA, ("time_s", *wanted), is_ragged=True, text=text)
@@ -117,13 +117,13 @@ def _read_own(path: Path, text: CsvText, clock_offset_s: float) -> Telemetry:
 
 
 class _Table:
-    """A table. columns: quantity -> place and meaning of its columns, the best first. used: places of those read."""
+    """A table. columns: quantity -> place and meaning of its columns, best first. used: places of columns in use."""
 
     def __init__(self, path: Path, text: CsvText) -> None:
         self.header, self.lines, self.rows = text
         places = [k for k, name in enumerate(self.header) if re.match(r"\W*lat|\W*lon|\W*lng", name, re.IGNORECASE)]
         if any(k < len(row) and _GROUPED.fullmatch(row[k]) for row in self.rows[:2] for k in places):
-            # Three digits behind each comma: that of a latitude is no mark of thousands.
+            # A comma in a latitude is decimal, even with three digits behind it.
             self.rows = [[c.replace(",", ".") if _GROUPED.fullmatch(c) else c for c in row] for row in self.rows]
         self.names = names_of_table(self.header)
         self.log = Log(path, f"table of {self.names.program or 'another program'}")
@@ -138,7 +138,7 @@ class _Table:
         self.used: set[int] = set()
 
     def _take_units(self) -> list[str]:
-        """The units of a line below the names, which is left out; none where there is no such line."""
+        """Remove a line of units below the names, and return the units; [] if there is no such line."""
         first = [cell.strip("()[]").lower() for cell in self.rows[0]] if self.rows else []
         is_unit = any(cell in units and not cell.isdigit() for cell in first for units in UNITS.values())
         if not is_unit or np.isfinite(parse_numbers(first)).any():
@@ -147,17 +147,17 @@ class _Table:
         return first
 
     def cells(self, place: int) -> list[str]:
-        """A column as text, "" where a row ends before it."""
+        """Return a column as text, "" for a row that ends before it."""
         self.used.add(place)
         return [row[place] if place < len(row) else "" for row in self.rows]
 
     def texts(self, quantity: str) -> list[str]:
-        """The first column of a quantity that is not empty; empty cells where there is none."""
+        """Return the first column of a quantity that is not empty; empty cells if there is no such column."""
         tried = (self.cells(place) for place, _ in self.columns.get(quantity, ())[:_TRIED])
         return next((cells for cells in tried if any(cells)), [""] * len(self.rows))
 
     def numbers(self, quantity: str) -> np.ndarray | None:
-        """The same in the record's unit and sign, (N,), NaN where there is no number; None if there is none at all."""
+        """Return a quantity in the record's unit and sign, (N,), NaN if unknown; None if no cell has a number."""
         columns = self.columns.get(quantity, [])[:_TRIED]
         for place, known in columns:
             cells = self.cells(place)
@@ -168,9 +168,9 @@ class _Table:
                 rows = [row for row in rows if math.isnan(values[row])]
             values[np.isinf(values)] = np.nan
             is_fixed = known.field.kind != "degrees" or (values != 0).any() or place == columns[-1][0]
-            if np.isfinite(values).any() and is_fixed:  # a receiver without a fix says 0, another may have one
+            if np.isfinite(values).any() and is_fixed:  # without a fix, a receiver says 0
                 if rows:
-                    what = f"{self.header[place]} is '{cells[rows[0]][:40]}', which is no number"
+                    what = f"{self.header[place]} is '{cells[rows[0]][:40]}', which is not a number"
                     self.log.note(f"line {self.lines[rows[0]]}: {what}; {len(rows)} left out")
                 if known.field.kind in ("angle", "degrees"):
                     self._note_radians(place, values, known)
@@ -179,7 +179,7 @@ class _Table:
         return None
 
     def _note_radians(self, place: int, values: np.ndarray, known: Known) -> None:
-        """Note angles that are taken for degrees, as nothing says their unit, and that could all be radians."""
+        """Note angles that are read as degrees because their unit is unknown, although all could be radians."""
         title, finite, quantity = self.header[place], values[np.isfinite(values)], known.field.quantity
         turn = 1 / 4 if quantity in ("pitch_rad", "latitude_deg") else 1 / 2 if quantity == "longitude_deg" else 1
         is_told = bool(re.search(r"deg|°", title.lower()) or self.units)
@@ -196,7 +196,7 @@ class _Table:
     def read(
         self, clock_offset_s: float, clip: Path | None, zone: tzinfo | None, order: str, rate_hz: float | None
     ) -> Telemetry:
-        """The record of the table."""
+        """Return the record of the table."""
         log = self.log
         if not self.columns:
             raise _no_log(log.path)
@@ -206,7 +206,7 @@ class _Table:
         if not self.rows:
             raise InputError(f"telemetry {log.path} has a header but no rows")
         if "time_s" in self.header and len(others := set(self.header) - set(SCHEMA.names)) < len(self.header) - 1:
-            log.note(f"no own table has the columns {', '.join(sorted(others)[:_LISTED])}: read as another program's")
+            log.note(f"own tables have no columns {', '.join(sorted(others)[:_LISTED])}: read as another program's")
         values = self._quantities(order)
         if "time" in self.columns:
             time_s, start_utc_s = self._times(values, zone)
@@ -216,7 +216,7 @@ class _Table:
         if not is_known.all():
             (place, _), *_ = self.columns.get("time") or self.columns["frame"]
             row = int((~is_known).argmax())
-            text = f"'{self.cells(place)[row][:40]}' is no time"
+            text = f"'{self.cells(place)[row][:40]}' is not a time"
             if 2 * is_known.sum() <= len(time_s):
                 raise log.refuse(f"{text}; wanted a date with a time, or seconds", where[row])
             log.note(f"line {where[row]:.0f}: {text}; {(~is_known).sum()} rows without a time are left out")
@@ -225,7 +225,7 @@ class _Table:
         log.add_all(time_s[is_known], where[is_known], values, known=True)
         if "filming" in self.columns and not clock_offset_s:
             self._note_film(time_s)
-        # Columns that look like what a record holds, those of unknown meaning first.
+        # List unused columns that may hold quantities of a record, columns of unknown meaning first.
         unused = [title for place, title in enumerate(self.header) if place not in self.used]
         more_known = [title for title in unused if self.names.find(title) is not None]
         if listed := [t for t in unused if self.names.find(t) is None and looks_alike(t)] + more_known:
@@ -234,7 +234,7 @@ class _Table:
         return build_record(log, clock_offset_s, start_utc_s)
 
     def _quantities(self, order: str) -> dict[str, np.ndarray]:
-        """The columns of the record, (N,) each, NaN where unknown."""
+        """Return the columns of the record, (N,) each, NaN if unknown."""
         values = dict[str, np.ndarray]()
         for quantity, kind, *_ in FIELDS:
             is_wanted = kind not in ("text", "number", "time") and not _BETTER.get(quantity, set()) & values.keys()
@@ -258,7 +258,7 @@ class _Table:
         return values
 
     def _scale_places(self, values: dict[str, np.ndarray]) -> None:
-        """Make degrees of whole numbers of ten-millionths, as autopilots write them, or of millionths."""
+        """Convert whole numbers to degrees, from ten-millionths, as autopilots write them, or from millionths."""
         known = {name: column[np.isfinite(column)] for name, column in values.items()}
         both = np.concatenate([known[name] for name in _PLACE])
         if not len(both) or np.abs(both).max() <= 1000 or (both != np.round(both)).any():
@@ -269,7 +269,7 @@ class _Table:
         values |= {name: values[name] * (1e-7 if is_e7 else 1e-6) for name in _PLACE}
         if not is_e7:
             self.log.note(
-                "whole numbers as places are taken for millionths of degrees; a name such as lat_e7 tells more"
+                "whole numbers as places are read as millionths of degrees; a name such as lat_e7 sets another unit"
             )
         tall = [
             name for name in values if name.startswith(("above", "bare")) and np.abs(known[name]).max(initial=0) > 1000
@@ -278,14 +278,14 @@ class _Table:
             self.log.note(f"{', '.join(tall)} beside whole numbers as places may be in millimetres: metres are assumed")
 
     def _pairs(self, order: str) -> dict[str, np.ndarray]:
-        """Longitudes and latitudes of a column with both."""
+        """Return the longitudes and latitudes of a column that contains both."""
         signs = (";", "/", ", ", None, ",")
         parts = [
             [two for sign in signs if len(two := cell.strip("()[]").split(sign)) in (2, 3)]
             for cell in self.texts("place")
         ]
         if any(two and len(two[0]) == 3 for two in parts):
-            self.log.note("of three numbers in a cell the third is not used")
+            self.log.note("the third number in a cell is not used")
         angles = [[parse_angle(part) for part in (two[0][:2] if two else ("", ""))] for two in parts]
         pairs = np.array([[value for value, _ in two] for two in angles])
         sides = {side for (_, side), _ in angles if side}
@@ -294,9 +294,9 @@ class _Table:
         is_first = sides <= {"N", "S"} if sides else self.log.latitude_first(pairs, told, order, "a cell")
         return dict(zip(_PLACE[::-1] if is_first else _PLACE, pairs.T, strict=True))
 
-    @np.errstate(over="ignore", invalid="ignore")  # numbers may be any
+    @np.errstate(over="ignore", invalid="ignore")  # cells may hold any numbers
     def _times(self, values: dict[str, np.ndarray], zone: tzinfo | None) -> tuple[np.ndarray, float]:
-        """Seconds since the first row, (N,), and when that was since 1970."""
+        """Return the seconds since the first row, (N,), and the time of the first row, s since 1970."""
         columns = self.columns["time"][:_CLOCKS]
         read = [read_times(self.header[place], self.cells(place), known) for place, known in columns]
         step_m, is_far = math.nan, np.zeros(len(self.rows), bool)
@@ -310,7 +310,7 @@ class _Table:
         return time_s, start_utc_s
 
     def _frames(self, clip: Path | None, rate_hz: float | None) -> np.ndarray:
-        """The same from the numbers of a clip's frames, which count from 0 or from 1."""
+        """Return the seconds since the first frame, (N,), from frame numbers, which count from 0 or from 1."""
         if clip is None and rate_hz is None:
             raise InputError(
                 f"telemetry {self.log.path} has frames and no times; give its clip, --rate, or a column time_s"
@@ -328,5 +328,5 @@ class _Table:
             more = f" and again at {', '.join(f'{begin:.1f}' for begin in begins[1:6])} s" if len(begins) > 1 else ""
             self.log.note(
                 f"the log says that the camera began to film {begins[0]:.1f} s after its first row{more}, and times "
-                f"count from that row: aerial.clock_offset_s={-begins[0]:.1f} counts them from where the film begins"
+                f"count from that row: aerial.clock_offset_s={-begins[0]:.1f} counts them from the start of the film"
             )

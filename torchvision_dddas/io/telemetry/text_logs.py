@@ -1,4 +1,4 @@
-"""DJI's subtitle files in any dialect, as telemetry."""
+"""Read DJI's subtitle files, in any dialect, as telemetry."""
 
 import math
 import re
@@ -22,7 +22,7 @@ _TIMING = re.compile(r"(?:(\d{1,6}):)?(\d{1,2}):(\d{1,2})[.,](\d{1,9})\s*-+>(?:\
 _MARKUP = re.compile(r"<[^<>]*>")
 _NUMBER = r"[-+]?\d+(?:[.,]\d+)?"
 _NUMERAL, _NO_LETTERS = re.compile(_NUMBER), re.compile(rf"{_NUMBER}|[\s:°]")
-# A name, and what follows it: see `_after_names`.
+# A name, and the value behind it: see `_after_names`.
 _TUPLE = re.compile(r"[A-Za-z][A-Za-z.]*"), re.compile(r"\s*(?::\s*)?\(([^)]*)\)?")
 _PAIR = (
     re.compile(r"[A-Za-z][A-Za-z_.]*", re.IGNORECASE),
@@ -44,7 +44,7 @@ _SIDED = re.compile(
 _TWO = re.compile(
     r"\b(?:gps|position|location|coord[a-z]{0,8})\s*[:=]\s*(-?\d+\.\d+\s*[,;]\s*-?\d+\.\d+)", re.IGNORECASE
 )
-# Forms of few dialects, and the forms of the others.
+# Forms of a few dialects, and functions that rewrite them in the usual form.
 _USUAL: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], str]], ...] = (
     (_GROUP, lambda found: _IN_GROUP.sub(rf"{found[1]}.\g<0>", found[2])),
     (_OWNED, lambda found: f"{found[1]}."),
@@ -61,7 +61,7 @@ _WORST, _SAMPLE, _SATELLITES = 1000, 10_000, 60
 def read_subtitles(
     path: Path, text: str, clock_offset_s: float, zone: tzinfo | None = None, order: str = "auto"
 ) -> Telemetry:
-    """The record of subtitles; arguments and errors as `read_telemetry`."""
+    """Return the record of subtitles. Arguments and errors are those of `read_telemetry`."""
     log = Log(path, "DJI subtitles", bridge_s=2.0)
     names = names_of_subtitles(text)
     some = "\n\n".join(text[k * len(text) // 4 :][:_SAMPLE] for k in range(4))
@@ -75,7 +75,7 @@ def read_subtitles(
     lacking: dict[str, list[int]] = {}
     timeless: list[int] = []
     lenses: list[dict[str, str]] = []
-    last_s = last_date_s = math.nan  # of the subtitle before
+    last_s = last_date_s = math.nan  # of the previous subtitle
     last: Values = {}
     jumps, shift_s = list[tuple[float, float]](), 0.0
     for (line, time_s, _), (tuples, rest), date in zip(subtitles, parted, dates, strict=True):
@@ -89,7 +89,7 @@ def read_subtitles(
         jump_s = date[0] - last_date_s - (time_s - last_s) if date is not None else math.nan
         if math.isfinite(jump_s):
             jumps.append((last_s, jump_s))
-        if time_s < last_s:  # the dates tell how much later another flight was; else a jump tells that there is one
+        if time_s < last_s:  # the dates or a jump of the place show whether another flight begins here
             here, there = ([at.get(f"{name}itude_deg", math.nan) for name in ("long", "lat")] for at in (values, last))
             if math.isnan(jump_s) and math.dist(here, there) * DEGREE_M > JUMP_M:
                 jump_s = last_s - time_s + 1.0
@@ -123,7 +123,7 @@ def read_subtitles(
 
 
 def _subtitles(text: str) -> list[tuple[int, float, str]]:
-    """Line, time (NaN without a timing) and text without markup of each subtitle.
+    """Return the line, the time (NaN without a timing) and the text without markup of each subtitle.
 
     Subtitles begin with a timing; in a file without timings they lie between blank lines.
     """
@@ -150,9 +150,9 @@ def _subtitles(text: str) -> list[tuple[int, float, str]]:
 
 
 def _after_names(text: str, name: re.Pattern[str], value: re.Pattern[str]) -> Iterator[tuple[str, re.Match[str], int]]:
-    """Each name that a value follows, the value, and where the name begins.
+    """Yield each name that a value follows, the value, and where the name begins.
 
-    One expression for both would try every part of a long word as a name: time as the square of its length, or worse.
+    A single expression would try every part of a long word as a name, in time quadratic in the word's length or worse.
     """
     place = 0
     while (word := name.search(text, place)) is not None:
@@ -163,7 +163,7 @@ def _after_names(text: str, name: re.Pattern[str], value: re.Pattern[str]) -> It
 
 
 def _tuples(text: str) -> tuple[dict[str, Numbers], str]:
-    """Numbers in brackets by the name before them, and the text without these."""
+    """Return the numbers in brackets by the name before them, and the text without names and brackets."""
     found: dict[str, Numbers] = {}
     parts, place = [], 0
     for name, brackets, begin in _after_names(text, *_TUPLE) if "(" in text else ():
@@ -184,14 +184,14 @@ def _tuples(text: str) -> tuple[dict[str, Numbers], str]:
 
 
 def _is_latitude_first(log: Log, names: Names, tuples: list[dict[str, Numbers]], order: str) -> bool:
-    """Whether GPS(...) has the latitude first."""
+    """Return whether GPS(...) has the latitude first."""
     places = [found[name] for found in tuples for name in ("gps", "home") if name in found]
     pairs = [(two[0][0], two[1][0]) for two in places if len(two) > 1 and {two[0][1], two[1][1]} <= {"", "."}]
     return bool(pairs) and log.latitude_first(np.array(pairs), names.order, order, "GPS(...)")
 
 
 def _quantities(names: Names, text: str, tuples: dict[str, Numbers], is_swapped: bool) -> tuple[Values, dict[str, str]]:
-    """Values of one subtitle by quantity, and those of the lens as text. text: without the tuples."""
+    """Return the values of a subtitle by quantity, and values of the lens as text. text: without the tuples."""
     values = _place(tuples.get("gps", []), is_swapped, names.order == "lat-lon")
     lens, ranks = dict[str, str](), dict[str, int]()
     found = [
@@ -224,7 +224,7 @@ def _place(gps: Numbers, is_swapped: bool, has_height: bool) -> dict[str, float]
     if not values and len(gps) > 1:
         names = ("latitude_deg", "longitude_deg") if is_swapped else ("longitude_deg", "latitude_deg")
         values = {name: value for name, (value, _) in zip(names, gps, strict=False)}
-    # A third number with a unit or decimals is a height, else the number of satellites; 0.0 m stands for none.
+    # A third number with a unit or decimals is a height, otherwise the number of satellites. 0.0 m means unknown.
     third, unit = gps[2] if len(gps) > 2 else (0.0, "")
     if third != 0 and (unit in ("M", ".") or (has_height and third > _SATELLITES)):
         values["bare_altitude_m"] = third
@@ -239,7 +239,7 @@ def _note_lacking(log: Log, lacking: dict[str, list[int]], last: int, count: int
     for (first, *others), names in together.items():
         what = f"lacks {', '.join(sorted(names))}"
         if first == last:
-            log.note(f"line {last}: the last subtitle {what}: the file is incomplete; unknown there")
+            log.note(f"line {last}: the last subtitle {what}: the file is incomplete, and values are unknown there")
         else:
             also = f", as do {len(others)} more of {count}" if others else ""
-            log.note(f"line {first}: the subtitle {what}{also}; unknown there")
+            log.note(f"line {first}: the subtitle {what}{also}: values are unknown there")
