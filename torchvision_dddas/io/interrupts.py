@@ -75,7 +75,7 @@ class StopSignals:
     ) -> None:
         """ask: called in another thread at the first signal. notice: called in the main thread at each signal.
 
-        at_once: called with the exit code at a further signal later than together_s.
+        at_once: called with the exit code at a signal that comes more than together_s after the first.
         """
         self._ask, self._at_once, self._notice, self._together_s = ask, at_once, notice, together_s
         self.signal: int | None = None

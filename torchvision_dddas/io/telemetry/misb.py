@@ -157,8 +157,8 @@ def local_sets(content: bytes) -> Iterator[LocalSet]:
 def _summed_otherwise(log: Log, content: bytes) -> list[LocalSet]:
     """Return the packets of an encoder with another checksum or none; [] if checksums are wrong in different ways.
 
-    An encoder may sum other bytes, in another order, or from another start. Under the right rule, the given checksum
-    differs from the sum by the same number in each packet.
+    An encoder may sum other bytes, in another order, or from another start. If a rule is right, the given checksum and
+    the sum by the rule differ by the same number in each packet.
     """
     keys = [found.start() for found in re.finditer(re.escape(KEY), content)]
     framed: list[tuple[int, int, LocalSet]] = []  # begin and end of the value
