@@ -1,4 +1,4 @@
-# A bare machine needs Python 3.11 and a package index; everything else is made here, inside .venv.
+# A bare machine needs Python 3.11 and a package index. Everything else is installed into .venv.
 PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3; do \
 	$$name -c '' 2> /dev/null && { echo $$name; break; }; done)
 VENV ?= .venv
@@ -11,7 +11,7 @@ EXTRAS := torch,video,telemetry,elevation,grid,photos,export,train,tune,distribu
 demo: $(STAMP)
 	$(BIN)/dddas demo --out demo-out
 
-# What a change needs: lint, types and the quick tests.
+# The checks that every change must pass: lint, types and the quick tests.
 test: lint quick
 
 quick: $(STAMP)
@@ -24,7 +24,7 @@ oldest:
 	VIRTUAL_ENV=.venv-oldest .venv-oldest/bin/uv pip install --quiet --resolution lowest-direct --editable '.[$(EXTRAS)]'
 	.venv-oldest/bin/python -m pytest --numprocesses 2 --dist loadfile -m "not slow and not browser and not gpu"
 
-# What a change needs, with each Python from 3.11 to 3.13 that is installed; those of pyenv are not on the path.
+# `make test` with each installed Python from 3.11 to 3.13, including those of pyenv, which are not on the path.
 OTHERS ?= 3.11 3.12 3.13
 test-python:
 	@for version in $(OTHERS); do \
@@ -36,7 +36,7 @@ test-python:
 		echo "no Python $$version: its tests are left out" >&2; \
 	done
 
-# Everything: the slow tests, those in a browser, and the install without torch too.
+# All checks: also the slow tests, the tests in a browser, and the install without torch.
 test-all: test onboard
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "slow or browser or gpu"
 
@@ -45,12 +45,12 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# On a machine with an accelerator: the tests that need one, and how fast it is beside OpenCV.
+# On a machine with an accelerator: run the tests that need it, and measure its speed beside OpenCV.
 gpu: $(STAMP)
 	$(BIN)/python -m pytest -m gpu
 	$(BIN)/python eval/speed.py gpu
 
-# The wheel with nothing but its own dependencies, as on a vehicle: does it work without torch?
+# Test the wheel with only its own dependencies and without torch, as on a vehicle.
 onboard: .venv-onboard/.installed
 	.venv-onboard/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall .
 	.venv-onboard/bin/python -I tests/torch_free.py
@@ -60,7 +60,7 @@ onboard: .venv-onboard/.installed
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check .
 	@touch $@
 
-# The files of a release, in dist/, as a package index wants them.
+# Build the files of a release in dist/, and check them for a package index.
 dist: .venv-dist/.installed
 	rm -rf dist
 	.venv-dist/bin/python -m build --outdir dist .
@@ -72,25 +72,25 @@ dist: .venv-dist/.installed
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check build twine check-wheel-contents
 	@touch $@
 
-# The site of docs/, in build/site; it needs no network. A warning, such as a link that leads nowhere, is an error.
+# Build the site of docs/ in build/site, without a network. A warning, such as a broken link, is an error.
 docs: $(STAMP)
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
 
-# Run the ten tutorials and take over the pictures that they make.
+# Run the ten tutorials, and copy their pictures into docs/.
 tutorials: $(STAMP)
 	for script in docs/tutorials/*.py; do \
 		mkdir -p build/tutorials/$$(basename $$script .py) && cd build/tutorials/$$(basename $$script .py) && \
 		PATH="$(abspath $(BIN)):$$PATH" MPLBACKEND=agg $(abspath $(BIN))/python $(CURDIR)/$$script && \
 		cp $$(basename $$script .py).??g $(CURDIR)/docs/tutorials/ && cd $(CURDIR) || exit 1; done
 
-# Tables of the documents from the results that studies keep in eval/results: none of their figures is typed.
+# Write the tables of the documents from the results of studies in eval/results. No figure is typed by hand.
 figures: $(STAMP)
 	$(BIN)/python eval/figures.py
 
-# Other trackers and TrackEval, in environments of their own: they bring an OpenCV that breaks ours. Then: are our
-# tracking measures TrackEval's? With DATA, a folder of sequences with identities: on them as well, and how well do we
-# keep identities beside the other trackers? WRITE=eval/results/identities.json keeps that; what the peers got is kept in
-# the file KEEP and not measured again while tables and settings are the same.
+# Install other trackers and TrackEval into separate environments, because their OpenCV breaks ours. Compare our tracking
+# measures with TrackEval's. With DATA, a folder of sequences with identities, also compare on these sequences, and
+# compare our identities with those of the other trackers. WRITE=eval/results/identities.json saves that result. KEEP
+# names a file of the peers' results, which are not measured again while tables and settings are unchanged.
 peers: $(STAMP) .venv-peers/.installed .venv-norfair/.installed
 	$(BIN)/python eval/peers/check.py $(DATA)
 ifdef DATA
@@ -104,7 +104,7 @@ endif
 	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check --requirement $<
 	@touch $@
 
-# The stamp makes a second run quick; a change of pyproject.toml installs again.
+# The stamp avoids a second installation, until pyproject.toml changes.
 $(STAMP): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "torchvision-dddas needs Python 3.11 or newer; name one with: make PYTHON=/path/to/python3.11" >&2; exit 2; }

@@ -105,7 +105,7 @@ def test_boxes_that_move_are_told_and_what_moves_without_a_box_is_kept(frames, i
         assert len(found) == 2 and speed["person"] == 0 and found.kind == "given"
         assert speed["car" if is_seen else ""] == pytest.approx(4, abs=1.6)  # of a blob without texture
     assert set(results[6].tracks.label.tolist()) == {"person", "car" if is_seen else ""}
-    with pytest.raises(InputError, match="movers is for a detector"):
+    with pytest.raises(InputError, match="movers needs a detector"):
         Pipeline(movers=True)
 
 

@@ -8,8 +8,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-# ONNX Runtime 1.29 and newer write a device id and a database of events below the home directory and send the events to
-# their maker. They read this variable when they are loaded, and a call of `disable_telemetry_events` comes too late.
+# ONNX Runtime 1.29 and newer write a device id and a database of events below the home directory, and send the events
+# to Microsoft. They read this variable when they are loaded. Calling `disable_telemetry_events` would be too late.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.types import Source
 
-# Each public name by subject, with the module that defines it, and its name in that module. `__init__.pyi` tells type
-# checkers and editors the same; a test compares the two.
+# Each public name by subject, with its module and its name in that module. `__init__.pyi` declares the same names for
+# type checkers and editors, and a test compares the two.
 _HOME = {
     # Clips, settings, and runs
     "Source": ("types", "Source"),
@@ -95,8 +95,8 @@ __all__ = ["open_source", "open_video", *_HOME]
 def open_video(spec: "str | Path", **options: Any) -> "Source":
     """Open a clip: a video file, a folder or glob of images, `camera:0`, `rtsp://...`, or `sim:` and a scenario.
 
-    options: rate_hz, full_scale, single, as `io.sources.open_source` has them. A simulated clip can be steered.
-    Raises InputError with one line when it cannot be read.
+    options: rate_hz, full_scale, single, as in `io.sources.open_source`. A simulated clip can be steered.
+    Raise InputError if the clip cannot be read.
 
     >>> import cv2
     >>> for number in (1, 2):
@@ -114,7 +114,7 @@ def open_video(spec: "str | Path", **options: Any) -> "Source":
     from torchvision_dddas.lab.simulation import open_scenario  # takes 0.4 s to import
 
     if options.get("rate_hz") is not None:
-        raise InputError(f"the scenario of {text} sets the frame rate (clip.rate_hz): leave --rate out")
+        raise InputError(f"the scenario of {text} sets the frame rate (clip.rate_hz); leave --rate out")
     return open_scenario(text.removeprefix("sim:"))
 
 

@@ -1,4 +1,4 @@
-"""InputError, the error that a user's mistake raises, and functions that make names and addresses safe to print."""
+"""InputError, the error for mistakes of the user, and functions that make names and addresses safe to print."""
 
 import re
 from unicodedata import category

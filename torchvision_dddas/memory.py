@@ -1,4 +1,4 @@
-"""The memory budget of an input. Every reader calls `check_memory` before it allocates what a header announces.
+"""The memory budget of an input. Every reader calls `check_memory` before it allocates memory for the size in a header.
 
 A file of a few bytes can announce billions of pixels or numbers. Small files therefore have a smaller budget. The costs
 are the largest that were measured for any command (docs/limitations.md).
@@ -32,7 +32,7 @@ def cost_of_pictures(count: int) -> int:
 def check_memory(needed: float, what: str, size: int | None = None, advice: str = "make it smaller") -> None:
     """Raise InputError if an input would take more than its budget.
 
-    needed: bytes. what: the input and what it announces, for the message. size: bytes of the file, None without one.
+    needed: bytes. what: the input and the size in its header, for the message. size: bytes of the file, if any.
     advice: what the user can do.
     """
     given = os.environ.get(VARIABLE, "")
@@ -49,13 +49,13 @@ def check_memory(needed: float, what: str, size: int | None = None, advice: str 
 
 
 def reset_peak_memory() -> None:
-    """Let the peak memory count from now on, where the system allows that."""
+    """Restart the measurement of peak memory now, if the system supports that."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_memory_mb() -> float:
-    """Return the process's peak in units of 2**20 bytes, NaN where it is not reported; some systems cannot reset it."""
+    """Return the process's peak memory in units of 2**20 bytes, NaN if unknown. Some systems cannot reset the peak."""
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return int(next(line for line in lines if line.startswith("VmHWM")).split()[1]) / 1024

@@ -25,26 +25,26 @@ MANIFEST = "manifest.json"
 
 
 def opened(folder: Path, name: str, **options: Any) -> Any:
-    """Open an ONNX Runtime session of a graph that runs on a single thread.
+    """Open a single-threaded ONNX Runtime session of a graph.
 
-    options: further attributes of SessionOptions. Raises InputError as `verified`, and if ONNX Runtime cannot open it.
+    options: further attributes of SessionOptions. Raise InputError as `verified` and `open_session` do.
     """
     # Pass the verified bytes, not the file, which may change meanwhile.
     return open_session(verified(folder, name), folder / name, threads=1, **options)
 
 
 def open_session(content: bytes | str, path: Path, provider: str = "cpu", threads: int = 0, **options: Any) -> Any:
-    """An ONNX Runtime session of a graph's bytes, or of the file of this name, whose weights may lie beside it.
+    """Open an ONNX Runtime session. content: bytes of a graph, or the name of its file, beside which weights may lie.
 
-    path: of the graph, for messages. provider: one of `providers`. threads: 0 lets the runtime choose. options: further
-    attributes of SessionOptions. Raises InputError for a provider that is not there and where the runtime refuses.
+    path: path of the graph, for messages. provider: one of `providers`. threads: 0 lets the runtime choose. options:
+    further attributes of SessionOptions. Raise InputError for an unknown provider, and if the runtime refuses.
     """
     import onnxruntime
 
     known, wanted = providers(), ["cpu"] if provider == "cpu" else [provider, "cpu"]
     if provider not in known:
         raise InputError(
-            f"no provider of ONNX Runtime is named '{provider}' here; there are {', '.join(known)}. Others come with "
+            f"the installed ONNX Runtime has no provider '{provider}', only {', '.join(known)}. Others come with "
             "other packages, such as onnxruntime-gpu or onnxruntime-openvino in place of onnxruntime"
         )
     chosen = onnxruntime.SessionOptions()
@@ -58,23 +58,23 @@ def open_session(content: bytes | str, path: Path, provider: str = "cpu", thread
         raise InputError(
             f"onnxruntime {onnxruntime.__version__} cannot open {path}: {first}; is it a model in ONNX, or a newer one?"
         ) from None
-    # The runtime falls back to the CPU with no more than a warning, as where a library of CUDA is missing.
+    # The runtime only warns and falls back to the CPU, for example if a library of CUDA is missing.
     if known[provider] not in session.get_providers():
-        raise InputError(f"ONNX Runtime could not start the provider '{provider}'; its own warning above says why")
+        raise InputError(f"ONNX Runtime could not start the provider '{provider}'; see its warning above")
     return session
 
 
 def providers() -> dict[str, str]:
-    """The providers that the installed ONNX Runtime computes with: short names, such as cuda, and its own names."""
+    """Return the providers of the installed ONNX Runtime: short names, such as cuda, with the runtime's names."""
     import onnxruntime
 
     names = onnxruntime.get_available_providers()
-    # Azure's sends pictures elsewhere.
+    # Leave out Azure's provider, because it sends pictures to a server.
     return {name.removesuffix("ExecutionProvider").lower(): name for name in names if "Azure" not in name}
 
 
 def verified(folder: Path, name: str) -> bytes:
-    """Return the bytes of a graph. Raises InputError if it is missing, not listed, or differs from the manifest."""
+    """Return the bytes of a graph. Raise InputError if it is missing, not listed, or differs from the manifest."""
     held = manifest(folder)["graphs"]
     if name not in held:
         raise InputError(f"{folder / MANIFEST} lists no {name}; {_again(folder)}")
@@ -90,7 +90,7 @@ def verified(folder: Path, name: str) -> bytes:
 
 
 def manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a folder. Raises InputError if it is missing, changed, or made by another version."""
+    """Return the manifest of a folder. Raise InputError if it is missing, changed, or made by another version."""
     path = folder / MANIFEST
     try:
         text = path.read_bytes()
@@ -135,7 +135,7 @@ def wants_torch(backend: str, auto_with_gpu: bool = True) -> bool:
     """Return whether the backend is torch, and prepare the environment for its import.
 
     `auto` is torch if torch sees a CUDA device, else onboard, which is faster for a single stream on a CPU.
-    auto_with_gpu: False for work that a GPU does not speed up. Raises InputError for another name or missing packages.
+    auto_with_gpu: False for work that a GPU does not speed up. Raise InputError for another name or missing packages.
     """
     if backend == "onboard" or (backend == "auto" and not (auto_with_gpu and _has_cuda())):
         return False
@@ -146,7 +146,7 @@ def wants_torch(backend: str, auto_with_gpu: bool = True) -> bool:
             f"--backend torch needs {' and '.join(missing)}; pip install 'torchvision-dddas[torch]', "
             "or use --backend onboard"
         )
-    # Without this, waiting threads spin and take the cores from working threads: minutes a frame on a busy machine.
+    # Without this setting, waiting threads spin and slow the others: a frame can take minutes on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     return True
 

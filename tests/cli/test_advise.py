@@ -36,7 +36,7 @@ def test_the_default_needs_no_option_for_usual_targets_at_a_usual_speed() -> Non
 def test_targets_that_are_tiny_without_a_log_ask_for_the_size_of_people() -> None:
     options, _, sizes = choose(look(square_px=4.0))
     assert list(options) == ["--set gates.person_px=4.0"]
-    assert "not known without --telemetry" in sizes
+    assert "unknown without --telemetry" in sizes
 
 
 def test_a_log_tells_the_sizes_and_no_option_is_needed_for_them() -> None:
@@ -49,7 +49,7 @@ def test_a_slow_machine_takes_the_first_quicker_configuration_that_keeps_up_with
     assert list(choose(look(rate_hz=5), live=True)[0]) == ["--config fast"]
     assert list(choose(look(rate_hz=5), live=True, quick_hz=20)[0]) == ["--config half"]
     options, remarks, _ = choose(look(rate_hz=5))
-    assert options == {} and "a recording loses nothing" in remarks[0]
+    assert options == {} and "without --live, no picture is dropped" in remarks[0]
 
 
 def test_no_configuration_without_settings_for_tiny_people_is_advised_where_they_are_tiny() -> None:

@@ -66,4 +66,4 @@ def test_what_is_missing_is_said_in_one_line(calibrate, tmp_path):
 
 def test_points_without_sigma_are_noted(calibrate):
     result = calibrate(head=HEAD.removesuffix(",sigma_m"), points=[row.rpartition(",")[0] for row in POINTS])
-    assert "points without sigma_m are taken to be known to 1.43 m" in result.stdout
+    assert "points without sigma_m get the standard deviation 1.43 m" in result.stdout

@@ -102,7 +102,7 @@ def test_detect_saves_everything_by_default_and_sums_up(dddas, engine, clip, tmp
     result = dddas("detect", clip, "--rate", 10, "--out", tmp_path / "out", "--backend", "onboard")
     assert result.stdout.splitlines() == [
         "5 frames, 5 detections, 1 frames with unreliable registration",
-        "scale: the size of people is not known: height above ground and focal length are not both known",
+        "scale: the size of people is unknown: it needs the height above ground and the focal length",
         f"{tmp_path / 'out'}: detections.csv, detections.txt, masks/, overlay.mp4, run.json",
     ]
     assert names(tmp_path / "out/masks") == [f"{k:06d}.png" for k in range(1, 6)]
@@ -166,7 +166,7 @@ def test_around_a_table_only_its_frames_are_searched(dddas, scorer, clip, file, 
     words = (*WINDOW, "--out", tmp_path / "out", "--save", "none")
     result = dddas("people", clip, "--around", table, *words)
     assert [row["frame"] for row in rows(tmp_path / "out/detections.csv")] == ["2", "4"]
-    assert f"note: 3 of 5 frames were not searched: {table} has no box there that a window fits" in result.stdout
+    assert f"note: 3 of 5 frames were not searched: {table} has no box of a suitable size there" in result.stdout
     kept = record(tmp_path / "out")
     assert (kept["searched"]["frames_nowhere"], kept["searched"]["frames_in_regions"]) == (3, 2)
     result = dddas("people", clip, "--around", file("none.txt", ""), *words)
@@ -227,7 +227,7 @@ def test_people_needs_little_memory_and_loads_neither_scipy_nor_torch(tmp_path):
 def test_a_table_alone_gives_tables_and_a_record_without_a_film(dddas, table, tmp_path):
     result = dddas("track", "--detections", table(), "--out", tmp_path / "out")
     assert result.stdout.splitlines() == [
-        "5 frames, 5 detections, 1 identities, 0 detections without one",
+        "5 frames, 5 detections, 1 identities, 0 detections without identity",
         f"{tmp_path / 'out'}: tracks.csv, tracks.txt, run.json",
     ]
     assert names(tmp_path / "out") == ["run.json", "tracks.csv", "tracks.txt"]
@@ -286,7 +286,7 @@ NOTED = {
     "SVM margins": (walker(range(1, 6)).replace("0.95", "43.332"), "scores from 43.332 to 43.332 are not prob", 43.332),
     "unlikely rows": (
         walker(range(1, 6)) + walker(range(1, 6), x=40).replace("0.95", "0.05"),
-        "10 detections, 1 identities, 5 detections without one",
+        "10 detections, 1 identities, 5 detections without identity",
         0.95,
     ),
 }
@@ -434,7 +434,7 @@ def test_repeated_pictures_are_noted(dddas, tmp_path):
     film = film_of(tmp_path / "twice.mp4", [shot for shot in textured_frames(8) for _ in (1, 2)], 20.0)
     result = dddas("detect", film, "--config", "fast", "--out", tmp_path / "out", "--save", "none")
     assert result.exit_code == 0, result.output
-    assert "8 of 16 frames repeat the picture before, and have its result" in result.stdout
+    assert "8 of 16 frames repeat the previous picture, and have its result" in result.stdout
 
 
 def test_a_varying_frame_rate_is_noted(dddas, engine, tmp_path):

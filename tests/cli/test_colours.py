@@ -30,7 +30,7 @@ def test_colours_are_found_named_and_shown(dddas, picture, tmp_path):
     assert sorted(found.names) == ["blue", "red"]
     lines = result.stdout.splitlines()
     assert [line.split(":")[0] for line in lines[:2]] == list(found.names)
-    assert lines[-1] == f"{out}; {out.with_suffix('.png')} shows what the ranges mark"
+    assert lines[-1] == f"{out}; {out.with_suffix('.png')} shows the areas that the ranges mark"
     drawn = cv2.imread(str(out.with_suffix(".png")))
     assert drawn is not None and drawn.shape == (120, 160, 3)
     assert drawn[68, 100].tolist() == list(BGR["blue"])  # what is marked keeps its colour

@@ -74,7 +74,7 @@ def test_a_study_writes_its_measures_its_report_and_what_was_run(study, dddas, t
     again = study("--set", "track.memory_frames=1", "--prune-cache", 0, "--out", tmp_path / "other")
     assert "results unused for 0 days were removed" in again.stdout
     shown = dddas("compare", tmp_path / "out", tmp_path / "other", "--out", tmp_path / "compare.html")
-    assert "tracking, 2 clips together" in shown.stdout and "the same in both" in shown.stdout
+    assert "tracking, 2 clips together" in shown.stdout and "identical in both" in shown.stdout
     page = (tmp_path / "compare.html").read_text()
     for name in "A: study (", "B: study (", "track.memory_frames: ", " in A, 1 in B":
         assert name in shown.stdout and name in page

@@ -121,14 +121,14 @@ def test_sightings_none_of_which_has_a_distance_end_with_an_exit_code_of_their_o
     table = file("t.csv", "frame,x_px,y_px,width_px,height_px,cut\n1,600,700,150,260,1\n")
     result = dddas("locate", "ground", table, "--camera", file("c.toml", CAMERA), "--out", out)
     cause = "0 located, because no sighting has a distance (see sightings.csv)"
-    assert (result.exit_code, result.stderr) == (3, f"dddas: {cause}; all else is in {out}\n")
+    assert (result.exit_code, result.stderr) == (3, f"dddas: {cause}; all other results are in {out}\n")
     assert "0 positions" in result.stdout and record(out)["state"] == "complete"
     assert cause in record(out)["notes"]
 
 
 def test_a_table_without_rows_gives_empty_tables(locate, out):
     said = locate("frame,x_px,y_px,width_px,height_px\n", cameras=[CAMERA + PLACE])
-    assert "note: the tables have no rows: nobody to locate" in said
+    assert "note: the tables have no rows: nothing to locate" in said
     assert len(read_positions(out / "positions.csv")) == 0
     assert json.loads((out / "tracks.geojson").read_text())["features"] == []
     assert (record(out)["state"], record(out)["people"]) == ("complete", 0)

@@ -130,7 +130,7 @@ def test_a_frame_with_too_few_landmarks_is_a_flagged_gap(located, tmp_path):
     (gap,) = record(tmp_path / "out")["unreliable"]
     assert (gap["first"], gap["last"]) == (4, 4)
     assert "3 landmarks" in gap["cause"] and "1 missing" in gap["cause"]
-    assert said.splitlines()[-1].endswith("; 1 of 10 frames without a position, run.json gives the causes")
+    assert said.splitlines()[-1].endswith("; 1 of 10 frames without a position; run.json lists the causes")
 
 
 def test_frames_that_a_log_does_not_cover_are_counted_on_the_screen_in_the_record_and_in_the_report(located, tmp_path):
@@ -309,8 +309,8 @@ def test_bridges_and_untracked_detections_have_no_place_as_in_a_run(located, tmp
     lines.append("6,-1,100,100,20,20,0.1,untracked,9,")
     found, said = located(flight, table="\n".join(lines) + "\n", **ALONE)
     assert "10 frames, 38 detections\n38 positions; of the frames 10 by telemetry\n" in said
-    assert "note: boxes that bridge gaps between detections: 2; not seen, they have no place\n" in said
-    assert "note: detections without identity: 1; not followed, they have no place\n" in said
+    assert "note: boxes that bridge gaps between detections were not seen and have no place: 2\n" in said
+    assert "note: detections without identity were not tracked and have no place: 1\n" in said
     assert {row["frame"] for row in found if row["target"] == "2"} == {*"1236789", "10"}
     assert (record(tmp_path / "out")["positions"], record(tmp_path / "out")["bridges"]) == (38, 2)
 

@@ -314,7 +314,7 @@ def test_single_pixels_of_a_moment_are_located(dddas, flown):
         and "with 95 % within" in one
         and other.startswith("320,180: ")
     )
-    for pixel, says in (("9000,5", "lies outside of"), ("5", "a pixel must be u,v")):
+    for pixel, says in (("9000,5", "lies outside "), ("5", "a pixel must be u,v")):
         assert says in bad(dddas(*words, pixel))
     assert "give its --telemetry" in bad(dddas("locate", "pixel", flown / "clip", "5,5"))
 
@@ -337,7 +337,7 @@ def test_why_nothing_was_located_stands_on_the_screen_in_the_report_and_in_the_r
         assert result.exit_code == 3, result.output
         (said,) = result.stderr.splitlines()[-1:]
         assert said.startswith("dddas: 0 located, because the telemetry") and cause in said
-        assert said.endswith(f"; all else is in {out}") and "0 located" not in result.stdout
+        assert said.endswith(f"; all other results are in {out}") and "0 located" not in result.stdout
         assert record(out)["state"] == "complete" and len(rows(out / "tracks.csv")) > 20
         assert any("0 located, because" in note and cause in note for note in record(out)["notes"])
         page = (out / "report.html").read_text()
@@ -419,7 +419,7 @@ def test_the_scale_stands_on_the_screen_in_the_record_and_in_the_report(dddas, f
 
 def test_the_same_clip_without_telemetry_says_that_its_scale_is_not_known(dddas, engine, flown, tmp_path):
     for words, said in (
-        ((), "the size of people is not known"),
+        ((), "the size of people is unknown"),
         (("--config", "patrol"), "about 4.0 px (as gates.person_px"),
     ):
         result = dddas("detect", flown / "clip", "--rate", RATE_HZ, *words, "--save", "none", "--out", tmp_path)

@@ -97,6 +97,6 @@ def test_mistakes_are_told_in_one_line(dddas, clip, file, platform, tmp_path):
         (["--ground", platform], "--telemetry or --landmarks"),
         (["--ground", tmp_path / "none.toml", "--telemetry", log], "none.toml cannot be read"),
         (["--ground", platform, "--ground", platform, "--telemetry", log], "its own name"),
-        (["--ground", platform, "--live", "--telemetry", log], "has detections, boxes of before"),
+        (["--ground", platform, "--live", "--telemetry", log], "has detections, which --live cannot use"),
     ):
         assert says in bad(dddas("run", clip, *words, "--out", out))

@@ -37,7 +37,7 @@ def test_an_empty_table_shares_nothing_and_a_note_says_so(tables, dddas, tmp_pat
     tables[1].write_text(HEADER + "\n", encoding="utf-8")
     said = dddas("views", *tables, "--out", tmp_path / "out").stdout
     assert (
-        "no overlap was found in 30 of 30 moments; do the clips begin at the same time" in said
+        "no overlap was found in 30 of 30 moments; check that the clips begin at the same time" in said
         and "has no rows" in said
     )
 

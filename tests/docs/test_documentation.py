@@ -227,7 +227,7 @@ def test_the_path_of_a_study_that_was_killed_can_be_followed(tmp_path: Path) -> 
     assert state() == "running" and not (tmp_path / "study/metrics.json").exists()
     done = subprocess.run([*program, *second], cwd=tmp_path, env=environ, capture_output=True, text=True, timeout=300)
     assert (done.returncode, state()) == (0, "complete"), done.stderr
-    kept = re.search(r"cases scored: \d+ stages computed, (\d+) cases kept from before", done.stdout)
+    kept = re.search(r"cases scored: \d+ stages computed, (\d+) cases taken from the cache", done.stdout)
     assert kept is not None and int(kept[1]) > 0
     assert "kept" in done.stderr and (tmp_path / "study/metrics.json").exists()
 

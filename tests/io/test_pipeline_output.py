@@ -114,7 +114,7 @@ def test_what_ground_vehicles_say_is_a_table_and_counted(tmp_path):
     assert table[1]["probability"] == "0.9600" and table[1]["seen_by"] == "blue" and table[1]["best_score"] == ""
     assert table[2]["seen_by"] == "ugv, red;blue" and float(table[2]["east_m"]) == 0
     assert kept["kinds"] == {"unseen": 1, "human": 1, "not_human": 1} and kept["rows_looked_at"] == 2
-    assert "it was told human before" in log(tmp_path)[-1]
+    assert "it was judged human before" in log(tmp_path)[-1]
     assert "kinds" not in run(tmp_path, [located(1)]) and not (tmp_path / "confirmed.csv").exists()
 
 

@@ -402,7 +402,8 @@ def test_an_overlay_that_fails_costs_itself_alone_and_is_told(tmp_path, monkeypa
         raise ValueError("the encoder is out of order")
 
     monkeypatch.setattr("torchvision_dddas.io.overlay_video._H264.encode", refuse)
-    with pytest.raises(InputError, match="overlay could not be written: the encoder is out of order; all else is in"):
+    words = "overlay could not be written: the encoder is out of order; all other results are in"
+    with pytest.raises(InputError, match=words):
         fill(tmp_path, [make_scene(1), make_scene(2)])
     assert {"detections.csv", "detections.txt", "masks/000002.png", "run.json"} <= set(visible(tmp_path))
     assert "overlay.mp4" not in visible(tmp_path)

@@ -123,7 +123,7 @@ def test_looks_that_come_after_the_last_main_result_are_counted(streams, tmp_pat
     while not team._looks["ugv1"] and time.monotonic() < until_s:
         time.sleep(0.01)
     notes = "\n".join(team.finish())
-    assert "ugv1: records not fused, for lack of time" in notes and "worked on before the last result" in notes
+    assert "ugv1: records not fused for lack of time" in notes and "worked on before the last result" in notes
 
 
 def test_work_that_fails_ends_its_platform_alone_and_is_noted(streams, tmp_path, monkeypatch):
@@ -144,5 +144,5 @@ def test_a_run_takes_platforms_of_its_own_kind_alone(streams, tmp_path, is_strea
     if is_stream:
         team_of(tmp_path, streams, main_clip())[0].finish()
     else:
-        with pytest.raises(InputError, match="the main clip is recorded, that of ugv1 live"):
+        with pytest.raises(InputError, match="the main clip is recorded, but ugv1 is live"):
             team_of(tmp_path, streams, main_clip(False))

@@ -1,4 +1,4 @@
-"""The command line, `dddas`: one file a command. This file imports nothing slow, so that signals are heeded early."""
+"""The command line, `dddas`: one file per command. This file imports nothing slow, so that signals work early."""
 
 import os
 import signal
@@ -15,14 +15,14 @@ def main() -> None:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _end)  # until the commands are loaded, which set their own
+            signal.signal(number, _end)  # until the commands are loaded and set their own handlers
     from torchvision_dddas.cli.commands import run_command_line
 
     run_command_line()
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    """As `say_stopped`, which is not loaded yet."""
+    """Report a signal as `say_stopped` does, which is not loaded yet."""
     how = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
     with suppress(OSError):
         os.write(2, f"dddas: {how}; nothing was kept\n".encode())

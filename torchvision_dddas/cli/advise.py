@@ -1,4 +1,4 @@
-"""`dddas advise`: what to expect of a clip, and the options to give, before a run."""
+"""`dddas advise`: show what to expect of a clip, and advise options, before a run."""
 
 import shlex
 from pathlib import Path
@@ -26,7 +26,7 @@ FRAMES = 60
 def advise(
     clip: Annotated[str, typer.Argument(metavar="CLIP", help=CLIP)],
     telemetry: Telemetry = None,
-    camera: Annotated[Path | None, typer.Option(metavar="FILE", help="Camera TOML, as of dddas run.")] = None,
+    camera: Annotated[Path | None, typer.Option(metavar="FILE", help="Camera TOML, as for dddas run.")] = None,
     set_: Overrides = None,
     rate: Rate = None,
 ) -> None:
@@ -41,7 +41,7 @@ def advise(
     from torchvision_dddas.types import Source
 
     if clip.startswith("sim:"):
-        raise InputError(f"advise looks at pictures of a clip, got {clip}; dddas simulate writes a scenario as a clip")
+        raise InputError(f"advise needs a clip with pictures, got {clip}; dddas simulate writes a scenario as a clip")
     if telemetry is None:
         refuse_options({"--camera": camera}, "is of no use without --telemetry FILE")
     given = None if telemetry is None else AerialInput(telemetry=telemetry, camera=camera)
@@ -72,7 +72,7 @@ def advise(
     lines += [f"note: {note}" for note in [*notes, *remarks]]
     lines += [f"{option}: {reason}" for option, reason in options.items()]
     if not options:
-        lines.append("the default is right, as far as these frames and the log tell")
+        lines.append("no option is needed, judging by these frames and the log")
     words = ["dddas", "run", clip]
     for name, value in {"--telemetry": telemetry, "--camera": camera, "--rate": rate}.items():
         words += [] if value is None else [name, f"{value:g}" if isinstance(value, float) else str(value)]

@@ -1,4 +1,4 @@
-"""`dddas bench`: how fast the package is on this machine, as tables to paste."""
+"""`dddas bench`: measure the speed of the package on this machine, and print tables to paste."""
 
 import os
 import time
@@ -11,18 +11,18 @@ from torchvision_dddas.cli.options import parse_size, print_lines, report_errors
 from torchvision_dddas.cli.progress import print_now
 
 _SIZES = ["640x480", "1280x720", "1920x1080"]
-_SHARE, _BATCH = 0.15, 4  # of the time for Kornia's operations, and their pictures at once
+_SHARE, _BATCH = 0.15, 4  # share of the time for Kornia's operations, and pictures per batch
 
 
 @report_errors
 def bench(
-    seconds: Annotated[float, typer.Option(min=5, max=3600, help="About how long it may take.")] = 120.0,
+    seconds: Annotated[float, typer.Option(min=5, max=3600, help="Approximate duration.")] = 120.0,
     size: Annotated[list[str] | None, typer.Option(metavar="WxH", help=f"May be repeated. [default: {_SIZES}]")] = None,
 ) -> None:
     """Measure this machine: frames per second, memory and stages of each engine and configuration, beside plain OpenCV.
 
-    Where torch is installed, Kornia's operations are measured beside ours. Prints Markdown tables; nothing is written.
-    Frames are synthetic and made in memory. Cells that the time does not allow are dashes.
+    If torch is installed, Kornia's operations are measured beside ours. Prints Markdown tables; nothing is written.
+    Frames are synthetic and made in memory. A dash marks a measurement for which there was no time.
     """
     sizes = [parse_size(text, 120, 8192) for text in dict.fromkeys(size or _SIZES)]
     from torchvision_dddas.lab.benchmark import CHAINS, format_chains, format_operations, machine_words, measure_chains

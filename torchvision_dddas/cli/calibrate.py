@@ -1,4 +1,4 @@
-"""`dddas calibrate`: the camera data that ranging needs, from people in the camera's pictures."""
+"""`dddas calibrate`: find the camera data that ranging needs, from people in the camera's pictures."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.config import Settings
 
-BODY_HEIGHTS_M = 0.1, 10.0  # of a person, or of an object used instead
+BODY_HEIGHTS_M = 0.1, 10.0  # lowest and greatest height of a person, or of an object used instead
 UNROUNDED = ("longitude_deg", "latitude_deg", "east_m", "north_m")  # keys that are written with all digits
 FOCAL_KEYS = ("focal_px", "focal_v_px", "hfov_deg", "focal_sigma")
 
@@ -48,7 +48,7 @@ def calibrate(
 ) -> None:
     """Find a camera's focal length from a person of known height at a known distance, f = D h / H.
 
-    The camera looks level at the person. Give --distance with --pixels or the boxes of one person; or many distances.
+    The camera looks horizontally. Give --distance with --pixels or the boxes of one person, or a table of distances.
 
     With boxes of people all over the picture and a --camera of known focal length: find the camera's height and pitch.
     """
@@ -69,7 +69,7 @@ def calibrate(
     if size is not None:
         known["width_px"], known["height_px"] = parse_size(size, 1, 100_000)
     if pixels and table is not None:
-        raise InputError("--pixels and a table were given; give the person's heights in one way")
+        raise InputError("--pixels and a table were both given; give only one of them")
     if not pixels and table is None:
         raise InputError("calibration needs --distance with --pixels, or a table (see --help); got neither")
     if table is not None and has_measurements(table):
@@ -82,7 +82,7 @@ def calibrate(
     elif table is not None:
         found, lines = _find_pose(table, camera, body_m, settings)
     else:
-        raise InputError("--pixels needs --distance: how far from the camera the person stood, in metres")
+        raise InputError("--pixels needs --distance, the person's distance from the camera in metres")
     key, unit = ("focal_px", "px") if "focal_px" in found else ("height_m", "m")
     low, high = LIMITS[key]
     if not low <= found[key] <= high:
@@ -116,11 +116,11 @@ def _read_heights(table: Path) -> "np.ndarray":
     if len(frames) and count.max() > 1:
         raise InputError(
             f"{table} has {count.max()} boxes in frame {frames[count.argmax()]}; "
-            "--distance needs one person alone in each picture"
+            "--distance needs a single person in each picture"
         )
     heights_px = read.box_px[:, 3] if read.cut is None else read.box_px[~read.cut, 3]
     if not len(heights_px):
-        raise InputError(f"{table} has no whole person to calibrate by")
+        raise InputError(f"{table} has no uncut person to calibrate with")
     return heights_px
 
 

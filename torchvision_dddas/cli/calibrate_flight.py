@@ -1,4 +1,4 @@
-"""`dddas calibrate-flight`: estimate the errors of one's own vehicle from a flight over points of known place."""
+"""`dddas calibrate-flight`: estimate the errors of the user's vehicle from a flight over points of known place."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 @report_errors
 def calibrate_flight(
     points: Annotated[
-        Path, typer.Argument(metavar="POINTS", help="A CSV of points as landmarks: places, and pixels in the frames.")
+        Path,
+        typer.Argument(metavar="POINTS", help="A CSV of points as for landmarks: places, and pixels in the frames."),
     ],
     telemetry: Annotated[Path, typer.Option(metavar="FILE", help=REPORTS)],
     camera: CameraFile = None,
@@ -37,7 +38,7 @@ def calibrate_flight(
     set_: Overrides = None,
     rate: Rate = None,
 ) -> None:
-    """Estimate the errors of a vehicle's log by points of known place in its pictures, and write a configuration.
+    """Estimate the errors of a vehicle's log from points of known place in its pictures, and write a configuration.
 
     Give 20 pictures or more, taken from several directions, distances and heights, with one to four points each.
     """
@@ -67,21 +68,19 @@ def calibrate_flight(
     save_file(out, format_toml(content, [made]).encode())
     if not all(math.isfinite(sigma_m) for sigma_m in locator.site.landmarks.sigma_m.tolist()):
         notes.append(
-            f"points without sigma_m are taken to be known to {settings.landmarks.sigma_m:g} m (landmarks.sigma_m)"
+            f"points without sigma_m get the standard deviation {settings.landmarks.sigma_m:g} m (landmarks.sigma_m)"
         )
     if own:
-        notes.append(
-            f"not written: {', '.join(own)}; the log, its course or the camera's file states that error itself"
-        )
+        notes.append(f"not written: {', '.join(own)}; the log, its course or the camera's file states this error")
     if errors.wrong:
         names = (f"{locator.site.landmarks.names[mark]} in frame {frame}" for frame, mark in errors.wrong)
-        notes.append(f"left out, as they contradict the rest: {', '.join(names)}")
+        notes.append(f"left out, because they contradict the other points: {', '.join(names)}")
     lines = [count, *describe_errors(errors, values), *(f"note: {note}" for note in notes)]
     print_lines([*lines, f"{out}: {len(values)} parameters; give it with --config {out}"])
 
 
 def describe_errors(errors: "FlightErrors", values: dict[str, float]) -> list[str]:
-    """Return a table of the errors, with errors that no parameter states or that the flight does not determine."""
+    """Return a table of the errors, and notes on errors without a parameter or not determined by the flight."""
     from torchvision_dddas.geo import OFFSETS, PART_OF_OFFSET, PARTS
 
     lines, folded, notes = [f"{'error':<14}{'offset':>16}{'sigma':>15}{'stated':>8}"], [], []
@@ -104,8 +103,8 @@ def describe_errors(errors: "FlightErrors", values: dict[str, float]) -> list[st
         lines.append(line)
     lines += notes
     if folded:
-        lines.append(f"note: no parameter takes the offset of {', '.join(folded)}; the sigmas written hold it")
+        lines.append(f"note: no parameter corrects the offset of {', '.join(folded)}; the written sigmas contain it")
     if kept := [name for name, shown in zip(PARTS, errors.shown, strict=True) if not shown]:
-        more = "give more pictures, other headings, distances and heights"
-        lines.append(f"note: not determined by this flight, and kept at the stated value: {', '.join(kept)}; {more}")
+        more = "give more pictures, from other headings, distances and heights"
+        lines.append(f"note: not determined by this flight, so the stated value is kept: {', '.join(kept)}; {more}")
     return lines

@@ -1,4 +1,4 @@
-"""`dddas citation`: how to cite the package and the work that it implements, as BibTeX."""
+"""`dddas citation`: print how to cite the package and the work that it implements, as BibTeX."""
 
 import re
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ _FIELDS |= {"license": "note", "repository-code": "url"}
 def citation() -> None:
     """Print how to cite this software and the work that it implements, as BibTeX."""
     package = Path(__file__).resolve().parents[1]
-    # A wheel carries the file beside the code; a checkout keeps it at its top.
+    # A wheel has the file beside the code. A checkout has the file in its top folder.
     for place in (package / "CITATION.cff", package.parent / "CITATION.cff"):
         if place.is_file():
             print_lines(list(bibtex_entries(place.read_text(encoding="utf-8"))))
@@ -25,7 +25,7 @@ def citation() -> None:
 
 
 def bibtex_entries(cff: str) -> Iterator[str]:
-    """Yield the BibTeX entry of the software, then one of each reference of a CITATION.cff.
+    """Yield the BibTeX entry of the software, then the entry of each reference in a CITATION.cff.
 
     Only the layout of our own file is read, so that no YAML library is needed: a key and its value on one line.
     """

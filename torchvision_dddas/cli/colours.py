@@ -11,7 +11,7 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.geo import CalibratedColours
 
-MOST = 12  # colours that can be distinguished by their hue
+MOST = 12  # largest number of colours that can be distinguished by hue
 Box = tuple[int, int, int, int]
 
 
@@ -21,17 +21,17 @@ def colours(
         list[Path], typer.Argument(metavar="PICTURE...", help="Pictures of all the landmarks, as the camera sees them.")
     ],
     count: Annotated[
-        int | None, typer.Option(metavar="N", help="Number of landmarks. [default: all that are clear]")
+        int | None, typer.Option(metavar="N", help="Number of landmarks. [default: all that stand out]")
     ] = None,
     names: Annotated[
         str | None,
-        typer.Option(metavar="A,B,...", help="Their names; names of colours go to the nearest, others by hue."),
+        typer.Option(metavar="A,B,...", help="Names of the landmarks; colour names go to the nearest colour."),
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=X,Y,W,H", help="A box of a landmark's colour in the first picture; repeat it."),
+        typer.Option(metavar="NAME=X,Y,W,H", help="A box of a landmark's colour in the first picture; repeatable."),
     ] = None,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The TOML to write; a picture comes beside it.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The TOML to write, with a picture beside it.")] = Path(
         "colours.toml"
     ),
     config: Config = None,
@@ -40,7 +40,7 @@ def colours(
 ) -> None:
     """Find the ranges of hue, saturation and value of the landmarks' colours: patches that stand out from the ground.
 
-    Writes a TOML for `dddas run --colours`, and beside it a picture of all that the ranges mark: look at it.
+    Writes a TOML for `dddas run --colours`, and a picture of all areas that the ranges mark. Check this picture.
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.geo import calibrate_colours, draw_calibration
@@ -53,7 +53,7 @@ def colours(
     _check(count, wanted, [name for name, _ in boxes])
     drawing = out.with_suffix(".png")
     if drawing == out:
-        raise InputError(f"--out must be a TOML's name such as colours.toml, got a picture's name, {out}")
+        raise InputError(f"--out must be the name of a TOML, such as colours.toml, got the name of a picture, {out}")
     refuse_own_input(pictures, [out, drawing], "--out")
     for path in (out, drawing):
         refuse_folder(path)
@@ -61,7 +61,7 @@ def colours(
     found = calibrate_colours(images, least_px, count, wanted, boxes)
     save_file(drawing, draw_calibration(images, found))
     save_file(out, format_colours(found.ranges).encode())
-    print_lines([*_describe(found, len(pictures)), f"{out}; {drawing} shows what the ranges mark"], quiet)
+    print_lines([*_describe(found, len(pictures)), f"{out}; {drawing} shows the areas that the ranges mark"], quiet)
 
 
 def parse_box(text: str) -> tuple[str, Box]:
@@ -78,16 +78,16 @@ def parse_names(text: str | None) -> list[str]:
     """Return names separated by commas. Raise InputError for an empty name."""
     names = [name.strip() for name in text.split(",")] if text is not None else []
     if "" in names:
-        raise InputError(f"--names must be names with commas between, such as red,blue,yellow,magenta, got '{text}'")
+        raise InputError(f"--names must be names separated by commas, such as red,blue,yellow,magenta, got '{text}'")
     return names
 
 
 def _check(count: int | None, names: list[str], box_names: list[str]) -> None:
     if box_names and (names or count is not None):
-        raise InputError("--at was given with --names or --count; boxes bring their own names, leave the others out")
+        raise InputError("--at was given with --names or --count; give only --at, which has its own names")
     called = names or box_names
     if twice := [name for name in called if called.count(name) > 1]:
-        raise InputError(f"the name {twice[0]} is given twice; give each landmark its own")
+        raise InputError(f"the name {twice[0]} is given twice; give each landmark its own name")
     if count is not None and not 1 <= count <= MOST:
         raise InputError(f"--count must be 1 to {MOST}, because more colours cannot be distinguished; got {count}")
     if count is not None and names and len(names) != count:

@@ -47,7 +47,7 @@ from torchvision_dddas.runtime import VERSION
 
 app = typer.Typer(
     name="dddas",
-    help="Moving targets from a moving camera, steered by what the data show.",
+    help="Detect, track and locate moving targets from a moving camera, steered by the data.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -85,7 +85,7 @@ def run_command_line() -> None:
         os._exit(say_stopped(number, KEPT if kept else ""))
 
     signals = raising_signals(end)
-    atexit.register(ignore_signals)  # Python removes the handlers before it has ended
+    atexit.register(ignore_signals)  # Python removes the signal handlers before it ends
     try:
         code = close_output(output, _run(signals))
     except KeyboardInterrupt:  # after the end of the command
@@ -95,7 +95,7 @@ def run_command_line() -> None:
 
 def _run(signals: StopSignals) -> int:
     try:
-        signals.__enter__()  # never left, because a second signal may come while Python ends
+        signals.__enter__()  # never exited, because a second signal may come while Python ends
         code = app(standalone_mode=False) or 0
         # Before the command begins, Typer treats any signal as Ctrl-C and prints nothing.
         is_said = code != 128 + signal.SIGINT or isinstance(code, Ended)
@@ -107,7 +107,7 @@ def _run(signals: StopSignals) -> int:
     except Exception as error:
         if is_stop(error):
             return say_stopped(signals.noticed or signal.SIGINT, describe_kept(error))
-        # A wrong word of the command line. Typer does not export the class of these errors.
+        # A wrong argument. Typer does not export the class of these errors.
         if not hasattr(error, "format_message"):
             say_fault()
             return FAULT

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @report_errors
 def compare(
     first: Annotated[
-        Path, typer.Argument(metavar="A", help="The folder of a study, as dddas evaluate --dataset wrote it.")
+        Path, typer.Argument(metavar="A", help="The folder of a study, written by dddas evaluate --dataset.")
     ],
     second: Annotated[Path, typer.Argument(metavar="B", help="The folder of another study of the same clips.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
@@ -30,7 +30,7 @@ def compare(
         ),
     ] = None,
 ) -> None:
-    """Compare two studies: which clips changed, by how much, and whether that is beyond noise."""
+    """Compare two studies: which clips changed, by how much, and whether the change exceeds the noise."""
     from torchvision_dddas.io.atomic_files import refuse_folder, save_file
     from torchvision_dddas.io.output import finite, read_run_record
     from torchvision_dddas.io.report.figure_files import save_figures
@@ -65,7 +65,7 @@ def compare(
 
 
 def show_comparison(found: Mapping[str, Any], pooled_only: bool = False) -> None:
-    """Print the tables of a comparison. pooled_only: leave out single clips, and what the verdicts mean."""
+    """Print the tables of a comparison. pooled_only: leave out single clips and the meaning of the verdicts."""
     from torchvision_dddas.lab.evaluation.studies.comparison import MEANING, entries_of
 
     print_lines([f"A: {found['first']}", f"B: {found['second']}"])
@@ -84,9 +84,9 @@ def show_comparison(found: Mapping[str, Any], pooled_only: bool = False) -> None
         if clips:
             console.print(_table(f"{task}, single clips", clips[:MOST_CLIPS]))
         if len(clips) > MOST_CLIPS:
-            echo(f"{len(clips) - MOST_CLIPS} more rows: --json")
+            echo(f"{len(clips) - MOST_CLIPS} more rows with --json")
         if changes["same"]:
-            echo(f"the same in both to the last digit: {', '.join(changes['same'])}")
+            echo(f"identical in both studies: {', '.join(changes['same'])}")
     if not pooled_only:
         console.print(MEANING, highlight=False)
 

@@ -1,4 +1,4 @@
-"""`dddas confirm`: classify blobs seen from the air by the people recognized from the ground."""
+"""`dddas confirm`: classify blobs seen from the air with people recognized from the ground."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,13 +34,12 @@ def confirm(
         Path, typer.Argument(metavar="BLOBS", help="positions.csv of the blobs, or their boxes in one camera's clip.")
     ],
     people: Annotated[
-        list[Path], typer.Argument(metavar="PEOPLE...", help="The same of people: one table per ground vehicle.")
+        list[Path],
+        typer.Argument(metavar="PEOPLE...", help="Positions or boxes of people: a table per ground vehicle."),
     ],
     camera: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE", help="The TOML of each table's camera, or of all cameras of one fused table: their views."
-        ),
+        typer.Option(metavar="FILE", help="The TOML of each table's camera, or of all cameras of one fused table."),
     ] = None,
     poses: Poses = None,
     interval: Annotated[
@@ -50,7 +49,7 @@ def confirm(
         bool | None,
         typer.Option(
             "--identities/--no-identities",
-            help="Whether target numbers last, so that evidence adds up over frames. "
+            help="Whether target numbers persist, so that evidence adds up over frames. "
             "[default: yes for boxes with identities, no for positions]",
         ),
     ] = None,
@@ -62,7 +61,7 @@ def confirm(
 ) -> None:
     """Classify blobs as human, not human, or unseen, by the people recognized near them.
 
-    Without cameras it is unknown what the ground vehicles could see: blobs are then human or unseen.
+    Without cameras, the views of the ground vehicles are unknown, and blobs are human or unseen.
     Writes confirmed.csv (the blobs' rows with kind, probability and evidence) and run.json under --out.
     """
     from torchvision_dddas.config import load_config
@@ -93,9 +92,9 @@ def confirm(
             table = read_positions(blobs)
             vehicles = _read_vehicles(people, cameras, poses, notes)
             if not cameras:
-                notes.append("without --camera the vehicles' views are unknown: no blob can be found not human")
-            if identities is None:  # identities are unknown, and evidence of two blobs must not add up
-                notes.append("every row is judged alone; if target numbers last, give --identities to add up evidence")
+                notes.append("without --camera the vehicles' views are unknown, so no blob can be judged not human")
+            if identities is None:  # do not add up evidence of two blobs if identities are unknown
+                notes.append("rows are judged alone; give --identities to add up evidence of lasting target numbers")
             found = confirm_positions(table, vehicles, settings, interval, bool(identities), rate)
         elif cameras or poses:
             raise InputError(f"{blobs} has boxes: --camera and --poses are for positions on the ground")
@@ -122,7 +121,7 @@ def _has_positions(blobs: Path, people: Sequence[Path]) -> bool:
     for path, here in is_ground.items():
         if here != is_ground[blobs]:
             if empty := [name for name in (blobs, path) if not headers[name]]:
-                raise InputError(f"{empty[0]} is empty; give a first line that names frame,target,east_m,north_m")
+                raise InputError(f"{empty[0]} is empty; its first line must be frame,target,east_m,north_m")
             raise InputError(
                 f"{blobs} has {KINDS[is_ground[blobs]]}, {path} has {KINDS[here]}; give positions.csv for all "
                 "(dddas locate), or boxes of the same pictures for all"
@@ -133,7 +132,7 @@ def _has_positions(blobs: Path, people: Sequence[Path]) -> bool:
 def _read_vehicles(
     people: Sequence[Path], cameras: Sequence[Path], poses: Sequence[Path], notes: list[str]
 ) -> "list[Vehicle]":
-    """Read the tables with their cameras: one each, or all for a single table. Raise InputError otherwise."""
+    """Read the tables with one camera per table, or all cameras for a single table. Raise InputError otherwise."""
     from torchvision_dddas.control import Vehicle
     from torchvision_dddas.io.camera_files import describe_missing, read_camera, read_poses
     from torchvision_dddas.io.ground_tables import read_positions
@@ -156,7 +155,7 @@ def _read_vehicles(
 
 
 def _names(people: Sequence[Path]) -> list[str]:
-    """Return a unique name for each table: its file's, or its folder's if all files have the same name."""
+    """Return a unique name for each table: the name of its file, or of its folder if all files have the same name."""
     names = [path.stem for path in people]
     if len(set(names)) < len(names):
         names = [path.resolve().parent.name for path in people]

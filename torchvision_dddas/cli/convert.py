@@ -1,4 +1,4 @@
-"""`dddas convert`: tables of detections, tracks and positions from one format to another."""
+"""`dddas convert`: convert tables of detections, tracks and positions from one format to another."""
 
 from pathlib import Path
 from typing import Annotated
@@ -16,11 +16,11 @@ def convert(
         str | None,
         typer.Option(
             metavar="FORMAT",
-            help="csv, mot, visdrone, coco, yolo, cvat, davis, parquet, gpkg. [default: by OUT's ending]",
+            help="csv, mot, visdrone, coco, yolo, cvat, davis, parquet, gpkg. [default: by the ending of OUT]",
         ),
     ] = None,
     clip: Annotated[
-        str | None, typer.Option(metavar="CLIP", help="The clip, which tells the size and names of the pictures.")
+        str | None, typer.Option(metavar="CLIP", help="The clip, for the size and the names of the pictures.")
     ] = None,
     box_format: BoxFormat = None,
     quiet: Quiet = False,

@@ -1,4 +1,4 @@
-"""`dddas demo`: a small scene from film to score, without any input."""
+"""`dddas demo`: film, detect and score a small scene, without any input."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the clip and the results.")] = Path("demo-out"),
     quiet: Quiet = False,
 ) -> None:
-    """Film a short scenario of walkers and cars from a moving camera, detect them, and compare with the truth."""
+    """Film a short scenario of walkers and cars from a moving camera, detect them, and compare them with the truth."""
     from torchvision_dddas.cli.detect import detect_clip
     from torchvision_dddas.cli.evaluate import score, show
     from torchvision_dddas.config import load_config

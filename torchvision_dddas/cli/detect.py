@@ -1,4 +1,4 @@
-"""`dddas detect`: moving targets from a moving camera."""
+"""`dddas detect`: find moving targets in clips of a moving camera."""
 
 from collections.abc import Sequence
 from pathlib import Path

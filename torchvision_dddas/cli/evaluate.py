@@ -1,4 +1,4 @@
-"""`dddas evaluate`: results against the truth, of files or of the whole study that `--dataset` names."""
+"""`dddas evaluate`: score files against the truth, or run and score the study that `--dataset` names."""
 
 import json
 import math
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from torchvision_dddas.lab.evaluation.studies.records import Results, Spec
 
-MOST_NOTES, MOST_CLIPS = 12, 20  # of a study; of more clips the worst are shown
+MOST_NOTES, MOST_CLIPS = 12, 20  # notes and clips shown of a study; of more clips, the worst are shown
 
 
 class Ignored(StrEnum):
@@ -55,18 +55,18 @@ def evaluate(
     result: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="What dddas detect or track wrote, MOTChallenge text, or a folder of such by clip name. Several: of "
-            "several methods, compared with the first."
+            help="Output of dddas detect or track, MOTChallenge text, or a folder of these by clip name. Results of "
+            "several methods are compared with the first."
         ),
     ] = None,
     names: Annotated[
         str | None,
-        typer.Option(metavar="NAME,...", help="Names of the methods, one per RESULT. [default: of their files]"),
+        typer.Option(metavar="NAME,...", help="Names of the methods, one per RESULT. [default: by their files]"),
     ] = None,
     dataset: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Instead of TRUTH RESULT: the TOML of a study, whose clips are run and scored."
+            metavar="FILE", help="Instead of TRUTH RESULT: the TOML of a study. Its clips are run and scored."
         ),
     ] = None,
     clips: Clips = None,
@@ -75,21 +75,21 @@ def evaluate(
     worker_silent: WorkerSilent = None,
     cache: CacheFolder = None,
     prune_cache: Annotated[
-        float | None, typer.Option(metavar="DAYS", min=0, help="Afterwards remove kept results unused for so long.")
+        float | None, typer.Option(metavar="DAYS", min=0, help="Afterwards remove cached results unused for this time.")
     ] = None,
     keep: Annotated[
         str | None,
-        typer.Option(metavar="KIND,...", help="Also write what was found into kept/: tracks, detections, masks."),
+        typer.Option(metavar="KIND,...", help="Also write results into kept/: tracks, detections, masks."),
     ] = None,
     config: Config = None,
     set_: Overrides = None,
     backend: StudyBackend = None,
     first_frame: Annotated[
         int | None,
-        typer.Option(help="Number in a mask's name that is the clip's first frame. [default: 0 if there, else 1]"),
+        typer.Option(help="Number in the name of the first frame's mask. [default: 0 if there is one, else 1]"),
     ] = None,
     interval: Annotated[
-        int | None, typer.Option(help="Score only frames 1, 1 + INTERVAL, ... [default: 1, or as FILE says]")
+        int | None, typer.Option(help="Score only frames 1, 1 + INTERVAL, ... [default: 1, or as in FILE]")
     ] = None,
     ignored: Annotated[
         Ignored | None,
@@ -106,10 +106,10 @@ def evaluate(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Score results: the six pixel measures, boxes, tracks (HOTA, MOTA, IDF1); per clip, pooled, and the mean.
+    """Score results by pixels, boxes and tracks (HOTA, MOTA, IDF1): for each clip, pooled, and as mean.
 
-    Several results of the same clips become a study each, which dddas compare takes, with a report, tables and figures
-    of all: intervals, and tests of each against the first.
+    Several results of the same clips become one study each, for dddas compare. A report, tables and figures show all
+    of them, with intervals, and with tests of each against the first.
     With --dataset, the clips of whole data sets are run and scored, and metrics.json, report.html and run.json are
     written. --clips, --jobs, --scheduler, --worker-silent, --cache, --prune-cache, --keep, --config, --set and
     --backend are for --dataset only.
@@ -133,7 +133,7 @@ def evaluate(
         report = score(truth, result[0], folder, **how)
         if not quiet:
             show(report)
-            echo(f"{folder / 'metrics.json'}: the same with its counts")
+            echo(f"{folder / 'metrics.json'}: these figures and their counts")
         return
     from torchvision_dddas.lab.evaluation.studies.cache import Cache, cache_folder
     from torchvision_dddas.lab.evaluation.studies.jobs import SILENT_S, Workers
@@ -169,7 +169,7 @@ def evaluate(
 def change_spec(
     file: Path, config: str | None, overrides: Sequence[str], backend: str | None, interval: int | None = None
 ) -> "Spec":
-    """Read a study's file and change it by what the command line says. Raises InputError for bad input."""
+    """Read a study's file, and apply the options of the command line. Raise InputError for bad input."""
     from torchvision_dddas.lab.evaluation.studies.runner import read_spec
 
     spec = read_spec(file)
@@ -186,7 +186,7 @@ def score(
     interval: int = 1,
     ignoring: Literal["dropped", "removed"] = "dropped",
 ) -> dict[str, Any]:
-    """Evaluate, and write metrics.json into a folder. Raises InputError."""
+    """Score a result, and write metrics.json into a folder. Raise InputError for bad input."""
     from torchvision_dddas.io.atomic_files import save_file
     from torchvision_dddas.io.output import finite
     from torchvision_dddas.lab.evaluation.evaluate import evaluate
@@ -203,7 +203,7 @@ def _split(text: str | None) -> list[str]:
 def _evaluate_methods(
     folder: Path, truth: Path, results: Sequence[Path], names: Sequence[str], how: Mapping[str, Any], quiet: bool
 ) -> None:
-    """Write the studies of several methods and their comparison, and print the measures of all clips together."""
+    """Write studies of several methods and their comparison, and print the measures of all clips together."""
     from torchvision_dddas.cli.compare import show_comparison
     from torchvision_dddas.lab.evaluation.studies.methods import name_results, write_methods
 
@@ -222,8 +222,8 @@ def _evaluate_methods(
 def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None) -> None:
     """Print a table for each group of measures: "clips" by name, "pooled" (with "intervals" in a study) and "mean".
 
-    prefix: stands before each title. most: the largest number of clips in a table; the worst ones are shown. Without it
-    all clips are shown, and the notes follow.
+    prefix: put before each title. most: largest number of clips in a table, which then shows the worst clips. None:
+    show all clips, and the notes.
     """
     from torchvision_dddas.lab.evaluation.metrics.registry import GROUPS
 
@@ -235,7 +235,7 @@ def show(measures: Mapping[str, Any], prefix: str = "", most: int | None = None)
 
 
 def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -> None:
-    """Print the main measures of each task, what was left out, and where the rest is."""
+    """Print the main measures of each task, clips left out, notes, and where further results are."""
     from torchvision_dddas.lab.evaluation.studies.runner import FILES
 
     for task, found in measures["tasks"].items():
@@ -246,7 +246,7 @@ def _show_study(results: "Results", measures: Mapping[str, Any], folder: Path) -
     if len(notes) > MOST_NOTES:
         lines.append(f"note: {len(notes) - MOST_NOTES} more in run.json")
     scored, facts = sum(1 for case in results.cases if not case.cause), results.facts
-    kept = f"{facts['computed']} stages computed, {facts['kept']} cases kept from before"
+    kept = f"{facts['computed']} stages computed, {facts['kept']} cases taken from the cache"
     lines.append(f"{scored} of {len(results.cases)} cases scored: {kept}")
     print_lines([*lines, f"{folder}: {', '.join(name for name in FILES if (folder / name).is_file())}"])
 
@@ -286,7 +286,7 @@ def _table(group: str, clips: Mapping[str, Any], measures: Mapping[str, Any], pr
 
 
 def format_figure(value: float | int | None, sign: str = "") -> str:
-    """A measure or a count for a table."""
+    """Format a measure or a count for a table."""
     if type(value) is int:
         return f"{value:{sign}d}"
     return "–" if value is None or math.isnan(value) else f"{value:{sign}.3f}"

@@ -13,8 +13,8 @@ from torchvision_dddas.errors import InputError, without_secrets
 from torchvision_dddas.io.interrupts import is_stop
 
 FAULT, BAD_INPUT, NOTHING_LOCATED, OUTPUT_FAILED = 1, 2, 3, 74
-"""Exit codes: a fault of the program; bad input; targets but no place of any, although all else succeeded; standard
-output that cannot be written (EX_IOERR of sysexits.h).
+"""Exit codes: a fault of the program; bad input; a run with targets that located none of them; standard output that
+cannot be written (EX_IOERR of sysexits.h).
 """
 
 
@@ -47,7 +47,7 @@ def describe_kept(error: BaseException) -> str:
 
 @contextmanager
 def noting(words: Callable[[], str], has: Callable[[], Any] = lambda: True) -> Iterator[None]:
-    """If a signal ends the block, add a note on what is kept, if there is anything."""
+    """Add a note to the exception if a signal ends the block and results are kept."""
     try:
         yield
     except BaseException as error:
@@ -57,7 +57,7 @@ def noting(words: Callable[[], str], has: Callable[[], Any] = lambda: True) -> I
 
 
 class StandardOutput(io.FileIO):
-    """Standard output whose reader may disappear, or whose disk may be full: only its text is lost, not the results.
+    """Standard output whose reader may disappear or whose disk may be full. Only its text is lost, not the results.
 
     failure: the first error, None if everything was written.
     """
@@ -81,7 +81,7 @@ def open_output() -> StandardOutput:
     if sys.stdin is None:
         sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (open until the process ends)
     before = sys.stdout
-    if before is None:  # closed: reserve its number, and let every write fail
+    if before is None:  # stdout is closed: reserve its number, and let every write fail
         raw = StandardOutput(os.open(os.devnull, os.O_RDONLY), "w")
         encoding, is_terminal = "utf-8", False
     else:
@@ -96,7 +96,7 @@ def open_output() -> StandardOutput:
 
 
 def close_output(output: StandardOutput, code: int) -> int:
-    """Write the rest, and return the exit code, which reports a failed standard output if nothing worse happened."""
+    """Write the rest, and return `code`, or OUTPUT_FAILED if only standard output failed."""
     sys.stdout.flush()
     if output.failure is None or code not in (0, NOTHING_LOCATED):
         return code

@@ -1,4 +1,4 @@
-"""`dddas export`: ONNX graphs with a manifest, each compared with torch before it is written."""
+"""`dddas export`: make ONNX graphs with a manifest, and compare each graph with torch before it is written."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +26,7 @@ def export(
         str, typer.Option(metavar="FILE|NAME", help="Parameters of the graphs: a TOML file or a shipped configuration.")
     ] = "fast",
     set_: Overrides = None,
-    list_: Annotated[bool, typer.Option("--list", help="List the graphs, and make none.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="List the graphs without making them.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Make ONNX graphs of the torch functions, for the onboard engine and for accelerators.

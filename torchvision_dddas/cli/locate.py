@@ -1,4 +1,4 @@
-"""`dddas locate`: positions of targets on the ground, seen from the air or by cameras on the ground."""
+"""`dddas locate`: locate targets on the ground, seen from the air or by cameras on the ground."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 CameraFile = Annotated[
     Path | None,
     typer.Option(
-        "--camera", metavar="FILE", help="The TOML of the camera, with what the telemetry lacks: pitch_deg, ..."
+        "--camera", metavar="FILE", help="The TOML of the camera, with data that the telemetry lacks: pitch_deg, ..."
     ),
 ]
 Elevation = Annotated[
@@ -46,7 +46,7 @@ Geoid = Annotated[
     ),
 ]
 Background = Annotated[
-    Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo under the map, a GeoTIFF.")
+    Path | None, typer.Option("--background", metavar="FILE", help="An ortho-photo for the map, a GeoTIFF.")
 ]
 
 OwnClip = Annotated[
@@ -83,7 +83,7 @@ def aerial(
     rate: Rate = None,
     quiet: Quiet = False,
 ) -> None:
-    """Locate what a clip shows from the air, by what the vehicle reports, by landmarks of known place, or by both.
+    """Locate targets of an aerial clip, by telemetry, by landmarks of known place, or by both.
 
     Writes positions.csv, fixes.csv (the pose of each picture), maps, a report and run.json under --out.
     """
@@ -127,8 +127,8 @@ def aerial(
         if beyond := int(is_outside(locator, read.box_px[:, :2] + read.box_px[:, 2:] / 2).sum()):
             width, height = locator.camera.size_px
             record.notes.append(
-                f"{beyond} of {len(read)} boxes lie far outside the camera's pictures of {width} x {height} px: is its "
-                "file for this size?"
+                f"{beyond} of {len(read)} boxes lie far outside the camera's pictures of {width} x {height} px; check "
+                "the size in its file"
             )
         count = len(frames_to_locate(read, locator.site.landmarks))
         record_results(output, record, locator.locate_table(read, times_s=times_s), "locate", count, quiet)
@@ -154,7 +154,7 @@ def pixel(
     set_: Overrides = None,
     rate: Rate = None,
 ) -> None:
-    """Locate the ground that pixels of a still picture, or of a clip at one time, show.
+    """Locate the ground at pixels of a still picture, or of a clip at one time.
 
     Without --telemetry and --landmarks, the EXIF and XMP of the picture give its camera's place, height and angles.
     Prints a line for each pixel; the ellipse holds the true place with a probability of 95 %.
@@ -178,10 +178,10 @@ def pixel(
             raise InputError(f"{picture} is a clip; give its --telemetry FILE or --landmarks FILE")
         telemetry = Path(picture)
     if not 0 <= time_s <= (count or math.inf) / rate_hz:
-        raise InputError(f"--time {time_s:g} lies outside of {picture}, which lasts {(count or 0) / rate_hz:g} s")
+        raise InputError(f"--time {time_s:g} lies outside {picture}, which lasts {(count or 0) / rate_hz:g} s")
     if (outside := ((uv < -0.5) | (uv > np.array(source.size) - 0.5)).any(axis=1)).any():
         u, v = uv[outside.argmax()]
-        raise InputError("{:g},{:g} lies outside of {}, of {}x{} px".format(u, v, picture, *source.size))
+        raise InputError("{:g},{:g} lies outside {}, which has {}x{} px".format(u, v, picture, *source.size))
     given, settings = AerialInput(landmarks, telemetry, camera, dem), load_settings(config, set_, geoid=geoid)
     locator, notes = read_locator(given, settings, source.size, rate_hz, "onboard", None, "clip", picture)
     found = locator.locate_pixels(uv, time_s=time_s)
@@ -189,7 +189,7 @@ def pixel(
     lines = []
     for k, (u, v) in enumerate(uv.tolist()):
         if not np.isfinite(found.east_north_m[k]).all():
-            lines.append(f"{u:g},{v:g}: no place; it lies above the horizon or near it, or beyond the ground's heights")
+            lines.append(f"{u:g},{v:g}: no place; it lies above or near the horizon, or outside the ground heights")
             continue
         place = "{:.3f} m east, {:.3f} m north".format(*found.east_north_m[k])
         if found.lonlat_deg is not None:
@@ -218,7 +218,7 @@ def ground(
     rate: Rate = None,
     quiet: Quiet = False,
 ) -> None:
-    """Locate people seen by cameras on the ground, by their height and their feet; several cameras are fused.
+    """Locate people seen by cameras on the ground, by their height and their feet. Several cameras are fused.
 
     Writes positions.csv, sightings.csv (what each camera alone found), tracks.geojson and tracks.kml if longitudes are
     known, and run.json under --out.
@@ -263,7 +263,7 @@ def ground(
         ]
         record_results(output, record, frames, "locate", quiet=quiet)
         if not any(len(table) for table in read):
-            record.notes.append("the tables have no rows: nobody to locate")
+            record.notes.append("the tables have no rows: nothing to locate")
         elif not record.counts["people"]:
             record.notes.append(f"{NONE_LOCATED}no sighting has a distance (see sightings.csv)")
     by = record.counts["sightings"]
@@ -282,7 +282,7 @@ def print_located(lines: Sequence[str], record: "RunRecord", folder: Path, quiet
     cause = next((note for note in record.notes if record.targets and note.startswith(NONE_LOCATED)), "")
     print_lines([line for line in lines if not cause or line != f"note: {cause}"], quiet)
     if cause:
-        say(f"{cause}; all else is in {folder}")
+        say(f"{cause}; all other results are in {folder}")
         raise typer.Exit(NOTHING_LOCATED)
 
 
@@ -292,9 +292,9 @@ def position_lines(record: "RunRecord") -> list[str]:
     by = ", ".join(f"{count} by {name}" for name, count in counts["by"].items() if count and name != "nothing")
     lines = [f"{counts['positions']} positions; of the frames {by or 'none'}"]
     if bridges := counts.get("bridges", 0):
-        lines.append(f"note: boxes that bridge gaps between detections: {bridges}; not seen, they have no place")
+        lines.append(f"note: boxes that bridge gaps between detections were not seen and have no place: {bridges}")
     if untracked := counts.get("untracked", 0):
-        lines.append(f"note: detections without identity: {untracked}; not followed, they have no place")
+        lines.append(f"note: detections without identity were not tracked and have no place: {untracked}")
     for what, words in (("weak", "located with a warning"), ("repairs", "repaired")):
         if spans := counts.get(what):
             lines.append(f"note: {words}, {_describe_longest(spans)}")
@@ -303,8 +303,8 @@ def position_lines(record: "RunRecord") -> list[str]:
         tried = kept["used"] + kept["left_out"]
         if kept["left_out"] > 0.5 * tried:
             lines.append(
-                f"note: {name} was left out in {kept['left_out']} of {tried} frames; is its place "
-                "right, and does the ground rise or fall there (--dem)?"
+                f"note: {name} was left out in {kept['left_out']} of {tried} frames; check its "
+                "place, and whether the ground rises or falls there (--dem)"
             )
     return lines
 

@@ -20,7 +20,7 @@ _Result = TypeVar("_Result")
 
 
 class Backend(StrEnum):
-    """The engines that --backend names."""
+    """The values of --backend."""
 
     auto = "auto"
     torch = "torch"
@@ -28,7 +28,7 @@ class Backend(StrEnum):
 
 
 class BoxOrder(StrEnum):
-    """The orders of a box's columns that --box-format names."""
+    """The values of --box-format: the order of a box's columns."""
 
     xywh = "xywh"
     xyxy = "xyxy"
@@ -39,23 +39,23 @@ CLIP = "A video file, a folder or glob of images, camera:0 or rtsp://..."
 
 Config = Annotated[
     str | None,
-    typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration; several between commas."),
+    typer.Option(metavar="FILE|NAME", help="A TOML file or a shipped configuration; separate several by commas."),
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="PARAMETER=VALUE", help="Change a parameter; may be repeated.")
 ]
-EngineOption = Annotated[Backend, typer.Option(help="The engine; auto takes torch with a CUDA device, else onboard.")]
-StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as the study's file says]")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not say.")]
-REPORTS = "What the vehicle reports: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
+EngineOption = Annotated[Backend, typer.Option(help="The engine. auto: torch with a CUDA device, else onboard.")]
+StudyBackend = Annotated[Backend | None, typer.Option(help="The engine. [default: as in the study's file]")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Frames per second, if the input does not state it.")]
+REPORTS = "The vehicle's log: CSV, .SRT, .tlog, .ulg, .bin, KLV, NMEA."
 Telemetry = Annotated[Path | None, typer.Option("--telemetry", metavar="FILE", help=REPORTS)]
 Ignore = Annotated[
     Path | None,
-    typer.Option("--ignore", metavar="MASK", help="A picture of the frames' size: what is not black is left out."),
+    typer.Option("--ignore", metavar="MASK", help="A picture of the frames' size; areas not black are left out."),
 ]
 BoxFormat = Annotated[
     BoxOrder | None,
-    typer.Option(help="What a box's columns are: left, top, size; corners; centre, size. [default: by the table]"),
+    typer.Option(help="Columns of a box: left, top, size; corners; centre, size. [default: by the table]"),
 ]
 Poses = Annotated[
     list[Path] | None,
@@ -73,24 +73,24 @@ WorkerSilent = Annotated[
     typer.Option(
         metavar="S",
         min=1,
-        help="A process of --jobs silent for so long is replaced, its clip begun again. [default: 60]",
+        help="Replace a process of --jobs after this silence, and restart its clip. [default: 60]",
     ),
 ]
 CacheFolder = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Where results are kept. [default: in the user's cache folder]")
+    Path | None, typer.Option(metavar="DIR", help="Folder of cached results. [default: in the user's cache folder]")
 ]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
-OutPerInput = Annotated[Path, typer.Option(help="Folder for the results; with several inputs, one folder each in it.")]
+OutPerInput = Annotated[Path, typer.Option(help="Folder for the results; several inputs get a folder each in it.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
 
 
 def echo(text: str, err: bool = False) -> None:
-    """Print text on stdout or stderr; control characters, as names may contain, are shown by their number."""
+    """Print text on stdout or stderr. Control characters, which names may contain, are shown by their codes."""
     typer.echo(printable(text), err=err)
 
 
 def report_errors(command: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Turn a command's InputError into `dddas: ...` on stderr and exit code 2, a signal into 128 plus its number."""
+    """Report a command's InputError on stderr with exit code 2, and a signal with exit code 128 plus its number."""
 
     @functools.wraps(command)
     def guarded(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
@@ -137,7 +137,7 @@ def check_jobs(jobs: int | None, scheduler: str | None = None) -> None:
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be 1 or more processes, got {jobs}")
     if jobs is not None and scheduler is not None:
-        raise InputError("--jobs and --scheduler were both given; a scheduler has its own workers, give only one")
+        raise InputError("--jobs and --scheduler were both given; a scheduler has its own workers; give only one")
 
 
 def parse_size(text: str, low: int, high: int) -> tuple[int, int]:
@@ -158,14 +158,14 @@ def split_patterns(text: str | None, option: str, what: str = "clip") -> list[st
 
 
 def note_patrol(config: str | None, quiet: bool) -> None:
-    """Explain that the default replaces the configuration `patrol`. Raise InputError if it has no effect."""
+    """Explain when the default equals the configuration `patrol`. Raise InputError if `patrol` has no effect."""
     names = (config or "").split(",")
     if "patrol" in names and (plain := {"fast", "half", "source", "two_frames"}.intersection(names)):
         raise InputError(
             f"patrol has no effect beside {min(plain)}, which has no settings for tiny people; leave it out"
         )
     if "patrol" in names and not quiet:
-        words = "with telemetry, which tells how large people are, it is the same as the default"
+        words = "with telemetry, which determines the size of people, patrol equals the default"
         echo(f"dddas: --config patrol takes people to be about 4 px large (gates.person_px); {words}", err=True)
 
 

@@ -1,4 +1,4 @@
-"""`dddas people`: find people by their shape, moving or not."""
+"""`dddas people`: find people by their shape, whether they move or not."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -34,7 +34,7 @@ def people(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Search around these boxes, and nowhere else unless people.search=regions; CSV or MOTChallenge text.",
+            help="Search only around these boxes, unless people.search=regions; CSV or MOTChallenge text.",
         ),
     ] = None,
     out: OutPerInput = Path("dddas-people"),
@@ -73,7 +73,7 @@ def people(
                 if table is not None:
                     check_within_clip(table, source)
                 try:
-                    levels(source.size, settings.people)  # refuse what is too small before the engine loads
+                    levels(source.size, settings.people)  # refuse pictures that are too small before the engine loads
                 except InputError as error:
                     raise InputError(f"{source.name}: {error}") from None
                 scorer = scorer or load_scorer(settings.people, backend.value)
@@ -100,7 +100,7 @@ def _notes(record: "RunRecord", name: str, table: "DetectionTable", source: "Sou
     if table.last > source.last:
         return [f"the clip ended after frame {source.last}, {name} goes on to {table.last}"]
     if nowhere := record.counts["searched"]["frames_nowhere"]:
-        what = f"{name} has no box there that a window fits" if len(table) else f"{name} holds no rows"
+        what = f"{name} has no box of a suitable size there" if len(table) else f"{name} holds no rows"
         return [f"{nowhere} of {record.frames} frames were not searched: {what}"]
     return []
 

@@ -28,7 +28,7 @@ EVERY_S = 5.0
 def progress(name: str, count: int | None, quiet: bool) -> Iterator[Callable[[], None]]:
     """Show a bar on a terminal, or a line every few seconds elsewhere; yield a function to call after each frame.
 
-    count: frames in all; None if the end is not known.
+    count: number of all frames; None if unknown.
     """
     if quiet:
         yield lambda: None
@@ -115,7 +115,7 @@ def show_progress(quiet: bool) -> "Iterator[Hooks]":
 
 
 def _bar(text: str, clock: str) -> "Progress":
-    """Make a bar with a text and, behind it, a clock, which is the name of one of rich's columns."""
+    """Make a bar with a text and a clock behind it. clock: the name of a column of rich."""
     from rich import progress
 
     columns = (
@@ -170,13 +170,11 @@ def record_results(
         record.notes += getattr(source, "notes", [])
         if concealed := getattr(source, "concealed", 0):
             record.counts["concealed"] = concealed
-            record.notes.append(
-                f"the decoder concealed errors in {concealed} frames: what is found there may be damage"
-            )
+            record.notes.append(f"the decoder concealed errors in {concealed} frames; detections there may be damage")
         if levels := getattr(source, "levels", None):
             record.notes.append(str(levels))
     if repeats:
-        record.notes.append(f"{repeats} of {record.frames} frames repeat the picture before, and have its result")
+        record.notes.append(f"{repeats} of {record.frames} frames repeat the previous picture, and have its result")
 
 
 def folders_for(inputs: Sequence[str], out: Path) -> list[Path]:
@@ -185,7 +183,7 @@ def folders_for(inputs: Sequence[str], out: Path) -> list[Path]:
 
 
 def clip_names(inputs: Sequence[str]) -> list[str]:
-    """Return a unique folder name for each input: its own name, or its parent's for `frames` or a pattern."""
+    """Return a unique folder name for each input: its name, or the name of its parent for `frames` or a pattern."""
     names: list[str] = []
     for clip in inputs:
         path = Path(clip.rstrip("/"))
@@ -214,5 +212,5 @@ def closing_lines(first: str | Sequence[str], record: "RunRecord", folder: Path,
         lines.append(record.scale.line())
     last = f"{folder}: {', '.join(files)}"
     if missing := record.counts.get("frames_without_position"):
-        last += f"; {missing} of {record.frames} frames without a position, run.json gives the causes"
+        last += f"; {missing} of {record.frames} frames without a position; run.json lists the causes"
     return [*lines, *(f"note: {note}" for note in record.notes), last]

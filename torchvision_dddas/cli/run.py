@@ -88,9 +88,9 @@ def run(
     provider: Annotated[
         str | None, typer.Option(metavar="NAME", help="What runs --detector: cpu, cuda, openvino, ... [default: cpu]")
     ] = None,
-    score: Annotated[float | None, typer.Option(help="The least score of --detector's boxes. [default: 0.25]")] = None,
+    score: Annotated[float | None, typer.Option(help="Lowest score of --detector's boxes. [default: 0.25]")] = None,
     classes: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A line for each class of --detector. [default: as MODEL says]")
+        Path | None, typer.Option(metavar="FILE", help="A line for each class of --detector. [default: as in MODEL]")
     ] = None,
     movers: Annotated[
         bool, typer.Option("--movers", help="Find what moves beside --detector or --detections: boxes get speeds.")
@@ -131,7 +131,7 @@ def run(
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="With --live: serve a status page, /metrics and /health.json."),
     ] = None,
-    people: Annotated[bool, typer.Option("--people", help="With --live: recognize people too.")] = False,
+    people: Annotated[bool, typer.Option("--people", help="With --live: also recognize people.")] = False,
     password_file: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help=f"Its first line is the password of rtsp://NAME@HOST/..., else ${PASSWORD}."),
@@ -224,7 +224,7 @@ def run(
             ground or (),
             aerial or (),
         )
-        raise typer.Exit(Ended(code))  # its last line says where the results are
+        raise typer.Exit(Ended(code))  # the last line on the screen says where the results are
     from torchvision_dddas import open_video
     from torchvision_dddas.detection import OnnxDetector
     from torchvision_dddas.io.atomic_files import refuse_own_input
@@ -285,7 +285,7 @@ def run(
         boxes = network or table
         finds_movers = boxes is None or movers
         if not finds_movers:
-            record.scale = None  # it is that of the search for what moves
+            record.scale = None  # this scale belongs to the motion detector
         record.notes += [*ready.notes, *checked]
         count = None if source.count is None else -(-source.count // interval)
         pipeline = Pipeline.from_assembly(ready, interval=interval, detector=boxes, movers=movers)
@@ -293,7 +293,7 @@ def run(
         results = results if placed is None else placed.mark(results)
         try:
             record_results(output, record, results, source.name, count, quiet, source)
-        finally:  # an interrupted run tells too what its platforms did
+        finally:  # also record the platforms of an interrupted run
             if team is not None:
                 record.counts["platforms"] = team.facts
         record.notes += [
@@ -312,7 +312,7 @@ def run(
 
 
 def _with_password(clip: str, path: Path | None) -> str:
-    """An address that has a name alone gets the password in the file, else in the environment. Raises InputError."""
+    """Add the password to an address with a user name only, from the file, else from the environment."""
     login = _LOGIN.fullmatch(clip)
     if path is None:
         password = os.environ.get(PASSWORD, "")
@@ -364,7 +364,7 @@ def _summary(record: "RunRecord", folder: Path, is_located: bool, has_overlay: b
 
     known = PipelineRecorder.files if is_located else PipelineRecorder.found_files
     files = [n for n in known if (folder / n).exists() and (n != "overlay.mp4" or has_overlay)]
-    # Where targets are located, detections without identity are counted in a note.
+    # If targets are located, a note counts the detections without identity.
     apart = " of" if is_located else ","
     identities = record.counts.get("identities", 0)
     found = f"{record.frames} frames, {record.targets} detections{apart} {identities} identities"

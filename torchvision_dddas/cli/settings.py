@@ -1,4 +1,4 @@
-"""`dddas settings`: the table of parameters."""
+"""`dddas settings`: print the table of parameters."""
 
 from typing import Annotated
 
@@ -16,7 +16,7 @@ def settings(
     group: Annotated[
         str | None,
         typer.Argument(
-            metavar="GROUP", help="Only this group, such as track; scenario: what --scene changes. [default: all]"
+            metavar="GROUP", help="Only this group, such as track; scenario: parameters of --scene. [default: all]"
         ),
     ] = None,
     backends: Annotated[
@@ -25,7 +25,7 @@ def settings(
 ) -> None:
     """List the parameters that --set and a configuration can change: default, unit, range and meaning.
 
-    `dddas settings scenario` lists those of a simulated world, for `dddas run sim:NAME --scene` and `dddas simulate`.
+    `dddas settings scenario` lists the parameters of scenarios, for `dddas run sim:NAME --scene` and `dddas simulate`.
     """
     from rich.table import Table
 

@@ -1,4 +1,4 @@
-"""`dddas simulate`: write a scenario as files: data of the instruments in the air and on the ground, and the truth."""
+"""`dddas simulate`: write a scenario as files: data of instruments in the air and on the ground, and the truth."""
 
 from functools import partial
 from pathlib import Path
@@ -22,13 +22,13 @@ def simulate(
         typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file. [default: list the shipped ones]"),
     ] = None,
     out: Out = Path("dddas-simulate"),
-    seed: Annotated[int | None, typer.Option(help="Random seed. [default: the scenario's]")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed. [default: as in the scenario]")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="PARAMETER=VALUE",
-            help="Change the scenario, as uav.altitude_m=100, see dddas settings scenario; may be repeated.",
+            help="Change the scenario, such as uav.altitude_m=100; see dddas settings scenario; may be repeated.",
         ),
     ] = None,
     frames: Annotated[int | None, typer.Option(metavar="N", help="Frames to make. [default: the whole run]")] = None,
@@ -38,7 +38,7 @@ def simulate(
     ] = "frames,masks,ground",
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a team above and on a piece of desert, and write the data of its instruments and the truth.
+    """Simulate a team of vehicles in and above a desert, and write the data of its instruments and the truth.
 
     Writes frames/, telemetry.csv, landmarks.csv, colours.toml, camera.toml and dem.tif for `dddas run`,
     ground/ for `dddas people` and `dddas locate ground`, truth/ for `dddas evaluate`, scenario.toml and run.json.
@@ -68,7 +68,7 @@ def _summary(record: "RunRecord", folder: Path, scenario: "Scenario") -> list[st
     lines.append(f"{folder}: {', '.join([*files, 'tables', 'scenario.toml', 'run.json'])}")
     if (folder / "frames").exists():
         names = ("landmarks.csv", "telemetry.csv", "colours.toml", "camera.toml", "dem.tif")
-        given = names if scenario.team.ugvs else names[1:]  # without vehicles there are no landmarks in the file
+        given = names if scenario.team.ugvs else names[1:]  # without ground vehicles, the file has no landmarks
         options = [f"--{name.partition('.')[0]} {folder / name}" for name in given if (folder / name).exists()]
         rate = f" --rate {scenario.clip.rate_hz:g}" if scenario.clip.rate_hz != 10 else ""
         lines.append(f"Next: dddas run {folder / 'frames'} {' '.join(options)}{rate}")

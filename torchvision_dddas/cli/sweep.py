@@ -1,4 +1,4 @@
-"""`dddas sweep`: a study with many values of parameters, and which of them measure best."""
+"""`dddas sweep`: run a study with many values of parameters, and find the best values."""
 
 import time
 from dataclasses import replace
@@ -31,13 +31,13 @@ from torchvision_dddas.errors import InputError
 if TYPE_CHECKING:
     from torchvision_dddas.lab.evaluation.studies.sweep import SweepRecord
 
-MOST_SHOWN = 20  # rows of the table
+MOST_SHOWN = 20  # largest number of rows of the table
 MOST_PROPOSED = 10_000
 
 
 @report_errors
 def sweep(
-    dataset: Annotated[Path, typer.Option(metavar="FILE", help="The TOML of a study, as of dddas evaluate.")],
+    dataset: Annotated[Path, typer.Option(metavar="FILE", help="The TOML of a study, as for dddas evaluate.")],
     measure: Annotated[
         str, typer.Option(metavar="TASK.GROUP.MEASURE", help="What to optimise, such as motion.pixels.f.")
     ],
@@ -60,9 +60,7 @@ def sweep(
     ] = "pooled",
     holdout: Annotated[
         str | None,
-        typer.Option(
-            metavar="PATTERN,...", help="Clips that do not choose the best; it is measured on them afterwards."
-        ),
+        typer.Option(metavar="PATTERN,...", help="Held-out clips: not used for the choice, and measured afterwards."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed of Optuna.")] = 0,
     clips: Clips = None,
@@ -76,10 +74,10 @@ def sweep(
     out: Annotated[Path, typer.Option(help="Folder for report.html, sweep.json and best.toml.")] = Path("dddas-sweep"),
     quiet: Quiet = False,
 ) -> None:
-    """Try parameters on whole data sets, all points of a grid or as Optuna proposes.
+    """Try parameters on whole data sets: all points of a grid, or points that Optuna proposes.
 
-    Writes report.html, sweep.json and best.toml. Results are kept as those of dddas evaluate --dataset: a repeated
-    sweep continues where it stopped.
+    Writes report.html, sweep.json and best.toml. Results are cached as by dddas evaluate --dataset, so that a
+    repeated sweep continues where it stopped.
     """
     from torchvision_dddas.config import load_config
     from torchvision_dddas.io.atomic_files import claimed
@@ -160,7 +158,7 @@ def _check_search(grid: list[str] | None, optuna: int | None, ranges: list[str] 
 
 
 def _show(record: "SweepRecord") -> None:
-    """Print the best trials, the measures on held-out clips, and where the rest is."""
+    """Print the best trials, the measures on held-out clips, and where further results are."""
     from rich.table import Table
 
     from torchvision_dddas.lab.evaluation.studies.sweep import format_value, ranked

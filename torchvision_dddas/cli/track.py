@@ -54,11 +54,11 @@ def track(
     ignore: Ignore = None,
     quiet: Quiet = False,
 ) -> None:
-    """Give targets lasting identities: those detected in a clip, or those of a table, with or without its clip.
+    """Give lasting identities to targets detected in a clip, or to targets of a table, with or without its clip.
 
-    Writes tracks.txt (MOTChallenge), tracks.csv, run.json, and if there is a clip overlay.mp4 and appearance.csv (why
-    the association used appearance, or not) under --out. With a clip, --backend chooses the engine of detection and
-    registration, and with --config paper that of the source's histograms and affinities; the default association
+    Writes tracks.txt (MOTChallenge), tracks.csv and run.json under --out. With a clip, also writes overlay.mp4 and
+    appearance.csv (why the association used appearance, or not). --backend chooses the engine of detection and
+    registration, and with --config paper also of the source's histograms and affinities. The default association
     does not run in torch.
     """
     from torchvision_dddas import open_video
@@ -74,7 +74,7 @@ def track(
         raise InputError("track needs a clip, a table of detections (--detections FILE), or both; none was given")
     check_interval(interval)
     if telemetry is not None and (clip is None or detections is not None):
-        raise InputError("--telemetry tells sizes to the detection in a clip; give INPUT, and leave --detections out")
+        raise InputError("--telemetry is for the detection in a clip; give INPUT, and leave --detections out")
     if clip is None and save and names:
         raise InputError("--save overlay needs a clip to draw on; give INPUT, or leave --save out")
     names = () if clip is None else names
@@ -122,7 +122,7 @@ def track(
     found = f"{record.frames} frames, {record.targets} detections, {counts.get('identities', 0)} identities"
     files = [name for name in TrackRecorder.files if (out / name).exists() and (name != "overlay.mp4" or names)]
     print_lines(
-        closing_lines(f"{found}, {counts.get('untracked', 0)} detections without one", record, out, files), quiet
+        closing_lines(f"{found}, {counts.get('untracked', 0)} detections without identity", record, out, files), quiet
     )
 
 

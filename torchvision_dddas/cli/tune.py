@@ -1,4 +1,4 @@
-"""`dddas tune`: parameters fitted by gradient on the clips of a study, and what that was worth on clips held out."""
+"""`dddas tune`: fit parameters by gradient on the clips of a study, and measure the gain on held-out clips."""
 
 import time
 from dataclasses import replace
@@ -32,41 +32,41 @@ if TYPE_CHECKING:
 
 @report_errors
 def tune(
-    study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as of dddas evaluate.")],
+    study: Annotated[Path, typer.Argument(metavar="STUDY", help="The TOML of a study, as for dddas evaluate.")],
     parameters: Annotated[
-        str, typer.Option(metavar="NAME,...", help="What to tune, such as difference.threshold or 'difference.*'.")
+        str, typer.Option(metavar="NAME,...", help="Parameters, such as difference.threshold or 'difference.*'.")
     ],
     steps: Annotated[int, typer.Option(metavar="N", help="Most steps.")] = 100,
     holdout: Annotated[
         str | None,
-        typer.Option(metavar="PATTERN,...", help="Clips that nothing is learned from, measured before and after."),
+        typer.Option(metavar="PATTERN,...", help="Held-out clips: not used for tuning, measured before and after."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Random seed of the order of examples.")] = 0,
     resume: Annotated[
         bool,
         typer.Option(
             "--resume",
-            help="Go on from the checkpoint in --out, if there is one. Without it, the checkpoint of an unfinished "
+            help="Continue from the checkpoint in --out, if there is one. Without it, the checkpoint of an unfinished "
             "descent is kept as checkpoint.old.pt.",
         ),
     ] = False,
     batch: Annotated[int, typer.Option(metavar="N", help="Examples per step.")] = 8,
-    rate: Annotated[float, typer.Option(help="Step size: 0.05 is about 5 % of a parameter.")] = 0.05,
+    rate: Annotated[float, typer.Option(help="Step size; 0.05 is about 5 % of a parameter.")] = 0.05,
     pull: Annotated[
         float,
         typer.Option(
-            help="Weight of the pull toward the first values, about 0.1 for few examples: a factor e costs half of it."
+            help="Weight of the pull toward the first values, about 0.1 for few examples. A factor e costs half of it."
         ),
     ] = 0.0,
     watched: Annotated[
         float,
-        typer.Option(help="Share of each clip's examples that nothing is learned from: they choose the best step."),
+        typer.Option(help="Share of each clip's examples that is not learned from, but chooses the best step."),
     ] = 0.25,
     patience: Annotated[
-        int, typer.Option(metavar="N", help="Checks of the watched examples, one per 5 steps, without a gain.")
+        int, typer.Option(metavar="N", help="Stop after N checks, one per 5 steps, without a gain.")
     ] = 10,
     minutes: Annotated[float | None, typer.Option(help="Start no step after this time.")] = None,
-    device: Annotated[str, typer.Option(help="Where the steps are computed: cpu, cuda, cuda:1.")] = "cpu",
+    device: Annotated[str, typer.Option(help="The device of the computation: cpu, cuda, cuda:1.")] = "cpu",
     measure: Annotated[
         str | None,
         typer.Option(
@@ -82,7 +82,7 @@ def tune(
     out: Annotated[Path, typer.Option(help="Folder for tuned.toml, report.html and run.json.")] = Path("dddas-tune"),
     quiet: Quiet = False,
 ) -> None:
-    """Tune parameters by gradient on the clips of a study, and measure before and after, held-out clips apart.
+    """Tune parameters by gradient on the clips of a study. Measure before and after, separately on held-out clips.
 
     Writes tuned.toml, which every command takes as --config, report.html and run.json.
     """
@@ -99,7 +99,7 @@ def tune(
         steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull, watched=watched
     )
     spec = change_spec(study, config, set_ or [], backend and backend.value)
-    # The settings are read again for the figures before: tuned.toml must not have replaced them by then.
+    # The measures before tuning read the settings again, so tuned.toml must not replace them.
     read = [study, *([Path(spec.config)] if spec.config else [])]
     refuse_own_input(read, [out / name for name in FILES], "folder with --out")
     names, held = split_patterns(parameters, "--parameters", "parameter"), split_patterns(holdout, "--holdout")
@@ -115,7 +115,7 @@ def tune(
 
 
 class _StepLines:
-    """Prints a line for each check of the watched examples, and otherwise one every few seconds."""
+    """Prints a line for each check of the watched examples, and otherwise a line every few seconds."""
 
     def __init__(self, steps: int) -> None:
         self._steps, self._printed_s, self._least = steps, 0.0, (float("inf"), 0)
@@ -135,7 +135,7 @@ class _StepLines:
 
 
 def _show(tuned: "Tuned", folder: Path) -> None:
-    """Print the parameters, what tuning was worth, and where the rest is."""
+    """Print the parameters, the gain of tuning, and where further results are."""
     from rich.table import Table
 
     from torchvision_dddas.lab.tuning import REPORT, RUN, TUNED

@@ -1,4 +1,4 @@
-"""`dddas views`: identities shared by the tables of several cameras."""
+"""`dddas views`: find identities that the tables of several cameras share."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,14 +20,14 @@ def views(
     ],
     rate: Annotated[
         list[float] | None,
-        typer.Option(metavar="HZ", help="Frames per second of each table, in order, where they differ."),
+        typer.Option(metavar="HZ", help="Frames per second of each table, in order, if they differ."),
     ] = None,
     out: Out = Path("dddas-views"),
     quiet: Quiet = False,
 ) -> None:
-    """Give the targets that several cameras see one identity each, from the tracks of each camera.
+    """Give each target that several cameras see one shared identity, from the tracks of each camera.
 
-    The cameras may move and see only part of the ground together. Writes view1.csv, view2.csv, ... (the rows of each
+    The cameras may move, and their views may overlap only in part. Writes view1.csv, view2.csv, ... (the rows of each
     table with the shared identity), pairs.csv, maps.csv and run.json under --out.
     """
     from torchvision_dddas.io.atomic_files import refuse_own_input
@@ -39,7 +39,7 @@ def views(
     for rate_hz in rates:
         check_rate(rate_hz)
     if len(tables) < 2:
-        raise InputError("views needs the tables of two cameras or more; got one. Give its other view too")
+        raise InputError("views needs the tables of two cameras or more, got one; give the other view too")
     if rates and len(rates) != len(tables):
         raise InputError(f"{len(rates)} rates and {len(tables)} tables; give --rate once for each table, in order")
     has_places = ["east_m" in read_header(path) for path in tables]
@@ -68,13 +68,13 @@ def views(
 
 
 def _read(path: Path, has_places: bool, notes: list[str]) -> "DetectionTable | Positions":
-    """The table of a view. Raise InputError for boxes without identities."""
+    """Read the table of a view. Raise InputError for boxes without identities."""
     from torchvision_dddas.io.detection_tables import read_detections
     from torchvision_dddas.io.ground_tables import read_positions
 
     table: DetectionTable | Positions = read_positions(path) if has_places else read_detections(path)
     if not len(table):
-        notes.append(f"{path} has no rows: no target of the other views is in it")
+        notes.append(f"{path} has no rows, so it shares no target with the other views")
     elif not has_places:
         identity = getattr(table, "identity", None)
         if identity is None or (identity < 1).all():

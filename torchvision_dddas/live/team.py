@@ -1,7 +1,7 @@
-"""Further platforms of a live run: each is read and located in a thread of its own, and one more thread fuses.
+"""Further platforms of a live run: one thread per platform reads and locates, and one more thread fuses the records.
 
-The thread of the main pictures hands its records over and does not wait: where the machine is too slow, the work of
-further platforms is left out and counted.
+The thread of the main pictures passes its records on without waiting. If the machine is too slow, records of further
+platforms are left out and counted.
 """
 
 import math
@@ -31,15 +31,15 @@ from torchvision_dddas.live.watchdog import Watchdog
 from torchvision_dddas.pipeline import prepare_uav
 from torchvision_dddas.types import FrameResult, FusedTargets
 
-_MOST = 50  # records that wait to be fused
-_KEPT = 1000  # looks of a platform that are kept while no main picture comes
-_SAME_S = 1e-6  # times that differ by less are the same
-_FRESH_S = 1.0  # an older look confirms nothing: the targets have walked on
-_REST_S, _END_S = 0.05, 10.0  # until late main results are looked at again; for all threads at the end
+_MOST = 50  # largest number of records that wait to be fused
+_KEPT = 1000  # largest number of looks of a platform that wait for a main picture
+_SAME_S = 1e-6  # times with a smaller difference are equal
+_FRESH_S = 1.0  # an older look confirms nothing, because the targets have moved on
+_REST_S, _END_S = 0.05, 10.0  # wait between checks of late main results; wait for all threads at the end
 
 
 class PlatformHealth(Health):
-    """The health of a platform, whose events and troubles become those of the run. over: why nothing more comes."""
+    """The health of a platform. Its events and troubles are added to the run. over: why no more pictures come."""
 
     def __init__(self, name: str, run: Health) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class PlatformHealth(Health):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Its state in words, and how many pictures came and were dropped."""
+        """The platform's state in words, and the numbers of captured and dropped pictures."""
         now = self.snapshot()
         comes = now.gauges.get("connected", now.counts.get("captured", 0))
         state = self.over or ("sends pictures" if comes else "sends no pictures")
@@ -60,7 +60,7 @@ class PlatformHealth(Health):
 
 
 class LiveTeam:
-    """Adds what further platforms see to the results of a live run: `confirmed` at once, `fused` seconds later.
+    """Adds observations of further platforms to live results: `confirmed` at once, `fused` seconds later.
 
     Writes confirmed.csv and fused.csv.
     """
@@ -74,9 +74,9 @@ class LiveTeam:
         source: LiveSource,
         health: Health,
     ) -> None:
-        """given: files of platforms on the ground, and of UAVs. The others are of the run.
+        """given: files of platforms on the ground, and of UAVs. The other arguments belong to the run.
 
-        Raises InputError for bad files, and for live platforms beside recorded ones.
+        Raise InputError for bad files, and if live and recorded platforms are mixed.
         """
         site = None if watch is None else watch.locator.site
         origin_deg = self._origin_deg = None if site is None else site.origin_deg
@@ -86,12 +86,12 @@ class LiveTeam:
         self._team = GroundTeam(given[0], settings, self._backend, uavs, live=True)
         for one in self._team.members:
             if one.detections is not None:
-                raise InputError(f"{one.name} has detections, boxes of before; wanted a clip alone beside --live")
+                raise InputError(f"{one.name} has detections, which --live cannot use; give its clip alone")
             if one.is_stream != source.is_stream:
                 kinds = ("live", "recorded") if source.is_stream else ("recorded", "live")
-                raise InputError(f"the main clip is {kinds[0]}, that of {one.name} {kinds[1]}; give all of a kind")
+                raise InputError(f"the main clip is {kinds[0]}, but {one.name} is {kinds[1]}; give clips of one kind")
             if one.is_stream and math.isnan(one.starts_s):
-                raise InputError(f"{one.name} is live and begins when it comes; leave starts_utc out")
+                raise InputError(f"{one.name} is live and begins with its first picture; leave starts_utc out")
         clock = math.nan if site is None or site.telemetry is None else site.telemetry.start_utc_s
         self._team.check(site is not None, origin_deg, clock)
         self._healths = {one.name: PlatformHealth(one.name, health) for one in self._team.members}
@@ -108,13 +108,13 @@ class LiveTeam:
         health.platforms = lambda: {name: one.facts | self._facts[name] for name, one in self._healths.items()}
 
     def begin(self, folder: Path) -> None:
-        """Start the threads, and the tables in a folder."""
+        """Open the tables in a folder, and start the threads."""
         self._tables = confirmed_positions(folder, has := self._origin_deg is not None), fused_table(folder, has)
         for thread in self._threads:
             thread.start()
 
     def add(self, result: FrameResult) -> FrameResult:
-        """The next main result with what platforms add; its `fused` is the newest that is final by now."""
+        """Return the next main result with `confirmed`, and with the newest `fused` record that is final."""
         located = result.locations
         if located is None or not math.isfinite(located.time_s) or result.repeats:
             return result
@@ -137,7 +137,7 @@ class LiveTeam:
         return replace(result, fused=self._write(result))
 
     def finish(self) -> list[str]:
-        """End the threads within seconds, and put the tables in their places; returns notes."""
+        """End the threads within seconds, move the tables to their places, and return notes."""
         if self._notes is not None:
             return self._notes
         notes = self._notes = []
@@ -150,23 +150,23 @@ class LiveTeam:
         for thread in self._threads:
             thread.join(max(until_s - time.monotonic(), 0.0))
         self._write(None)
-        if not self._threads[-1].is_alive():  # it would change what is read here
+        if not self._threads[-1].is_alive():  # a running thread would change the records that are read here
             self._team.finish()
         for name, one in self._healths.items():
             if one.facts["dropped"]:
-                told = "{dropped} of {captured} pictures were dropped, so that the others keep up"
+                told = "{dropped} of {captured} pictures were dropped, so that processing keeps up"
                 notes.append(f"{name}: {told.format(**one.facts)}")
             notes += [f"{name}: {words}" for words in one.snapshot().troubles]
         late = [look for looks in self._looks.values() for look in [*looks] if look.time_s <= self._now_s]
         self._left_out.update(look.name for look in [*self._inbox, *late])
-        notes += [f"{name}: records not fused, for lack of time: {n}" for name, n in self._left_out.items()]
+        notes += [f"{name}: records not fused for lack of time: {n}" for name, n in self._left_out.items()]
         if count := self._team.fusion.late:
-            notes.append(f"records not fused, as they came later than fusion.delay_s: {count}")
+            notes.append(f"records not fused because they came later than fusion.delay_s: {count}")
         notes += self._team.notes
         return notes
 
     def _have_come(self, time_s: float) -> bool:
-        """Whether each platform has come as far as the main pictures, or comes no further."""
+        """Return whether each platform has ended, or has reached the time of the main pictures."""
         last = ((self._healths[name].over, looks[-1].time_s if looks else -1.0) for name, looks in self._looks.items())
         return all(over or at_s > time_s for over, at_s in last)
 
@@ -176,7 +176,7 @@ class LiveTeam:
             pass
 
     def _read(self, one: Platform) -> None:
-        """Locate what a platform sees until the end, whatever happens to it."""
+        """Locate the pictures of a platform until it ends or fails. Its failure never ends the run."""
         _give_way()
         own, looks, over = self._healths[one.name], self._looks[one.name], ""
         try:
@@ -198,8 +198,8 @@ class LiveTeam:
             self._changed.notify_all()
 
     def _see(self, one: Platform) -> Iterator[PlatformLook]:
-        """What a platform sees. A stream that is not there is waited for, also where it was there before."""
-        from torchvision_dddas.live.session import build_path  # which needs this file
+        """Yield the looks of a platform. Wait for a stream that is missing or lost."""
+        from torchvision_dddas.live.session import build_path  # imported here, because it imports this module
 
         def wait() -> None:
             if self._ended.is_set():
@@ -216,32 +216,32 @@ class LiveTeam:
             prepare = partial(prepare_uav, one, self._settings, source, self._backend)
             ready = prepare()
             if ready.watch is not None and (ready.watch.locator.site.origin_deg is None) != (self._origin_deg is None):
-                raise InputError("its places and those of the main clip are not of one kind")
+                raise InputError("it and the main clip need places of one kind: all in degrees, or all in local metres")
             feed = Feed(source, own, Watchdog(own, 0.0), ready.telemetry)
             feed.clock_offset_s = ready.settings.aerial.clock_offset_s if one.is_stream else math.nan
             begin = build_path(ready, source, False, one.interval, self._backend, own, prepare)
             for result, _ in results(begin, feed, own):
                 if (located := result.locations) is None or result.repeats:
                     continue
-                if (time_s := located.time_s + self._shift_s(one, source)) >= 0:  # not NaN: the main clip has begun
+                if (time_s := located.time_s + self._shift_s(one, source)) >= 0:  # NaN before the main clip begins
                     yield PlatformLook(time_s, one.name, located)
 
     def _pictures(self, one: PlatformFile, source: LiveSource) -> Iterator[Picture]:
-        """The newest pictures of a platform on the ground."""
+        """Yield the newest pictures of a platform on the ground."""
         for frame in source.every(one.interval):
             check_size(one, (frame.image.shape[1], frame.image.shape[0]))
             if (time_s := frame.time_s + self._shift_s(one, source)) >= 0:
                 yield frame.number, time_s, frame.image
 
     def _shift_s(self, one: Platform, source: LiveSource) -> float:
-        """From a platform's times to those of the main clip. Of streams the clock at reception counts."""
+        """Return the shift from a platform's times to times of the main clip, for streams by the clock at reception."""
         start_s = self._team.starts_s[one.name]
         if not one.is_stream:
             return start_s
         return source.start_utc_s - self._source.start_utc_s + start_s + self._settings.aerial.clock_offset_s
 
     def _fuse(self) -> None:
-        """Fuse the records that wait, and what is left at the end; one that cannot be fused is left out."""
+        """Fuse waiting records, and the remaining records at the end. Leave out a record that cannot be fused."""
         _give_way()
         is_last = False
         while not is_last:
@@ -262,7 +262,7 @@ class LiveTeam:
             self._rest()
 
     def _write(self, result: FrameResult | None) -> FusedTargets | None:
-        """Write a result and all that has become final; returns the newest of that. None: the end of the tables."""
+        """Write a result and all final fused records, and return the newest of them. None: close the tables."""
         final = [self._fused.popleft() for _ in range(len(self._fused))]
         confirmed, fused = self._tables
         try:
@@ -275,13 +275,13 @@ class LiveTeam:
                 fused.close()
         except OSError as error:
             if not self._refused:
-                self._run.event("sink", f"confirmed.csv and fused.csv are not whole: {error.strerror}")
+                self._run.event("sink", f"confirmed.csv and fused.csv are incomplete: {error.strerror}")
             self._refused = True
         return final[-1] if final else None
 
 
 def _give_way() -> None:
     """Lower the priority of this thread."""
-    if sys.platform == "linux":  # elsewhere threads have no priority of their own
+    if sys.platform == "linux":  # other systems have no priority per thread
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)

@@ -1,4 +1,4 @@
-"""Runs: `assemble...` builds their parts, and `Pipeline` processes a clip."""
+"""Runs: `assemble` and its variants build the parts of a run, and `Pipeline` processes a clip."""
 
 from torchvision_dddas.pipeline import advice
 from torchvision_dddas.pipeline.assembly import (

@@ -1,4 +1,4 @@
-"""Advice before a run: what some frames of a clip and its log say of sizes, motion, delay and cost, and what to set."""
+"""Advice before a run, from some frames of a clip and its log: sizes, motion, delay, cost, and options to set."""
 
 import math
 import time
@@ -16,7 +16,7 @@ from torchvision_dddas.pipeline.pipeline import Pipeline
 from torchvision_dddas.types import Frame, Scene, Source
 
 VEHICLE_M = 4.5
-_LOG_SAMPLES = 50  # of the log over the length of the clip
+_LOG_SAMPLES = 50  # moments of the log over the length of the clip
 _QUICKER = ("fast", "half")  # configurations in the order in which they are tried
 
 
@@ -24,9 +24,9 @@ _QUICKER = ("fast", "half")  # configurations in the order in which they are tri
 class Look:
     """Facts from the first frames of a clip, filled while a pipeline processes them.
 
-    sides_px, squares_px: of each detection the longer side of its box, and the root of its area. flows_px: background
-    motion of each reliable step. causes: why frames are unreliable, by number. delay_frames: the longest wait for a
-    result, None where no result came before the end. rate_hz: frames processed per second, without reading.
+    sides_px, squares_px: longer side of the box and root of the area of each detection. flows_px: background motion of
+    each reliable step. causes: causes of unreliable frames, with counts. delay_frames: longest delay of a result, None
+    if no result came before the end. rate_hz: frames processed per second, without reading.
     """
 
     frames: int = 0
@@ -49,7 +49,7 @@ class Look:
 
 
 class _Excerpt:
-    """The first frames of a source. taken: frames read so far. waited_s: seconds that reading took."""
+    """The first frames of a source. taken: frames read so far. waited_s: seconds spent on reading."""
 
     def __init__(self, source: Source, frames: int) -> None:
         self._source, self.most, self.taken, self.last = source, min(frames, source.count or frames), 0, 0
@@ -70,10 +70,10 @@ class _Excerpt:
 
 
 def look_at(source: Source, ready: Assembly, frames: int, tick: Callable[[], None] = lambda: None) -> Look:
-    """Process the first frames of a clip. tick: called after each. Raises InputError for fewer than three frames."""
+    """Process the first frames of a clip. tick: called after each result. Raise InputError for fewer than 3 frames."""
     excerpt, look, begun = _Excerpt(source, frames), Look(), (time.perf_counter(), 0, 0.0)
     for result in Pipeline.from_assembly(ready, seen=look.see, pictures=False)(excerpt):
-        if not begun[1]:  # what is loaded and filled before the first result is not repeated
+        if not begun[1]:  # do not time loading and warming up before the first result
             begun = time.perf_counter(), excerpt.taken, excerpt.waited_s
         if excerpt.taken < excerpt.most:
             look.delay_frames = max(look.delay_frames or 0, excerpt.taken - result.number)
@@ -85,7 +85,7 @@ def look_at(source: Source, ready: Assembly, frames: int, tick: Callable[[], Non
 
 
 def distances_over(ready: Assembly, source: Source, frames: int) -> list[DistanceSettings]:
-    """The settings that detection will take, at moments all over the clip whose height above ground the log knows."""
+    """Return the settings that detection will use, at moments all over the clip with a logged height above ground."""
     if ready.telemetry is None:
         return []
     moments_s = np.linspace(0, (source.count or frames) / source.rate_hz, _LOG_SAMPLES)
@@ -94,7 +94,7 @@ def distances_over(ready: Assembly, source: Source, frames: int) -> list[Distanc
 
 
 def describe_sizes(look: Look, ready: Assembly, distances: list[DistanceSettings]) -> list[str]:
-    """The sizes of targets that the log tells, and those that were found, in lines."""
+    """Return lines on the sizes of targets that follow from the log, and on the sizes that were found."""
     known = [at for at in distances if at.person_px and at.flight is not None]
     if known:
         focal = ready.settings.gates.focal_px
@@ -107,29 +107,29 @@ def describe_sizes(look: Look, ready: Assembly, distances: list[DistanceSettings
     else:
         missing = "without --telemetry FILE" if ready.telemetry is None else "by this log"
         if distances:
-            missing += ", which tells the height but no focal length; give --camera FILE"
+            missing += ", which has a height but no focal length; give --camera FILE"
         elif ready.telemetry is not None:
             missing += ", which has no height above ground for this clip"
-        lines = [f"sizes in metres: not known {missing}"]
+        lines = [f"sizes in metres: unknown {missing}"]
     if not look.sides_px:
-        return [*lines, f"found: nothing moves in {look.frames} frames, so that the sizes of targets were not seen"]
+        return [*lines, f"found: nothing moves in {look.frames} frames, so the sizes of targets are unknown"]
     low, middle_px, high = np.percentile(look.sides_px, [25, 50, 75])
-    found = f"found: {len(look.sides_px) / look.frames:.1f} targets a frame, {middle_px:.0f} px long"
+    found = f"found: {len(look.sides_px) / look.frames:.1f} targets per frame, {middle_px:.0f} px long"
     found += f" (quartiles {low:.0f} to {high:.0f})"
-    return [*lines, found + ("" if known else "; pixels alone do not tell people from vehicles")]
+    return [*lines, found + ("" if known else "; sizes in pixels do not distinguish people from vehicles")]
 
 
 def describe_clip(look: Look, source: Source) -> list[str]:
-    """The camera's motion, the delay of the results, and the cost on this machine, in lines."""
+    """Return lines on the camera's motion, the delay of the results, and the cost on this machine."""
     rate_hz, lines = source.rate_hz, []
     if look.flows_px:
         middle, high = np.percentile(look.flows_px, [50, 95])
-        lines.append(f"camera: the background moves {middle:.1f} px a frame, {high:.1f} px in the fastest 5 %")
+        lines.append(f"camera: the background moves {middle:.1f} px per frame, {high:.1f} px in the fastest 5 %")
     if look.causes:
         cause, count = look.causes.most_common(1)[0]
         lines.append(f"unreliable: {look.causes.total()} of {look.frames} frames; {count} because {cause}")
-    assumed = ", assumed: the clip does not say; give --rate" if getattr(source, "assumes_rate", False) else ""
-    delay = f"not seen within {look.frames} frames"
+    assumed = " (assumed; state it with --rate)" if getattr(source, "assumes_rate", False) else ""
+    delay = f"more than {look.frames} frames"
     if look.delay_frames is not None:
         delay = f"up to {look.delay_frames} frames ({look.delay_frames / rate_hz:.1f} s)"
     lines.append(f"rate: {rate_hz:g} frames/s{assumed}; delay of a result: {delay}")
@@ -150,22 +150,22 @@ def choose_options(
     live: bool,
     look_with: Callable[[str], Look],
 ) -> tuple[dict[str, str], list[str]]:
-    """{option of `dddas run`: its reason}, and remarks. live: of a stream. look_with: looks with a configuration.
+    """Return options of `dddas run` with their reasons, and remarks. live: whether the source is a stream.
 
-    The rule is that of detection: people smaller than `gates.tiny_px` need the settings for tiny people.
+    look_with: processes the first frames with a configuration. As in detection, `gates.tiny_px` defines tiny people.
     """
     options, remarks, gates = dict[str, str](), list[str](), ready.settings.gates
     size_px = float(np.median(look.squares_px)) if look.squares_px else 0.0
     tiny = is_tiny(gates.person_px, gates.tiny_px, "normalized") or any(at.tiny for at in distances)
     if not (gates.person_px or any(at.person_px for at in distances)):
         if is_tiny(size_px, gates.tiny_px, ready.settings.difference.kind):
-            tiny, reason = True, f"the median target covers a square of {size_px:.1f} px: people, which are no larger,"
+            tiny, reason = True, f"the median target covers a square of {size_px:.1f} px; people of this size or less"
             options[f"--set gates.person_px={size_px:.1f}"] = f"{reason} need the settings for tiny people"
         elif not size_px:
-            remarks.append(f"if people are smaller than {gates.tiny_px:g} px here, give --config patrol")
+            remarks.append(f"if people are smaller than {gates.tiny_px:g} px in this clip, give --config patrol")
     if not look.rate_hz < rate_hz:
         return options, remarks
-    slow = f"the clip has {rate_hz:g} frames/s, this machine processes {look.rate_hz:.1f}"
+    slow = f"the clip has {rate_hz:g} frames/s, and this machine processes {look.rate_hz:.1f}"
     if tiny:
         remarks.append(f"with --live, pictures are dropped: {slow}; fast and half have no settings for tiny people")
         return options, remarks
@@ -175,11 +175,11 @@ def choose_options(
         if quick.rate_hz >= rate_hz:
             break
     else:
-        slow += ", so that none keeps up"
+        slow += ", so no configuration keeps up"
     if live:
         options[f"--config {name}"] = slow
     else:
-        remarks.append(f"with --live, pictures would be dropped: {slow}; a recording loses nothing")
+        remarks.append(f"with --live, pictures would be dropped: {slow}; without --live, no picture is dropped")
     return options, remarks
 
 

@@ -45,7 +45,7 @@ from torchvision_dddas.types import Camera, Colours, Elevation, Landmarks, Scene
 
 @dataclass(frozen=True)
 class AerialInput:
-    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as the options of `dddas locate`."""
+    """The files beside a clip or a table. landmarks, telemetry, camera, dem: as in the options of `dddas locate`."""
 
     landmarks: Path | None = None
     telemetry: Path | None = None
@@ -123,7 +123,7 @@ def _with_locator(
 
 
 def assemble_mission(source: Instrument, settings: Settings, backend: str, by_landmarks: bool) -> Assembly:
-    """Assemble the closed loop around a source whose first frame was read. Raise InputError as `build_mission`."""
+    """Assemble the closed loop around a source whose first frame was read. Raise InputError as `build_mission` does."""
     mission = build_mission(source, settings, backend, by_landmarks)
     return Assembly(mission.settings, load_engine(backend, mission.settings), None, mission.watch, mission)
 

@@ -1,4 +1,4 @@
-"""Further UAVs beside a clip: each has its own pipeline for its own clip, and its places go to the team."""
+"""Further UAVs beside a clip. Each has its own clip and pipeline, and its places are fused with the others."""
 
 import math
 from pathlib import Path
@@ -16,7 +16,7 @@ from torchvision_dddas.types import Source
 
 
 def open_uav(path: str | Path, settings: Settings, backend: str) -> FurtherUav:
-    """Open a further UAV by its file. settings: of the run. Raise InputError for bad files or if it locates nothing."""
+    """Open a further UAV by its file. settings: the run's. Raise InputError for bad files or without places."""
     file = read_aerial_platform(path)
     source = open_source(file.clip, rate_hz=file.rate_hz, full_scale=_own(file, settings).levels.given)
     table = None if file.detections is None else read_for_clip(file.detections, None, source)
@@ -31,7 +31,7 @@ def open_uav(path: str | Path, settings: Settings, backend: str) -> FurtherUav:
 
 
 def prepare_uav(file: Platform, settings: Settings, source: Source, backend: str) -> Assembly:
-    """Assemble the parts that locate the targets of a UAV's pictures. Raise InputError as `open_uav`."""
+    """Assemble the parts that locate the targets of a UAV's pictures. Raise InputError as `open_uav` does."""
     telemetry = file.beside.get("telemetry")
     ready = assemble_files(AerialInput(**file.beside), telemetry, _own(file, settings), source, backend, file.clip)
     if ready.watch is None:

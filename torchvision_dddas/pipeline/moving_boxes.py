@@ -1,4 +1,4 @@
-"""The boxes of the user's detector, and what moves, in one scene: which boxes move, how fast, and what has no box."""
+"""Combine the boxes of the user's detector with the movers that the motion detector found."""
 
 from collections import deque
 from dataclasses import replace
@@ -9,27 +9,27 @@ from torchvision_dddas.geometry import shared_px, window_of
 from torchvision_dddas.pipeline.own_detector import Detector, run_detector
 from torchvision_dddas.types import Detections, DetectionTable, Scene, is_sampled
 
-_COVERED = 1 / 3  # of a moving box, at least: hulls of movers fill two thirds of their boxes and more, but miss parts
-_ALIKE = 0.1  # of the union of a box and its mover's, at least: a walker before a bus has less of the bus's
-_SCORES = 500  # of the latest boxes, whose median is the score of movers
+_COVERED = 1 / 3  # least share of a moving box that its mover covers (hulls fill two thirds or more, but miss parts)
+_ALIKE = 0.1  # least intersection over union of a box and its mover's box; a walker in front of a bus has less
+_SCORES = 500  # number of latest scores of boxes, whose median is the score of movers
 
 
 class MovingBoxes:
-    """Gives scenes of the motion detector the boxes of another one. Give it scenes in order.
+    """Adds the boxes of another detector to scenes of the motion detector. Pass the scenes in order.
 
-    A box moves if a mover covers _COVERED of it or more, or if their boxes share _ALIKE of their union or more; it then
-    has the mover's speed and heading. Another box has the speed 0, or NaN where the motion was not seen. A mover is
-    kept if no box has its motion, and less than half of it lies in boxes. It has the usual score of boxes, so that
-    neither kind is trusted more.
+    A box moves if a mover covers at least the share _COVERED of it, or if the intersection over union of their boxes is
+    at least _ALIKE. The box then gets the mover's speed and heading. Other boxes have the speed 0, or NaN in unreliable
+    scenes. A mover is kept if it gave no box its motion, and less than half of it lies in boxes. Its score is the
+    median score of the latest boxes, so that neither kind is trusted more.
     """
 
     def __init__(self, detect: Detector | DetectionTable, interval: int = 1) -> None:
-        """detect, interval: as for `OwnDetector`."""
+        """detect, interval: as in `OwnDetector`."""
         self._detect, self._interval = detect, interval
         self._scores: deque[float] = deque(maxlen=_SCORES)
 
     def combine(self, scene: Scene) -> Scene:
-        """The scene with boxes, then movers without one. Its mask keeps only these movers."""
+        """Return the scene with the boxes, then the movers without a box. The mask keeps only these movers."""
         moving, mask = scene.detections, scene.mask
         if not is_sampled(scene.frame.number, self._interval):
             return replace(scene, detections=replace(moving, kind="given"))

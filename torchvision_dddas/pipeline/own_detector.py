@@ -12,11 +12,11 @@ from torchvision_dddas.tracking import CameraMotion, Registrar
 from torchvision_dddas.types import Detections, DetectionTable, Frame, Registration, Scene, as_picture, is_sampled
 
 Detector = Callable[[Frame], Any]
-"""Returns the detections of a frame: Detections, or a result that `Detections.from_supervision` accepts."""
+"""A function that returns Detections of a frame, or a result that `Detections.from_supervision` accepts."""
 
 
 class OwnDetector:
-    """Turn frames into scenes by a function or a table. Give it frames in order; each is settled at once.
+    """Turn frames into scenes by a function or a table. Pass the frames in order. Each scene is returned at once.
 
     The camera's motion is registered as for `Tracker`. A frame that is not sampled gets no detections.
     """

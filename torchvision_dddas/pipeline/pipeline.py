@@ -1,4 +1,4 @@
-"""The whole path from frames to results: detection, identities, places on the ground, and commands in a closed loop."""
+"""The pipeline from frames to results: detection, identities, places on the ground, and commands in a closed loop."""
 
 import math
 from collections import deque
@@ -81,7 +81,7 @@ class Pipeline:
     """
 
     open_clip: Callable[..., Any] = staticmethod(open_source)
-    """Opens a path. The package's top level replaces it by `open_video`, which also opens `sim:`."""
+    """Function that opens a path. The top-level package replaces it by `open_video`, which also opens `sim:`."""
 
     def __init__(
         self,
@@ -102,12 +102,12 @@ class Pipeline:
     ) -> None:
         """settings: a record, the name of a shipped configuration, or a TOML file. backend: auto, onboard or torch.
 
-        landmarks: their places; their pixels come from the table, or from colours if these are given.
-        elevation: as for AerialLocator. detector: finds the targets instead of the motion detector: a function that is
-        called with each tracked Frame and returns Detections, or a result of supervision, ultralytics and others as
-        `Detections.from_supervision` accepts it; or a table of boxes. Classes are kept.
-        movers: run the motion detector beside the detector: boxes then have speeds, and moving targets without a box
-        are kept, without a class.
+        landmarks: places of landmarks. Their pixels come from the table, or from `colours` if given.
+        elevation: as in AerialLocator. detector: replaces the motion detector. Either a function that gets
+        each tracked Frame and returns Detections, or a result of supervision, ultralytics and others that
+        `Detections.from_supervision` accepts; or a table of boxes. Classes are kept.
+        movers: also run the motion detector. Boxes then have speeds, and moving targets without a box are kept
+        without a class.
         ground, aerial: TOML files of ground platforms and further UAVs, as for `dddas run`; results then have
         `confirmed` and `fused`.
         interval: frames from one tracked frame to the next. rate_hz: frames a second for frames that come one by one; a
@@ -132,7 +132,7 @@ class Pipeline:
         if not (detector is None or callable(detector) or isinstance(detector, DetectionTable)):
             raise InputError(f"detector must be a function or a DetectionTable, got {type(detector).__name__}")
         if movers and detector is None:
-            raise InputError("movers is for a detector; without one the pipeline finds what moves")
+            raise InputError("movers needs a detector; without a detector, the pipeline finds movers anyway")
         self._assembly: Assembly | None = None
         self._given: dict[str, Any] = {
             "telemetry": telemetry,
@@ -195,7 +195,7 @@ class Pipeline:
         return self._run(source)
 
     def update(self, frame: Frame | np.ndarray) -> list[FrameResult]:
-        """Process one frame, and return the results that it settles. Raise InputError for anything but a picture."""
+        """Process one frame, and return the results that it settles. Raise InputError if it is no picture."""
         if self._detector is None:
             image = as_picture(frame.image if isinstance(frame, Frame) else frame)
             engine = self._begin((image.shape[1], image.shape[0]), self.rate_hz)
@@ -258,7 +258,7 @@ class Pipeline:
         join_m = self.settings.crowds.join_m if self._watch is not None else 0.0
         self._crowds = (CrowdIdentities(), CrowdEvents(join_m)) if join_m else None
         self._waiting: dict[int, WatchedScene] = {}
-        self._watched: WatchedScene | None = None  # the last one
+        self._watched: WatchedScene | None = None  # the last watched scene
         self._motions: deque[tuple[float, np.ndarray]] = deque(maxlen=_MOST_MOTIONS)
         return assembly.engine
 
@@ -288,7 +288,7 @@ class Pipeline:
         waiting = deque(self._tracker.flush())
         while waiting:
             result = self._finish(waiting.popleft())
-            if not waiting and self._crowds is not None:  # the last frame gets the events that are still open
+            if not waiting and self._crowds is not None:  # the last frame gets the open events
                 result = replace(result, events=(*result.events, *self._in_degrees(self._crowds[1].flush())))
             yield result
         if self._crowds is not None:  # the tracker held no frame back, so open events become notes

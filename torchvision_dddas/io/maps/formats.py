@@ -28,14 +28,13 @@ from torchvision_dddas.io.overlay import identity_colour
 def geojson(
     tracks: GroundTracks, landmarks: GroundTracks | None = None, names: Sequence[str] = (), name: str = "tracks"
 ) -> dict[str, Any]:
-    """A FeatureCollection, a feature a target: a line, or a point where it was located once.
+    """Return a FeatureCollection with one feature per target: a line, or a point if the target has a single place.
 
-    `frames` has the frame of each place and `times` its time where a clock is known, else `seconds` since the clip's
-    first frame where that is; `sigma_m` how well it is known: the root of the covariance's trace, null where it is not.
-    A line over 180 degrees of longitude is cut there, into lines whose ends on it are no places of frames.
-    landmarks: they too, by their names. name: of the layer.
-    `bbox` goes from west to east, over 180 degrees where the places do.
-    Raises ValueError where there is no geographic origin.
+    `frames` holds the frame of each place, `times` its time. Without a clock, `seconds` holds seconds since the clip's
+    first frame, if known. `sigma_m` is the root of the trace of each covariance, null if unknown. A line that crosses
+    longitude 180 is cut there, and the cut adds points that belong to no frame. `bbox` goes from west to east, across
+    longitude 180 if the places do. landmarks: added under their names. name: name of the layer.
+    Raise ValueError without a geographic origin.
     """
     features = [_geojson_track(tracks, rows, {"target": target}) for target, rows in tracks.of.items()]
     if landmarks is not None and landmarks.lonlat_deg is not None:
@@ -44,10 +43,10 @@ def geojson(
 
 
 def ellipses_geojson(tracks: GroundTracks) -> dict[str, Any]:
-    """A FeatureCollection of the ellipses that hold the true place with 95 %, as in `ellipse_rows`.
+    """Return a FeatureCollection of the 95 % ellipses of the rows that `ellipse_rows` selects.
 
-    They have a file of their own because GDAL and QGIS read a file as one layer with one type of shape.
-    Raises ValueError where there is no geographic origin.
+    The ellipses need a separate file, because GDAL and QGIS read a file as one layer with one type of shape.
+    Raise ValueError without a geographic origin.
     """
     features = []
     for ellipse in map_ellipses(tracks, ellipse_rows(tracks)):
@@ -69,12 +68,12 @@ def ellipses_geojson(tracks: GroundTracks) -> dict[str, Any]:
 
 
 def encode_geojson(collection: dict[str, Any]) -> bytes:
-    """The bytes of the file."""
+    """Return a collection as the bytes of a file."""
     return (json.dumps(collection, separators=(",", ":")) + "\n").encode()
 
 
 def _collection(name: str, features: list[dict[str, Any]]) -> dict[str, Any]:
-    """name: GDAL takes it for that of the layer."""
+    """Return a FeatureCollection. GDAL uses the name as the name of the layer."""
     places = [place for feature in features for place in _places(feature["geometry"]["coordinates"])]
     box = {"bbox": _box(places)} if places else {}
     return {"type": "FeatureCollection", "name": name, **box, "features": features}
@@ -112,7 +111,7 @@ def _feature(kind: str, parts: Sequence[Any], properties: dict[str, Any]) -> dic
 
 
 def _places(coordinates: list[Any]) -> list[Place]:
-    """All places of a shape, however deep they lie."""
+    """Return all places of a shape from its nested lists."""
     if isinstance(coordinates[0], float):
         return [coordinates]
     return [place for part in coordinates for place in _places(part)]
@@ -122,7 +121,7 @@ def _box(places: list[Place]) -> list[float]:
     longitude, latitude = np.array(places).T
     west, east = longitude.min(), longitude.max()
     if east - west > 180:
-        # They lie on both sides of 180 degrees: so west is the larger number.
+        # The places lie on both sides of longitude 180, so the western edge is the larger number.
         east = longitude[longitude < 0].max(initial=-180.0)
         west = longitude[longitude >= 0].min(initial=180.0)
     return [float(west), float(latitude.min()), float(east), float(latitude.max())]
@@ -143,11 +142,11 @@ _KML = """<?xml version="1.0" encoding="UTF-8"?>
 def kml(
     tracks: GroundTracks, name: str = "tracks", landmarks: GroundTracks | None = None, names: Sequence[str] = ()
 ) -> str:
-    """The document: folders of tracks, of ellipses that hold the true place with 95 %, and of landmarks.
+    """Return a KML document with folders of tracks, 95 % ellipses and landmarks.
 
-    With a clock a track is a gx:Track, several where it goes over 180 degrees of longitude, and an ellipse has the time
-    of its place; else a track is a line, cut there, and there are the ellipses of the last places only.
-    Raises ValueError where there is no geographic origin.
+    With a clock, tracks are gx:Track elements and each ellipse has the time of its place. Without a clock, tracks are
+    lines, and only the last place of each target has an ellipse. Tracks are cut where they cross longitude 180.
+    Raise ValueError without a geographic origin.
     """
     styles = {f"target-{target}": identity_colour(target) for target in tracks.of}
     folders = {
@@ -168,13 +167,13 @@ def kml(
 
 
 def xml_text(text: str) -> str:
-    """A text as XML holds it: escaped, without the control characters that XML has no way to write."""
+    """Escape a text for XML, and remove the control characters that XML cannot represent."""
     kept = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff" and c < "\ufffe"))
     return escape(kept, quote=False).replace('"', "&quot;")
 
 
 def _kml_style(name: str, colour: tuple[int, int, int]) -> str:
-    tint = "{:02x}{:02x}{:02x}".format(*colour)  # KML has blue before red as OpenCV has, and opacity before both
+    tint = "{:02x}{:02x}{:02x}".format(*colour)  # KML's order is opacity, blue, green, red
     return (
         f'<Style id="{name}"><IconStyle><color>ff{tint}</color><scale>0.6</scale></IconStyle>'
         f"<LineStyle><color>ff{tint}</color><width>3</width></LineStyle>"
@@ -225,7 +224,7 @@ def _kml_ellipses(tracks: GroundTracks) -> list[str]:
 
 
 def _one_or(several: str, shapes: Sequence[str]) -> str:
-    """The shape, or an element that holds several."""
+    """Return a single shape as it is, or several shapes inside an element of this name."""
     return shapes[0] if len(shapes) == 1 else f"<{several}>{''.join(shapes)}</{several}>"
 
 
@@ -237,19 +236,19 @@ def _coordinates(places: list[Place]) -> str:
 # Cursor-on-Target, the XML that situational-awareness tools exchange.
 
 UNKNOWN = "9999999.0"
-"""A height or an error that is not known."""
+"""The value of an unknown height or error."""
 STALE_S, MARK_STALE_S = 10.0, 600.0
-"""How long a target and a mark are valid."""
+"""Seconds for which the events of a target and of a mark are valid."""
 _KIND = "a-u-G"  # an atom on the ground of unknown affiliation
 _MARK = "b-m-p-s-m"  # a spot on the map
 
 
 def cot(tracks: GroundTracks, source: str = "dddas") -> str:
-    """`<events>` in the order of time, a line each, at most one per target and second.
+    """Return `<events>` in the order of time, one event per line, and at most one event per target and second.
 
-    ce is one standard deviation along the ellipse's longer axis, remarks name the category of the
-    90 % error; how="m-f" is fused from several machine sources.
-    uid: the source, the start of the clip, the target. Raises ValueError without a geographic origin or a clock.
+    ce is one standard deviation along the longer axis of the ellipse. The remarks name the category of the 90 % error.
+    how="m-f" means "fused from several machine sources". A uid consists of the source, the start of the clip, and the
+    target. Raise ValueError without a geographic origin or a clock.
     Source: MITRE, Event-PUBLIC.xsd, version 2.0.
     """
     if tracks.times_utc is None:
@@ -269,7 +268,7 @@ def cot(tracks: GroundTracks, source: str = "dddas") -> str:
 
 
 def event_uid(source: str, start_utc_s: float, target: int) -> str:
-    """The uid of a target of a run."""
+    """Return the uid of a target in a run."""
     return f"{xml_text(source)}-{start_utc_s:.0f}-{target}"
 
 
@@ -281,11 +280,10 @@ def event(
     sigma_m: np.ndarray,
     velocity_m_s: np.ndarray,
 ) -> str:
-    """One event, a line. when: its time, and the time until which it is valid.
+    """Return the line of a target's event. when: its time, and the time until which it is valid.
 
-    sigma_m: (2,) standard deviations along the axes, the longer becomes ce; the remark has the 90 % error's category.
-
-    place: longitude, latitude, and metres above the ellipsoid, NaN where unknown.
+    place: longitude, latitude, and metres above the ellipsoid, NaN if unknown. sigma_m: (2,) standard deviations along
+    the axes of the ellipse, the longer first. The first becomes ce. The remark names the category of the 90 % error.
     """
     within_m = circular_error_90(sigma_m)
     category = error_category(within_m)[0]
@@ -299,7 +297,7 @@ def event(
 
 
 def mark(uid: str, name: str, when: tuple[str, str], place: tuple[float, float]) -> str:
-    """An event that marks a spot on the map. when: as for `event`. place: longitude, latitude."""
+    """Return an event that marks a spot on the map. when: as for `event`. place: longitude, latitude."""
     return _event(uid, _MARK, name, when, (*place, math.nan), math.nan)
 
 

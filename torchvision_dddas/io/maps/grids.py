@@ -1,4 +1,4 @@
-"""Places in the grids of maps: UTM, and the references of MGRS to one metre. They need the extra `grid`."""
+"""Places in map grids: UTM, and MGRS references to one metre. Both need the extra `grid`."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ COLUMNS = {
     "mgrs": (Column("mgrs"),),
     "utm": (Column("utm_zone"), Column("utm_east_m", ".2f"), Column("utm_north_m", ".2f")),
 }
-"""The columns of each grid; "" is none."""
+"""The columns of each grid; "" means no grid."""
 
 
 def check_grid(grid: str, has_degrees: bool) -> None:
-    """Raises InputError for a grid where its package or longitudes and latitudes are missing."""
+    """Raise InputError if a grid is wanted but its package, or longitudes and latitudes, are missing."""
     if not grid:
         return
     try:
@@ -26,13 +26,13 @@ def check_grid(grid: str, has_degrees: bool) -> None:
         raise InputError(f"aerial.grid={grid} needs mgrs and utm: pip install 'torchvision-dddas[grid]'") from None
     if not has_degrees:
         raise InputError(
-            f"aerial.grid={grid} needs longitudes and latitudes; this run is in local metres: leave it out, or give "
-            "telemetry or landmarks in degrees"
+            f"aerial.grid={grid} needs longitudes and latitudes, but this run is in local metres; leave the grid "
+            "out, or give telemetry or landmarks in degrees"
         )
 
 
 def grid_rows(grid: str, lonlat_deg: np.ndarray) -> Rows:
-    """The columns of places (N, 2). Empty where a place is unknown, and in UTM beyond its latitudes, -80 to 84."""
+    """Return the grid columns of (N, 2) places, empty for unknown places, and in UTM outside latitudes -80 to 84."""
     if not grid:
         return {}
     import mgrs

@@ -1,4 +1,4 @@
-"""The places of all targets over time, from which maps are made at the end of a run, and their error ellipses."""
+"""The places of all targets over time, with error ellipses. Maps are made from them at the end of a run."""
 
 import math
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ from torchvision_dddas.types import Positions
 CHI2_95 = 5.991464547107979
 """The 95 % quantile of chi-squared with two degrees of freedom, -2 ln 0.05."""
 MOST_ELLIPSES = 2_000
-"""Ellipses of a map, about."""
+"""Approximate largest number of ellipses on a map."""
 
 Place = list[float]
-"""Longitude and latitude in degrees, rounded to 1e-8, a millimetre."""
+"""Longitude and latitude in degrees, rounded to 1e-8 (about 1 mm)."""
 
 _ROW = np.dtype(
     [
@@ -30,12 +30,12 @@ _ROW = np.dtype(
 
 @dataclass(frozen=True)
 class GroundTracks:
-    """All places of all targets, one row a place, by target and then by time.
+    """All places of all targets, one row per place, sorted by target and then by time. Unknown values are NaN.
 
-    target, frame: (N,) int64. time_s: (N,) since the clip's first frame, NaN where unknown. east_north_m: (N, 2).
-    covariance_m2: (N, 2, 2), velocity_m_s: (N, 2), NaN where unknown. lonlat_deg: (N, 2); None where there is no
-    geographic origin. above_sea_m, above_ellipsoid_m: (N,) heights of the ground, NaN where unknown.
-    start_utc_s: seconds since 1970 at time_s = 0; NaN where no clock is known.
+    target, frame: (N,) int64. time_s: (N,) seconds since the clip's first frame. east_north_m: (N, 2).
+    covariance_m2: (N, 2, 2). velocity_m_s: (N, 2). lonlat_deg: (N, 2); None without a geographic origin.
+    above_sea_m, above_ellipsoid_m: (N,) heights of the ground. start_utc_s: seconds since 1970 at time_s = 0; NaN
+    without a clock.
     """
 
     target: np.ndarray
@@ -61,41 +61,41 @@ class GroundTracks:
 
     @cached_property
     def sigma_m(self) -> np.ndarray:
-        """(N,) how well each place is known: the root of the covariance's trace, NaN where it is not."""
+        """(N,) root of the trace of each place's covariance, NaN if unknown."""
         return np.sqrt(self.covariance_m2[:, 0, 0] + self.covariance_m2[:, 1, 1])
 
     @cached_property
     def circular_error90_m(self) -> np.ndarray:
-        """(N,) radius of the circle about each place that holds the true one with 90 %; NaN where it is not known."""
+        """(N,) radius of the circle that contains the true place with a probability of 90 %; NaN if unknown."""
         return geometry.circular_error_90(semi_axes(self.covariance_m2, 1.0)[0])
 
     @cached_property
     def times_utc(self) -> list[str] | None:
-        """When each place was taken, ISO 8601 to the millisecond; None where no clock is known."""
+        """The time of each place, ISO 8601 to the millisecond; None without a clock or if a time is unknown."""
         if not (math.isfinite(self.start_utc_s) and np.isfinite(self.time_s).all()):
             return None
         return iso_utc(self.start_utc_s + self.time_s)
 
     @property
     def degrees(self) -> np.ndarray:
-        """(N, 2) longitudes and latitudes. Raises ValueError without a geographic origin."""
+        """(N, 2) longitudes and latitudes. Raise ValueError without a geographic origin."""
         if self.lonlat_deg is None:
             raise ValueError("these positions have no longitude and latitude")
         return self.lonlat_deg
 
     def places(self, rows: slice) -> list[Place]:
-        """The longitudes and latitudes of some rows."""
+        """Return the longitudes and latitudes of some rows."""
         return [*np.round(self.degrees[rows], 8).tolist()]
 
     def pieces(self, rows: slice) -> list[slice]:
-        """Split a target's rows where it was not located for more than four times its usual step of frames."""
+        """Split a target's rows at gaps longer than four times the median step between its frames."""
         steps = np.diff(self.frame[rows])
         longest = 4 * max(float(np.median(steps)), 1.0) if len(steps) else 0.0
         cuts = rows.start + 1 + np.flatnonzero(steps > longest)
         return [slice(*edge) for edge in pairwise([rows.start, *cuts.tolist(), rows.stop])]
 
     def spaced(self, seconds: float, rows: slice) -> list[int]:
-        """The first of a target's rows with a known time, and those that follow at least so long after another."""
+        """Select rows of a target with known times that are at least this number of seconds apart."""
         due = -math.inf
         chosen: list[int] = []
         for row, at in enumerate(self.time_s[rows].tolist(), rows.start):
@@ -107,13 +107,13 @@ class GroundTracks:
 
 
 def iso_utc(utc_s: np.ndarray) -> list[str]:
-    """Seconds since 1970 as ISO 8601 to the millisecond, as in 2026-03-01T12:00:00.250Z."""
+    """Format seconds since 1970 as ISO 8601 to the millisecond, such as 2026-03-01T12:00:00.250Z."""
     stamps = np.round(np.asarray(utc_s, float) * 1000).astype("i8").astype("M8[ms]")
     return [f"{stamp}Z" for stamp in np.datetime_as_string(stamps).tolist()]
 
 
 class Gathered:
-    """Collects rows of GroundTracks, 120 bytes each, and up to three times that while the array grows."""
+    """Collects rows of GroundTracks. A row takes 120 bytes, and up to three times as much while the array grows."""
 
     def __init__(self) -> None:
         self._rows = np.zeros(256, _ROW)
@@ -133,7 +133,7 @@ class Gathered:
         self._count = count
 
     def tracks(self, geographic: bool, start_utc_s: float = math.nan) -> GroundTracks:
-        """The places by target. geographic: whether they have longitudes and latitudes."""
+        """Return the places sorted by target. geographic: whether they have longitudes and latitudes."""
         rows = self._rows[: self._count]
         rows = rows[np.argsort(rows["target"], kind="stable")]
         columns: dict[str, Any] = {name: rows[name] for name in _ROW.names or ()}
@@ -147,9 +147,9 @@ class Gathered:
 
 
 def semi_axes(covariance_m2: np.ndarray, chi2: float = CHI2_95) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 2) metres, the longer first, and (N,) the longer one's bearing in [0, pi), clockwise from north.
+    """Return (N, 2) semi-axes in metres, the longer first, and (N,) its bearing in [0, pi), clockwise from north.
 
-    covariance_m2: (N, 2, 2) along east and north. NaN where it is. chi2 = 1: one standard deviation along each axis.
+    covariance_m2: (N, 2, 2) of east and north; NaN gives NaN. chi2 = 1: one standard deviation along each axis.
     """
     east, both, north = covariance_m2[:, 0, 0], covariance_m2[:, 0, 1], covariance_m2[:, 1, 1]
     mean, apart = (east + north) / 2, np.hypot((east - north) / 2, both)
@@ -160,7 +160,7 @@ def semi_axes(covariance_m2: np.ndarray, chi2: float = CHI2_95) -> tuple[np.ndar
 
 
 def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.ndarray:
-    """(N, points, 2) metres east and north of each centre, anticlockwise; the first point is not given again."""
+    """Return (N, points, 2) metres east and north of each centre, anticlockwise, without repeating the first point."""
     turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
     along = np.stack([np.sin(bearing_rad), np.cos(bearing_rad)], axis=1)[:, None]
     across = np.stack([-along[..., 1], along[..., 0]], axis=2)
@@ -168,9 +168,9 @@ def ring_m(axes_m: np.ndarray, bearing_rad: np.ndarray, points: int = 24) -> np.
 
 
 def ellipse_rows(tracks: GroundTracks, most: int = MOST_ELLIPSES) -> np.ndarray:
-    """(K,) rows whose ellipses a map shows: the last of each target, and about one each second before it.
+    """Return the (K,) rows whose ellipses a map shows: the last row of each target, and about one row per second.
 
-    The intervals grow where there would be more than `most`; each target's last with a known covariance is among them.
+    The intervals grow if there would be more than about `most` ellipses. Rows without a covariance are left out.
     """
     times = [tracks.time_s[rows] for rows in tracks.of.values()]
     apart_s = max(1.0, sum(float(t[-1] - t[0]) for t in times if np.isfinite(t).all()) / most)
@@ -180,7 +180,7 @@ def ellipse_rows(tracks: GroundTracks, most: int = MOST_ELLIPSES) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MapEllipse:
-    """The ellipse that holds the true place of a row of GroundTracks with 95 %. rings: closed, in degrees."""
+    """The 95 % ellipse of a row of GroundTracks. rings: closed rings of places in degrees."""
 
     row: int
     rings: list[list[Place]]
@@ -190,7 +190,7 @@ class MapEllipse:
 
 
 def map_ellipses(tracks: GroundTracks, rows: np.ndarray) -> list[MapEllipse]:
-    """The ellipses of some rows, except those too near a pole."""
+    """Return the ellipses of some rows, without ellipses too near a pole."""
     axes, bearing = semi_axes(tracks.covariance_m2[rows])
     found = []
     for row, ring, (major, minor), turn in zip(rows.tolist(), ring_m(axes, bearing), axes, bearing, strict=True):
@@ -200,14 +200,14 @@ def map_ellipses(tracks: GroundTracks, rows: np.ndarray) -> list[MapEllipse]:
 
 
 def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
-    """A small ring of metres about a place as closed rings in degrees, two where it lies on both sides of 180 degrees.
+    """Convert a small ring around a place to closed rings in degrees: two rings if it crosses longitude 180.
 
-    ring_m: (K, 2) metres east and north, convex and anticlockwise, as the rings will be. Degrees a metre are those at
-    the place: on the ellipsoid 100 m off are 1 mm out. None where the ring comes too near a pole to be a ring there.
+    ring_m: (K, 2) metres east and north, convex and anticlockwise. The rings are anticlockwise, too. The scale at the
+    place is used for the whole ring, which causes an error of 1 mm at 100 m. Return no ring too near a pole.
     """
     longitude, latitude = (float(v) for v in lonlat_deg)
     to_pole_m = (90 - abs(latitude)) * 111_000
-    # Within a tenth of the way to the pole a degree of longitude changes its length by as much.
+    # Within a tenth of the distance to the pole, the length of a degree of longitude changes by about a tenth.
     if not np.hypot(*ring_m.T).max() <= to_pole_m / 10:
         return []
     degrees_per_metre = np.diag(geometry.lonlat(np.eye(2), (0.0, latitude)) - (0.0, latitude))
@@ -220,7 +220,7 @@ def ring_about(lonlat_deg: np.ndarray, ring_m: np.ndarray) -> list[list[Place]]:
 
 
 def _clip(ring: np.ndarray, edge: float, side: float) -> np.ndarray:
-    """The part of a convex ring east (side 1) or west (-1) of a longitude."""
+    """Return the part of a convex ring east (side 1) or west (side -1) of a longitude."""
     inside = (ring[:, 0] - edge) * side >= 0
     if inside.all() or not inside.any():
         return ring[inside]
@@ -235,12 +235,12 @@ def _clip(ring: np.ndarray, edge: float, side: float) -> np.ndarray:
 
 
 def cut_line(places: list[Place]) -> list[list[Place]]:
-    """Cut a line where it crosses 180 degrees of longitude; the cut ends lie on that meridian."""
+    """Cut a line where it crosses longitude 180. The cut ends lie on that meridian."""
     lines = [places[:1]]
     for before, after in pairwise(places):
         if abs(after[0] - before[0]) > 180:
             edge = math.copysign(180.0, before[0])
-            # Degrees to the edge, and from it on the other side.
+            # Degrees of longitude before and behind the meridian.
             ahead, behind = abs(edge - before[0]), abs(-edge - after[0])
             share = ahead / (ahead + behind) if ahead + behind > 0 else 0.0
             latitude = round(before[1] + share * (after[1] - before[1]), 8)

@@ -1,4 +1,4 @@
-"""The data of the interactive map in report.html, in local metres, which every map has."""
+"""The data of the interactive map in report.html, in local metres."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -26,10 +26,10 @@ from torchvision_dddas.io.report import data_url
 from torchvision_dddas.types import Ortho
 
 MOST_PLACES = 10_000
-"""Places of all targets, as of all landmarks, beside the first and the last of each; longer runs are thinned."""
+"""Approximate largest number of places of all targets together, and of all landmarks; longer runs are thinned."""
 _NOTE = f"The run is long: this map has about {MOST_PLACES} of its places, evenly spread; the tables have all of them."
-_MOST_STEPS = 2_000  # of the slider
-_PHOTO_PX = 1600  # the longer side
+_MOST_STEPS = 2_000  # steps of the slider
+_PHOTO_PX = 1600  # longer side of the photo
 
 
 def map_data(
@@ -43,12 +43,12 @@ def map_data(
     to_degrees: Callable[[np.ndarray], np.ndarray] | None,
     fused: GroundTracks | None = None,
 ) -> dict[str, Any] | None:
-    """The data that map.js draws; None where no target's place is known. It holds NaN where a value is unknown.
+    """Return the data that map.js draws; None if no place of a target is known. Unknown values are NaN.
 
-    way: the camera's places, of target 0. fused: targets as all platforms know them together.
-    Boxes are [west, south, east, north]: `box` is shown first, `whole` holds all
-    places. degrees: of the corners of `box`; the page interpolates between them, to 2 m in a box of 10 km. A row of a
-    mover is [time or frame, east, north, semi-axes of the 95 % ellipse, its bearing, frame].
+    way: the camera's places, as target 0. fused: targets located by all platforms together.
+    Boxes are [west, south, east, north]: the map opens with `box`, and `whole` contains all places. `degrees` holds the
+    corners of `box`; the page interpolates between them, with an error of up to 2 m in a box of 10 km. A row of a mover
+    is [time or frame, east, north, semi-axes of the 95 % ellipse, its bearing, frame].
     """
     shown = extent(tracks, landmarks, camera, signs)
     layers = {"target": tracks, "landmark": landmarks, "camera": way}
@@ -75,7 +75,7 @@ def map_data(
         "utc": tracks.start_utc_s if is_timed else None,
         "box": box,
         "whole": whole,
-        # Longitudes may go on beyond 180 degrees.
+        # Unwrapped longitudes may exceed 180 degrees.
         "degrees": None if to_degrees is None else np.unwrap(to_degrees(corners), period=360, axis=0).tolist(),
         "photo": None if photo is None else _photo(photo, whole),
         "movers": [
@@ -95,7 +95,7 @@ def map_data(
 def _movers(
     tracks: GroundTracks, is_timed: bool, kind: str, named: Callable[[int], tuple[str, Colour]]
 ) -> list[dict[str, Any]]:
-    """The tracks of one kind, in parts without a gap."""
+    """Return the tracks of one kind, split into parts without gaps."""
     at = tracks.time_s if is_timed else tracks.frame.astype(float)
     spans = sum(float(np.ptp(at[rows])) for rows in tracks.of.values())
     apart = spans / MOST_PLACES if len(tracks) > MOST_PLACES else 0.0
@@ -118,7 +118,7 @@ def _movers(
 
 
 def _photo(photo: Ortho, whole: Sequence[float]) -> dict[str, Any] | None:
-    """The part of the photo within a box as JPEG, and its own box; None where they have no part in common."""
+    """Return the part of the photo inside a box as JPEG, and the box of this part; None if they do not overlap."""
     height, width = photo.image.shape[:2]
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ photo.east_north_from_pixel.T
     low, high = np.maximum(corners.min(axis=0), whole[:2]), np.minimum(corners.max(axis=0), whole[2:])

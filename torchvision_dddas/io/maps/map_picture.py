@@ -14,7 +14,7 @@ from torchvision_dddas.io.overlay import Colour, identity_colour
 from torchvision_dddas.types import Camera, Fix, Ortho
 
 FINE = 2
-"""The map is drawn so many times larger and then reduced, for clean thin lines and small letters."""
+"""The map is drawn larger by this factor and then reduced, so that thin lines and small letters look clean."""
 WIDTH = 1400
 LEFT, RIGHT, TOP, BOTTOM = 86, 24, 46, 106
 SHORTEST, TALLEST = 420, 880
@@ -30,23 +30,23 @@ EVENTS: dict[str, tuple[str, str, Colour]] = {
     "split": ("S", "split off", (150, 110, 0)),
     "gather": ("G", "gathered", (120, 40, 120)),
     "scatter": ("C", "scattered", (150, 110, 0)),
-    "human": ("H", "told human", (60, 130, 20)),
-    "not_human": ("N", "told not human", (40, 70, 190)),
+    "human": ("H", "judged human", (60, 130, 20)),
+    "not_human": ("N", "judged not human", (40, 70, 190)),
 }
-"""The letter, the name and the colour of an event at a zone or of crowds, and of what ground vehicles told."""
+"""The letter, name and colour of each kind of event: at zones, of crowds, and confirmations by ground vehicles."""
 AREA, FUSED = (150, 60, 120), (110, 130, 0)
 _LINES_ACROSS = 12
-_SUB = 3  # bits of a pixel's fraction that OpenCV draws with
+_SUB = 3  # fractional bits of the pixel coordinates that OpenCV draws
 _MOST_SIGNS = 400
 _LOOKS_APART_M = 2.0
-_LOWEST = math.sin(math.radians(3))  # flatter rays end where one at 3 degrees reaches the ground
+_LOWEST = math.sin(math.radians(3))  # flatter rays are cut at the distance of a ray 3 degrees below the horizon
 
 
 class Signs:
-    """Map signs: the zones of the run, events at them, and what ground vehicles said of targets and where they looked.
+    """Map signs: zones, events, and looks, which are the places from which ground vehicles saw targets.
 
-    zones: names, rings (N, 2) and whether they are lines. There are at most 800 events, of either sort, and 400 looks,
-    of each vehicle one every 2 m.
+    zones: name, rings (N, 2), and whether the zone is a line. At most 800 events and 400 looks are kept. Successive
+    looks of a vehicle are at least 2 m apart.
     """
 
     def __init__(self) -> None:
@@ -56,12 +56,12 @@ class Signs:
         self._last: dict[str, np.ndarray] = {}
 
     def add_event(self, kind: str, east_north_m: np.ndarray) -> None:
-        """Add the place, if known, of an event at a zone or of a target first found human or not, or otherwise."""
+        """Add an event, if its place is known: an event at a zone or of crowds, or a new confirmation of a target."""
         if len(self.events) < 2 * _MOST_SIGNS and np.isfinite(east_north_m).all():
             self.events.append((kind, np.array(east_north_m, float)))
 
     def add_look(self, vehicle: str, from_m: np.ndarray, at_m: np.ndarray) -> None:
-        """Add the places of a vehicle and of a target that it saw."""
+        """Add a look: the places of a vehicle and of a target that it saw."""
         last = self._last.get(vehicle)
         if not np.isfinite(from_m).all() or (last is not None and np.linalg.norm(from_m - last) < _LOOKS_APART_M):
             return
@@ -74,7 +74,7 @@ class Signs:
 class CameraPath:
     """The camera's places (M, 2), and the outline of its last view (K, 2), east and north in m; empty if unknown.
 
-    views: some of its views with their frame numbers and times.
+    views: frame number, time and outline of some of its views.
     """
 
     east_north_m: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
@@ -91,17 +91,17 @@ def map_picture(
     title: str = "",
     signs: Signs | None = None,
 ) -> np.ndarray:
-    """(H, 1400, 3) uint8 BGR, north up, over a photo of the ground or a plain grid.
+    """Return the map, (H, 1400, 3) uint8 BGR, north up, over a photo of the ground or a plain grid.
 
-    A few places far from all others, farther than the middle 96 % reach, do not stretch the map; it says how
-    many lie outside. Lines are broken where a target was not located for a while.
+    Places far outside the range of the middle 96 % are not shown; a text states how many lie outside. The line of a
+    track is interrupted at gaps.
     """
     camera, signs = camera or CameraPath(), signs or Signs()
     frame = frame_around(extent(tracks, landmarks, camera, signs))
     picture = np.full(((frame.height + TOP + BOTTOM) * FINE, WIDTH * FINE, 3), 255, np.uint8)
     plot = picture[frame.plot]
     if photo is not None:
-        # A faded photo lets what is drawn over it stand out.
+        # Fade the photo, so that the drawing over it stands out.
         plot[:] = (0.75 * ground_photo(frame, photo) + 0.25 * 255).astype(np.uint8)
     _draw_grid(picture, frame, photo is not None)
     _draw_zones(plot, frame, signs)
@@ -146,7 +146,7 @@ def map_picture(
 
 
 def view_of(fix: Fix, camera: Camera) -> np.ndarray:
-    """(K, 2) local metres of the ground at up = 0 along the picture's border; empty where that is not known."""
+    """Return (K, 2) local metres of the ground (up = 0) along the picture's border; empty if unknown."""
     width, height = camera.size_px
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
     share = np.linspace(0, 1, 8, endpoint=False)[:, None]
@@ -163,7 +163,7 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
         border = undistort_pixels(border, camera)
         border = border[np.isfinite(border).all(axis=1)]
     ground = np.c_[border, np.ones(len(border))] @ np.linalg.inv(fix.image_from_ground).T
-    # Pixels on both sides of the horizon have scales of both signs.
+    # If the border crosses the horizon, the third coordinates have both signs, and the view has no outline.
     has_one_sign = (ground[:, 2] > 0).all() or (ground[:, 2] < 0).all()
     return ground[:, :2] / ground[:, 2:] if has_one_sign else np.zeros((0, 2))
 
@@ -174,7 +174,7 @@ def view_of(fix: Fix, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MapFrame:
-    """West and south edge in local metres, metres a pixel, and the plot's size in pixels of the finished picture."""
+    """West and south edge in local metres, metres per pixel, and the plot's size in pixels of the finished picture."""
 
     west_m: float
     south_m: float
@@ -183,7 +183,7 @@ class MapFrame:
     height: int
 
     def pixels(self, east_north_m: np.ndarray) -> np.ndarray:
-        """(..., 2) x, y in the plot, in pixels of the enlarged picture."""
+        """Return (..., 2) x, y in the plot, in pixels of the enlarged picture."""
         fine = FINE / self.metres_a_pixel
         return (np.asarray(east_north_m, float) - (self.west_m, self.south_m)) * (fine, -fine) + (0, self.height * FINE)
 
@@ -200,7 +200,7 @@ class MapFrame:
 
 
 def frame_around(east_north_m: np.ndarray) -> MapFrame:
-    """The frame that shows all of these places, with room around them; ten metres where there are none."""
+    """Return a frame that shows all places with a margin around them; ten metres wide without places."""
     known = east_north_m[np.isfinite(east_north_m).all(axis=1)]
     low, high = (known.min(axis=0), known.max(axis=0)) if len(known) else (np.zeros(2), np.zeros(2))
     middle, size = (low + high) / 2, np.maximum((high - low) * 1.16, 10.0)
@@ -212,7 +212,7 @@ def frame_around(east_north_m: np.ndarray) -> MapFrame:
 
 
 def extent(tracks: GroundTracks, landmarks: GroundTracks, camera: CameraPath, signs: Signs) -> np.ndarray:
-    """Places that the map must show: the camera's way, view, zones and ellipses too, unless they go far beyond."""
+    """Return places that the map must show: also the camera's path and view, zones and ellipses, if they are near."""
     targets = tracks.east_north_m[np.isfinite(tracks.east_north_m).all(axis=1)]
     if len(targets):
         low, high = np.percentile(targets, (2, 98), axis=0)
@@ -231,30 +231,30 @@ def extent(tracks: GroundTracks, landmarks: GroundTracks, camera: CameraPath, si
 
 
 def _last_rings(tracks: GroundTracks) -> np.ndarray:
-    """(T, 72, 2) the 95 % ellipse of each target's last place; NaN where it is not known."""
+    """Return (T, 72, 2) the 95 % ellipse of each target's last place; NaN if unknown."""
     last = [rows.stop - 1 for rows in tracks.of.values()]
     return tracks.east_north_m[last, None] + ring_m(*semi_axes(tracks.covariance_m2[last]), points=72)
 
 
 def round_step(span: float, lines: int) -> float:
-    """1, 2 or 5 times a power of ten, so that about so many lines cover a span."""
+    """Return a step of 1, 2 or 5 times a power of ten, so that about `lines` steps cover a span."""
     power = 10.0 ** math.floor(math.log10(span / lines))
     return next(power * k for k in (1, 2, 5, 10) if power * k >= span / lines)
 
 
 def ground_photo(frame: MapFrame, photo: Ortho) -> np.ndarray:
-    """(H, W, 3) the photo as the frame's plot shows it, in pixels of the enlarged picture; paper beside the photo."""
+    """Warp the photo into the frame's plot, (H, W, 3) in pixels of the enlarged picture; white outside the photo."""
     fine, size = FINE / frame.metres_a_pixel, (frame.width * FINE, frame.height * FINE)
     plot_from_metres = np.array([[fine, 0, -frame.west_m * fine], [0, -fine, size[1] + frame.south_m * fine]])
     whole = np.vstack([photo.east_north_from_pixel, [0, 0, 1]])
     image, plot_from_pixel = photo.image, np.vstack([plot_from_metres @ whole, [0, 0, 1]])
-    # Warping takes single pixels: a photo that is much finer than the map is reduced first.
+    # Reduce a photo that is much finer than the map first, because warping does not average pixels.
     coarser = int(1 / max(np.sqrt(abs(np.linalg.det(plot_from_pixel[:2, :2]))), 1e-3))
     if coarser > 1:
         small = max(image.shape[1] // coarser, 1), max(image.shape[0] // coarser, 1)
         share = np.array([image.shape[1] / small[0], image.shape[0] / small[1]])
         image = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-        # Pixels count from the centre of the first one.
+        # Pixel coordinates start at the centre of the first pixel.
         plot_from_pixel = plot_from_pixel @ np.array(
             [[share[0], 0, (share[0] - 1) / 2], [0, share[1], (share[1] - 1) / 2], [0, 0, 1]]
         )
@@ -262,7 +262,7 @@ def ground_photo(frame: MapFrame, photo: Ortho) -> np.ndarray:
 
 
 def _draw_grid(picture: np.ndarray, frame: MapFrame, over_photo: bool) -> None:
-    """Grid lines through the plot and their numbers outside it."""
+    """Draw grid lines in the plot, and their numbers outside the plot."""
     rows, columns = frame.plot
     plot = picture[rows, columns]
     size = np.array([frame.width, frame.height]) * frame.metres_a_pixel
@@ -287,7 +287,7 @@ def _draw_grid(picture: np.ndarray, frame: MapFrame, over_photo: bool) -> None:
 
 
 def _draw_scale(picture: np.ndarray, frame: MapFrame) -> None:
-    """A bar of a round length and an arrow to the north, outside the plot."""
+    """Draw a scale bar of a round length and an arrow to the north, outside the plot."""
     length = round_step(frame.width * frame.metres_a_pixel, _LINES_ACROSS)
     right, low = WIDTH - RIGHT - 4, TOP + frame.height + BOTTOM - 18
     left = right - length / frame.metres_a_pixel
@@ -316,7 +316,7 @@ def _draw_legend(picture: np.ndarray, frame: MapFrame, camera: CameraPath, has_l
         (True, "target: number, way, 95 % ellipse of the last place", target),
         (has_landmarks, "landmark", _draw_landmark),
         (len(camera.east_north_m) > 0, "camera", _draw_camera),
-        (len(camera.view_m) > 0, "what it saw last", view),
+        (len(camera.view_m) > 0, "its last view", view),
         (len(signs.looks) > 0, "seen from here", look),
     ]
     x, y = LEFT + 8.0, TOP + frame.height + 62
@@ -337,7 +337,7 @@ def _draw_event_legend(picture: np.ndarray, x: float, y: float, signs: Signs) ->
 
 
 def _draw_zones(plot: np.ndarray, frame: MapFrame, signs: Signs) -> None:
-    """Areas tinted and outlined; lines with an arrow to their right, the direction to_right."""
+    """Draw areas tinted and outlined, and lines with an arrow in the direction `to_right`."""
     areas = [[frame.pixels(ring) for ring in rings] for _, rings, is_line in signs.zones if not is_line]
     tinted = plot.copy()
     for rings in areas:
@@ -360,7 +360,7 @@ def _draw_zones(plot: np.ndarray, frame: MapFrame, signs: Signs) -> None:
 
 
 class _Labels:
-    """Labels beside their places; one that would cover others or a sign moves around its place."""
+    """Writes labels beside their places. A label that would cover another label or a sign is moved around its place."""
 
     def __init__(self, picture: np.ndarray, frame: MapFrame, signs_m: Sequence[np.ndarray]) -> None:
         """signs_m: places of signs that no label may cover."""
@@ -401,7 +401,7 @@ def _draw_landmark(picture: np.ndarray, at: np.ndarray) -> None:
 
 
 def _draw_look(picture: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray) -> None:
-    """A wedge from where a vehicle was, open towards what it looked at."""
+    """Draw a wedge from the place of a vehicle, open towards the target that it saw."""
     way = at_xy - from_xy
     edge = np.arctan2(way[1], way[0]) + np.linspace(-0.38, 0.38, 9)
     shape = np.vstack([from_xy, from_xy + 26.0 * FINE * np.stack([np.cos(edge), np.sin(edge)], axis=1)])
@@ -416,7 +416,7 @@ def _draw_look(picture: np.ndarray, from_xy: np.ndarray, at_xy: np.ndarray) -> N
 
 
 def _draw_letter(picture: np.ndarray, at: np.ndarray, letter: str, colour: Colour) -> None:
-    """A disc with a letter, as H for human."""
+    """Draw a disc with a letter, such as H for human."""
     _disc(picture, at, 9, colour)
     (wide, high), _ = cv2.getTextSize(letter, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * FINE, 2 * FINE)
     x, y = np.round(np.clip(np.nan_to_num(at), -30_000, 30_000)).astype(int).tolist()
@@ -424,7 +424,7 @@ def _draw_letter(picture: np.ndarray, at: np.ndarray, letter: str, colour: Colou
 
 
 def _disc(picture: np.ndarray, at: np.ndarray, radius: int, colour: Colour) -> None:
-    """A disc with a rim of paper; radius in the finished picture."""
+    """Draw a disc with a white rim. radius: in pixels of the finished picture."""
     centre = _fixed(at).tolist()
     cv2.circle(picture, centre, ((radius + 1) * FINE) << _SUB, PAPER, -1, cv2.LINE_AA, _SUB)
     cv2.circle(picture, centre, (radius * FINE) << _SUB, colour, -1, cv2.LINE_AA, _SUB)
@@ -435,9 +435,9 @@ def _fill(picture: np.ndarray, points: np.ndarray, colour: Colour) -> None:
 
 
 def _line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, halo: bool = False) -> None:
-    """A line through (N, 2) pixels, so thick in the finished picture."""
+    """Draw a line through (N, 2) pixels. thick: in pixels of the finished picture. halo: draw a white rim."""
     if len(points) > 99:
-        # A long track jitters within a pixel from frame to frame: drawing that would take most of the time.
+        # Simplify a long track, because drawing its jitter within a pixel would take most of the time.
         points = cv2.approxPolyDP(points.astype(np.float32)[:, None], 0.4 * FINE, False)[:, 0]
     if halo:
         cv2.polylines(picture, [_fixed(points)], False, PAPER, (thick + 2) * FINE, cv2.LINE_AA, _SUB)
@@ -445,7 +445,7 @@ def _line(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, h
 
 
 def _dashes(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int, dash: float = 9.0 * FINE) -> None:
-    """A broken line, as far as it lies in the picture."""
+    """Draw the part of a dashed line that lies in the picture."""
     height, width = picture.shape[:2]
     whole = np.clip(np.nan_to_num(points), -1e6, 1e6).round().astype(int).tolist()
     for a, b in pairwise(whole):
@@ -461,28 +461,28 @@ def _dashes(picture: np.ndarray, points: np.ndarray, colour: Colour, thick: int,
 def _write(
     picture: np.ndarray, text: str, at: tuple[float, float], size: float, colour: Colour = INK, halo: bool = False
 ) -> None:
-    """A text whose first letter stands at a place of the finished picture. OpenCV's letters are those of ASCII."""
+    """Write a text that starts at a place of the finished picture. OpenCV only draws ASCII, so others become `?`."""
     text = text.encode("ascii", "replace").decode()
     for tint, thick in ((PAPER, 4 * FINE), (colour, FINE))[not halo :]:
         cv2.putText(picture, text, _fine(*at), cv2.FONT_HERSHEY_SIMPLEX, size * FINE, tint, thick, cv2.LINE_AA)
 
 
 def _text_width(text: str, size: float) -> float:
-    """Pixels of the finished picture."""
+    """Return the width of a text in pixels of the finished picture."""
     return float(cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size * FINE, FINE)[0][0] / FINE)
 
 
 def _fine(x: float, y: float) -> tuple[int, int]:
-    """A place of the finished picture in the enlarged one."""
+    """Convert a place of the finished picture to pixels of the enlarged picture."""
     return round(x * FINE), round(y * FINE)
 
 
 def _fixed(points: np.ndarray) -> np.ndarray:
-    """Fixed-point pixels for OpenCV; those far outside are clipped."""
+    """Return fixed-point pixels for OpenCV. Pixels far outside are clipped."""
     return np.round(np.clip(np.nan_to_num(points), -30_000, 30_000) * 2**_SUB).astype(np.int32)
 
 
 def _dark(target: int) -> Colour:
-    """A target's colour as in the overlay, darker for white paper."""
+    """Return a target's colour in the overlay, made darker for a white background."""
     blue, green, red = (round(0.72 * c) for c in identity_colour(target))
     return blue, green, red

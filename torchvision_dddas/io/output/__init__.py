@@ -1,4 +1,4 @@
-"""What runs write: recorders of output folders, run.json, log.txt, tables, maps and reports."""
+"""The output of runs: recorders of output folders, run.json, log.txt, tables, maps and reports."""
 
 from torchvision_dddas.io.atomic_files import Part
 from torchvision_dddas.io.output.map_files import MapSite

@@ -25,16 +25,16 @@ from torchvision_dddas.types import AerialLocations, Camera, Fix, FusedTargets, 
 
 GEOJSON, ELLIPSES, KML, COT, MAP = "tracks.geojson", "ellipses.geojson", "tracks.kml", "tracks.cot.xml", "map.png"
 FUSED = "fused.geojson"
-_MOST_VIEWS = 400  # of the camera, in the report
+_MOST_VIEWS = 400  # largest number of camera views in the report
 
 
 @dataclass(frozen=True)
 class MapSite:
-    """The ground that maps show, and what is known of the run.
+    """The ground that maps show, and facts of the run that maps need.
 
-    names: of the landmarks. origin_deg: longitude and latitude of the local metres, None where there are none.
-    start_utc_s: as in Telemetry. rate_hz: of the frames, for run.json. background: an ortho-photo under the map.
-    camera: if given, the map shows its view. to_degrees: (N, 2) local metres to longitudes and latitudes.
+    names: names of the landmarks. origin_deg: longitude and latitude of the origin of the local metres, None if
+    unknown. start_utc_s: as in Telemetry. rate_hz: frame rate, for run.json. background: an ortho-photo under the map.
+    camera: if given, the map shows its view. to_degrees: converts (N, 2) local metres to longitudes and latitudes.
     """
 
     names: Sequence[str]
@@ -47,17 +47,17 @@ class MapSite:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What run.json says of it."""
+        """The entries for run.json."""
         begun = iso_utc(np.array([self.start_utc_s]))[0] if math.isfinite(self.start_utc_s) else None
         return {"origin_deg": self.origin_deg, "start_utc": begun, "rate_hz": self.rate_hz}
 
 
 class AerialMaps(Part[AerialLocations]):
-    """Three GeoJSON, tracks.kml, tracks.cot.xml, map.png and report.html of targets located from the air.
+    """Writes maps of targets located from the air: GeoJSON, KML, Cursor-on-Target, map.png and report.html.
 
-    Memory: 120 bytes per place of a target or landmark, three times that while the array grows, and about 800 while
-    the files are written; 200 bytes per frame.
-    record: of the run; set before the end.
+    Memory: 120 bytes per place of a target or landmark, three times as much while the array grows, and about 800 bytes
+    while the files are written. In addition, 200 bytes per frame.
+    record: the record of the run. It must be set before `close`.
     """
 
     files = (GEOJSON, ELLIPSES, FUSED, KML, COT, MAP, REPORT)
@@ -71,12 +71,12 @@ class AerialMaps(Part[AerialLocations]):
         story: RunStory | None = None,
         zones: Sequence[Zone] = (),
     ) -> None:
-        """story: the timeline, events and key frames of the run, which the report shows; None without them."""
+        """story: timeline, events and key frames of the run for the report, if there are any."""
         self._folder, self._save, self._site, self._story = folder, save, site, story
         self._timeline = Timeline() if story is None else story.timeline
         self._targets, self._landmarks, self._way, self._fused = Gathered(), Gathered(), Gathered(), Gathered()
         self._views: list[tuple[int, float, np.ndarray]] = []
-        self._due, self._stride = 0, 1  # of views
+        self._due, self._stride = 0, 1  # number of candidate views; every `stride`-th view is kept
         self._last: Fix | None = None
         self._zones = {zone.name: zone_rings(zone, site.origin_deg) for zone in zones if zone.unit != "px"}
         self._unseen = dict(self._zones) if site.camera is not None else {}
@@ -112,7 +112,7 @@ class AerialMaps(Part[AerialLocations]):
         self._fused.add(places, fused.time_s, fused.state[seen, 2:])
 
     def _add_view(self, located: AerialLocations, camera: Camera | None) -> None:
-        """Keep the view for the report, and look for zones in it."""
+        """Keep the view for the report, and note which zones it shows."""
         is_due = "report" in self._save and self._due % self._stride == 0
         self._due += 1
         if camera is None or not (is_due or self._unseen):
@@ -131,8 +131,8 @@ class AerialMaps(Part[AerialLocations]):
         site, save, names, way = self._site, self._save, tuple(self._site.names), self._way.tracks(geographic=False)
         for name, rings in self._unseen.items():
             away = np.concatenate(rings).mean(axis=0) - (way.east_north_m[-1] if len(way) else 0.0)
-            where = f"its middle lies {np.hypot(*away):.0f} m from where the camera was last"
-            self.record.notes.append(f"{name} is in no located picture, so that nothing is seen there: {where}")
+            where = f"its middle lies {np.hypot(*away):.0f} m from the last place of the camera"
+            self.record.notes.append(f"{name} is in no located picture, so no event is seen there: {where}")
         has_degrees = site.origin_deg is not None
         targets = self._targets.tracks(has_degrees, site.start_utc_s)
         fused = self._fused.tracks(has_degrees, site.start_utc_s)
@@ -182,7 +182,7 @@ class AerialMaps(Part[AerialLocations]):
 
 
 class GroundMaps(Part[GroundLocations]):
-    """tracks.geojson and tracks.kml of people located from the ground, if their longitudes and latitudes are known."""
+    """Writes tracks.geojson and tracks.kml of people located from the ground, if longitudes and latitudes are known."""
 
     files = (GEOJSON, KML)
 
@@ -196,14 +196,14 @@ class GroundMaps(Part[GroundLocations]):
             self._gathered.add(located.positions)
 
     def close(self, complete: bool) -> None:
-        """Write the maps. Raises OSError if they cannot be written."""
+        """Write the maps. Raise OSError if they cannot be written."""
         tracks = self._gathered.tracks(geographic=True)
         makers = {GEOJSON: lambda: encode_geojson(geojson(tracks)), KML: lambda: kml(tracks).encode()}
         _write(self._folder, makers if self._has_degrees else {})
 
 
 def _shows(view_m: np.ndarray, rings: Sequence[np.ndarray]) -> bool:
-    """Whether a view of the ground (K, 2) and a zone have a place in common, by their corners and middles."""
+    """Return whether a (K, 2) view of the ground overlaps a zone, tested by their corners and the zone's middle."""
     if len(view_m) < 3:
         return False
     view, places = edges_of([view_m], closed=True), np.concatenate([*rings, [np.concatenate(rings).mean(axis=0)]])
@@ -211,6 +211,6 @@ def _shows(view_m: np.ndarray, rings: Sequence[np.ndarray]) -> bool:
 
 
 def _write(folder: Path, makers: Mapping[str, Callable[[], bytes]]) -> None:
-    """Write the files one after the other."""
+    """Make and write each file in turn."""
     for name, make in makers.items():
         write_whole(folder / name, make())

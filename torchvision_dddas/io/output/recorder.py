@@ -1,4 +1,4 @@
-"""The output folder of a run: claimed before any work, filled item by item, and valid at every close."""
+"""The output folder of a run. It is claimed before any work, filled item by item, and valid whenever it is closed."""
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +13,7 @@ from torchvision_dddas.io.images import NUMBERED
 from torchvision_dddas.io.interrupts import KEPT, is_stop, rescued_by, uninterrupted
 from torchvision_dddas.io.output.run_record import RUN_JSON, RunRecord, read_run_record
 
-# A disk or an encoder that needs longer than this to write or close counts as stuck.
+# Seconds after which a disk or an encoder that writes or closes counts as stuck.
 _WRITING_S = 20.0
 
 Item = TypeVar("Item")
@@ -33,7 +33,7 @@ class PartOf(Generic[Whole, Item]):
 
 
 class _Picture(Generic[Item]):
-    """A part that only shows results: its failure is recorded as a problem of the run, and ends this part alone."""
+    """A part that only shows results. If it fails, a problem of the run is recorded, and the other parts continue."""
 
     def __init__(self, name: str, part: Part[Item], record: RunRecord) -> None:
         self.failure = ""
@@ -65,24 +65,24 @@ class _Picture(Generic[Item]):
 class RunRecorder(Generic[Item]):
     """Record a run in a folder: begin, write items, and leave the context.
 
-    Leaving the context normally, by a signal (see `interrupts`) or by LostInputError keeps the results; any other
-    exception discards unfinished files. With the first item run.json says `running`, and the files of an earlier run
-    are removed: from then on all files in the folder belong to one run. Bad input before the first item changes
-    nothing. files: names of the files that a run may leave in the folder. numbered: folders of its pictures, 000001.png
-    and so on. Both may be patterns. saved: names that `--save` accepts.
+    Leaving the context normally, by a signal (see `interrupts`) or by LostInputError keeps the results. Any other
+    exception discards unfinished files. The first item writes `running` into run.json and removes the files of an
+    earlier run, so that all files in the folder belong to one run. Bad input before the first item changes nothing.
+    files: names of the files that a run may leave in the folder. numbered: folders of its pictures, 000001.png and so
+    on. Both may be patterns. saved: names that `--save` accepts.
     """
 
     files: ClassVar[tuple[str, ...]] = ()
     numbered: ClassVar[tuple[str, ...]] = ()
     saved: ClassVar[tuple[str, ...]] = ()
     pictures: ClassVar[tuple[str, ...]] = ("overlay", "video")
-    """Parts that the results do not need."""
+    """Parts that only show results. A run continues if they fail."""
 
     def __init__(self, folder: Path, save: Sequence[str] | None = None) -> None:
         """Claim a folder. save: which of `saved` to write, all by default.
 
-        Raise InputError if another run writes into the folder, if it cannot be written, or if it holds such files of
-        another program.
+        Raise InputError if another run writes into the folder, if it cannot be written, or if it holds files of these
+        names from another program.
         """
         self.folder = folder
         self.save = self.saved if save is None else tuple(save)
@@ -99,9 +99,9 @@ class RunRecorder(Generic[Item]):
         return self._record
 
     def start(self, facts: Mapping[str, Any], parts: Mapping[str, Part[Item]]) -> RunRecord:
-        """Begin the record with some facts, and the parts, except those in `saved` that are not to be saved.
+        """Begin the record with some facts, and set the parts, without parts that the user does not save.
 
-        Parts are written in this order and closed in the reverse; run.json is closed last.
+        Parts are written in this order and closed in the reverse order. run.json is closed last.
         """
         self._record = RunRecord(self.folder, facts)
         wanted = {name: part for name, part in parts.items() if name in self.save or name not in self.saved}
@@ -111,7 +111,7 @@ class RunRecorder(Generic[Item]):
         return self._record
 
     def _count(self, item: Item) -> None:
-        """Note an item in the record."""
+        """Count an item in the record."""
         raise NotImplementedError
 
     def _replace_earlier(self) -> None:
@@ -123,9 +123,9 @@ class RunRecorder(Generic[Item]):
                     path.unlink(missing_ok=True)
 
     def write(self, item: Item) -> None:
-        """Write an item to every part, or to none if a signal came before. Raise InputError if the disk refuses."""
+        """Write an item to every part, or to no part after `_rescue`. Raise InputError if a file cannot be written."""
         with uninterrupted(), self._lock, self._refusals():
-            if self._is_closed:  # by `_rescue`: the process ends
+            if self._is_closed:  # closed by `_rescue`, because the process ends
                 return
             self._replace_earlier()
             self._count(item)
@@ -133,7 +133,7 @@ class RunRecorder(Generic[Item]):
                 part.write(item)
 
     def close(self, complete: bool) -> None:
-        """Move everything to its place, run.json last. Raise InputError if the disk refuses."""
+        """Move all files to their places, run.json last. Raise InputError if a file cannot be written."""
         with uninterrupted(), self._lock, self._refusals():
             if self._is_closed:
                 return
@@ -144,7 +144,7 @@ class RunRecorder(Generic[Item]):
             self.record.close(complete)
 
     def discard(self) -> None:
-        """Keep only complete files, and no folder that was created for a run that never began."""
+        """Remove unfinished files, and a folder that was created for a run without any item."""
         with uninterrupted(), self._lock:
             self._is_closed = True
             for part in reversed(self._parts):
@@ -177,13 +177,13 @@ class RunRecorder(Generic[Item]):
             record.problems.append(str(refusal))
             self.discard()
             raise
-        except KeyboardInterrupt as stop:  # a signal during the closing of files, which waited for its end
+        except KeyboardInterrupt as stop:  # a signal that came while files were closed
             stop.add_note(KEPT)
             raise
         if error is not None:
             error.add_note(KEPT)
         elif failed := [part.failure for part in self._parts if isinstance(part, _Picture) and part.failure]:
-            raise InputError(f"{failed[0]}; all else is in {self.folder}")
+            raise InputError(f"{failed[0]}; all other results are in {self.folder}")
 
     def _rescue(self) -> bool:
         """Close the run from another thread, when the main thread is not writing."""
@@ -210,7 +210,7 @@ class RunRecorder(Generic[Item]):
 def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
     """Return the names to save, from `masks,overlay`, `all` (or None) or `none`.
 
-    Raise InputError for an unknown name, and without any name.
+    Raise InputError for an unknown name, and if no name is given.
     """
     chosen = [n.strip() for n in ("all" if names is None else names).split(",") if n.strip()]
     if not chosen:
@@ -222,13 +222,13 @@ def parse_save(names: str | None, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def _files_of_runs(folder: Path, files: Iterable[str], numbered: Iterable[str]) -> list[Path]:
-    """Return the files in a folder that runs leave there; arguments as in RunRecorder."""
+    """Return the files of earlier runs in a folder. files, numbered: as in RunRecorder."""
     pictures = [path for name in numbered for path in sorted(folder.glob(f"{name}/*")) if NUMBERED.fullmatch(path.name)]
     return [path for name in files for path in folder.glob(name)] + pictures
 
 
 def _claim(folder: Path, files: Sequence[str], numbered: Sequence[str]) -> ClaimedFolder:
-    """Claim a folder. Raise InputError if that fails, or if it holds such files of another program."""
+    """Claim a folder. Raise InputError if that fails, or if it holds files of these names from another program."""
     claim = ClaimedFolder(folder)
     foreign = _files_of_runs(folder, files, {"masks", *numbered})
     if foreign and read_run_record(folder) is None:

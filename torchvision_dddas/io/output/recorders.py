@@ -44,14 +44,14 @@ from torchvision_dddas.types import (
 
 
 class DetectionRecorder(RunRecorder[Scene]):
-    """The folder of `dddas detect`: tables, masks, overlay."""
+    """Write the output folder of `dddas detect`: tables, masks and an overlay."""
 
     files = ("detections.txt", "detections.csv", "overlay.mp4", RUN_JSON)
     numbered = ("masks",)
     saved = ("masks", "overlay")
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float) -> RunRecord:
-        """Start the run. facts: for run.json. rate_hz: of the overlay."""
+        """Start the run. facts: entries for run.json. rate_hz: frame rate of the overlay."""
         parts: dict[str, Part[Scene]] = {
             "tables": detection_tables(self.folder),
             "masks": Masks(self.folder),
@@ -67,13 +67,13 @@ class DetectionRecorder(RunRecorder[Scene]):
 
 
 class TrackRecorder(RunRecorder[TrackedFrame]):
-    """The folder of `dddas track`: tables, overlay."""
+    """Write the output folder of `dddas track`: tables and an overlay."""
 
     files = ("tracks.csv", "tracks.txt", "appearance.csv", "overlay.mp4", RUN_JSON)
     saved = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, size: tuple[int, int]) -> RunRecord:
-        """Start the run. rate_hz, size: of the overlay, (width, height)."""
+        """Start the run. rate_hz, size: frame rate and (width, height) of the overlay."""
         pictures = RunPictures(size)
         parts: dict[str, Part[TrackedFrame]] = {
             "tables": tables.track_tables(self.folder),
@@ -90,18 +90,18 @@ class TrackRecorder(RunRecorder[TrackedFrame]):
 
 
 class PeopleRecorder(RunRecorder[PeopleFrame]):
-    """The folder of `dddas people`: tables, overlay.
+    """Write the output folder of `dddas people`: tables and an overlay.
 
-    The record counts unlikely people, people cut by the picture's border, and the searched share of the windows of all
-    frames.
+    The record counts unlikely people and people cut by the picture's border. It states which share of the windows of
+    all frames was searched.
     """
 
     files = ("detections.txt", "detections.csv", "overlay.png", "overlay.mp4", RUN_JSON)
-    numbered = ("masks",)  # those of `dddas detect`, whose detections.csv is replaced
+    numbered = ("masks",)  # masks of an earlier `dddas detect`, whose detections.csv is replaced
     saved = ("overlay",)
 
     def begin(self, facts: Mapping[str, Any], rate_hz: float, is_single: bool = False) -> RunRecord:
-        """Start the run. rate_hz: of the overlay. is_single: one image, whose overlay is no video."""
+        """Start the run. rate_hz: frame rate of the overlay. is_single: input and overlay are a single image."""
         overlay: Part[PeopleFrame] = OverlayVideo(self.folder, rate_hz, draw_people)
         if is_single:
             overlay = OverlayPicture(self.folder, draw_people)
@@ -129,15 +129,15 @@ class PeopleRecorder(RunRecorder[PeopleFrame]):
 
 
 class GroundRecorder(RunRecorder[GroundLocations]):
-    """The folder of `dddas locate ground`: tables, maps.
+    """Write the output folder of `dddas locate ground`: tables and maps.
 
-    The record counts rows of positions.csv, and sightings by the source of their distance, `bearing` without distance.
+    The record counts rows of positions.csv, and sightings by the source of their distance (`bearing`: no distance).
     """
 
     files = ("positions.csv", "sightings.csv", *GroundMaps.files, RUN_JSON)
 
     def begin(self, facts: Mapping[str, Any], cameras: Sequence[str], has_degrees: bool) -> RunRecord:
-        """Start the run. cameras: their names. has_degrees: whether longitudes and latitudes are known."""
+        """Start the run. cameras: names of the cameras. has_degrees: whether longitudes and latitudes are known."""
         parts: dict[str, Part[GroundLocations]] = {
             "tables": tables.ground_tables(self.folder, cameras, has_degrees),
             "maps": GroundMaps(self.folder, has_degrees),
@@ -155,12 +155,12 @@ class GroundRecorder(RunRecorder[GroundLocations]):
 
 
 class ConfirmationRecorder(RunRecorder[Confirmation]):
-    """The folder of `dddas confirm`: the blobs' table with the findings, and the number of blobs of each kind."""
+    """Write the output folder of `dddas confirm`: the table of blobs with findings. Count the blobs of each kind."""
 
     files = ("confirmed.csv", RUN_JSON)
 
     def begin(self, facts: Mapping[str, Any], header: Sequence[str], cells: Sequence[Sequence[str]]) -> RunRecord:
-        """Start the run. header, cells: of the blobs' table, sorted by frame."""
+        """Start the run. header, cells: column names and cells of the table of blobs, sorted by frame."""
         record = self.start(facts, {"table": tables.confirmed_table(self.folder, header, cells)})
         record.counts = {"kinds": {}, "rows_looked_at": 0}
         return record
@@ -174,14 +174,14 @@ class ConfirmationRecorder(RunRecorder[Confirmation]):
 
 
 class ViewsRecorder(RunRecorder[SharedFrame]):
-    """The folder of `dddas views`: the table of each view with shared identities, the pairs, and the maps of views."""
+    """Write the output folder of `dddas views`: tables with shared identities, of pairs, and of maps between views."""
 
     files = ("view*.csv", "pairs.csv", "maps.csv", RUN_JSON)
 
     def begin(
         self, facts: Mapping[str, Any], own: str, cells: Sequence[tuple[list[str], list[list[str]]]]
     ) -> RunRecord:
-        """Start the run. own: the column of a table's own identities. cells: names and cells of each table."""
+        """Start the run. own: column of the tables' own identities. cells: column names and cells of each table."""
         parts: dict[str, Part[SharedFrame]] = {
             f"view{k}": tables.view_table(self.folder, k, own, *view) for k, view in enumerate(cells)
         }
@@ -204,12 +204,12 @@ class ViewsRecorder(RunRecorder[SharedFrame]):
         self.record.note(item.moment, sum(map(len, item.views)), {})
 
     def note_overlap(self) -> None:
-        """Note views that were not registered, and in how many moments."""
+        """Note pairs of views that were not registered, and in how many moments."""
         for pair, count in self._registered.items():
             if count < self.record.frames:
                 why = "the overlap was not found, or too few targets were in it" if count else "no overlap was found"
                 moments = f"in {self.record.frames - count} of {self.record.frames} moments"
-                hint = "" if count else "; do the clips begin at the same time, and are five targets in both?"
+                hint = "" if count else "; check that the clips begin at the same time and share five targets"
                 self.record.notes.append(f"views {pair}: {why} {moments}{hint}")
 
 
@@ -233,24 +233,24 @@ class AerialRecorder(RunRecorder[AerialLocations]):
         self._counts.add(item)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place, with the reason if nothing was located."""
+        """Note the reason if nothing was located, and move all files to their places."""
         self._counts.note_unplaced()
         super().close(complete)
 
 
 class PipelineRecorder(RunRecorder[FrameResult]):
-    """The folder of `dddas run`: tables, overlay, log, and, if targets are located, maps and a report of them."""
+    """Write the output folder of `dddas run`: tables, overlay, log and report, and maps if targets are located."""
 
     found_files: ClassVar[tuple[str, ...]] = (
         *("detections.csv", "detections.txt", "tracks.csv", "tracks.txt", "appearance.csv", SUMMARY, *EventFiles.files),
         *(LOG_TXT, REPORT, "overlay.mp4", RUN_JSON),
     )
-    """Files of a run that does not locate targets."""
+    """Files of a run without located targets."""
     files: ClassVar[tuple[str, ...]] = (
         *(*found_files, "landmarks.csv", "confirmed.csv", "crowds.csv", "fused.csv"),
         *(name for name in AerialRecorder.files if name not in (REPORT, RUN_JSON)),
     )
-    numbered: ClassVar[tuple[str, ...]] = ("masks",)  # as of PeopleRecorder
+    numbered: ClassVar[tuple[str, ...]] = ("masks",)  # as in PeopleRecorder
     saved: ClassVar[tuple[str, ...]] = ("overlay", *AerialRecorder.saved)
 
     def begin(
@@ -261,7 +261,7 @@ class PipelineRecorder(RunRecorder[FrameResult]):
         site: MapSite | None = None,
         zones: Sequence[Zone] = (),
     ) -> RunRecord:
-        """Start the run. rate_hz, size: of the overlay, (width, height). site: None if nothing is located."""
+        """Start the run. rate_hz, size: frame rate and (width, height) of the overlay. site: None: locate nothing."""
         folder, save = self.folder, self.save
         names = () if site is None else site.names
         pictures = RunPictures(size, names, zones)
@@ -319,16 +319,16 @@ class PipelineRecorder(RunRecorder[FrameResult]):
             self._not_found.add(tracked.number, tracked.number - 1, tracked.cause)
 
     def close(self, complete: bool) -> None:
-        """Put everything in its place, with the reason if nothing was located."""
+        """Note the reason if nothing was located, and move all files to their places."""
         if self._locations is not None:
             self._locations.note_unplaced()
         super().close(complete)
 
 
 def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
-    """Add a frame: identities so far, boxes that bridge gaps between detections, detections without identity.
+    """Count a frame: identities so far, boxes that bridge gaps between detections, detections without identity.
 
-    For the decisions whether to use appearance: their number, their causes, and the range of dispersions.
+    Count decisions about the use of appearance and their causes, and keep the range of dispersions.
     """
     counts["identities"] = int(tracked.tracks.identity.max(initial=counts.get("identities", 0)))
     counts["bridges"] = counts.get("bridges", 0) + int((tracked.tracks.row < 0).sum())
@@ -346,7 +346,7 @@ def _count_identities(counts: dict[str, Any], tracked: TrackedFrame) -> None:
 
 
 def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
-    """Add a frame of a run with identities and without places."""
+    """Count a frame of a run with identities but without places."""
     counts, targets = record.counts, len(tracked.detections)
     counts.setdefault("first_frame", tracked.number)
     counts["last_frame"] = tracked.number
@@ -356,17 +356,17 @@ def _count_tracks(record: RunRecord, tracked: TrackedFrame) -> None:
 
 
 class _LocationCounts:
-    """Counts in a record what is located from the air.
+    """Counts results of locating from the air in a record.
 
     positions: rows of positions.csv. unplaced: targets of located frames without a place. frames_without_position:
     frames that are not located, for example if a log covers only a part of a clip. by: frames by the source of the
     camera's pose, `nothing` for frames that are not located. weak: spans of frames that were located with a warning.
-    repairs: changes and their reasons. landmarks: for each, the number of frames in which it was seen, used, and left
-    out (of located frames); and the spans of frames in which it was reassigned or excluded.
+    repairs: changes and their reasons. landmarks: the number of frames in which each landmark was seen, used, and left
+    out although the frame was located, and the spans of frames in which it was reassigned or excluded.
     """
 
     def __init__(self, record: RunRecord, names: Sequence[str]) -> None:
-        """names: of the landmarks."""
+        """names: names of the landmarks."""
         self._record, self._names = record, tuple(names)
         self._weak, self._repairs = Spans(), Spans()
         record.counts |= {
@@ -411,7 +411,7 @@ class _LocationCounts:
         if unplaced := counts["unplaced"]:
             record.notes.append(
                 f"{unplaced} boxes of located frames have no place: they lie above the horizon or off the known "
-                "ground, or how far away they are is uncertain by a fifth, as near the horizon or from a low vehicle"
+                "ground, or their distance is uncertain by more than a fifth, as near the horizon or from a low vehicle"
             )
         if counts["positions"] == 0:
             causes = Counter[str]()
@@ -423,9 +423,9 @@ class _LocationCounts:
 def _missing_maps(site: MapSite, save: Sequence[str]) -> list[str]:
     """Notes on maps that are left out."""
     if site.origin_deg is None:
-        return ["no longitude and latitude are known: no maps for other tools, but local metres"]
+        return ["no longitude and latitude are known: positions are local metres, without maps for other tools"]
     if site.facts["start_utc"] is None and "cot" in save:
-        return [f"no clock is known: no {COT}, and times are seconds since the first frame"]
+        return [f"no clock is known: {COT} is left out, and times are seconds since the first frame"]
     return []
 
 
@@ -435,11 +435,11 @@ def _locations(result: FrameResult) -> AerialLocations:
 
 
 def _scene(result: FrameResult) -> Scene:
-    """The part of a scene that tables of detections need."""
+    """Return a scene with the parts that tables of detections need."""
     assert result.tracked.frame is not None
     return Scene(result.tracked.frame, np.zeros((0, 0), np.uint16), result.tracked.detections, 1)
 
 
 def _grid(facts: Mapping[str, Any]) -> str:
-    """The grid that the settings of a run ask for."""
+    """Return the grid that the settings of a run name."""
     return str(facts.get("settings", {}).get("aerial", {}).get("grid", ""))

@@ -74,9 +74,9 @@ class RunLog:
         self.entries.append(Entry(frame, kind, text, frame, time_s=time_s, short=short or text))
 
     def add_lasting(self, frame: int, step: int, kind: str, text: str, key: str = "") -> None:
-        """Add an event that may last: repeated within a few frames it stays one entry, even if its numbers differ.
+        """Add an event that may last. A repetition within a few frames extends its entry, even if numbers differ.
 
-        step: frames since the last one processed. key: identifies the event, by default its text without numbers.
+        step: frames since the last processed frame. key: identifies the event, by default its text without numbers.
         """
         key = f"{kind} {key or _NUMBER.sub('0', text)}"
         entry = self._open.get(key)
@@ -92,7 +92,7 @@ class RunLog:
         self.add(moved.frame, ADJUSTED, f"{change}: {moved.cause}" if moved.cause else change, short=change)
 
     def add_orders(self, result: FrameResult, explained: Iterable[str]) -> None:
-        """Add the new orders of a frame. explained: vehicles whose orders adjustments explain already."""
+        """Add the new orders of a frame, except orders of `explained` vehicles, whose adjustments are logged."""
         command, frame = result.command, result.tracked.number
         if command is None:
             return
@@ -113,7 +113,7 @@ class RunLog:
                 self.add(frame, ORDERED, text, short=f"{order.vehicle} sent")
 
     def _is_new(self, vehicle: str, goal: np.ndarray, to_metres: ToMetres | None) -> bool:
-        """Return whether a goal is far from that of the vehicle's last order."""
+        """Return whether a goal is far from the goal of the vehicle's last order."""
         place, far = (np.asarray(goal, float), 0.0) if to_metres is None else (to_metres(goal), _FAR_M)
         if vehicle in self._goal and float(np.linalg.norm(place - self._goal[vehicle])) <= far:
             return False
@@ -121,16 +121,16 @@ class RunLog:
         return True
 
     def ordered(self) -> list[Entry]:
-        """Return all entries by frame, without landmarks that are rarely unseen."""
+        """Return the entries sorted by frame, without landmarks that were unseen in fewer than three frames."""
         entries = [e for e in self.entries if e.kind != LANDMARK or e.count >= _LEAST_UNSEEN]
         return sorted(entries, key=lambda entry: entry.first)
 
 
 class LogClock:
-    """The times of frames, interpolated between those that were processed."""
+    """The times of frames, interpolated between processed frames."""
 
     def __init__(self, frame: np.ndarray, time_s: np.ndarray) -> None:
-        """frame, time_s: (N,) of the processed frames, increasing; NaN if a time is unknown."""
+        """frame, time_s: (N,) numbers and times of the processed frames, increasing; unknown times are NaN."""
         self._processed, known = frame, np.isfinite(time_s)
         self._frame, self._time_s = frame[known], time_s[known]
 
@@ -175,32 +175,32 @@ class RunStory(Part[FrameResult]):
     """Writes log.txt, and collects the events, the timeline, the key frames and the map's signs for report.html.
 
     If a run locates nothing, no map exists, and this part writes report.html itself.
-    record: of the run; set before the first frame.
+    record: the record of the run. It must be set before the first frame.
     """
 
     record: RunRecord
 
     def __init__(self, folder: Path, names: Sequence[str], pictures: RunPictures | None, is_located: bool) -> None:
-        """names: of the landmarks. pictures: draws key frames, None for a run without a report."""
+        """names: names of the landmarks. pictures: draws key frames, None for a run without a report."""
         self.log, self.signs, self.timeline = RunLog(), Signs(), Timeline(names)
         self._folder, self._names, self._pictures, self._is_located = folder, tuple(names), pictures, is_located
         self._key_frames = KeyFrames()
         self._explained: set[str] = set()
         self._measures: dict[str, Any] = {}
         self._sentences: tuple[str, ...] = ()
-        self._waiting: list[Entry] = []  # logged for frames that are still to come
+        self._waiting: list[Entry] = []  # entries of later frames
         self._read = self._before = 0
         self._kind_of: dict[int, str] = {}
 
     def event(self, frame: int, text: str, time_s: float | None = None, kind: str = WORLD) -> None:
-        """Log an event that the results do not hold, best before its frame is written.
+        """Log an event that is not part of the results. Call this before the frame of the event is written.
 
-        time_s: None: computed from the frame. kind: as named in log.txt.
+        time_s: None: computed from the frame. kind: as in log.txt.
         """
         self.log.add(frame, kind, text, time_s)
 
     def score(self, measures: Mapping[str, Any], sentences: Sequence[str] = ()) -> None:
-        """Set the score of the run against the truth: measures by name, and the main ones as sentences."""
+        """Set the score of the run against the truth: measures by name, and sentences on the main measures."""
         self._measures, self._sentences = dict(measures), tuple(sentences)
 
     def write(self, result: FrameResult) -> None:
@@ -225,7 +225,7 @@ class RunStory(Part[FrameResult]):
     def close(self, complete: bool) -> None:
         """Write log.txt and add the run's counts to its record. Raise OSError if it cannot be written."""
         record, entries, clock = self.record, self.log.ordered(), self._clock()
-        heading = f"{record.input_name or 'run'}: {describe_state(complete)}, {len(self.timeline)} frames looked at"
+        heading = f"{record.input_name or 'run'}: {describe_state(complete)}, {len(self.timeline)} frames processed"
         text = format_log(entries, clock, f"{heading}; settings and totals are in run.json")
         write_whole(self._folder / LOG_TXT, readable(text).encode())
         if events := [e for e in entries if e.kind == WORLD]:
@@ -254,7 +254,7 @@ class RunStory(Part[FrameResult]):
         if "zones" in self.record.counts:
             report.first_tables.append(zone_table(self.record.counts["zones"]))
         kinds = Counter(self._kind_of.values())
-        report.figures += [(f"told {kind.replace('_', ' ')}", f"{count}") for kind, count in kinds.items()]
+        report.figures += [(f"judged {kind.replace('_', ' ')}", f"{count}") for kind, count in kinds.items()]
         report.figures.append(("adjustments", f"{sum(e.kind == ADJUSTED for e in entries)}"))
         measures = ("measure", "value"), list(self._measures.items()), ""
         if self._sentences:
@@ -272,7 +272,7 @@ class RunStory(Part[FrameResult]):
         self.log.add_lasting(frame, frame - self._before, kind, text, key)
 
     def _log_location(self, result: FrameResult) -> None:
-        """Log why a frame was not located, or located with a warning, repairs, and unseen landmarks."""
+        """Log why a frame was not located or has a warning, and log repairs and unseen landmarks."""
         located = result.locations
         if located is None:
             return
@@ -309,12 +309,12 @@ class RunStory(Part[FrameResult]):
             short = f"target {target} is {kind.replace('_', ' ')}"
             text = f"{short} (probability of being human {confirmed.probability[i]:.2f})"
             text += f", seen by {' and '.join(by)}" if by else ""
-            text += f"; it was told {before.replace('_', ' ')} before" if before else ""
+            text += f"; it was judged {before.replace('_', ' ')} before" if before else ""
             self.log.add(located.frame, VERDICT, text, short=short)
             self.signs.add_event(kind, at.east_north_m[row])
 
     def _consider_key_frame(self, result: FrameResult, pictures: RunPictures) -> None:
-        """World events and targets each are a kind; adjustments and problems are grouped by parameter or first word."""
+        """Offer a frame as key frame. Entries are grouped by their first word, except world events and judgements."""
         pictures.show(result)
         number = result.tracked.number
         self._waiting += self.log.entries[self._read :]

@@ -1,4 +1,4 @@
-"""run.json: what was run, with which settings and versions, what happened, how long it took; the log of a session."""
+"""run.json (input, settings, versions, counts, problems and times of a run), and the log of a live session."""
 
 import json
 import math
@@ -34,7 +34,7 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Durations:
-    """Total and median of a stage's times in constant memory: counts in bins of 1 % width."""
+    """Total and median of a stage's times. Times are counted in bins of 1 % width, so that memory stays constant."""
 
     def __init__(self) -> None:
         self.total_s = 0.0
@@ -47,7 +47,7 @@ class Durations:
 
     @property
     def median_s(self) -> float:
-        """The median to 1 %; 0 without any time."""
+        """The median with a precision of 1 %; 0 without any time."""
         bins = sorted(self._bins)
         if not bins:
             return 0.0
@@ -106,7 +106,7 @@ def describe_nothing_located(causes: Mapping[str, int], unplaced: int) -> str:
 class AdjustmentList:
     """The first adjustments of each parameter, as listed in run.json, and the number of all adjustments.
 
-    rows: a dictionary each. made: by parameter.
+    rows: one dictionary per adjustment. made: number of adjustments of each parameter.
     """
 
     def __init__(self, most: int = 1000) -> None:
@@ -129,9 +129,8 @@ class AdjustmentList:
 class RunRecord:
     """Collects the facts of a run. run.json says `running` from the first frame on, so that a killed run is visible.
 
-    counts: further counts of a command beside frames and targets. scale: for a run that detects movers. notes: notes
-    for the user.
-    has_begun: whether run.json is this run's.
+    counts: further counts of a command beside frames and targets. scale: only for a run that detects movers.
+    notes: notes for the user. has_begun: whether run.json belongs to this run.
     """
 
     def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
@@ -152,7 +151,7 @@ class RunRecord:
 
     @property
     def input_name(self) -> str:
-        """The name of the clips or the table, without folders; empty where there is none."""
+        """The name of the clips or the table, without folders; empty if unknown."""
         given = self.facts.get("input", "")
         names = given if isinstance(given, list) else [given]
         return readable(", ".join(Path(str(name)).name for name in names))
@@ -165,7 +164,7 @@ class RunRecord:
         adjustments: Sequence[Adjustment] = (),
         cause: str | None = None,
     ) -> None:
-        """Count a frame. cause: why nothing could be concluded from it; None if it was concluded."""
+        """Count a frame. cause: why the frame has no reliable result; None if it has one."""
         self.frames += 1
         self.targets += targets
         for stage, spent in seconds.items():
@@ -188,9 +187,9 @@ class RunRecord:
         self._save("complete" if complete else "interrupted")
 
     def discard(self) -> None:
-        """Write that the run failed, if it had begun."""
+        """Write that the run failed, if the run had begun."""
         if self.has_begun:
-            with suppress(OSError):  # the file that says `running` stays
+            with suppress(OSError):  # on failure, run.json still says `running`
                 self._save("failed")
 
     def _save(self, state: str) -> None:
@@ -217,13 +216,13 @@ class RunRecord:
 
 
 def write_run_record(path: Path, state: str, record: Mapping[str, Any]) -> None:
-    """Replace run.json. state: running, complete, interrupted, stopped or failed. Raise OSError."""
+    """Replace run.json. state: running, complete, interrupted, stopped or failed. Raise OSError if that fails."""
     content = finite({"state": state, "versions": versions(), **record})
     write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def read_run_record(folder: Path) -> dict[str, Any] | None:
-    """Return the content of run.json in a folder; None if there is none written by dddas."""
+    """Return the content of run.json in a folder; None unless dddas wrote it."""
     try:
         record = json.loads((folder / RUN_JSON).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -240,7 +239,7 @@ def clip_facts(source: Source) -> dict[str, Any]:
 def finite(value: Any) -> Any:
     """Convert a value for JSON: numbers that are not finite become null, unknown types become text.
 
-    Texts are without passwords, and readable in any encoding.
+    Passwords are removed from texts, and the texts can be encoded as UTF-8.
     """
     if isinstance(value, dict):
         return {readable(str(k)): finite(v) for k, v in value.items()}
@@ -267,15 +266,15 @@ def versions() -> dict[str, str]:
 
 
 # --------------------------------------------------------------------------------------------------------------------
-# The folder of one live session. Earlier sessions stay as they are, and its files are valid at every moment:
-# results.jsonl grows by a line per frame, events.log by a line per event; run.json is replaced whole.
+# The folder of one live session. Folders of earlier sessions are not changed. The files are valid at every moment:
+# results.jsonl gets a line per frame, events.log gets a line per event, and run.json is replaced as a whole.
 
 RESULTS, EVENTS = "results.jsonl", "events.log"
 
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a session. utc_s: seconds since 1970. frame: 0 if it belongs to none. kind: one word."""
+    """An event of a session. utc_s: seconds since 1970. frame: 0 if no frame belongs to the event. kind: one word."""
 
     utc_s: float
     frame: int
@@ -284,7 +283,7 @@ class Event:
 
 
 def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
-    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raise InputError if that is impossible."""
+    """Make a new folder out/<UTC start> such as 2026-03-01T120000Z. Raise InputError if that fails."""
     name = datetime.fromtimestamp(time.time() if utc_s is None else utc_s, UTC).strftime("%Y-%m-%dT%H%M%SZ")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -292,7 +291,7 @@ def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
             folder = out / (name if k == 1 else f"{name}-{k}")
             try:
                 folder.mkdir()
-            except FileExistsError:  # a supervisor may start it twice within a second
+            except FileExistsError:  # a supervisor may start two sessions within a second
                 continue
             return folder
     except OSError as error:
@@ -303,7 +302,7 @@ def make_session_folder(out: Path, utc_s: float | None = None) -> Path:
 
 
 class SessionLog:
-    """events.log and run.json of a session. A method that raises OSError, as on a full disk, may be called again."""
+    """Writes events.log and run.json of a session. After OSError, as on a full disk, a method may be called again."""
 
     def __init__(self, folder: Path, facts: dict[str, Any]) -> None:
         """facts: entries of run.json that are known at the start."""
@@ -311,7 +310,7 @@ class SessionLog:
         self._events = -1
 
     def append(self, events: Sequence[Event]) -> None:
-        """Append events, a line each: UTC time, frame or -, kind, text."""
+        """Append one line per event: UTC time, frame or -, kind, text."""
         if self._events < 0:
             self._events = os.open(self.folder / EVENTS, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         stamps = iso_utc(np.array([event.utc_s for event in events]))
@@ -324,7 +323,7 @@ class SessionLog:
             while rest:
                 rest = rest[os.write(self._events, rest) :]
         except OSError:
-            with suppress(OSError):  # remove an incomplete line, which is written again later
+            with suppress(OSError):  # remove an incomplete line; the line is written again later
                 os.ftruncate(self._events, size)
             raise
 

@@ -1,4 +1,4 @@
-"""report.html of a run: figures, map, key frames, plots over time, tables, and what was run, in one offline file."""
+"""report.html of a run, one offline file: figures, map, key frames, plots over time, tables, input and settings."""
 
 import json
 import math
@@ -15,13 +15,13 @@ from torchvision_dddas.io.report import Cell, Column, render_page, table
 
 REPORT = "report.html"
 MOST_TABLE_ROWS = 200
-"""Rows of a table in the report; run.json or log.txt has them all."""
+"""Largest number of rows of a table in the report; run.json or log.txt has all rows."""
 MOST_KEY_FRAMES = 9
-"""Pictures in a report."""
-_FOLDED_FACTS = ("scenario", "settings")  # they are long
-_MARKED = 7  # key frames at events, at most
-_HELD = 18  # key frames of either kind while the run goes on
-_AREA_PX = 520 * 390  # of a key frame
+"""Largest number of key frames in a report."""
+_FOLDED_FACTS = ("scenario", "settings")  # long facts, which the report folds
+_MARKED = 7  # largest number of key frames at events
+_HELD = 18  # largest number of candidates at events, and at even distances, during the run
+_AREA_PX = 520 * 390  # largest area of a key frame
 
 Table = tuple[str, Sequence[str], Sequence[Sequence[Any]], str]
 """A title, the columns' names, rows of values, and a text for a table without rows."""
@@ -29,7 +29,7 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[Any]], str]
 
 @dataclass(frozen=True)
 class KeyFrame:
-    """A picture as JPEG with its frame number, time and a caption. weight: how much its events matter."""
+    """A picture as JPEG with its frame number, time and a caption. weight: importance of its events."""
 
     number: int
     time_s: float
@@ -45,10 +45,10 @@ class KeyFrame:
 
 @dataclass
 class RunReport:
-    """The content of a run's report; facts, notes and problems are those of its record.
+    """The content of a run's report. Facts, notes and problems come from the record.
 
-    figures: names and values. map: as map_data makes it. map_file: the picture that is printed in its place.
-    first_tables: shown before the map.
+    figures: names and values. map: from `map_data`. map_file: a picture that replaces the map on paper.
+    first_tables: tables before the map.
     """
 
     title: str
@@ -63,7 +63,7 @@ class RunReport:
     key_frames: list[KeyFrame] = field(default_factory=list)
 
     def html(self) -> str:
-        """The HTML text of the report."""
+        """Return the HTML text of the report."""
         facts = self.record.facts
         told = [(name, value) for name, value in facts.items() if name not in _FOLDED_FACTS]
         if self.record.scale is not None:
@@ -86,17 +86,17 @@ class RunReport:
 
 
 def describe_state(complete: bool) -> str:
-    """The words that say whether a run was completed or interrupted."""
-    return "complete" if complete else "interrupted: up to the last whole frame"
+    """Return words that say whether a run was completed or interrupted."""
+    return "complete" if complete else "interrupted, with results up to the last whole frame"
 
 
 def format_span(first: int, last: int) -> str:
-    """A span of frames, such as `3 to 7`."""
+    """Return a span of frames as text, such as `3 to 7`."""
     return f"{first}" if first == last else f"{first} to {last}"
 
 
 def location_tables(record: RunRecord) -> list[Table]:
-    """What the report of a run that locates targets from the air says of its frames and landmarks."""
+    """Return the report's tables on frames, repairs, adjustments and landmarks of a run that locates from the air."""
 
     def rows(spans: Sequence[Mapping[str, Any]], *keys: str) -> list[tuple[Any, ...]]:
         return [(format_span(span["first"], span["last"]), *(span[key] for key in keys)) for span in spans]
@@ -114,7 +114,7 @@ def location_tables(record: RunRecord) -> list[Table]:
     gaps, weak = rows(record.unreliable.rows, "cause"), rows(counts["weak"], "by", "cause")
     return [
         ("Frames that could not be located", ("frames", "cause"), gaps, "none"),
-        ("Frames located with something amiss", ("frames", "by", "cause"), weak, "none"),
+        ("Frames located with a warning", ("frames", "by", "cause"), weak, "none"),
         ("Repairs and exclusions", ("frames", "what and why"), rows(counts["repairs"], "cause"), "none"),
         ("Adjustments of the feedback loop", ("frame", "parameter", "from", "to", "cause"), adjustments, "none"),
         *([("Landmarks", columns, landmarks, "none")] if landmarks else []),
@@ -122,7 +122,7 @@ def location_tables(record: RunRecord) -> list[Table]:
 
 
 def _html_table(content: Table) -> dict[str, Any]:
-    """Its title, the HTML of the first MOST_TABLE_ROWS rows, how many more there are, the text if there are none."""
+    """Return a table's title, the HTML of its first MOST_TABLE_ROWS rows, the number of further rows, and a text."""
     title, names, rows, empty = content
     columns = [Column(name, text=True) for name in names]
     cells = [[_cell(value) for value in row] for row in rows[:MOST_TABLE_ROWS]]
@@ -136,7 +136,7 @@ def _cell(value: Any) -> Cell:
 
 
 def _text(value: Any) -> str:
-    """A value for a reader."""
+    """Format a value for a reader."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "unknown"
     if isinstance(value, float):
@@ -165,7 +165,7 @@ class KeyFrames:
     ) -> None:
         """Consider the next frame.
 
-        kinds: kinds of events at it with their weights; the first frame of each kind is kept. text: the caption.
+        kinds: weights of the kinds of events at the frame. The first frame of each kind is kept. text: the caption.
         draw: returns the frame's picture, (H, W, 3) uint8 BGR; called only if the frame is kept.
         """
         new = kinds.keys() - self._known
@@ -183,11 +183,11 @@ class KeyFrames:
         if is_due:
             self._even.append(frame)
             if len(self._even) > _HELD:
-                # Dropping every other one keeps the rest evenly spread.
+                # Drop every other frame, so that the others stay evenly spread.
                 self._even, self._stride = self._even[::2], 2 * self._stride
 
     def chosen(self) -> list[KeyFrame]:
-        """The key frames by number: those at events, and others that are far from all of these."""
+        """Return the key frames by number: frames at events, and further frames far from all chosen frames."""
         chosen = list(self._marked)
         while len(chosen) > _MARKED:
             del chosen[_least_needed(chosen)]
@@ -202,7 +202,7 @@ class KeyFrames:
 
 
 def _least_needed(frames: Sequence[KeyFrame]) -> int:
-    """The index of the frame with the least weight or the nearest neighbour."""
+    """Return the index of the frame with the smallest product of weight and distance to the nearest frame."""
     apart = np.diff([frame.number for frame in frames]).astype(float)
     nearest = np.minimum(np.r_[np.inf, apart], np.r_[apart, np.inf])
     return int(np.argmin(nearest * [frame.weight for frame in frames]))

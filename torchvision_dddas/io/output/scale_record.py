@@ -1,4 +1,4 @@
-"""How large people were in the pictures of a run, and from which data: for the screen, run.json and the report."""
+"""The size of people in the pictures of a run, and its source: for the screen, run.json and the report."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,20 +8,20 @@ from torchvision_dddas.types import Adjustment
 
 
 class ScaleRecord:
-    """Follows the adjustments of `gates.person_px`, px, 0 where it is not known, and of `gates.tiny`, 1 or 0."""
+    """Follows the adjustments of `gates.person_px` (px, 0 if unknown) and `gates.tiny` (1 or 0)."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        """settings: of the run, as run.json has them."""
+        """settings: settings of the run, as in run.json."""
         gates, kind = settings.get("gates", {}), settings.get("difference", {}).get("kind", "")
         stated_px = gates.get("person_px", 0.0)
         tiny = is_tiny(stated_px, gates.get("tiny_px", 0.0), kind)
         self._now = {"gates.person_px": stated_px, "gates.tiny": float(tiny)}
         self._cause = "as gates.person_px says"
-        self._sizes: dict[float, str] = {}  # and from which data
+        self._sizes: dict[float, str] = {}  # the source of each size
         self._frames = self._tiny = self._known = 0
 
     def add(self, adjustments: Sequence[Adjustment]) -> None:
-        """Take the next frame and the adjustments before it."""
+        """Count the next frame after its adjustments."""
         for made in adjustments:
             if made.parameter in self._now:
                 self._now[made.parameter], self._cause = made.new, made.cause
@@ -31,15 +31,15 @@ class ScaleRecord:
         self._frames, self._tiny, self._known = self._frames + 1, self._tiny + bool(tiny), self._known + bool(size_px)
 
     def facts(self) -> dict[str, Any]:
-        """The range of sizes, the data of the first, and in how many frames they were known, and tiny."""
+        """Return the range of sizes, the source of the first size, and in how many frames sizes were known and tiny."""
         sizes = [min(self._sizes), max(self._sizes)] if self._sizes else None
         counts = {"frames": self._frames, "frames_known": self._known, "frames_tiny": self._tiny}
         return {"person_px": sizes, "from": next(iter(self._sizes.values()), None), **counts}
 
     def line(self) -> str:
-        """The same in one line."""
+        """Return the facts in one line."""
         if not self._sizes:
-            return "scale: the size of people is not known: height above ground and focal length are not both known"
+            return "scale: the size of people is unknown: it needs the height above ground and the focal length"
         low, high = f"{min(self._sizes):.1f}", f"{max(self._sizes):.1f}"
         size, first = (low, "") if low == high else (f"{low} to {high}", "at first ")
         unknown = f"; unknown in {self._frames - self._known} frames" if self._known < self._frames else ""

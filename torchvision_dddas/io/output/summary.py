@@ -1,4 +1,4 @@
-"""summary.csv of a run: a row for each target, from where it was first seen to where it was last."""
+"""summary.csv of a run: one row per target, with its first and last place, path, speeds, classes and zones."""
 
 import math
 from collections import Counter
@@ -36,7 +36,7 @@ _STEP_S, _STEP_SIGMAS = 1.0, 4.0
 
 @dataclass
 class _Look:
-    """A target seen at place (6,): east, north, longitude, latitude, u, v. own_m2: its covariance on the ground."""
+    """A target at one frame. place: (6,) east, north, longitude, latitude, u, v. own_m2: covariance on the ground."""
 
     frame: int
     time_s: float
@@ -46,9 +46,9 @@ class _Look:
 
 @dataclass
 class _Row:
-    """A target. placed, step: the two ends of its path, to which the way to `end`, its last place, is added.
+    """A target. placed, step: first place, and last step of the path. end: last place, where the path ends.
 
-    top: its highest speed over a step, with standard deviation.
+    top: highest speed over a step, with its standard deviation.
     """
 
     first: _Look
@@ -64,9 +64,9 @@ class _Row:
     zones: dict[str, None] = field(default_factory=dict)
 
     def go(self, now: _Look) -> None:
-        """Add a step to the path once it lasts 1 s and is longer than four times what the jitter makes of it.
+        """Add a step to the path, if it lasts 1 s and its length exceeds four standard deviations of the jitter.
 
-        Shorter ones would add up the jitter of the places.
+        Shorter steps would add up the jitter of the places.
         """
         self.jitter.add(now.time_s, now.place[:2])
         if self.placed is None or self.step is None:
@@ -81,9 +81,9 @@ class _Row:
             self.step = now
 
     def speeds(self) -> list[float]:
-        """Path, mean and top speed with their standard deviations.
+        """Return path, mean and top speed, each speed with its standard deviation.
 
-        The mean is over the time of the path. Its error is by the covariances of the two ends.
+        The mean speed is over the time of the path. Its error follows from the covariances of the two ends.
         """
         if self.placed is None or self.step is None or self.step is self.placed:
             return [math.nan if self.placed is None else 0.0, *[math.nan] * 4]
@@ -95,7 +95,7 @@ class _Row:
 
 
 class Summary(Part[FrameResult]):
-    """Writes summary.csv. Memory: about 2 kB a target."""
+    """Writes summary.csv. Memory: about 2 kB per target."""
 
     def __init__(self, folder: Path, start_utc_s: float = math.nan) -> None:
         self._rows: dict[int, _Row] = {}
@@ -125,7 +125,7 @@ class Summary(Part[FrameResult]):
                 self._rows[event.target].zones[event.zone] = None
 
     def close(self, complete: bool) -> None:
-        """Write the table. Raises OSError if it cannot be written."""
+        """Write the table. Raise OSError if it cannot be written."""
         columns: dict[str, list[Any]] = {name: [] for name in _SCHEMA.names}
         for number, row in sorted(self._rows.items()):
             label, class_id = most_common(row.classes)
@@ -147,5 +147,5 @@ class Summary(Part[FrameResult]):
         self._table.close()
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove the unfinished file."""
         self._table.discard()

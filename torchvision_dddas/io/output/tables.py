@@ -52,17 +52,17 @@ TRACKS = Schema(
     *(FRAME, IDENTITY, *BOX, PRECISE_SCORE, KIND, Column("row", "d"), *MOTION),
     *(Column("link", ".3f", may_be_empty=True), *_CLASS),
 )
-"""tracks.csv. kind: `detection`, `bridge` for a box between two detections, `untracked` for one without identity.
+"""tracks.csv. kind: `detection`, `bridge` (a box between two detections), or `untracked` (without identity).
 
-row: the detection's line in the file it comes from, or its number in the frame. Heading and speed are over the ground.
-link: as in Tracks, empty where unknown. class, class_id: of the detection, for a bridge of the identity's box before.
+row: the detection's line in its file, or its number in the frame. Heading and speed are over the ground.
+link: as in Tracks, empty if unknown. class, class_id: the detection's; for a bridge, those of the box before.
 """
 
 _FEET = (Column("feet_u_px", ".2f"), Column("feet_v_px", ".2f"))
 PEOPLE = Schema("people", FRAME, TARGET, *BOX, SCORE, KIND, Column("margin", ".4f"), *_FEET, Column("cut", "d"))
-"""detections.csv of `dddas people`. The box is the body's. margin: the classifier's score. feet: between the feet.
+"""detections.csv of `dddas people`. The box bounds the body. margin: the classifier's score. feet: between the feet.
 
-cut: 1 where the picture's border cuts the body, so that its height is not to be trusted.
+cut: 1 if the picture's border cuts the body, so that its height is unreliable.
 """
 
 _POSE = (
@@ -75,8 +75,8 @@ FIXES = Schema(
     *(FRAME, Column("time_s", ".4f"), Column("by"), Column("landmarks_seen", "d"), Column("landmarks_used", "d")),
     *(Column("chi2", ".3f"), Column("freedom", "d"), *_POSE, Column("cause"), Column("changes")),
 )
-"""fixes.csv. Where the camera looks nearly straight down, heading and roll trade off against each other; the bearing of
-the picture's upper edge is steady there. focal: as a share of what the camera's file says.
+"""fixes.csv. If the camera looks nearly straight down, heading and roll are ill-determined, but the bearing of the
+picture's upper edge is stable. focal: the focal length as a multiple of the value in the camera's file.
 """
 
 SIGHTINGS = Schema(
@@ -90,13 +90,13 @@ APPEARANCE = Schema(
     *(FRAME, Column("looked", "d"), Column("weight", ".4g")),
     *(Column("location_dispersion", ".4f"), Column("appearance_dispersion", ".4f"), Column("cause")),
 )
-"""appearance.csv: a row for each frame in which it was decided whether to look at appearance; as AppearanceUse."""
+"""appearance.csv: one row per decision whether to use appearance, with the fields of AppearanceUse."""
 
 CONFIRMATION = (
     *(KIND, Column("probability", ".4f"), Column("seen_by"), Column("people", "d")),
     *(Column("nearest_m", ".3f"), Column("nearest_sigmas", ".3f"), Column("best_score", ".4f")),
 )
-"""Columns that confirmed.csv adds to the blobs' own; theirs of the same names are replaced."""
+"""Columns that confirmed.csv adds to the columns of the blobs. They replace columns of the same names."""
 CONFIRMATION_NAMES = tuple(column.name for column in CONFIRMATION)
 
 _HEIGHTS = (Column("above_sea_m", ".2f"), Column("above_ellipsoid_m", ".2f"))
@@ -109,7 +109,7 @@ _AERIAL = (
 
 
 def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
-    """tracks.txt and tracks.csv, with heading and speed since the box before for identities that have one."""
+    """Open tracks.txt and tracks.csv. Heading and speed are computed from an identity's last two boxes."""
     trails = Trails(length=2)
 
     def motion(identity: int) -> tuple[float, float]:
@@ -141,13 +141,13 @@ def track_tables(folder: Path) -> TableFiles[TrackedFrame]:
 
 
 def track_rows(tracked: TrackedFrame) -> Rows:
-    """The boxes with an identity, as MOTChallenge text has them."""
+    """Return the boxes with an identity as rows of MOTChallenge text."""
     tracks = tracked.tracks
     return mot_rows(tracked.number, tracks.box_px, tracks.score, tracks.identity)
 
 
 def people_tables(folder: Path) -> TableFiles[PeopleFrame]:
-    """detections.txt and detections.csv of people."""
+    """Open detections.txt and detections.csv of people."""
 
     def rows(found: PeopleFrame) -> Rows:
         people = found.people
@@ -164,9 +164,9 @@ def people_tables(folder: Path) -> TableFiles[PeopleFrame]:
 
 
 def aerial_tables(folder: Path, has_degrees: bool, grid: str = "") -> TableFiles[AerialLocations]:
-    """positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known. grid: as in `grids`.
+    """Open positions.csv and fixes.csv. has_degrees: whether longitudes and latitudes are known. grid: as in `grids`.
 
-    Raises InputError as `check_grid`.
+    Raise InputError as `check_grid` does.
     """
     check_grid(grid, has_degrees)
     columns = *_AERIAL, *_CLASS, *_HEIGHTS, *_ERROR, *COLUMNS[grid]
@@ -187,7 +187,7 @@ def aerial_tables(folder: Path, has_degrees: bool, grid: str = "") -> TableFiles
 
 
 def fix_row(located: AerialLocations) -> Rows:
-    """The row of a frame in fixes.csv."""
+    """Return the row of a frame in fixes.csv."""
     fix = located.fix
     pose = [math.nan] * len(_POSE)
     if fix.pose is not None:
@@ -207,20 +207,20 @@ def fix_row(located: AerialLocations) -> Rows:
 
 
 def angles_deg(pose: CameraPose) -> tuple[float, float, float]:
-    """Heading in [0, 360), pitch below the horizon, roll clockwise; straight down the upper edge gives the heading."""
+    """Return heading in [0, 360), pitch below the horizon and roll clockwise. All are in degrees."""
     heading, pitch, roll = pose.angles_rad
-    # Rounded first, so that a hair below north is not written as 360.
+    # Round first, so that a heading just below 360 is written as 0.
     return round(math.degrees(heading), 4) % 360, math.degrees(pitch), math.degrees(roll)
 
 
 def upper_edge_deg(pose: CameraPose) -> float:
-    """The bearing of the picture's upper edge from its middle, in [0, 360); NaN where it is overhead."""
+    """Return the bearing from the picture's middle to its upper edge, in [0, 360); NaN if the edge is overhead."""
     east, north, _ = -np.asarray(pose.axes, float)[:, 1]
     return round(math.degrees(math.atan2(east, north)), 4) % 360 if math.hypot(east, north) > 1e-9 else math.nan
 
 
 def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> TableFiles[GroundLocations]:
-    """positions.csv and sightings.csv. cameras: their names."""
+    """Open positions.csv and sightings.csv. cameras: names of the cameras."""
     schema = Schema(
         "positions",
         *(*_position_columns(has_degrees), PRECISE_SCORE, Column("cameras", "d"), *_CLASS, *_HEIGHTS, *_ERROR),
@@ -249,7 +249,7 @@ def ground_tables(folder: Path, cameras: Sequence[str], has_degrees: bool) -> Ta
 
 
 def landmark_table(folder: Path, names: Sequence[str], has_degrees: bool) -> TableFiles[FrameResult]:
-    """landmarks.csv, as `dddas locate aerial --landmarks` takes it. names: of the landmarks."""
+    """Open landmarks.csv, in the format of `dddas locate aerial --landmarks`. names: names of the landmarks."""
     place = DEGREES if has_degrees else EAST_NORTH
     pixel = (Column("u_px", ".3f"), Column("v_px", ".3f"))
     own = (Column("sigma_m", ".4g"), Column("seen_by"), Column("state"))
@@ -279,7 +279,7 @@ def landmark_table(folder: Path, names: Sequence[str], has_degrees: bool) -> Tab
 
 
 def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequence[str]]) -> TableFiles[Confirmation]:
-    """confirmed.csv of a table of blobs. header, cells: the table's own, sorted by frame."""
+    """Open confirmed.csv of a table of blobs. header, cells: columns and cells of the table, sorted by frame."""
     schema = Schema("blobs", *(Column(name) for name in header), *CONFIRMATION)
 
     def rows(confirmed: Confirmation) -> Rows:
@@ -292,7 +292,7 @@ def confirmed_table(folder: Path, header: Sequence[str], cells: Sequence[Sequenc
 def view_table(
     folder: Path, view: int, own: str, header: Sequence[str], cells: Sequence[Sequence[str]]
 ) -> TableFiles[SharedFrame]:
-    """view1.csv and so on: the rows of a view's table, sorted by frame, with the shared identities before its own."""
+    """Open view1.csv and so on: the rows of a view's table, sorted by frame, with shared and own identities."""
     names = [f"own_{name}" if name == own else name for name in header if name != "frame"]
     schema = Schema("views", FRAME, Column(own, "d"), *(Column(name) for name in names))
     columns = [[row[k] for row in cells] for k, name in enumerate(header) if name != "frame"]
@@ -311,7 +311,7 @@ def view_table(
 
 
 def pair_table(folder: Path) -> TableFiles[SharedFrame]:
-    """pairs.csv: the targets that two views see at one moment."""
+    """Open pairs.csv: the targets that two views see at one moment."""
     names = ("moment", "view", "other_view", "identity", "own_identity", "other_identity")
 
     def rows(item: SharedFrame) -> Rows:
@@ -327,7 +327,7 @@ def pair_table(folder: Path) -> TableFiles[SharedFrame]:
 
 
 def map_table(folder: Path) -> TableFiles[SharedFrame]:
-    """maps.csv: the homography to the other view from a view, row by row, at each moment at which it is known."""
+    """Open maps.csv: the homography from a view to the other view, row by row, at each moment with a known one."""
     terms = [f"h{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)]
     whole = [Column(name, "d") for name in ("moment", "view", "other_view")]
     schema = Schema("maps", *whole, Column("quality", ".3f"), *(Column(name, ".9g") for name in terms))
@@ -345,7 +345,7 @@ def map_table(folder: Path) -> TableFiles[SharedFrame]:
 
 
 def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
-    """confirmed.csv of targets located from the air; no file if no ground vehicle observed any."""
+    """Open confirmed.csv of targets located from the air. No file is made if ground vehicles confirm nothing."""
 
     def rows(result: FrameResult) -> Rows | None:
         confirmed, located = result.confirmed, result.locations
@@ -359,7 +359,7 @@ def confirmed_positions(folder: Path, has_degrees: bool) -> TableFiles[FrameResu
 
 
 def fused_table(folder: Path, has_degrees: bool) -> TableFiles[FusedTargets | None]:
-    """fused.csv, of the targets as all platforms know them together; no file without ground platforms."""
+    """Open fused.csv: targets fused from all platforms. No file is made without further platforms."""
     own = (Column("speed_m_s", ".4f"), Column("speed_sigma_m_s", ".4f"), Column("class"), Column("probability", ".4f"))
     places = (*EAST_NORTH, *COVARIANCE, *(DEGREES if has_degrees else ()), *_VELOCITY)
     schema = Schema("fused", Column("time_s", ".4f"), FRAME, TARGET, *places, *own, Column("seen_by"))
@@ -393,7 +393,7 @@ def fused_table(folder: Path, has_degrees: bool) -> TableFiles[FusedTargets | No
 
 
 def crowd_table(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
-    """crowds.csv, of crowds as ground vehicles see them; no file if none was seen."""
+    """Open crowds.csv: crowds seen by ground vehicles. No file is made if no crowd was seen."""
     own = (Column("people", "d"), *_VELOCITY, Column("seen_by"), Column("steers", "d"))
     schema = Schema("crowds", FRAME, TARGET, *EAST_NORTH, *(DEGREES if has_degrees else ()), *own)
 
@@ -418,7 +418,7 @@ def crowd_table(folder: Path, has_degrees: bool) -> TableFiles[FrameResult]:
 
 
 def appearance_table(folder: Path) -> TableFiles[TrackedFrame]:
-    """appearance.csv; no file if nothing was decided, as without pictures."""
+    """Open appearance.csv. No file is made without decisions, as in a run without pictures."""
 
     def rows(tracked: TrackedFrame) -> Rows | None:
         use = tracked.tracks.appearance
@@ -465,11 +465,11 @@ def _class_rows(label: np.ndarray, class_id: np.ndarray) -> dict[str, np.ndarray
 
 
 def _variances(covariance_m2: np.ndarray) -> np.ndarray:
-    """(N, 3) east, both, north."""
+    """Return (N, 3): variance of east, covariance, variance of north."""
     return covariance_m2.reshape(-1, 4)[:, [0, 1, 3]]
 
 
 def _named(columns: Sequence[Column], values: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns of (N, K) values by their names."""
+    """Return the columns of (N, K) values by their names."""
     named = np.reshape(values, (-1, len(columns))).T
     return {column.name: cells for column, cells in zip(columns, named, strict=True)}

@@ -11,31 +11,31 @@ from markupsafe import Markup
 from torchvision_dddas.io.report.charts import Events, Line, Panel, time_chart
 from torchvision_dddas.types import Adjustment, AerialLocations, FrameResult
 
-# Kinds of events, as log.txt names them.
-ADJUSTED = "adjusted"  # a parameter that the feedback moved
+# Kinds of events, named as in log.txt.
+ADJUSTED = "adjusted"  # the feedback changed a parameter
 WORLD = "world"  # an event of a simulated world
-PROBLEM = "problem"  # something that went wrong
-NOTICED = "noticed"  # an instrument that is silent or frozen
-VERDICT = "told"  # a target's confirmation by ground vehicles
-ORDERED = "ordered"  # an order to a vehicle
-ZONE = "zone"  # what a target did at a zone
-CROWD = "crowd"  # what crowds did
+PROBLEM = "problem"  # a fault
+NOTICED = "noticed"  # an instrument is silent or frozen
+VERDICT = "told"  # ground vehicles judged a target
+ORDERED = "ordered"  # a vehicle got an order
+ZONE = "zone"  # an event at a zone
+CROWD = "crowd"  # an event of crowds
 
 _EVENT_COLOURS = {WORLD: 7, ADJUSTED: 1, VERDICT: 3, ORDERED: 5, NOTICED: 4, PROBLEM: 2, ZONE: 8, CROWD: 6}
-_KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds of a target in a Confirmation, and their colours
-_COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)  # of stages and parameters
+_KINDS = {"human": 3, "not_human": 2, "unseen": 6}  # kinds in a Confirmation, and their colours
+_COLOURS = (1, 2, 3, 7, 5, 8, 4, 6)  # colours of stages and parameters
 _MOST_PARAMETERS, _MOST_STAGES = 12, 7
 
 
 class Timeline:
-    """Figures of the frames of a run by name, 8 bytes each, 4 for the time spent in a stage.
+    """Figures of each frame of a run by name. A figure takes 8 bytes, the time spent in a stage 4 bytes.
 
-    `frame` and `time_s` are the time axis; frames with `located` 0 are shaded.
-    events: frame and text of those of each kind.
+    `frame` and `time_s` are the time axis. Frames with `located` 0 are shaded.
+    events: frame and text of each event, by kind.
     """
 
     def __init__(self, vehicles: Collection[str] = ()) -> None:
-        """vehicles: names of the ground vehicles; the same parameter of all of them shares a panel."""
+        """vehicles: names of the ground vehicles. A panel shows the same parameter of all vehicles."""
         self.events: dict[str, list[tuple[int, str]]] = {}
         self._vehicles = frozenset(vehicles)
         self._figures: dict[str, array[float]] = {}
@@ -46,7 +46,7 @@ class Timeline:
         return len(self._figures.get("frame", ()))
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """(N,) a figure of each frame, NaN where it is not known."""
+        """(N,) values of a figure, NaN if unknown."""
         return np.array(self._figures[name]) if name in self._figures else np.full(len(self), np.nan)
 
     @property
@@ -55,7 +55,7 @@ class Timeline:
         return self._figures["time_s"][-1]
 
     def add_result(self, result: FrameResult) -> None:
-        """Add a frame with its targets, confirmations, the time spent, and what was adjusted."""
+        """Add a frame with its targets, confirmations, computing times and adjustments."""
         tracked, located, confirmed = result.tracked, result.locations, result.confirmed
         figures = {
             "frame": tracked.number,
@@ -70,7 +70,7 @@ class Timeline:
         self._add(figures, source.seconds, source.adjustments)
 
     def add_locations(self, located: AerialLocations) -> None:
-        """Add a frame of which only the places are known."""
+        """Add a frame of a run that only locates targets."""
         self._add(_location_figures(located))
 
     def _add(
@@ -92,14 +92,14 @@ class Timeline:
             self._moves.setdefault(moved.parameter, []).append((moved.frame, moved.old, moved.new))
 
     def parameter(self, name: str) -> np.ndarray:
-        """(N,) values of a parameter in each frame; NaN where it is not finite."""
+        """Return the (N,) values of a parameter in each frame; NaN if not finite."""
         moves = sorted(self._moves[name], key=lambda move: move[0])
         levels = np.array([moves[0][1], *(new for _, _, new in moves)], float)
         found = levels[np.searchsorted([frame for frame, _, _ in moves], self["frame"], side="right")]
         return np.where(np.isfinite(found), found, np.nan)
 
     def axis(self) -> tuple[np.ndarray, str]:
-        """(N,) places of the frames on the time axis and its unit: seconds where all are known."""
+        """Return the (N,) places of the frames on the time axis, and its unit: seconds if all times are known."""
         time_s = self["time_s"]
         return (time_s, "time, s") if np.isfinite(time_s).all() else (self["frame"], "frame")
 
@@ -109,7 +109,7 @@ class Timeline:
         return time_chart(self.panels(), at, self["located"] == 0, unit)
 
     def panels(self) -> list[Panel]:
-        """Events, targets, confirmations, adjusted parameters, the time spent, and how well frames were located."""
+        """Return panels of events, targets, confirmations, adjusted parameters, computing time, and accuracy."""
         found = [("found", "found", 6), ("tracked", "with an identity", 1), ("placed", "located", 2)]
         kinds = [(kind, kind.replace("_", " "), colour) for kind, colour in _KINDS.items()]
         sigmas = [("sigma_m", "absolute", 2), ("relative_m", "relative to the team", 3)]
@@ -118,7 +118,7 @@ class Timeline:
         return [
             ("what happened", self._events()),
             ("targets", self._lines(found)),
-            ("targets by what ground vehicles say", self._lines(kinds)),
+            ("targets as judged by ground vehicles", self._lines(kinds)),
             *self._parameters(),
             ("time spent on a frame, ms, stacked", self._time_spent()),
             ("landmarks", self._lines(seen)),
@@ -127,7 +127,7 @@ class Timeline:
         ]
 
     def _lines(self, figures: Sequence[tuple[str, str, int]], band: bool = False) -> list[Line]:
-        """Lines of those figures that are known in any frame. figures: their names, titles and colours."""
+        """Return lines of the figures that are known in any frame. figures: names, titles and colours."""
         at, _ = self.axis()
         lines = [Line(title, at, self[name], colour, band=band) for name, title, colour in figures]
         return [line for line in lines if np.isfinite(line.y).any()]
@@ -142,7 +142,7 @@ class Timeline:
         return found
 
     def _parameters(self) -> list[Panel]:
-        """The panels of the parameters moved most often, without those that never changed."""
+        """Return the panels of the parameters that were adjusted most often, without constant parameters."""
         at, _ = self.axis()
         values = {parameter: self.parameter(parameter) for parameter in self._moves}
         panels: dict[str, list[str]] = {}
@@ -159,7 +159,7 @@ class Timeline:
         return found
 
     def _time_spent(self) -> list[Line]:
-        """The slowest stages, each stacked on those below; the highest is drawn first, so that none is hidden."""
+        """Return the slowest stages as stacked areas. The highest area is drawn first, so that no area is hidden."""
         at, _ = self.axis()
         spent_ms = {stage: 1000 * np.asarray(times, float) for stage, times in self._seconds.items()}
         by_time = sorted(spent_ms, key=lambda stage: -float(spent_ms[stage].sum()))
@@ -172,9 +172,9 @@ class Timeline:
 
 
 def _location_figures(located: AerialLocations) -> dict[str, float]:
-    """Landmarks seen and used, standard deviations, chi-squared with its 95 % limit.
+    """Return landmarks seen and used, standard deviations, and chi-squared with its 95 % limit.
 
-    sigma_m, relative_m: the median of the frame's targets' roots of the covariance's trace.
+    sigma_m, relative_m: the root of the covariance's trace, as the median of the frame's targets.
     """
     fix = located.fix
     return {
@@ -191,8 +191,8 @@ def _location_figures(located: AerialLocations) -> dict[str, float]:
 
 
 def chi2_limit(freedom: int) -> float:
-    """The 95 % quantile of chi-squared, NaN without degrees of freedom."""
-    from scipy.special import chdtri  # it would slow down the start of runs without positions
+    """Return the 95 % quantile of chi-squared; NaN without degrees of freedom."""
+    from scipy.special import chdtri  # imported here, because it would slow down runs without positions
 
     return float(chdtri(freedom, 0.05)) if freedom >= 1 else math.nan
 

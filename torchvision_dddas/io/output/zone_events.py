@@ -1,4 +1,4 @@
-"""What targets did at zones and crowds with each other: events.csv, .jsonl, .geojson, .cot.xml, and counts."""
+"""Events of targets at zones and of crowds: events.csv, .jsonl, .geojson and .cot.xml, and counts."""
 
 import json
 import math
@@ -23,12 +23,12 @@ EVENTS = Schema(
     *(Column("class"), Column("class_id", ".0f"), Column("direction"), Column("inside_s", ".3f")),
     *(Column("speed_m_s", ".3f"), Column("speed_px_s", ".2f"), *EAST_NORTH, *DEGREES, *_PIXEL, Column("others")),
 )
-"""events.csv; the members of a line of events.jsonl have the same names. As in ZoneEvent."""
+"""The columns of events.csv, with the meanings in ZoneEvent. A line of events.jsonl has the same names."""
 COUNTED = ("enter", "leave", "present", "dwell", "to_right", "to_left")
 
 
 def event_fields(event: ZoneEvent, start_utc_s: float = math.nan) -> dict[str, Any]:
-    """The columns of an event; None where a value is unknown, and numbers as events.csv rounds them."""
+    """Return the columns of an event. Unknown values are None, and numbers are rounded as in events.csv."""
     names = [column.name for column in (*EAST_NORTH, *DEGREES, *_PIXEL)]
     places = [*event.east_north_m.tolist(), *event.lonlat_deg.tolist(), *event.image_px.tolist()]
     utc_s = start_utc_s + event.time_s
@@ -56,9 +56,9 @@ def event_fields(event: ZoneEvent, start_utc_s: float = math.nan) -> dict[str, A
 
 
 class ZoneCounts:
-    """Counts events. rows: of each zone how many targets were at it, of which class, and events by kind.
+    """Counts events. rows: number of targets, classes, and events by kind of each zone.
 
-    crowds: what crowds did, by kind.
+    crowds: events of crowds, by kind.
     """
 
     def __init__(self, zones: Sequence[Zone]) -> None:
@@ -83,7 +83,7 @@ class ZoneCounts:
 
 
 def zone_table(counts: dict[str, dict[str, Any]]) -> Table:
-    """The counts for a report."""
+    """Return the counts as a table for a report."""
     rows = [
         (name, row["targets"], row["classes"], {kind: row[kind] for kind in COUNTED if row.get(kind)})
         for name, row in counts.items()
@@ -92,9 +92,9 @@ def zone_table(counts: dict[str, dict[str, Any]]) -> Table:
 
 
 class EventFiles(Part[FrameResult]):
-    """The files of events; events.geojson only where longitudes and latitudes are known, with the zones in degrees.
+    """Writes the files of events. events.geojson needs longitudes and latitudes, and also holds the zones in degrees.
 
-    events.cot.xml, marks as Cursor-on-Target, needs a clock too.
+    events.cot.xml holds marks as Cursor-on-Target. It also needs a clock.
     """
 
     files = (CSV, JSONL, GEOJSON, COT)
@@ -111,7 +111,7 @@ class EventFiles(Part[FrameResult]):
         return {name: [one[name] for one in fields] for name in EVENTS.names}
 
     def write(self, item: FrameResult) -> None:
-        """Add the events of a frame. Raises OSError if the disk refuses."""
+        """Add the events of a frame. Raise OSError if a file cannot be written."""
         self._table.write(item)
         fields = [event_fields(event, self._start_utc_s) for event in item.events]
         self._lines.write("".join(json.dumps(one) + "\n" for one in fields))
@@ -126,7 +126,7 @@ class EventFiles(Part[FrameResult]):
                 self._marks.append(mark(uid, event.describe(), (one["utc"], until), place))
 
     def close(self, complete: bool) -> None:
-        """Put the files in their places. Raises OSError if they cannot be written."""
+        """Move the files to their places. Raise OSError if they cannot be written."""
         self._table.close()
         self._lines.close()
         if self._has_degrees:
@@ -139,7 +139,7 @@ class EventFiles(Part[FrameResult]):
                 write_whole(self._folder / COT, text.encode())
 
     def discard(self) -> None:
-        """Remove what was begun."""
+        """Remove the unfinished files."""
         self._table.discard()
         self._lines.discard()
 

@@ -1,10 +1,10 @@
-"""The report kit: pages that open offline, in light and dark, on a desk and on a phone; tables that sort; SVG charts.
+"""The report kit: offline pages in light and dark for desktop and phone, sortable tables, and SVG charts.
 
     svg = chart("Loss", Axis("step"), Axis("loss"), [Line("batch", steps, losses)])
     rows = [[text_cell("a"), number_cell(0.5)]]
     html = render_page("tuning.html", title="Tuning", plots=[svg], parameters=table("parameters", columns, rows))
 
-Charts are in `charts`. Templates lie in `templates/`, the macros that they share in `templates/parts.html`.
+Charts are in `charts`. Templates are in `templates/`, and their shared macros are in `templates/parts.html`.
 """
 
 import base64
@@ -32,7 +32,7 @@ _TEMPLATES = Path(__file__).parent / "templates"
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table. value: what it sorts by, None last. small: a second line. best: shown in bold."""
+    """A cell of a table. value: sort key, None last. small: text of a second line. best: shown in bold."""
 
     text: str
     value: float | str | None = None
@@ -41,13 +41,13 @@ class Cell:
 
     @property
     def sort_key(self) -> str:
-        """The value as the page's script reads it, with all digits."""
+        """The value with all digits, for the script that sorts tables."""
         return "" if self.value is None else repr(self.value) if isinstance(self.value, float) else str(self.value)
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column's name and its meaning. text: its cells hold words and are set to the left."""
+    """A column's name and its meaning. text: the cells hold words and are aligned to the left."""
 
     name: str
     meaning: str = ""
@@ -56,7 +56,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a page that can be a file, too. caption: its name. foot: rows that stay below the others."""
+    """A table for a page or a file. caption: name of the table. foot: rows that stay below the others."""
 
     caption: str
     columns: Sequence[Column]
@@ -65,7 +65,7 @@ class Table:
 
     @property
     def markup(self) -> Markup:
-        """The HTML."""
+        """The table as HTML."""
         return table(self.caption, self.columns, self.rows, self.foot)
 
 
@@ -81,9 +81,9 @@ def table(
     foot: Sequence[Sequence[Cell]] = (),
     sorts: bool = True,
 ) -> Markup:
-    """A table that sorts by a click or a key. The first cell of a row names it.
+    """Return a table as HTML, which the reader can sort. The first cell of a row is its heading.
 
-    caption: its name for screen readers. foot: rows that stay below the others.
+    caption: name for screen readers. foot: rows that stay below the others. sorts: whether the table can be sorted.
     """
     for row in (*rows, *foot):
         if len(row) != len(columns):
@@ -93,12 +93,12 @@ def table(
 
 
 def text_cell(text: str) -> Cell:
-    """A cell of words."""
+    """Return a cell of words."""
     return Cell(text, text)
 
 
 def number_cell(value: float | None, digits: int = 3, interval: tuple[float, float] | None = None) -> Cell:
-    """A cell of a number with its interval below it; a dash where the value is unknown."""
+    """Return a cell of a number with its interval below; a dash if the value is unknown."""
     if value is None or not math.isfinite(value):
         return Cell(UNKNOWN)
     small = ""
@@ -108,7 +108,7 @@ def number_cell(value: float | None, digits: int = 3, interval: tuple[float, flo
 
 
 def format_number(value: float, digits: int = 3) -> str:
-    """A number for a reader: an int without decimals, a float with `digits`; thin spaces, a true minus."""
+    """Format a number: an int without decimals, a float with `digits` decimals, with thin spaces and a true minus."""
     if not math.isfinite(value):
         return UNKNOWN
     text = f"{value:,}" if isinstance(value, int) else f"{value:,.{digits}f}"
@@ -119,26 +119,26 @@ def format_number(value: float, digits: int = 3) -> str:
 
 
 def format_count(count: int, noun: str) -> str:
-    """A count with its noun: 1 frame, 2 frames."""
+    """Return a count with its noun, such as 1 frame or 2 frames."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def data_url(picture: bytes) -> str:
-    """A JPEG or PNG picture as a URL that holds it."""
+    """Return a data URL of a JPEG or PNG picture."""
     kind = "jpeg" if picture[:2] == b"\xff\xd8" else "png"
     return f"data:image/{kind};base64,{base64.b64encode(picture).decode()}"
 
 
 def read_vendored(name: str) -> Markup:
-    """The text of a library's file in templates/, without addresses of other files."""
+    """Return the text of a library's file in templates/, without addresses of other files."""
     text = (_TEMPLATES / name).read_text(encoding="utf-8")
     return Markup(re.sub(r"url\([^)]*\)|//# sourceMappingURL=\S+", "", text))
 
 
 @cache
 def environment() -> "Environment":
-    """The templates of this kit, with filters for numbers and pictures."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # here, as loading it takes 60 ms
+    """Return the templates of this kit, with filters for numbers and pictures."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # imported here, because it takes 60 ms
 
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),

@@ -13,9 +13,9 @@ from torchvision_dddas.io.report import format_number
 
 WIDTH, HEIGHT = 420, 300
 MOST_POINTS = 400
-"""Points drawn per curve of `chart`."""
+"""Largest number of points per curve of `chart`."""
 MOST_ROWS = 40
-"""Rows of an interval chart."""
+"""Largest number of rows of an interval chart."""
 TIME_LEFT, TIME_WIDTH = 64, 1080
 """Left edge and width in pixels of the panels of a time chart."""
 
@@ -26,7 +26,7 @@ _MOST_BINS = 540
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis with its limits; a limit of NaN follows from the values. log: decades."""
+    """An axis with its limits; a limit of NaN is taken from the values. log: logarithmic axis."""
 
     name: str
     low: float = math.nan
@@ -36,10 +36,10 @@ class Axis:
 
 @dataclass(frozen=True)
 class Line:
-    """A curve through (N,) points, broken where they are NaN.
+    """A curve through (N,) points, interrupted at NaN.
 
-    colour: 1 to 8, see style.css. faint: one of many. steps: each value holds until the next point.
-    area: filled down to zero. band: `time_chart` shades the range of the values behind the medians that it draws.
+    colour: 1 to 8, see style.css. faint: drawn faintly, for one of many curves. steps: each value holds until the next
+    point. area: filled down to zero. band: `time_chart` also shades the range of values in each bin.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Dots:
 
 @dataclass(frozen=True)
 class Interval:
-    """A named value with an interval, NaN where unknown."""
+    """A named value with an interval; unknown limits are NaN."""
 
     name: str
     value: float
@@ -76,7 +76,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Events:
-    """A row of ticks at (N,) places on the time axis, each with a text that is shown under the pointer."""
+    """A row of ticks at (N,) places on the time axis, each with a text that appears under the pointer."""
 
     name: str
     x: np.ndarray
@@ -85,13 +85,13 @@ class Events:
 
 
 Panel = tuple[str, Sequence[Line] | Sequence[Events]]
-"""A title and what a panel of a time chart shows: lines or events, not both."""
+"""A title and the content of a panel of a time chart: either lines or events."""
 
 
 def chart(
     title: str, across: Axis, up: Axis, lines: Sequence[Line] = (), dots: Sequence[Dots] = (), equal: bool = False
 ) -> Markup:
-    """Draw lines and points over two axes. equal: one scale for both, as on a map. Values beyond the axes are cut."""
+    """Draw lines and points over two axes. equal: use the same scale for both. Values beyond the axes are clipped."""
     series: list[Line | Dots] = [*lines, *dots]
     named = [one for one in series if one.name]
     legend, legend_high = _legend(named if len(named) > 1 else [], 8, 30, WIDTH)
@@ -122,9 +122,9 @@ def chart(
 def interval_chart(
     title: str, rows: Sequence[Interval], whole: Interval | None = None, limits: tuple[float, float] = (0.0, 1.0)
 ) -> Markup:
-    """Draw a row per value with its interval: the first MOST_ROWS known ones, in their order.
+    """Draw one row per value with its interval, for the first MOST_ROWS known values, in the given order.
 
-    whole: a line through all rows with its band. limits: what the axis covers at least.
+    whole: drawn as a line with a band through all rows. limits: smallest range of the axis.
     """
     shown = [row for row in rows if math.isfinite(row.value)][:MOST_ROWS]
     ends = [end for row in shown for end in (row.value, row.low, row.high) if math.isfinite(end)]
@@ -158,10 +158,10 @@ def interval_chart(
 
 
 def time_chart(panels: Sequence[Panel], at: np.ndarray, has_gap: np.ndarray, unit: str) -> Markup:
-    """Draw panels one below the other over a shared time axis; empty for fewer than two frames.
+    """Draw panels one below the other over a shared time axis. Return empty markup for fewer than two frames.
 
-    at: (N,) places of the frames on the axis, growing; each line has a value for each of them. has_gap: (N,) bool,
-    frames that are shaded. unit: what the axis counts. Panels without a known value are left out.
+    at: (N,) increasing places of the frames on the axis; each line has N values. has_gap: (N,) bool, frames to shade.
+    unit: name of the axis. Panels without a known value are left out.
     """
     panels = [(title, series) for title, series in panels if any(map(_is_known, series))]
     if len(at) < 2 or not panels:
@@ -231,17 +231,17 @@ class _Plot:
         return f'<rect {place} class="{style}"/>'
 
     def curve(self, line: Line) -> list[str]:
-        """The path of a line, with the area below it where that is filled."""
+        """Return the path of a line, after the filled area below it, if there is one."""
         pieces, areas = [], []
         for piece in _runs(np.isfinite(line.x) & np.isfinite(line.y)):
             x, y = line.x[piece], line.y[piece]
             if line.steps:
-                # The corners of a line whose values hold until they change.
+                # Add the corners of the steps.
                 jumps = np.flatnonzero(np.diff(y)) + 1
                 corner_y = np.stack([y[jumps - 1], y[jumps]], axis=1).ravel()
                 x, y = np.r_[x[0], np.repeat(x[jumps], 2), x[-1]], np.r_[y[0], corner_y, y[-1]]
             way = _way(*self.place(x, y))
-            pieces.append(f"M{way}" + ("h1.5" if len(x) == 1 else ""))  # a single point would be no line
+            pieces.append(f"M{way}" + ("h1.5" if len(x) == 1 else ""))  # draw a single point as a short line
             if line.area and len(x) > 1:
                 areas.append(f"M{way}L{_way(*self.place(x[[-1, 0]], np.zeros(2)))}Z")
         dashes, kind = _DASHES if line.dashed else "", "faint" if line.faint else "line"
@@ -265,7 +265,7 @@ def _limits(axis: Axis, series: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def _with_equal_scales(plot: _Plot) -> _Plot:
-    """Widen the limits about their middles and choose the height so that a unit is as long in both directions."""
+    """Widen the limits and choose the height so that a unit has the same length in both directions."""
     (west, east), (south, north) = plot.x, plot.y
     size_x, size_y = 1.1 * (east - west), 1.1 * (north - south)
     high = float(min(max(plot.wide * size_y / size_x, 150), 420))
@@ -276,7 +276,7 @@ def _with_equal_scales(plot: _Plot) -> _Plot:
 
 
 def _share(values: np.ndarray, limits: tuple[float, float], log: bool) -> np.ndarray:
-    """Where values lie between the limits, 0 to 1."""
+    """Return the positions of values between the limits, from 0 to 1."""
     if log:
         values, limits = np.log10(np.maximum(values, 1e-30)), (math.log10(limits[0]), math.log10(limits[1]))
     return np.clip((values - limits[0]) / (limits[1] - limits[0]), 0, 1)
@@ -292,9 +292,9 @@ def _ticks(limits: tuple[float, float], log: bool, count: int) -> list[tuple[flo
 
 
 def _panel(lines: Sequence[Line], at: np.ndarray, plot: _Plot) -> list[str]:
-    """Lines as the medians of bins of successive frames."""
+    """Draw lines through the medians of bins of successive frames."""
     values = np.concatenate([line.y for line in lines])
-    low, high = np.percentile(values[np.isfinite(values)], [0.5, 99.5]) * 1.12  # a few outliers flatten nothing
+    low, high = np.percentile(values[np.isfinite(values)], [0.5, 99.5]) * 1.12  # ignore a few outliers
     plot = replace(plot, y=(min(float(low), 0.0), max(float(high) or 1.0, 0.0)))
     parts = plot.grid(4)
     size = math.ceil(len(at) / _MOST_BINS)
@@ -303,7 +303,7 @@ def _panel(lines: Sequence[Line], at: np.ndarray, plot: _Plot) -> list[str]:
     for line in lines:
         bins = np.full(count * size, np.nan)
         bins[: len(at)] = np.where(np.isfinite(line.y), line.y, np.nan)
-        ordered = np.sort(bins.reshape(count, size), axis=1)  # unknown values come last
+        ordered = np.sort(bins.reshape(count, size), axis=1)  # NaN is sorted last
         known, row = np.maximum(np.isfinite(ordered).sum(axis=1), 1), np.arange(count)
         median = (ordered[row, (known - 1) // 2] + ordered[row, known // 2]) / 2
         for piece in _runs(np.isfinite(median)) if line.band else ():
@@ -330,7 +330,7 @@ def _event_rows(events: Sequence[Events], plot: _Plot) -> list[str]:
 
 
 def _legend(series: Sequence[Line | Dots], left: float, top: float, right: float) -> tuple[list[str], int]:
-    """A sign and a name for each series in rows between left and right, and the height of these rows."""
+    """Return a sign and a name for each series, in rows between left and right, and the height of these rows."""
     parts, x, row = [], left, 0
     for one in series:
         name = one.name if len(one.name) <= 40 else f"{one.name[:39]}…"
@@ -371,7 +371,7 @@ def _way(x: Sequence[float], y: Sequence[float]) -> str:
 
 
 def _runs(flags: np.ndarray) -> list[slice]:
-    """Each run of True."""
+    """Return the slices of successive True values."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags.astype(np.int8), 0])).reshape(-1, 2)
     return [slice(first, last) for first, last in edges.tolist()]
 

@@ -1,4 +1,4 @@
-"""The charts of a report's page as files: SVG, and PDF where fpdf2 is installed."""
+"""Write the charts of a report's page as files: SVG, and PDF if fpdf2 is installed."""
 
 import re
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ _FONT = 'font-family="Helvetica, Arial, sans-serif"'
 
 
 def save_figures(folder: Path, page: str) -> list[str]:
-    """Write each chart of a page as NAME.svg and NAME.pdf, and return the names. Raises InputError if the disk refuses.
+    """Write each chart of a page as NAME.svg and NAME.pdf, and return the names, made from the charts' titles.
 
-    The names come from the titles of the charts. PDF needs fpdf2; its letters are those of Latin-1, others become "?".
+    PDF needs fpdf2, and letters outside Latin-1 become "?" in it. Raise InputError if a file cannot be written.
     """
     names: list[str] = []
     for wide, high, label, body in _CHART.findall(page):
@@ -37,13 +37,13 @@ def save_figures(folder: Path, page: str) -> list[str]:
 
 
 def _slug(text: str, taken: Sequence[str]) -> str:
-    """A file name from a text: small letters, digits and hyphens, with a number if the name is taken."""
+    """Make a file name from a text: lower-case letters, digits and hyphens, with a number if the name is taken."""
     name = re.sub(r"[^a-z0-9]+", "-", text.translate(_LATIN).lower()).strip("-")[:60].strip("-") or "figure"
     return next(one for k in count(1) if (one := f"{name}-{k}" if k > 1 else name) not in taken)
 
 
 def _with_attributes(body: str) -> str:
-    """The chart with the light style of the pages as attributes, which need no style sheet."""
+    """Return a chart with the light style of the pages as attributes, so that it needs no style sheet."""
     css = (Path(__file__).parent / "templates" / "style.css").read_text(encoding="utf-8")
     colours = dict(re.findall(r"(--\w+):(#\w+)", css[: css.index("@media")]))
     rules = [
@@ -65,7 +65,7 @@ def _with_attributes(body: str) -> str:
 
 
 def _pdf(svg: str, wide: float, high: float) -> bytes:
-    """The PDF; empty without fpdf2."""
+    """Return the chart as PDF; empty without fpdf2."""
     try:
         from fpdf import FPDF
         from fpdf.svg import SVGObject

@@ -1,4 +1,4 @@
-"""The tables of a report as files: CSV, LaTeX (for the package booktabs) and Markdown."""
+"""Write the tables of a report as files: CSV, LaTeX (for the package booktabs) and Markdown."""
 
 import csv
 import io
@@ -15,14 +15,14 @@ _LATEX = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
 
 
 def save_tables(folder: Path, tables: Mapping[str, Table]) -> None:
-    """Write each table as NAME.csv, NAME.tex and NAME.md. Raises InputError if the disk refuses."""
+    """Write each table as NAME.csv, NAME.tex and NAME.md. Raise InputError if a file cannot be written."""
     for name, table in tables.items():
         for ending, write in {"csv": to_csv, "tex": to_latex, "md": to_markdown}.items():
             save_file(folder / f"{name}.{ending}", write(table).encode())
 
 
 def to_csv(table: Table) -> str:
-    """The table with all digits; the intervals are columns of text, and unknown values are empty."""
+    """Return a table as CSV with all digits. Intervals become columns of text, and unknown values stay empty."""
     rows = [*table.rows, *table.foot]
     spans = [any(row[k].small for row in rows) for k in range(len(table.columns))]
     text = io.StringIO()
@@ -38,7 +38,7 @@ def to_csv(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    r"""A tabular with the rules of booktabs; intervals are small, the best values bold."""
+    r"""Return a tabular with the rules of booktabs. Intervals are set small, and the best values bold."""
 
     def escape(text: str) -> str:
         return "".join(_LATEX.get(letter, letter) for letter in text)
@@ -61,7 +61,7 @@ def to_latex(table: Table) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """A table of GitHub's Markdown; intervals follow in brackets, the best values are bold."""
+    """Return a table in GitHub's Markdown. Intervals follow in brackets, and the best values are bold."""
 
     def fill(cell: Cell) -> str:
         text = f"**{cell.text}**" if cell.best else cell.text

@@ -160,7 +160,7 @@ def test_the_page_begins_with_what_changed_by_how_much_and_whether_that_is_beyon
     text = comparison_report(comparison(CLIPS))
     page = Page(text)
     assert "+0.100 F, pixels 0.500 → 0.600: better on these clips" in page.shown()
-    assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 not, 1 the same" in page.shown()
+    assert "clips: 1 better beyond noise, 1 worse beyond noise, 1 changed within noise, 1 the same" in page.shown()
     assert "only in the first" in page.shown() and "untouched" in page.shown()
     assert not {"i", "b>"} & set(page.found)
     # The interval over clips stands before that over frames, and the raw p before the corrected one.

@@ -4,7 +4,7 @@
  const map=L.map("map",{crs:L.CRS.Simple,minZoom:-10,maxZoom:9,zoomSnap:.25,attributionControl:false,zoomControl:false,preferCanvas:true,
   renderer:L.canvas({tolerance:8,padding:.3})});
  const at=p=>[p[1],p[0]],spot=row=>[row[2],row[1]],box=b=>[[b[1],b[0]],[b[3],b[2]]];
- // Names come from files: they become text nodes, never HTML.
+ // Names come from files, so they become text nodes, never HTML.
  function words(text,style){const e=document.createElement("div");e.textContent=text;e.className=style||"";return e;}
  const tag=(layer,text,stays)=>layer.bindTooltip(words(text),{permanent:stays,direction:"right",className:"tag",offset:[6,0]});
  function place(e,n){
@@ -28,7 +28,7 @@
  const lines=data.movers.map(m=>({name:m.name,kind:m.kind,colour:m.kind==="camera"?soft:shade(m.colour),parts:m.parts,
   places:m.parts.map(part=>part.map(spot))}));
 
- // Under the tracks: the photo and a grid, whose lines are drawn anew where the map goes.
+ // Draw the photo and a grid below the tracks. The grid is redrawn when the map moves.
  if(data.photo)L.imageOverlay(data.photo.url,box(data.photo.box),{pane:"ground",opacity:dark?.6:.8,alt:"photo of the ground"})
   .addTo(group("photo",soft));
  const grid=group("grid, m",soft);
@@ -47,12 +47,12 @@
    line(n,[[n,more.getWest()],[n,more.getEast()]],[n,seen.getEast()],[62,16],"right");}
  map.on("moveend resize",drawGrid);
 
- // Zones, and what ground vehicles saw and said.
+ // Draw zones, looks of ground vehicles, and events.
  const named=[];
  for(const [name,rings,isLine] of data.zones){
   const ends=rings.map(ring=>ring.map(at)),style={color:area,weight:isLine?3:2,fillOpacity:.12,interactive:false};
   named.push(tag((isLine?L.polyline(ends,style):L.polygon(ends,style)).addTo(group("zones",area)),name,true));}
- // A name that would cover another zone's goes below it.
+ // Move a zone's name below another name that it would cover.
  function part(){
   const kept=[];
   for(const zone of named){
@@ -70,7 +70,7 @@
   const face=words(letter,"sign");face.style.background=colour;
   tag(L.marker(at(p),{icon:L.divIcon({className:"",html:face,iconSize:[16,16]}),keyboard:false}).addTo(group("events",colour)),text);}
 
- // What moves. A row: time, east, north, semi-axes and bearing of the ellipse, frame.
+ // Draw the movers. A row: time, east, north, semi-axes and bearing of the ellipse, frame.
  function ellipse(row){
   const s=Math.sin(row[5]*Math.PI/180),c=Math.cos(row[5]*Math.PI/180);
   return Array.from({length:48},(_,k)=>{const u=row[3]*Math.cos(k*Math.PI/24),v=row[4]*Math.sin(k*Math.PI/24);
@@ -109,7 +109,7 @@
     past.push(m.places[i].slice(0,k+1).concat([spot(here)]));
     now=here;isSeen=!!b||t-a[0]<=half;});
    m.past.setLatLngs(past);
-   // The dot of a target that is not seen now stays pale where it was seen last, unless there are many.
+   // The dot of a target that is not seen now stays pale at its last place, unless there are many targets.
    if(!isSeen&&!few)now=null;
    if(now)m.group.addLayer(m.dot.setLatLng(spot(now)).setStyle({fillOpacity:isSeen?1:.3}));else m.group.removeLayer(m.dot);
    if(m.ring)m.ring.setLatLngs(now&&now[3]!==null?ellipse(now):[]);}
@@ -123,7 +123,7 @@
  function stop(){clearInterval(timer);timer=0;get("play").textContent="Play";}
  get("play").addEventListener("click",()=>{
   if(timer)return stop();
-  // As fast as the clip, or faster so that a minute shows all of it.
+  // Play as fast as the clip, or faster, so that playing takes a minute at most.
   const whole=data.unit==="s"?Math.min(last-first,60):20,step=.05*(steps-1)/Math.max(whole,.05);
   exact=+slider.value>=steps-1?0:+slider.value;get("play").textContent="Pause";
   timer=setInterval(()=>{exact+=step;slider.value=exact;show(time());if(exact>=steps-1)stop();},50);});
@@ -131,6 +131,6 @@
  map.on("mousemove click",event=>{get("place").textContent=place(event.latlng.lng,event.latlng.lat).replace("\n", ", ");});
  L.control.scale({imperial:false}).addTo(map);
  get("whole").addEventListener("click",()=>map.fitBounds(box(data.whole)));
- L.control.zoom({position:"bottomright"}).addTo(map);  // below, where popups seldom are
+ L.control.zoom({position:"bottomright"}).addTo(map);  // at the bottom, where popups rarely open
  drawGrid();show(last);part();
 })();
