@@ -29,7 +29,7 @@ def colours(
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=X,Y,W,H", help="A box of a landmark's colour in the first picture; repeatable."),
+        typer.Option(metavar="NAME=X,Y,W,H", help="A box of a landmark's colour in the first picture; repeat it."),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="FILE", help="The TOML to write, with a picture beside it.")] = Path(
         "colours.toml"

@@ -94,7 +94,7 @@ def confirm(
             if not cameras:
                 notes.append("without --camera the vehicles' views are unknown, so no blob can be judged not human")
             if identities is None:  # do not add up evidence of two blobs if identities are unknown
-                notes.append("rows are judged alone; give --identities to add up evidence of lasting target numbers")
+                notes.append("rows are judged alone; if target numbers persist, --identities adds up evidence")
             found = confirm_positions(table, vehicles, settings, interval, bool(identities), rate)
         elif cameras or poses:
             raise InputError(f"{blobs} has boxes: --camera and --poses are for positions on the ground")

@@ -166,7 +166,7 @@ def note_patrol(config: str | None, quiet: bool) -> None:
         )
     if "patrol" in names and not quiet:
         words = "with telemetry, which determines the size of people, patrol equals the default"
-        echo(f"dddas: --config patrol takes people to be about 4 px large (gates.person_px); {words}", err=True)
+        echo(f"dddas: --config patrol assumes people of about 4 px (gates.person_px); {words}", err=True)
 
 
 def load_settings(

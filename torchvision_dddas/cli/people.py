@@ -96,7 +96,7 @@ def people(
 
 
 def _notes(record: "RunRecord", name: str, table: "DetectionTable", source: "Source") -> list[str]:
-    """Return notes for the user on a table that determined where to search."""
+    """Return notes for the user on the table that selected the searched areas."""
     if table.last > source.last:
         return [f"the clip ended after frame {source.last}, {name} goes on to {table.last}"]
     if nowhere := record.counts["searched"]["frames_nowhere"]:

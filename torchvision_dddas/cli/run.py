@@ -181,7 +181,7 @@ def run(
         )
         return
     if scene or seed is not None:
-        raise InputError(f"--scene and --seed change a simulated scenario, and {clip} is none; give sim:NAME")
+        raise InputError(f"--scene and --seed change a simulated scenario, but {clip} is no scenario; give sim:NAME")
     if landmarks is None:
         refuse_options({"--colours": colours}, "is of no use without --landmarks FILE: they are the landmarks' colours")
     if landmarks is None and telemetry is None:
@@ -193,7 +193,7 @@ def run(
     elif detections is not None and detector is not None:
         raise InputError("--detections and --detector were both given; give one of them")
     elif not movers:
-        refuse_options({"--ignore": ignore}, "is for the search for what moves; give --movers too, or leave it out")
+        refuse_options({"--ignore": ignore}, "is for the search for movers; give --movers too, or leave it out")
     if detector is None:
         of_detector = {"--provider": provider, "--score": score, "--classes": classes}
         refuse_options(of_detector, "is for --detector MODEL; give it too")
@@ -354,7 +354,7 @@ def _fly(
     if "truth" in names:
         command = f"dddas evaluate {out / 'truth' / 'gt.txt'} {out}"
         lines.append(
-            f"{out / 'truth'}: what is true; boxes in the picture, not places as above, are scored by {command}"
+            f"{out / 'truth'}: the truth; boxes in the picture (not places, as above) are scored by {command}"
         )
     print_located(lines, record, out, quiet)
 

@@ -29,7 +29,7 @@ class OwnDetector:
         self._camera, self._last = CameraMotion(registrar), 0
 
     def update(self, frame: Frame | np.ndarray) -> list[Scene]:
-        """Return the scene of the next frame. Raise InputError for data that is no picture, and for other results."""
+        """Return the scene of the next frame. Raise InputError for a bad picture or a bad result."""
         image = as_picture(frame.image if isinstance(frame, Frame) else frame)
         if isinstance(frame, Frame):
             frame = replace(frame, image=image)
