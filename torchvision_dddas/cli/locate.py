@@ -299,7 +299,7 @@ def position_lines(record: "RunRecord") -> list[str]:
         if spans := counts.get(what):
             lines.append(f"note: {words}, {_describe_longest(spans)}")
     for name, kept in counts.get("landmarks", {}).items():
-        # Frames that could not be located use no landmark, so they do not count against this landmark.
+        # Count located frames only, because frames that were not located use no landmark.
         tried = kept["used"] + kept["left_out"]
         if kept["left_out"] > 0.5 * tried:
             lines.append(

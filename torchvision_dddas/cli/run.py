@@ -353,9 +353,7 @@ def _fly(
     lines = [first, *score.lines(), *others]
     if "truth" in names:
         command = f"dddas evaluate {out / 'truth' / 'gt.txt'} {out}"
-        lines.append(
-            f"{out / 'truth'}: the truth; boxes in the picture (not places, as above) are scored by {command}"
-        )
+        lines.append(f"{out / 'truth'}: the truth; boxes in the picture (not places, as above) are scored by {command}")
     print_located(lines, record, out, quiet)
 
 

@@ -99,7 +99,7 @@ def tune(
         steps=steps, batch=batch, rate=rate, seed=seed, patience=patience, most_s=longest_s, pull=pull, watched=watched
     )
     spec = change_spec(study, config, set_ or [], backend and backend.value)
-    # The measures before tuning read the settings again, so tuned.toml must not replace them.
+    # The measures before tuning read the settings files again, so tuned.toml must not overwrite one of them.
     read = [study, *([Path(spec.config)] if spec.config else [])]
     refuse_own_input(read, [out / name for name in FILES], "folder with --out")
     names, held = split_patterns(parameters, "--parameters", "parameter"), split_patterns(holdout, "--holdout")
